@@ -24,9 +24,9 @@ from converters.records.errors import StageFailed
 from converters.segmenting import SEGMENTING, label_unlabelled, propose_unproposed
 from converters.tables import alignment_table, bounds, gate_table, proposal_tables
 from interactive_nav_common.config import read_words, refuse_unused
-from interactive_nav_common.errors import UserError
-from interactive_nav_common.progress import stage_progress, warn_once
-from interactive_nav_common.signals import interrupts_heard, number_of
+from interactive_nav_common.errors import UserError, printable, reports_errors
+from interactive_nav_common.progress import SafeConsole, stage_progress, warn_once
+from interactive_nav_common.signals import STOPS, interrupts_heard, number_of
 from interactive_nav_common.words import Command, Commands, Parser, add_words, read_commands
 from scenes_mjcf.schema import CATEGORIES
 from scenes_mjcf.sets import installed
@@ -98,7 +98,7 @@ def _convert_many(arguments: argparse.Namespace, config: ConvertConfig, console:
     with stage_progress(console) as report:
         failed = convert_many(
             [Path(place) for place in arguments.places], arguments.into, config, launcher, side_by_side, report,
-            lambda line: console.print(line, soft_wrap=True, highlight=False, markup=False),
+            lambda line: console.print(line, soft_wrap=True, highlight=False),
         )  # fmt: skip
     if failed:
         console.print(f"not converted, or with gates that fail: {', '.join(failed)}", soft_wrap=True, highlight=False)
@@ -134,7 +134,7 @@ def _check(arguments: argparse.Namespace, console: Console) -> int:
             f"({gate.limit.meaning})"
         )
     for warning in (w for gate in gates for w in gate.warnings):
-        print(f"warning: {warning}")
+        print(f"warning: {printable(warning)}")
     failed = sum(not g.passed for g in gates)
     print(f"{manifest.name}: {len(gates) - failed} of {len(gates)} gates pass")
     return 1 if failed else 0
@@ -151,7 +151,7 @@ def _export(arguments: argparse.Namespace, console: Console) -> None:
     from converters.write.sh3d import export_sh3d
 
     for line in export_sh3d(installed(arguments.scene), arguments.output):
-        console.print(f"{arguments.output}: {line}", soft_wrap=True, highlight=False, markup=False)
+        console.print(f"{arguments.output}: {line}", soft_wrap=True, highlight=False)
 
 
 def _propose(arguments: argparse.Namespace, console: Console) -> None:
@@ -172,19 +172,19 @@ def _propose(arguments: argparse.Namespace, console: Console) -> None:
 
 def _annotate(arguments: argparse.Namespace, console: Console) -> int:
     from converters.annotate.browser import Page
-    from converters.annotate.guard import guarded_server
     from converters.annotate.session import Store, start
     from converters.propose.proposals import propose_instances
     from converters.propose.retrieval import read_library
     from converters.read.source import read_source
     from interactive_nav_common.locks import alone_in
+    from interactive_nav_common.untrusted.guard import guarded_server
 
     with alone_in(arguments.output):
         raw = read_source(arguments.source, arguments.format, up=arguments.up, unit=arguments.unit)
         own = arguments.source if (arguments.source / "cad").is_dir() else None
         store, proposals = Store(arguments.output, read_library(arguments.library or own)), propose_instances(raw.scan)
         session = store.save(store.open(raw, lambda: start(raw, proposals)))
-        server, address = guarded_server(arguments.host, arguments.port, raw.name)
+        server, address = guarded_server(arguments.host, arguments.port, raw.name, "annotate")
         page = Page(server, store, session, raw, proposals)
         console.print(f"{address} (Ctrl-C ends it; every action is saved)", soft_wrap=True, highlight=False)
         try:
@@ -265,11 +265,12 @@ def _standing(arguments: argparse.Namespace) -> dict[str, int]:
     return found
 
 
-@interrupts_heard(signal.SIGTERM)
+@reports_errors("error")
+@interrupts_heard(*STOPS)
 def main(argv: list[str] | None = None) -> int:
     """Runs one command and returns its exit code."""
     arguments = _parse(argv)
-    console = Console()
+    console = SafeConsole()
     before = _standing(arguments)
 
     def written() -> str:
@@ -282,9 +283,11 @@ def main(argv: list[str] | None = None) -> int:
         return arguments.run(arguments, console) or 0
     except KeyboardInterrupt as stop:
         number = number_of(stop)
-        print(f"{'terminated' if number == signal.SIGTERM else 'interrupted'}; {written()}", file=sys.stderr)
+        print(f"{'interrupted' if number == signal.SIGINT else 'terminated'}; {written()}", file=sys.stderr)
         return 128 + number
     except OSError as error:
+        if isinstance(error, BrokenPipeError):
+            raise
         where = error.filename or getattr(arguments, "out", None) or "file system"
         print(f"error: {where}: {error.strerror or error}; {written()}", file=sys.stderr)
         return 2

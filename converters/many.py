@@ -9,7 +9,6 @@ import dataclasses
 import hashlib
 import json
 import os
-import signal
 import sys
 import tempfile
 import time
@@ -29,7 +28,7 @@ from interactive_nav_common.errors import ConfigError, FileError, UserError, rea
 from interactive_nav_common.files import check_name, write_text
 from interactive_nav_common.jobs.processes import Launcher
 from interactive_nav_common.rows import write_parquet
-from interactive_nav_common.signals import heard
+from interactive_nav_common.signals import interrupts_heard
 from scenes_mjcf.schema import SceneError, load_manifest
 
 ROWS = "conversions.parquet"
@@ -170,9 +169,9 @@ def measured(results: Sequence[Converted], seconds: float) -> dict[str, Any]:
     }
 
 
+@interrupts_heard()  # so that what is unfinished is removed
 def main(task: str) -> int:
     """Converts one source and writes its row; the exit code is that of `python -m converters convert`."""
-    signal.signal(signal.SIGTERM, heard(lambda *_: sys.exit(143)))  # so that what is unfinished is removed
     told, began, code = json.loads(task), time.monotonic(), 2
     config = told["config"]
     places = {word: Path(config[word]) if config[word] else None for word in ("library", "root")}

@@ -19,6 +19,7 @@ from converters.pipeline import ConvertConfig, Converted, convert
 from interactive_nav_common.config import Natural, nearest
 from interactive_nav_common.files import check_name, part_folder, publish
 from interactive_nav_common.records import Reader
+from interactive_nav_common.untrusted.reading import read_bytes
 
 MODELS = {"train": TRAIN_MODELS, "test": TEST_MODELS}
 """Split -> CAD models of sparse buildings: held-out models are held out here."""
@@ -166,7 +167,7 @@ def load_recipes(path: Path) -> Recipes:
         GenerationError: no such file, not YAML, or wrong content.
     """
     try:
-        text = path.read_bytes()
+        text = read_bytes(path)
     except OSError as error:
         why = "no such file" if isinstance(error, FileNotFoundError) else error.strerror
         raise GenerationError(

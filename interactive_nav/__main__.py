@@ -9,7 +9,6 @@ from pathlib import Path
 from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.records import read_packaged
-from interactive_nav_common.signals import heard
 from interactive_nav_common.words import TYPED
 
 PROGRAMS = read_packaged(Path(__file__).with_name("programs.yaml"), dict[str, tuple[str, str]])
@@ -29,7 +28,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     module, _ = PROGRAMS[words[0]]
     TYPED[f"python -m {module}"] = "interactive-nav" if module == "converters" else f"interactive-nav {words[0]}"
     sys.argv = [module, *words[module != "converters" :]]
-    signal.signal(signal.SIGTERM, heard(lambda number, _: sys.exit(128 + number)))  # programs that save have their own
     try:
         runpy.run_module(module, run_name="__main__", alter_sys=True)
     except KeyboardInterrupt:

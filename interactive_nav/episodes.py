@@ -13,7 +13,6 @@ import gzip
 import hashlib
 import json
 import sys
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -32,6 +31,7 @@ from interactive_nav_common.config import Natural, NotNegative, Seed
 from interactive_nav_common.errors import ConfigError, UserError, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.records import Reader
+from interactive_nav_common.untrusted.reading import read_bytes, unpack
 from interactive_nav_common.words import Parser, add_words, read_commands
 
 FORMAT = "interactive-nav-episodes"
@@ -223,10 +223,10 @@ def save(file: EpisodeFile, path: str | Path) -> None:
 def load(path: str | Path) -> EpisodeFile:
     """Reads and checks a file."""
     try:
-        text = Path(path).read_bytes()
-        text = gzip.decompress(text) if Path(path).suffix == PACKED else text
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise EpisodeFileError(f"{path}: not readable as packed with gzip ({error}); make it again") from None
+        text = read_bytes(path)
+        text = unpack(text, "gzip") if Path(path).suffix == PACKED else text
+    except ValueError as error:
+        raise EpisodeFileError(f"{path}: {error}; make it again") from None
     except OSError as error:
         raise EpisodeFileError(
             f"{path}: cannot read ({error.strerror}); make one with 'python -m interactive_nav.episodes make'"

@@ -38,7 +38,7 @@ from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav.sensing.base import CameraPose, Lens, look_along
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.files import whole_file
-from interactive_nav_common.progress import progress_bar
+from interactive_nav_common.progress import SafeConsole, progress_bar
 from interactive_nav_common.rotations import yaw_from_quat
 from interactive_nav_common.words import add_words, program, read_commands
 
@@ -327,7 +327,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         check_picture_words(arguments)
         if source.suffix != ".npz":
             source = replay_of(source, arguments.episode, arguments.policy, arguments.out)
-        record(source, arguments, Console())
+        record(source, arguments, SafeConsole())
     except KeyboardInterrupt:
         print("interactive_nav.record: stopped; no video was written", file=sys.stderr)
         return 130

@@ -24,6 +24,7 @@ from interactive_nav.scenes.objects import SPLITS, VISUAL_GROUP, SmallObject, ad
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav.sensing.base import look_along
 from interactive_nav_common.errors import UserError, missing, reports_errors
+from interactive_nav_common.untrusted.guard import guarded_server
 from interactive_nav_common.words import program
 
 GAP_M = 0.03
@@ -153,11 +154,12 @@ def open_window(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     importlib.import_module("mujoco.viewer").launch(model, data)
 
 
-def open_browser(model: mujoco.MjModel, data: mujoco.MjData, port: int) -> None:
-    """Serves mjviser's page until Ctrl-C; on the whole scene, or through the camera of `vis.global.cameraid`."""
-    viser, mjviser = importlib.import_module("viser"), importlib.import_module("mjviser")
+def open_browser(model: mujoco.MjModel, data: mujoco.MjData, host: str, port: int) -> None:
+    """Serve mjviser's page until Ctrl-C: the whole scene, or the view of the camera `vis.global.cameraid`."""
+    mjviser = importlib.import_module("mjviser")
     model.stat.extent /= 3  # mjviser looks from three extents away, and follows a body of its choice
-    server, camera = viser.ViserServer(port=port), model.vis.global_.cameraid
+    (server, address), camera = guarded_server(host, port, "view", "view"), model.vis.global_.cameraid
+    print(f"{address} (Ctrl-C ends it)", flush=True)
 
     def draw(scene: Any) -> None:
         scene.update_from_mjdata(data)
@@ -192,7 +194,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         open_window(model, data)
     else:
         with contextlib.suppress(KeyboardInterrupt):
-            open_browser(model, data, arguments.port)
+            open_browser(model, data, arguments.host, arguments.port)
     return 0
 
 

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple,
 import yaml
 
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.untrusted.reading import Loader
 
 Config = TypeVar("Config")
 
@@ -213,7 +214,7 @@ def read_words(words: Sequence[str], example: str = "ppo.learning_rate=1e-4") ->
         if not equals or not name:
             raise ConfigError(f"override {word!r}: expected key=value, for example {example}")
         try:
-            value = yaml.safe_load(text)
+            value = yaml.load(text, Loader)
         except (yaml.YAMLError, ValueError, RecursionError):
             value = text
         settings.append((name, value))
@@ -322,7 +323,7 @@ def _convert(value: Any, kind: Any, where: str) -> Any:
     if origin in (Mapping, Sequence):  # whose items are checked by who reads them
         expected, empty = ("a mapping of settings", {}) if origin is Mapping else ("a list", [])
         if not isinstance(empty if value is None else value, type(empty)):
-            raise ConfigError(f"{where}: got {value!r}, expected {expected}")
+            raise ConfigError(f"{where}: got {_shown(value)}, expected {expected}")
         return value or empty
     if origin is Literal:  # which choices there are is checked with the bounds
         return value
@@ -367,4 +368,5 @@ def nearest(word: str, known: Sequence[str]) -> str:
 
 
 def _shown(value: Any) -> str:
-    return f"{value!r} ({type(value).__name__})"
+    text = repr(value)
+    return f"{text if len(text) < 80 else text[:76] + '...'} ({type(value).__name__})"

@@ -1,8 +1,13 @@
 """What a user can cause or mend: each error is one clear line (what, got, expected, remedy)."""
 
 import contextlib
+import errno
 import functools
 import importlib
+import io
+import os
+import select
+import stat
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,12 +23,19 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
+MOST_LETTERS = 1_900
+"""Of a message: the middle of a longer one, which shows a value of a file, is cut out."""
+
+
 class UserError(Exception):
     """Base of the errors that programs print as one line and exit with 2."""
 
     def __str__(self) -> str:
         """Return the message, safe to print."""
-        return printable(super().__str__())
+        text = super().__str__()
+        if len(text) > MOST_LETTERS:
+            text = f"{text[: MOST_LETTERS * 2 // 3]} [...] {text[-MOST_LETTERS // 3 :]}"
+        return printable(text)
 
 
 class ConfigError(UserError):
@@ -34,9 +46,17 @@ class FileError(UserError):
     """A file or folder that cannot be read, written or locked."""
 
 
+def regular(path: str | Path) -> Path:
+    """Return the path of a file or folder; a FIFO, socket or device, which may block or never end, raises OSError."""
+    mode = os.stat(path).st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise OSError(errno.EINVAL, "no regular file but a FIFO, socket or device", str(path))
+    return Path(path)
+
+
 @contextlib.contextmanager
 def readable(path: str | Path, kind: type[UserError], remedy: str, what: str = "") -> Iterator[None]:
-    """Whatever goes wrong in the block that reads a file is told as one line.
+    """Report whatever goes wrong in the block that reads a file as one line.
 
     Zip, npy, Parquet, msgpack, picture and mesh readers raise many kinds for a damaged file.
 
@@ -47,6 +67,7 @@ def readable(path: str | Path, kind: type[UserError], remedy: str, what: str = "
         what: it should be, such as ` as Parquet`.
     """
     try:
+        regular(path)
         yield
     except UserError:
         raise
@@ -56,22 +77,51 @@ def readable(path: str | Path, kind: type[UserError], remedy: str, what: str = "
         raise kind(f"{path}: not readable{what} ({told}); {remedy}") from error
 
 
+_REFUSED = {errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EACCES, errno.ENAMETOOLONG}
+"""Of an OSError: the system's refusals, which are no fault of ours."""
+
+
 def reports_errors(program: str) -> Callable[[Callable[Arguments, int]], Callable[Arguments, int]]:
-    """Of a program's `main`: a user's error is printed as one line, and its exit code is 2."""
+    """Decorate a program's `main`: a user's error is printed as one line, and its exit code is 2."""
 
     def of(main: Callable[Arguments, int]) -> Callable[Arguments, int]:
         @functools.wraps(main)
         def reported(*arguments: Arguments.args, **keywords: Arguments.kwargs) -> int:
+            for stream in (sys.stdout, sys.stderr):
+                if isinstance(stream, io.TextIOWrapper):  # a locale without our letters must not end a program
+                    stream.reconfigure(errors="backslashreplace")
+            code = 0
             try:
                 with interrupts_heard():
-                    return main(*arguments, **keywords)
+                    code = main(*arguments, **keywords)
+                    sys.stdout.flush()
             except UserError as error:
                 print(f"{program}: {error}", file=sys.stderr)
-                return 2
+                code = 2
+            except SystemExit as stop:
+                if not isinstance(stop.__context__, BrokenPipeError):  # of rich
+                    raise
+                code = 141
+            except OSError as error:
+                if error.errno not in _REFUSED or isinstance(error, BrokenPipeError) and not _reader_gone():
+                    raise
+                code = 141 if isinstance(error, BrokenPipeError) else 2  # 141: as of SIGPIPE
+                with contextlib.suppress(OSError), open(os.devnull, "w") as nowhere:  # takes what Python flushes
+                    os.dup2(nowhere.fileno(), sys.stdout.fileno())
+                if code == 2:
+                    print(f"{program}: {printable(str(error.filename or 'output'))}: {error.strerror}", file=sys.stderr)
+            return code
 
         return reported
 
     return of
+
+
+def _reader_gone() -> bool:
+    """Return whether nobody reads stdout any more."""
+    pipe = select.poll()
+    pipe.register(sys.stdout.fileno(), 0)
+    return bool(pipe.poll(0))
 
 
 class MissingPackage(ConfigError, ImportError):

@@ -7,6 +7,7 @@ import os
 import re
 import secrets
 import shutil
+import stat
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from interactive_nav_common.errors import FileError, UserError
+from interactive_nav_common.errors import FileError, UserError, regular
 from interactive_nav_common.locks import is_locked, release, take_lock
 from interactive_nav_common.signals import signals_wait
 
@@ -72,14 +73,18 @@ def whole_file(path: str | Path) -> Iterator[Path]:
         FileError: it cannot be written; what stood at `path` is untouched.
     """
     path = Path(path)
-    partial, lock = path.with_name(f"{PARTIAL}{secrets.token_hex(4)}-{path.name}"), None
+    partial, lock = path.with_name(f"{PARTIAL}{secrets.token_hex(4)}-{path.name[-40:]}"), None
     try:
         with writing(path, "make room or choose another place"):
             path.parent.mkdir(parents=True, exist_ok=True)
-            lock = os.open(partial, os.O_CREAT | os.O_RDWR, 0o666)
+            if path.exists():
+                regular(path)
+            lock = os.open(partial, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
             with contextlib.suppress(OSError):  # a file system without locks: what a killed writer leaves stays there
                 fcntl.flock(lock, fcntl.LOCK_EX)
             yield partial
+            with contextlib.suppress(OSError):  # none stands there, or it is another user's
+                os.chmod(partial, stat.S_IMODE(path.stat().st_mode))
             os.replace(partial, path)
     finally:
         with contextlib.suppress(OSError):
@@ -87,14 +92,25 @@ def whole_file(path: str | Path) -> Iterator[Path]:
         release(lock)
 
 
+def _is_young(path: Path) -> bool:
+    """Return whether it was changed just now; what the clock, set back since, puts into the future is not."""
+    return abs(time.time() - path.stat().st_mtime) < STALE_S
+
+
 def remove_partial(folder: Path) -> None:
     """Removes unfinished files of a folder whose writers were killed; those of writers that run are locked and stay."""
     for path in folder.glob(f"{PARTIAL}*"):
         with contextlib.suppress(OSError, FileError):
-            lock = None if time.time() - path.stat().st_mtime < STALE_S else take_lock(path)
+            lock = None if _is_young(path) else take_lock(path)
             if lock is not None:
                 path.unlink()
                 release(lock)
+
+
+def append_text(path: Path, text: str) -> None:
+    """Add to a text file, which must be no link to another file."""
+    with open(path, "a", encoding="utf-8", opener=lambda p, flags: os.open(p, flags | os.O_NOFOLLOW, 0o666)) as file:
+        file.write(text)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -223,8 +239,7 @@ def remove_stale(target: Path) -> None:
         name = re.compile(re.escape(f".{target.name}.{kind}-") + r"\d+(-[0-9a-f]{8})?")
         for folder in sorted(p for p in target.parent.iterdir() if name.fullmatch(p.name)):
             with contextlib.suppress(OSError, FileError):
-                young = time.time() - folder.stat().st_mtime < STALE_S
-                lock = None if young and kind == "part" else take_lock(folder)
+                lock = None if kind == "part" and _is_young(folder) else take_lock(folder)
                 if lock is None:
                     running = True
                     continue

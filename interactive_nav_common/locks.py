@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from interactive_nav_common.errors import FileError
+from interactive_nav_common.errors import FileError, regular
 
 PATIENCE_S = 0.5
 """How long a lock is tried for: whoever only looks (`is_locked`) holds it for an instant."""
@@ -95,8 +95,10 @@ def locked(path: Path, busy: str) -> Iterator[None]:
 
 
 def _open(path: Path, flags: int) -> int:
-    try:
-        return os.open(path, flags, 0o644)
+    try:  # a link would let the lock's text replace what it leads to, a FIFO would block
+        if path.exists():
+            regular(path)
+        return os.open(path, flags if path.is_dir() else flags | os.O_NOFOLLOW, 0o644)
     except OSError as error:
         raise FileError(f"{path}: cannot be opened ({error.strerror}); expected a writable folder") from error
 

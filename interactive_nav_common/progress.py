@@ -3,6 +3,7 @@
 import contextlib
 import functools
 from collections.abc import Callable, Iterator
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -13,6 +14,17 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
+
+from interactive_nav_common.errors import printable
+
+
+class SafeConsole(Console):
+    """Prints names as they are written: they may hold neither markup nor control characters that have an effect."""
+
+    def render_str(self, text: str, **how: Any) -> Text:
+        """Render text that is printed, or that stands in a table."""
+        return super().render_str("\n".join(map(printable, text.split("\n"))), **{**how, "markup": False})
 
 
 @contextlib.contextmanager
@@ -20,9 +32,10 @@ def progress_bar(
     console: Console, what: str, total: float | None = None, transient: bool = False
 ) -> Iterator[Callable[..., None]]:
     """A bar on a terminal, nothing elsewhere; what updates it takes `Progress.update`'s words, and a `status`."""
+    plain = functools.partial(TextColumn, markup=False)
     columns = (
-        *(TextColumn("{task.description:<14}"), BarColumn(bar_width=24), TaskProgressColumn(), TimeElapsedColumn()),
-        *(TextColumn("[dim]left[/]"), TimeRemainingColumn(), TextColumn("{task.fields[status]}")),
+        *(plain("{task.description:<14}"), BarColumn(bar_width=24), TaskProgressColumn(), TimeElapsedColumn()),
+        *(plain("left", style="dim"), TimeRemainingColumn(), plain("{task.fields[status]}")),
     )
     with Progress(*columns, console=console, transient=transient, disable=not console.is_terminal) as bar:
         yield functools.partial(bar.update, bar.add_task(what, total=total, status=""))
@@ -42,6 +55,6 @@ def warn_once(console: Console) -> Callable[[str], None]:
     def warn(warning: str) -> None:
         if warning not in printed:
             printed.add(warning)
-            console.print(f"warning: {warning}", soft_wrap=True, markup=False, highlight=False)
+            console.print(f"warning: {warning}", soft_wrap=True, highlight=False)
 
     return warn

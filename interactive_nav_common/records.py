@@ -19,6 +19,7 @@ import yaml
 from interactive_nav_common.config import Bounds, nearest
 from interactive_nav_common.errors import FileError, UserError, readable
 from interactive_nav_common.files import whole_file, write_text
+from interactive_nav_common.untrusted.reading import Loader, read_bytes, unpack
 
 Record = TypeVar("Record")
 LARGEST = 2.0**64
@@ -69,13 +70,13 @@ class Reader:
             UserError: it cannot be read, is not JSON, or holds such a number.
         """
         try:
-            return self.decoded(path.read_bytes(), "JSON", str(path))
+            return self.decoded(read_bytes(path), "JSON", str(path))
         except OSError as error:
             if isinstance(error, FileNotFoundError) and absent is not None:
                 return absent
             raise self.error(f"{path}: cannot be read ({error.strerror or error}); {self.remedy}") from None
 
-    def decoded(self, text: str | bytes, kind: Literal["JSON", "YAML"], where: str, loader=yaml.SafeLoader) -> Any:
+    def decoded(self, text: str | bytes, kind: Literal["JSON", "YAML"], where: str, loader: Any = Loader) -> Any:
         """As `json`, of a file's text."""
         try:
             value = json.loads(text) if kind == "JSON" else yaml.load(text, loader)
@@ -156,13 +157,12 @@ class Reader:
         return value
 
     def _check_numbers(self, value: Any, where: str) -> None:
-        left, seen = [(where, value)], set()
+        left = [(where, value)]
         while left:
             place, item = left.pop()
             if isinstance(item, int | float) and not abs(item) < LARGEST:  # NaN too
                 raise self.error(f"{place} is {shown(item)}, expected a finite number below 2**64; {self.remedy}")
-            if isinstance(item, dict | list) and id(item) not in seen:  # YAML's anchors may share, or make circles
-                seen.add(id(item))
+            if isinstance(item, dict | list):
                 pairs = item.items() if isinstance(item, dict) else enumerate(item)
                 left += [(f"{place}[{k}]" if isinstance(item, list) else f"{place}: {k!s:.60}", v) for k, v in pairs]
 
@@ -208,7 +208,8 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
         FileError: it cannot be read.
     """
     with readable(path, FileError, "expected the metrics of a run"):
-        everything = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+        everything = read_bytes(path)
+        everything = unpack(everything, "gzip") if path.suffix == ".gz" else everything
     lines = []
     for text in everything.decode(errors="replace").splitlines():
         try:

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM: collected by programs that save before they end, held back for an instant, or never lost."""
+"""SIGINT, SIGTERM and SIGHUP: collected by programs that save before they end, held back, or never lost."""
 
 import contextlib
 import os
@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
-STOPS = (signal.SIGINT, signal.SIGTERM)
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""SIGHUP comes when the terminal closes; under nohup it is ignored, and stays so."""
 Handler = Callable[[int, FrameType | None], Any]
 _AGAIN_S = 0.05
 _LOST_IN = ("<frozen importlib._bootstrap>", "jax/_src/compiler.py", "jax/_src/callback.py")
@@ -63,17 +64,30 @@ def _come_again(number: int) -> None:
 
 @contextlib.contextmanager
 def interrupts_heard(*also: int) -> Iterator[None]:
-    """SIGINT raises KeyboardInterrupt as always, but where it is not lost; without effect where others handle it.
+    """Raise KeyboardInterrupt at SIGINT as always, but where it is not lost, and SystemExit at other stops.
+
+    The latter, where they would end the process at once: so nothing unfinished stays behind. Signals that others
+    handle, or that are ignored, are left alone.
 
     Args:
-        *also: signals that raise it, too, unless they are ignored. `number_of` tells which.
+        *also: signals that raise KeyboardInterrupt, too, unless they are ignored. `number_of` tells which.
     """
     mine = threading.current_thread() is threading.main_thread()
-    usual = {n: signal.getsignal(n) for n in (signal.SIGINT, *also) if mine}
+    usual = {n: signal.getsignal(n) for n in STOPS if mine}
+    keyboard, ends = (heard(h) for h in (signal.default_int_handler, lambda number, _: sys.exit(128 + number)))
     others = (signal.SIG_IGN, None)
-    usual = {n: h for n, h in usual.items() if h is signal.default_int_handler or n in also and h not in others}
-    for number in usual:
-        signal.signal(number, heard(signal.default_int_handler))
+    chosen: dict[int, Any] = {
+        n: keyboard if n in also or h is signal.default_int_handler else ends
+        for n, h in usual.items()
+        if h in (signal.default_int_handler, signal.SIG_DFL) or n in also and h not in others
+    }
+    with _handled(chosen):
+        yield
+
+
+@contextlib.contextmanager
+def _handled(handlers: dict[int, Any]) -> Iterator[None]:
+    usual = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         yield
     finally:
@@ -83,7 +97,7 @@ def interrupts_heard(*also: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stop_signals(second_ends: bool = True) -> Iterator[list[int]]:
-    """Collects SIGINT and SIGTERM into the list that it yields; what they did before is put back at the end.
+    """Collect `STOPS` into the list that it yields; what they did before is put back at the end.
 
     Args:
         second_ends: a second one acts as it always would; False: it is collected too (a sweep waits for its runs,
@@ -91,24 +105,21 @@ def stop_signals(second_ends: bool = True) -> Iterator[list[int]]:
     """
     seen: list[int] = []
     usual: dict[int, Any] = {n: signal.getsignal(n) for n in STOPS}
+    if usual[signal.SIGHUP] is signal.SIG_IGN:
+        del usual[signal.SIGHUP]
 
     def remember(number: int, _: FrameType | None) -> None:
         seen.append(number)
         if second_ends:
             signal.signal(number, usual[number])
 
-    for number in usual:
-        signal.signal(number, remember)
-    try:
+    with _handled(dict.fromkeys(usual, remember)):
         yield seen
-    finally:
-        for number, handler in usual.items():
-            signal.signal(number, handler)
 
 
 @contextlib.contextmanager
 def signals_wait() -> Iterator[None]:
-    """Holds back SIGINT and SIGTERM; one that came is raised at the end.
+    """Hold back `STOPS`; one that came is raised at the end.
 
     By handlers and not by a mask, which would hold for this thread only: libraries run others.
     """

@@ -12,9 +12,10 @@ from typing import Any, Literal
 import numpy as np
 
 from interactive_nav_common.config import Positive
-from interactive_nav_common.errors import UserError, readable
+from interactive_nav_common.errors import UserError
 from interactive_nav_common.files import check_name
 from interactive_nav_common.records import Reader
+from interactive_nav_common.untrusted.reading import check_named, read_npz
 from scenes_mjcf.categories import OBJECT_CATEGORIES
 
 SCHEMA_VERSION = 1
@@ -135,6 +136,8 @@ def load_manifest(folder: str | Path) -> SceneManifest:
             f"{path}: no such file; expected a scene folder (scene.xml, scene.json, maps.npz, assets/), "
             "make one with 'python -m converters convert SRC OUT'"
         )
+    if (xml := path.with_suffix(".xml")).is_file():
+        check_named(xml, SceneError, "convert the scene again")
     return manifest_from_dict(SCENES.json(path), str(path))
 
 
@@ -153,7 +156,7 @@ def load_maps(folder: str | Path) -> SceneMaps:
     path = Path(folder) / "maps.npz"
     if not path.is_file():
         raise SceneError(f"{path}: no such file; convert the scene again")
-    with readable(path, SceneError, "convert the scene again"), np.load(path, allow_pickle=False) as arrays:
+    with read_npz(path, SceneError, "convert the scene again") as arrays:
         traversable = arrays["traversable"]
         resolution, floor_height = float(arrays["resolution"]), float(arrays["floor_height"])
         origin = np.asarray(arrays["origin"], float).reshape(-1)

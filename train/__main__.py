@@ -6,9 +6,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from interactive_nav_common.errors import reports_errors
+from interactive_nav_common.progress import SafeConsole
 from interactive_nav_common.words import Parser
 from train import config_io
 from train.config import TrainConfig
@@ -51,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Heavy: after the config is known to be right.
     from train.runs.run import train_run
 
-    _, _, stopped_by = train_run(config, Console())
+    _, _, stopped_by = train_run(config, SafeConsole())
     return 128 + stopped_by if stopped_by else 0
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from interactive_nav_common.config import flatten, nearest, overlay, read_words, settings_help, to_dict
-from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.errors import ConfigError, regular
 from interactive_nav_common.records import Reader
 from scenes_mjcf.sets import scene_folders
 from train.config import AUTO as AUTO_SIZES
@@ -60,7 +60,7 @@ def read_file(name_or_path: str, folder: Path, what: str, told: str = "") -> tup
                 f"expected one of {', '.join(known)}, or the path of a .yaml file"
             )
     try:
-        return path, _parsed(path.read_text(), path.name)
+        return path, _parsed(regular(path).read_text(encoding="utf-8"), path.name)
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a text file"
         raise ConfigError(f"{told}cannot read {path} ({reason}); expected a YAML file") from None

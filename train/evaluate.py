@@ -16,8 +16,9 @@ from interactive_nav.episodes import EpisodeFile, EpisodeFileError, load_all
 from interactive_nav.types import FAILURES
 from interactive_nav_common.config import refuse_unused, replace
 from interactive_nav_common.errors import ConfigError, reports_errors
+from interactive_nav_common.progress import SafeConsole
 from interactive_nav_common.rows import write_parquet
-from interactive_nav_common.signals import interrupts_heard, number_of
+from interactive_nav_common.signals import STOPS, interrupts_heard, number_of
 from interactive_nav_common.words import program
 from scenes_mjcf.sets import installed, scene_folders
 from train import config_io
@@ -124,7 +125,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
     """Evaluates; 0 when done, 2 on a user's error, 128 + signal when stopped, which keeps what has been played."""
     kept: dict[Path, str] = {}
     try:
-        with interrupts_heard(signal.SIGTERM):
+        with interrupts_heard(*STOPS):
             return _run(parser().parse_intermixed_args(argv), build_env, kept)
     except KeyboardInterrupt as stop:
         told = "; ".join(kept.values()) or "nothing, no policy had played all"
@@ -135,7 +136,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
 
 def _run(arguments: argparse.Namespace, build_env: Callable[[EnvConfig], Any], kept: dict[Path, str]) -> int:
     """Fills `kept` with what has been written: a run's file of rows -> how to say it."""
-    console = Console()
+    console = SafeConsole()
     arguments.words = config_io.with_robot(arguments.words, arguments.robot)
     seed = _checked_seed(arguments)
     policies = _policies(arguments)
@@ -200,7 +201,7 @@ def _tell(console: Console, rows: pa.Table, config: TrainConfig, env: Any, out: 
     for name in FAILURES[:3]:
         bad = int((rows[name].to_numpy() > 0).sum())
         if bad:
-            console.print(f"[yellow]{bad} of {len(rows)} episodes with {name} > 0: their scores are in doubt[/]")
+            console.print(f"{bad} of {len(rows)} episodes with {name} > 0: their scores are in doubt", style="yellow")
     console.print(f"rows: {out}", highlight=False, soft_wrap=True)
 
 

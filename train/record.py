@@ -9,11 +9,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from interactive_nav.pictures.replay import replay_path
 from interactive_nav.record import add_picture_words, check_picture_words, record
 from interactive_nav_common.errors import reports_errors
+from interactive_nav_common.progress import SafeConsole
 from interactive_nav_common.words import program
 from train import replay
 from train.config import EnvConfig
@@ -35,7 +34,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         if refused:
             return refused
         path = replay_path(Path(arguments.run), arguments.policy, arguments.episode)
-        record(path, arguments, Console())
+        record(path, arguments, SafeConsole())
     except KeyboardInterrupt:
         print("train.record: stopped; no video was written", file=sys.stderr)
         return 130

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from rich.console import Console
 
 from interactive_nav.episodes import load, starts_of
 from interactive_nav.pictures import replay
 from interactive_nav_common.config import refuse_unused
 from interactive_nav_common.errors import ConfigError, reports_errors
+from interactive_nav_common.progress import SafeConsole
 from interactive_nav_common.words import program
 from scenes_mjcf.sets import installed
 from train.config import EnvConfig
@@ -37,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = make_env) -> int:
     """Records; 0 when done, 2 on a user's error."""
     arguments = parser().parse_intermixed_args(argv)
-    console = Console()
+    console = SafeConsole()
     if not all(word.isdecimal() for word in arguments.episodes.split(",")):
         raise ConfigError(f"--episodes is {arguments.episodes!r}, expected numbers from 0 on, such as 0,1,5")
     episodes = [int(word) for word in arguments.episodes.split(",")]

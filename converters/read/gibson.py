@@ -18,6 +18,7 @@ from converters.read.surfaces import check_upright, labelled, with_own_corners
 from converters.records.errors import SceneRejected
 from converters.records.raw import ATTRIBUTION, FLOOR, WINDOWS, GivenMap, RawScene, Storey, Window
 from interactive_nav_common.errors import readable
+from interactive_nav_common.untrusted.reading import read_npz as open_npz
 
 MESH = "mesh_z_up.obj"
 LABELS = "mesh_z_up.labels.npz"
@@ -84,7 +85,7 @@ def building(source: SourceFolder, layout: str, mesh: TexturedMesh, labels, heig
 
 def _furnished(path: Path) -> bool:
     """Whether the mesh shows what is annotated: so it does unless the labels' file says otherwise."""
-    with np.load(path, allow_pickle=False) as arrays:
+    with open_npz(path, SceneRejected, "expected labels as an NPZ") as arrays:
         if "furnished" not in arrays.files:
             return True
     value = read_npz(path, "furnished", "expected true or false")

@@ -21,9 +21,10 @@ from interactive_nav.scenes.object_folders import small_objects
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.task.env import EPISODE_METRICS, InteractiveNav
 from interactive_nav.types import EpisodeStart
-from interactive_nav_common.errors import UserError, readable
+from interactive_nav_common.errors import UserError
 from interactive_nav_common.files import write_arrays
 from interactive_nav_common.signals import signals_wait
+from interactive_nav_common.untrusted.reading import read_npz
 from scenes_mjcf.categories import MaskClasses
 
 FORMAT = 1
@@ -245,7 +246,7 @@ def load(path: str | Path) -> Replay:
     path = Path(path)
     if not path.is_file():
         raise ReplayError(f"{path}: no such file, expected a replay (npz)")
-    with readable(path, ReplayError, "record the episode again"), np.load(path, allow_pickle=False) as stored:
+    with read_npz(path, ReplayError, "record the episode again") as stored:
         if "policies" in stored.files:
             raise ReplayError(
                 f"{path}: holds paths that an evaluation recorded, expected a replay, which has the poses of all "

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from interactive_nav.robots import get_robot, robot_names
 from interactive_nav_common.errors import reports_errors
+from interactive_nav_common.progress import SafeConsole
 from interactive_nav_common.words import program
 
 
@@ -50,7 +51,7 @@ def _print_table(names: tuple[str, ...], console: Console) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Runs the command; returns its exit status."""
     args = program(Path(__file__).parents[1] / "words.yaml", "robots").parse_args(argv)
-    console = Console(width=None if sys.stdout.isatty() else 220)
+    console = SafeConsole(width=None if sys.stdout.isatty() else 220)
     _print_table((*_names(args.robots or ("" if args.files else "all")), *args.files), console)
     return 0
 

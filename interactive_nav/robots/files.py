@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import mujoco
 
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.untrusted.reading import check_named
 
 _FLOATS = ("floating", "planar")
 """URDF joints that only say that the robot moves."""
@@ -63,6 +64,7 @@ def read_file(path: Path, base_body: str = "") -> mujoco.MjSpec:
         )
     try:
         if root.tag == "mujoco":
+            check_named(path, ConfigError, "name meshes that are files")
             return mujoco.MjSpec.from_file(str(path))
         _simplify(root, path, base_body)
         [float(limit.get("velocity", 0)) for limit in root.iter("limit")]  # MuJoCo does not read it

@@ -13,6 +13,7 @@ from interactive_nav.scenes.scene import Movable, hull_sources, read_movable, ta
 from interactive_nav_common.config import Positive
 from interactive_nav_common.files import check_name
 from interactive_nav_common.records import Reader
+from interactive_nav_common.untrusted.reading import check_named
 from scenes_mjcf.schema import CATEGORIES, SceneError
 
 RGBA = (0.6, 0.6, 0.6, 1.0)
@@ -69,6 +70,7 @@ def load_object(folder: str | Path) -> ConvertedObject:
     about = _OBJECTS.record(_OBJECTS.json(described), _About, str(described), others=True)
     category, friction = about.category, about.friction
     name = check_name(about.name, f"{described}: name", SceneError)
+    check_named(xml, SceneError, _OBJECTS.remedy)
     try:
         hulls = sorted((folder / "assets").glob("*_hull_*.obj"))
         sha256 = hashlib.sha256(b"".join(p.read_bytes() for p in (xml, *hulls))).hexdigest()

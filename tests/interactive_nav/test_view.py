@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import sys
 import types
+import urllib.error
+import urllib.request
 
 import mujoco
 import numpy as np
@@ -72,30 +74,37 @@ def test_bad_arguments_give_one_line(room, capsys, arguments, message):
 def test_the_chosen_viewer_is_given_the_model(room, monkeypatch):
     opened = []
     monkeypatch.setattr(view.choose_viewer, "__defaults__", (no, yes))
-    monkeypatch.setattr(view, "open_browser", lambda model, data, port: opened.append((model.nbody, port)))
+    monkeypatch.setattr(view, "open_browser", lambda model, data, *where: opened.append((model.nbody, *where)))
     assert view.main([str(room), "--robot", "turtlebot", "--objects", "1", "--port", "9000"]) == 0
     # World, structure, the room's cube, robot with two wheels, one small object.
-    assert opened == [(7, 9000)]
+    assert opened == [(7, "127.0.0.1", 9000)]
 
 
 def test_the_browsers_page_opens_on_the_whole_scene(room, monkeypatch):
-    """With stand-ins for viser and mjviser 0.0.14, which looks from 3 x extent at the centre, or a body."""
+    """With a stand-in for mjviser 0.0.14, which looks from 3 x extent at the centre, or a body."""
     seen = {}
 
     class Viewer:
         def __init__(self, model, data, render_fn, server):
             self.scene = types.SimpleNamespace(camera_tracking_enabled=True)
-            seen.update(distance_m=3 * model.stat.extent, server=server, time=data.time)
+            seen.update(distance_m=3 * model.stat.extent, host=server.get_host(), time=data.time)
+            self._server = server
 
         def run(self):
             seen["tracking"] = self.scene.camera_tracking_enabled
+            page = urllib.request.Request(
+                f"http://127.0.0.1:{self._server.get_port()}", headers={"Host": "evil.example"}
+            )
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                urllib.request.urlopen(page)
+            self._server.stop()
 
-    monkeypatch.setitem(sys.modules, "viser", types.SimpleNamespace(ViserServer=lambda port: f"port {port}"))
+    pytest.importorskip("viser", reason="viser is not installed (pip install 'viser>=1.1,<1.2')")
     monkeypatch.setitem(sys.modules, "mjviser", types.SimpleNamespace(Viewer=Viewer))
     model = view.build_model(room, None, [])
     extent = float(model.stat.extent)
-    view.open_browser(model, mujoco.MjData(model), 8123)
-    assert seen == {"distance_m": pytest.approx(extent), "server": "port 8123", "time": 0.0, "tracking": False}
+    view.open_browser(model, mujoco.MjData(model), "127.0.0.1", 0)
+    assert seen == {"distance_m": pytest.approx(extent), "host": "127.0.0.1", "time": 0.0, "tracking": False}
 
 
 @pytest.mark.parametrize(("name", "back_m", "high_m"), [("follow", 1.8, 1.8), ("eye", 2.6, 1.5)])
@@ -132,13 +141,13 @@ def test_the_browsers_page_looks_through_the_robots_camera(two_rooms, monkeypatc
         def run(self):
             self._draw(self.scene)
 
-    monkeypatch.setitem(sys.modules, "viser", types.SimpleNamespace(ViserServer=lambda port: server))
+    monkeypatch.setattr(view, "guarded_server", lambda *_: (server, "http://localhost"))
     monkeypatch.setitem(sys.modules, "mjviser", types.SimpleNamespace(Viewer=Viewer))
     model = view.build_model(two_rooms, get_robot("turtlebot"), [])
     model.vis.global_.cameraid = model.camera("eye").id
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    view.open_browser(model, data, 8123)
+    view.open_browser(model, data, "127.0.0.1", 8123)
     eye = data.camera("eye")
     np.testing.assert_allclose(client.camera.position, eye.xpos)
     np.testing.assert_allclose(client.camera.position - client.camera.look_at, eye.xmat.reshape(3, 3)[:, 2])

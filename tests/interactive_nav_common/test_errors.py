@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import io
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from rich.table import Table
 
 from interactive_nav_common.errors import ConfigError, UserError, reports_errors
+from interactive_nav_common.progress import SafeConsole
 
 ROOT = Path(__file__).parents[2]
 
@@ -46,3 +50,57 @@ def test_our_own_error_in_a_program_prints_its_traceback_and_exits_with_1(tmp_pa
         [sys.executable, "-c", code, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=120
     )
     assert ran.returncode == 1 and "Traceback" in ran.stderr and "broadcast" in ran.stderr
+
+
+def test_a_long_value_is_cut_out_of_a_message():
+    text = str(ConfigError(f"seed is {'x' * 10**6}, expected a number"))
+    assert len(text) < 2000 and text.startswith("seed is xxx") and text.endswith("xxx, expected a number")
+
+
+PRINTS = """
+import sys
+from interactive_nav_common.errors import reports_errors
+from interactive_nav_common.progress import SafeConsole
+
+@reports_errors("program")
+def main():
+    for _ in range(10_000):
+        {prints}
+    return 0
+
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("prints", ["print('m² ┏')", "SafeConsole().print('m² ┏')"])
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_output_that_nobody_takes_ends_a_program_in_one_line_or_none(tmp_path, prints, unbuffered):
+    (tmp_path / "p.py").write_text(PRINTS.format(prints=prints))
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": unbuffered, "PYTHONIOENCODING": "ascii"}
+
+    def run(out):
+        return subprocess.run(
+            [sys.executable, "p.py"], cwd=tmp_path, env=env, stdout=out, stderr=subprocess.PIPE, text=True
+        )
+
+    reading, writing = os.pipe()
+    os.close(reading)
+    broken = run(writing)
+    os.close(writing)
+    assert (broken.returncode, broken.stderr) == (141, "")
+    with open("/dev/full", "w") as full:
+        refused = run(full)
+    assert (refused.returncode, refused.stderr) == (2, "program: output: No space left on device\n")
+    with open(tmp_path / "out", "w") as file:
+        assert run(file).returncode == 0
+    assert (tmp_path / "out").read_text().startswith("m\\xb2 \\u250f\n")
+
+
+def test_names_with_markup_or_control_characters_are_printed_as_they_are():
+    out = io.StringIO()
+    table = Table("[red]x[/]\x1b[2J")
+    table.add_row("[/]\u202e")
+    console = SafeConsole(file=out, width=60)
+    console.print("[bold]a[/b]\x1b]0;t\x07\nb", table)
+    assert all(text in out.getvalue() for text in ("[bold]a[/b]\\x1b]0;t\\x07\nb", "[red]x[/]\\x1b[2J", "[/]\\u202e"))
+    assert "\x1b" not in out.getvalue()

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 
-from converters.annotate.guard import guarded_server
 from converters.read.datasets.scanned import read_scan
 from docs.studies.pybullet_peer import BulletScene
 from interactive_nav import view
@@ -20,6 +19,7 @@ from interactive_nav.interop.torch_bridge import to_torch
 from interactive_nav.physics import resolve_backend
 from interactive_nav_common.errors import UserError, optional
 from interactive_nav_common.jobs.on_ray import RayLauncher
+from interactive_nav_common.untrusted.guard import guarded_server
 from topological_nav.scenes.rendering import need_engine
 from train.runs.tracking import import_wandb
 
@@ -28,7 +28,7 @@ EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["option
 FOLDERS = ("interactive_nav_common", "interactive_nav", "converters", "train", "topological_nav", "benchmarks", "docs")
 GYM_ENV = "interactive_nav.interop.gym_env"
 USES: list[tuple[str, str, Callable[[], Any]]] = [
-    ("annotate", "viser", lambda: guarded_server("localhost", 0, "label")),
+    ("annotate", "viser", lambda: guarded_server("localhost", 0, "label", "annotate")),
     ("datasets", "scenezoo", lambda: read_scan("3rscan", ROOT / "docs")),
     ("gymnasium", "gymnasium", lambda: importlib.import_module(GYM_ENV)),
     ("gymnasium", "gymnasium", lambda: importlib.import_module("interactive_nav.interop.sb3_env")),

@@ -6,12 +6,14 @@ import errno
 import os
 import shutil
 import signal
+import time
 from pathlib import Path
 
 import pytest
 
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import (
+    append_text,
     check_name,
     part_folder,
     publish,
@@ -199,3 +201,47 @@ def test_files_of_killed_writers_go_and_those_of_running_ones_stay(tmp_path):
     remove_partial(tmp_path)
     assert path.read_text() == "half" and list(tmp_path.iterdir()) == [path]
     remove_partial(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o664])
+def test_a_file_that_is_replaced_keeps_its_mode(tmp_path, mode):
+    usual = os.umask(0o022)
+    try:
+        write_text(tmp_path / "new", "a")
+        assert (tmp_path / "new").stat().st_mode & 0o777 == 0o644
+        (tmp_path / "new").chmod(mode)
+        write_text(tmp_path / "new", "b")
+    finally:
+        os.umask(usual)
+    assert (tmp_path / "new").stat().st_mode & 0o777 == mode and (tmp_path / "new").read_text() == "b"
+
+
+def test_a_device_or_fifo_is_not_replaced_and_a_link_is_not_appended_to(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(FileError, match=r"pipe: cannot be written \(no regular file but a FIFO"):
+        write_text(tmp_path / "pipe", "a")
+    assert (tmp_path / "pipe").is_fifo() and [p.name for p in tmp_path.iterdir()] == ["pipe"]
+    (tmp_path / "precious").write_text("mine")
+    (tmp_path / "log").symlink_to("precious")
+    with pytest.raises(OSError):
+        append_text(tmp_path / "log", "more")
+    append_text(tmp_path / "precious", " and more")
+    assert (tmp_path / "precious").read_text() == "mine and more"
+
+
+def test_the_longest_names_are_written_and_longer_ones_are_one_line(tmp_path):
+    write_text(tmp_path / f"{'n' * 250}.txt", "a")
+    assert [p.name for p in tmp_path.iterdir()] == [f"{'n' * 250}.txt"]
+    with pytest.raises(FileError, match="cannot be written .File name too long"):
+        write_text(tmp_path / ("n" * 300), "a")
+
+
+def test_what_comes_from_the_future_was_left_by_a_killed_writer(tmp_path):
+    partial, part = tmp_path / ".partial-0-a", tmp_path / ".scene.part-1-01234567"
+    partial.write_text("")
+    part.mkdir()
+    for path in (partial, part):
+        os.utime(path, (time.time() + 1e6,) * 2)
+    remove_partial(tmp_path)
+    remove_stale(tmp_path / "scene")
+    assert list(tmp_path.iterdir()) == []

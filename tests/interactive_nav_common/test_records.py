@@ -87,7 +87,12 @@ def test_what_does_not_fit_is_named(change, message):
         ("a: .inf", "YAML", "f: a is Infinity, expected a finite number"),
         ("a: 0x1%s" % ("0" * 9000), "YAML", "f: a is int, expected a finite number"),
         ("a: 2026-99-99", "YAML", "f: not readable as YAML (month must be in 1..12)"),
-        ("a: &a [*a, .nan]", "YAML", "f: a[1] is NaN, expected a finite number"),
+        (
+            "a: &a [*a, .nan]",
+            "YAML",
+            "f: not readable as YAML (aliases repeat more than 10,000 values, or hold themselves",
+        ),
+        ("a: [&a 1, {b: *a, c: &b .nan}, *b]", "YAML", "f: a[2] is NaN, expected a finite number"),
         ("a: [", "YAML", "f: not readable as YAML ("),
     ],
 )

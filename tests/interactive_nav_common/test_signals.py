@@ -11,7 +11,7 @@ import weakref
 import jax
 import pytest
 
-from interactive_nav_common.signals import heard, interrupts_heard, number_of
+from interactive_nav_common.signals import heard, interrupts_heard, number_of, stop_signals
 
 DEAF = """
 import signal
@@ -125,3 +125,27 @@ def test_who_handles_interrupts_goes_on_doing_so():
             assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, usual)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_what_would_end_the_process_at_once_lets_it_clean_up(number):
+    usual = signal.signal(number, signal.SIG_DFL)
+    try:
+        with pytest.raises(SystemExit) as stop, interrupts_heard():
+            signal.raise_signal(number)
+        assert stop.value.code == 128 + number and signal.getsignal(number) is signal.SIG_DFL
+    finally:
+        signal.signal(number, usual)
+
+
+def test_a_closed_terminal_stops_as_sigterm_does_unless_nohup_ignores_it():
+    usual = signal.getsignal(signal.SIGHUP)
+    try:
+        for handler, seen in ((signal.SIG_DFL, [signal.SIGHUP, signal.SIGHUP]), (signal.SIG_IGN, [])):
+            signal.signal(signal.SIGHUP, handler)
+            with stop_signals(second_ends=False) as stops, interrupts_heard():
+                signal.raise_signal(signal.SIGHUP)
+                signal.raise_signal(signal.SIGHUP)
+            assert stops == seen and signal.getsignal(signal.SIGHUP) is handler
+    finally:
+        signal.signal(signal.SIGHUP, usual)

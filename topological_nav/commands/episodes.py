@@ -6,12 +6,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.config import overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import write_text
+from interactive_nav_common.progress import SafeConsole
 from interactive_nav_common.signals import stop_signals
 from scenes_mjcf.sets import scene_folders
 from topological_nav.commands.maps import build
@@ -131,7 +130,7 @@ def evaluate(arguments: argparse.Namespace) -> None:
         )
     lines, compared = summary(rows), differences(rows)
     write_text(contest.out / "summary.md", markdown(lines, compared))
-    Console(width=None if sys.stdout.isatty() else 160).print(console_table(lines))
+    SafeConsole(width=None if sys.stdout.isatty() else 160).print(console_table(lines))
     for difference in compared:
         print(f"{difference.compared}, {difference.score}: {difference.result}")
     print(f"{contest.out}: {len(rows)} episodes; tables in summary.md, a picture a scene")

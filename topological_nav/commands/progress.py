@@ -4,9 +4,7 @@ import sys
 import time
 from contextlib import contextmanager
 
-from rich.console import Console
-
-from interactive_nav_common.progress import progress_bar
+from interactive_nav_common.progress import SafeConsole, progress_bar
 from topological_nav.errors import Asked, Progress, Stopped
 
 
@@ -39,7 +37,7 @@ def tell_line(line: str) -> None:
 @contextmanager
 def bar():
     """A bar with the time left on a terminal, a line every tenth elsewhere."""
-    console = Console(stderr=True)
+    console = SafeConsole(stderr=True)
     with progress_bar(console, "starting") as update:
         tenths = 0
         # Neither compiling before the first step nor what an earlier run has done says how fast it goes.

@@ -14,6 +14,7 @@ from PIL import Image
 
 from interactive_nav_common.errors import readable
 from interactive_nav_common.files import whole_file
+from interactive_nav_common.untrusted.reading import read_npz
 from interactive_nav_common.versions import usable_cores
 from topological_nav.errors import DatasetError
 
@@ -62,7 +63,7 @@ def read_arrays(path: Path, command: str = "data") -> dict[str, np.ndarray]:
     """The arrays of an npz file that a command wrote."""
     need_files([path], command)
     remedy = f"delete it and run '{command}' again"
-    with readable(path, DatasetError, remedy), np.load(path, allow_pickle=False) as arrays:
+    with read_npz(path, DatasetError, remedy) as arrays:
         return dict(arrays)
 
 

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.progress import SafeConsole
 from topological_nav.config import PASSAGE_POLICY, DataConfig, EvaluationConfig, MapConfig
 from topological_nav.data.domains import as_seen_from, preset
 from topological_nav.data.folders import lens_of
@@ -224,7 +224,7 @@ def _learned(run: Path, scene: Scene, config: EvaluationConfig) -> tuple[Simulat
 
     folder, words = RunFolder(run), [f"env.backend={config.backend}"] if config.backend != "auto" else []
     words += [f"env.num_objects={config.objects}"] if config.objects else []
-    made = config_to_play(folder, words, [str(scene.path)], Console(stderr=True))
+    made = config_to_play(folder, words, [str(scene.path)], SafeConsole(stderr=True))
     env = make_trained_env(made.env)
     policy, _ = load_policy(folder, made, env, "best", deterministic=False)
     return Simulator(env), policy

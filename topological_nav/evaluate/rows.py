@@ -21,7 +21,9 @@ import pyarrow as pa
 
 from interactive_nav_common.files import write_arrays
 from interactive_nav_common.rows import read_rows, write_parquet
+from interactive_nav_common.untrusted.reading import read_npz
 from interactive_nav_common.versions import versions
+from topological_nav.errors import RunError
 from topological_nav.evaluate.contest import Contest, ContestScene
 from topological_nav.evaluate.episodes import DrivenEpisodes
 from topological_nav.evaluate.evaluation import Played, columns, play
@@ -122,6 +124,6 @@ def tracks_of(contest: Contest, scene: ContestScene, contender: str) -> dict[int
     """Episode number -> [t, 2] m, of what has been played."""
     found: dict[int, np.ndarray] = {}
     for path in sorted((contest.out / "tracks").glob(f"{_stem(scene, contender)}-*.npz")):
-        with np.load(path) as stored:
+        with read_npz(path, RunError, "delete it and evaluate again") as stored:
             found = {int(number): stored[number] for number in stored.files} | found
     return found

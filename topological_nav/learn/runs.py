@@ -17,9 +17,10 @@ import numpy as np
 import yaml
 
 from interactive_nav_common.errors import readable
-from interactive_nav_common.files import whole_file, write_text
+from interactive_nav_common.files import append_text, whole_file, write_text
 from interactive_nav_common.locks import alone_in
 from interactive_nav_common.records import Reader, read_metrics
+from interactive_nav_common.untrusted.reading import Loader, unpack
 from interactive_nav_common.versions import versions
 from topological_nav.errors import Asked, RunError, Stopped
 
@@ -48,7 +49,7 @@ def claimed(out: Path, settings: dict[str, Any]) -> Iterator[None]:
 
 def _compare(path: Path, settings: dict[str, Any]) -> None:
     with readable(path, RunError, "choose another folder (-o) or delete it"):
-        there = dict(yaml.safe_load(path.read_text()))
+        there = dict(yaml.load(path.read_text(), Loader))
     for name, value in settings.items():
         if there.get(name) != value:
             shown = (there.get(name), value) if not isinstance(value, dict) else ("another", "this one")
@@ -97,8 +98,7 @@ def run_epochs(
         now = time.perf_counter()
         if not np.isfinite(line["loss"]):
             raise RunError(f"{out}: the loss of epoch {number + 1} is {line['loss']}; try a smaller learning_rate")
-        with open(out / METRICS, "a") as file:
-            file.write(json.dumps({**line, "seconds": round(now - started, 3)}) + "\n")
+        append_text(out / METRICS, json.dumps({**line, "seconds": round(now - started, 3)}) + "\n")
         left = (now - began) / (number + 1 - first) * (epochs - number - 1)
         scores = "  ".join(f"{k} {line[k]:.3f}" for k in means)
         tell(f"{phase}: epoch {number + 1} of {epochs}  {scores}  {now - started:.1f} s  {left:.0f} s left")
@@ -137,7 +137,7 @@ def packed(content: bytes) -> bytes:
 def weights_content(run: Path) -> bytes:
     """The msgpack of a run's weights, whether it was exported or not."""
     path = run / PACKED_WEIGHTS
-    return lzma.decompress(path.read_bytes()) if path.is_file() else (run / WEIGHTS).read_bytes()
+    return unpack(path.read_bytes(), "xz") if path.is_file() else (run / WEIGHTS).read_bytes()
 
 
 @dataclasses.dataclass(frozen=True)

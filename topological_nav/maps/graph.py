@@ -20,8 +20,8 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from interactive_nav_common.errors import readable
 from interactive_nav_common.files import write_arrays
+from interactive_nav_common.untrusted.reading import read_npz
 from topological_nav.errors import MapError
 
 FORMAT = 1
@@ -245,10 +245,9 @@ def load_map(path: Path, digest: str | None = None) -> TopologicalMap:
     Raises:
         MapError: missing, damaged, of another format, or of another scene.
     """
-    with readable(path, MapError, "build the map: python -m topological_nav map SCENE"):
-        with np.load(path, allow_pickle=False) as stored:
-            header = json.loads(stored["header"].tobytes())
-            arrays = {name: stored[name] for name in _ARRAYS}
+    with read_npz(path, MapError, "build the map: python -m topological_nav map SCENE") as stored:
+        header = json.loads(stored["header"].tobytes())
+        arrays = {name: stored[name] for name in _ARRAYS}
         arrays["embeddings"] = arrays["embeddings"].astype(np.float32)  # exported maps hold them in half precision
         version, scene, own, about = (header[k] for k in ("format", "scene", "digest", "about"))
     if version != FORMAT:

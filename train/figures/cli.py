@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from interactive_nav_common.errors import FileError, readable, reports_errors
+from interactive_nav_common.errors import FileError, reports_errors
 from interactive_nav_common.records import METRICS, PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_rows
+from interactive_nav_common.untrusted.reading import read_npz
 from interactive_nav_common.words import program
 from train.figures import style  # first: it chooses matplotlib's backend
 from train.figures.curves import cell_curves, learning_curves
@@ -141,7 +142,7 @@ def _by_k_int(by_k_int: dict[float, Path]) -> Figure:
 
 
 def _paths(path: Path) -> dict[str, np.ndarray] | None:
-    with readable(path, FileError, "evaluate the run again"), np.load(path, allow_pickle=False) as stored:
+    with read_npz(path, FileError, "evaluate the run again") as stored:
         first = f"{stored['policies'][0]}/goal_xy_w" if "policies" in stored.files else ""
         return dict(stored) if first and len(stored[first]) else None
 

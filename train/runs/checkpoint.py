@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav_common.config import Natural
-from interactive_nav_common.errors import FileError, readable
+from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import writing
 from interactive_nav_common.records import Reader
+from interactive_nav_common.untrusted.reading import read_npz
 from train.errors import CheckpointError
 from train.runs import policy_file
 from train.runs.run_folder import GOES_ON
@@ -182,7 +183,7 @@ def load_env_state(folder: Path, template: Any) -> Any | None:
         return None
     leaves, structure = jax.tree.flatten(template)
     remedy = "remove it: the run goes on with new episodes"
-    with readable(path, CheckpointError, remedy), np.load(path) as stored:
+    with read_npz(path, CheckpointError, remedy) as stored:
         arrays = [stored[f"arr_{i}"] for i in range(len(stored.files))]
     like = [_raw(leaf) for leaf in leaves]
     if [(a.shape, a.dtype) for a in arrays] != [(x.shape, x.dtype) for x in like]:

@@ -14,8 +14,8 @@ import flax.serialization
 import flax.traverse_util
 import numpy as np
 
-from interactive_nav_common.errors import readable
 from interactive_nav_common.files import whole_file
+from interactive_nav_common.untrusted.reading import read_npz, unpack
 from train.errors import CheckpointError
 
 POLICY = "policy.npz"
@@ -80,7 +80,7 @@ def unpacked(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     out: dict[str, np.ndarray] = {}
     for name, array in arrays.items():
         if name + SHAPE in arrays:
-            levels = np.frombuffer(zlib.decompress(array.tobytes()), np.int8).reshape(arrays[name + SHAPE])
+            levels = np.frombuffer(unpack(array.tobytes(), "zlib"), np.int8).reshape(arrays[name + SHAPE])
             out[name] = levels.astype(np.float32) * arrays[name + SCALE]
         elif not name.endswith((SHAPE, SCALE)):
             out[name] = array
@@ -96,7 +96,7 @@ def write(source: Path, algorithm: str, target: Path, step: float = STEP) -> Non
 
 def read(path: Path, template: Any) -> Any:
     """A learner in the template's structure whose policy is the file's; what acting does not read is the template's."""
-    with readable(path, CheckpointError, "export the run again"), np.load(path, allow_pickle=False) as stored:
+    with read_npz(path, CheckpointError, "export the run again") as stored:
         leaves = unpacked({name: stored[name] for name in stored.files})
     own = flax.serialization.to_state_dict(template)
     flat = flax.traverse_util.flatten_dict(own, sep="/", keep_empty_nodes=True)

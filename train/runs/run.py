@@ -261,7 +261,7 @@ def _train_in(
     each, limit = config.run.num_timesteps // num_envs(config), config.env.rules.episode_steps
     if each < limit:
         told = f"{each:,} steps for each environment, and an episode has up to {limit:,}: none that fails comes to its"
-        console.print(f"[yellow]{told} end and begins anew; lower env.episode_steps or train longer[/]", soft_wrap=True)
+        console.print(f"{told} end; lower env.episode_steps or train longer", style="yellow", soft_wrap=True)
     with stop_signals() as stops, TrainingDisplay(console) as display:
         callbacks = FolderCallbacks(folder, config, env, display, stops)
         try:
@@ -282,7 +282,7 @@ def _train_in(
     lost = failures(folder)
     if lost:
         told = ", ".join(f"{name} {count:,.0f}" for name, count in lost.items())
-        console.print(f"[yellow]what physics lost, summed over ended episodes: {told}[/]", soft_wrap=True)
+        console.print(f"what physics lost, summed over ended episodes: {told}", style="yellow", soft_wrap=True)
     return result, folder, stops[0] if stops else None
 
 

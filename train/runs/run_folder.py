@@ -19,7 +19,7 @@ from typing import Any
 
 from interactive_nav_common.config import Natural, NotNegative, flatten, replace
 from interactive_nav_common.errors import FileError
-from interactive_nav_common.files import write_text, writing
+from interactive_nav_common.files import append_text, write_text, writing
 from interactive_nav_common.records import METRICS, RUNS, read_metrics, write_metrics
 from interactive_nav_common.versions import versions
 from train.config import TrainConfig
@@ -121,8 +121,8 @@ class RunFolder:
 
     def append_metrics(self, line: dict[str, Any]) -> None:
         """Adds one line to metrics.jsonl."""
-        with writing(self.metrics, GOES_ON), open(self.metrics, "a") as file:
-            file.write(json.dumps(line) + "\n")
+        with writing(self.metrics, GOES_ON):
+            append_text(self.metrics, json.dumps(line) + "\n")
 
     def read_metrics(self) -> list[dict[str, Any]]:
         """The lines of metrics.jsonl; none where nothing was logged."""

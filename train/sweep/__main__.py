@@ -5,11 +5,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from interactive_nav_common.config import refuse_unused
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.jobs.processes import Launcher
+from interactive_nav_common.progress import SafeConsole
 from interactive_nav_common.signals import stop_signals
 from interactive_nav_common.words import program
 from train.config_io import known_in
@@ -46,7 +45,7 @@ def make_launcher(name: str, address: str, sweep: Sweep) -> Launcher:
 def main(argv: Sequence[str] | None = None, programs: Programs | None = None) -> int:
     """Runs a sweep; see `Outcome.exit_code`."""
     arguments = parser().parse_args(argv)
-    console = Console()
+    console = SafeConsole()
     chosen = [name for name in (arguments.sweep, arguments.config) if name]
     if len(chosen) != 1:
         raise ConfigError(f"expected one sweep, by name or path, got {len(chosen)}; see --help")

@@ -23,6 +23,7 @@ from interactive_nav_common.config import (
 )
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import check_name
+from interactive_nav_common.untrusted.reading import Loader
 from scenes_mjcf.sets import scene_folders
 from train import config_io
 from train.config import TrainConfig, validate
@@ -208,7 +209,7 @@ def select(sweep: Sweep, where: Sequence[str], shard: str | None) -> Sweep:
         if not equals:
             raise ConfigError(f"--where {word!r}: expected setting=value[,value], for example env.robot=fetch")
         try:
-            chosen = [yaml.safe_load(item) for item in text.split(",")]
+            chosen = [yaml.load(item, Loader) for item in text.split(",")]
         except (yaml.YAMLError, ValueError, RecursionError):
             raise ConfigError(f"--where {word!r}: not readable, expected setting=value[,value]") from None
         wanted = _where({axis: chosen}, sweep.config, f"--where {word}")

@@ -13,7 +13,6 @@ import trimesh
 
 from converters.__main__ import main
 from converters.annotate.browser import Page
-from converters.annotate.guard import guarded_server
 from converters.annotate.session import Store, start
 from converters.annotate.view import hit
 from converters.bodies.alignment import apply_alignment
@@ -22,6 +21,7 @@ from converters.propose.proposals import bounds, box_iou, propose_instances
 from converters.propose.retrieval import annotated_vertices, read_library
 from converters.read.source import read_source
 from interactive_nav_common.rotations import wrap_angle
+from interactive_nav_common.untrusted.guard import guarded_server
 from tests.converters.annotate.chromium import Tab, tab, until
 
 pytest.importorskip("viser", reason="viser is not installed (pip install 'viser>=1.1,<1.2')")
@@ -33,7 +33,7 @@ def opened(source, folder):
     raw = read_source(source)
     store, proposals = Store(folder, read_library(source)), propose_instances(raw.scan)
     session = store.save(store.open(raw, lambda: start(raw, proposals)))
-    server, address = guarded_server("127.0.0.1", 0, raw.name)
+    server, address = guarded_server("127.0.0.1", 0, raw.name, "annotate")
     # Without a GPU reflections and shadows take half of the time, and no test looks at them.
     server.scene.configure_environment_map(None)
     server.scene.configure_default_lights(cast_shadow=False)

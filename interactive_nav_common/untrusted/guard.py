@@ -18,6 +18,8 @@ from urllib.parse import parse_qs, urlsplit
 
 from interactive_nav_common.errors import ConfigError, missing, optional
 
+COOKIE = "interactive_nav"
+
 
 def is_local(host: str) -> bool:
     """Whether an address is reached from this machine alone."""
@@ -40,7 +42,7 @@ def refusal(path: str, headers: Any, token: str | None) -> str | None:
         local = is_local(urlsplit(f"//{host}").hostname or "")
         return None if local else f"the page was asked for as '{host}', expected localhost"
     try:
-        cookie = SimpleCookie(headers.get("Cookie", "")).get("annotate")
+        cookie = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)
     except CookieError:
         cookie = None
     given = [cookie.value] if cookie else []
@@ -65,10 +67,17 @@ def bind(host: str, port: int) -> socket.socket:
     return listening
 
 
-def guarded_server(host: str, port: int, label: str) -> tuple[Any, str]:
-    """A running viser server, and the address to open; with a token where others can reach it."""
+def guarded_server(host: str, port: int, label: str, user: str) -> tuple[Any, str]:
+    """Start viser's server; return it and the address to open, which has a token where others can reach it.
+
+    Args:
+        host: address to listen on.
+        port: 0 for any that is free.
+        label: title of the page.
+        user: the command, and the extra that installs viser for it: annotate or view.
+    """
     names = "viser", "websockets.asyncio.server"
-    viser, serving = (optional(name, missing("annotate", "viser", "annotate")) for name in names)
+    viser, serving = (optional(name, missing(user, "viser", user)) for name in names)
     token, listening = None if is_local(host) else secrets.token_urlsafe(24), bind(host, port)
     original, checked = serving.serve, []
 
@@ -80,7 +89,7 @@ def guarded_server(host: str, port: int, label: str) -> tuple[Any, str]:
             if token and "token" in parse_qs(urlsplit(request.path).query):  # from here on the cookie says it
                 answer = connection.respond(http.HTTPStatus.SEE_OTHER, "")
                 answer.headers["Location"] = "/"
-                answer.headers["Set-Cookie"] = f"annotate={token}; HttpOnly; SameSite=Lax; Path=/"
+                answer.headers["Set-Cookie"] = f"{COOKIE}={token}; HttpOnly; SameSite=Lax; Path=/"
                 return answer
             return process_request(connection, request)
 
@@ -95,7 +104,7 @@ def guarded_server(host: str, port: int, label: str) -> tuple[Any, str]:
         setattr(serving, "serve", original)  # noqa: B010
     if not checked:
         server.stop()
-        raise ConfigError(f"viser {viser.__version__} cannot be guarded; pip install 'interactive-nav[annotate]'")
+        raise ConfigError(f"viser {viser.__version__} cannot be guarded; pip install 'interactive-nav[{user}]'")
     own = listening.getsockname()[1]
     shown = f"[{host}]" if ":" in host else host
     return server, f"http://{shown}:{own}/" + (f"?token={token}" if token else "")

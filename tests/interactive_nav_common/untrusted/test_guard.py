@@ -15,8 +15,8 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from converters.__main__ import main
-from converters.annotate.guard import bind, guarded_server, is_local, refusal
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.untrusted.guard import bind, guarded_server, is_local, refusal
 
 NEEDS = "viser is not installed (pip install 'viser>=1.1,<1.2')"
 
@@ -31,10 +31,10 @@ NEEDS = "viser is not installed (pip install 'viser>=1.1,<1.2')"
         ("/", {"Host": "127.0.0.1:8080", "Origin": "http://evil.example"}, None, "another site's page"),
         ("/", {"Host": "host:1"}, "secret", "no token, or a wrong one"),
         ("/?token=secreT", {"Host": "host:1"}, "secret", "no token, or a wrong one"),
-        ("/", {"Host": "host:1", "Cookie": "annotate=other"}, "secret", "no token, or a wrong one"),
-        ("/", {"Host": "host:1", "Cookie": 'annotate="\\', "Origin": "http://host:1"}, "secret", "no token"),
+        ("/", {"Host": "host:1", "Cookie": "interactive_nav=other"}, "secret", "no token, or a wrong one"),
+        ("/", {"Host": "host:1", "Cookie": 'interactive_nav="\\', "Origin": "http://host:1"}, "secret", "no token"),
         ("/?token=secret", {"Host": "host:1"}, "secret", None),
-        ("/", {"Host": "host:1", "Cookie": "a=b; annotate=secret", "Origin": "http://host:1"}, "secret", None),
+        ("/", {"Host": "host:1", "Cookie": "a=b; interactive_nav=secret", "Origin": "http://host:1"}, "secret", None),
         ("/?token=secret", {"Host": "host:1", "Origin": "http://evil.example"}, "secret", "another site's page"),
     ],
 )
@@ -59,7 +59,7 @@ def test_addresses_of_this_machine():
 
 def test_nothing_is_sent_before_the_token(capsys):
     viser = pytest.importorskip("viser", reason=NEEDS)
-    server, address = guarded_server("0.0.0.0", 0, "room")
+    server, address = guarded_server("0.0.0.0", 0, "room", "view")
     try:
         port, token = server.get_port(), address.partition("?token=")[2]
         page, own = f"http://127.0.0.1:{port}/", [Subprotocol(f"viser-v{viser.__version__}")]
@@ -72,7 +72,7 @@ def test_nothing_is_sent_before_the_token(capsys):
         opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
         with opener.open(f"{page}?token={token}") as answer:
             assert answer.url == page and b"<html" in answer.read()
-        cookie = {"Cookie": f"annotate={token}"}
+        cookie = {"Cookie": f"interactive_nav={token}"}
         with connect(page.replace("http", "ws"), subprotocols=own, additional_headers=cookie, max_size=None) as socket_:
             assert len(socket_.recv(10)) > 0
     finally:
