@@ -1,7 +1,8 @@
 """Placed parts of a home in; structure as a scan, furniture as models and annotations, out.
 
 Authors of simulated homes fix most furniture to the world to save time. Here a part moves if its name says that it is
-of a movable category, whatever its source calls it; what stands on such a part moves with it.
+of a movable category and it is no larger than those are, whatever its source calls it; what stands on such a part moves
+with it.
 """
 
 import collections

@@ -20,7 +20,7 @@ from converters.read.files import SourceFolder, read_image
 from converters.read.homes.parts import LEVEL, Part, home
 from converters.read.homes.sdf_frames import Model
 from converters.read.homes.solids import height_field
-from converters.read.meshes import read_surface, textured_by_face
+from converters.read.meshes import UP_AXES, read_surface, textured_by_face
 from converters.read.obj import GREY, TexturedMesh, find_file
 from converters.read.urdf import count_unread, joined, numbers, parse_xml, placed, primitive, report_unread
 from converters.records.errors import SceneRejected
@@ -35,6 +35,7 @@ HEIGHTS = 256
 TABLES = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, dict[str, str]])
 FUEL = re.compile(r"https?://.*/models/([^/]+)(?:/(?:\d+|tip))?(?:/files)?(/.*)?")
 """The address of a model, or of a file of one, on Gazebo's server."""
+UP_AXIS = re.compile(rb"<up_axis>\s*([XYZ]_UP)")
 GAZEBOS_OWN = {
     "sun": ElementTree.fromstring("<sdf><light/></sdf>"),
     "groundplane": ElementTree.fromstring(
@@ -216,8 +217,12 @@ class _Reader:
         if shape.tag in ("mesh", "heightmap"):
             file = self.source.inside(self._find((shape.findtext("uri") or "").strip(), path))
             if shape.tag == "mesh":
-                scale = numbers(shape.findtext("scale"), (1.0, 1.0, 1.0))
-                return placed(read_surface(self.source, file, ""), np.diag([*scale, 1.0]))
+                matrix = np.diag([*numbers(shape.findtext("scale"), (1.0, 1.0, 1.0)), 1.0])
+                mesh = read_surface(self.source, file, "")
+                if file.lower().endswith(".dae"):  # Gazebo does not read the axis that points up
+                    axis = UP_AXIS.search(self.source.use(file, "").read_bytes())
+                    matrix[:3, :3] @= UP_AXES[axis[1].decode() if axis else "Y_UP"].T
+                return placed(mesh, matrix)
             at, size_m = numbers(shape.findtext("pos"), (0.0, 0.0, 0.0)), numbers(size, (1.0, 1.0, 1.0))
             grey = read_image(self.source.use(file, ""), "L")[::-1].astype(float)
             step = max(1, max(grey.shape) // HEIGHTS)

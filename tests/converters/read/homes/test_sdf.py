@@ -230,6 +230,17 @@ def test_a_tilted_plane_is_a_sheet_of_its_size(tmp_path):
     assert floor_of(raw) == pytest.approx(4.2 * 3.2, rel=0.01)
 
 
+@pytest.mark.parametrize("axis", ["Y_UP", "Z_UP", "X_UP", None])
+def test_the_up_axis_of_a_collada_file_is_not_read_as_gazebo_does_not(tmp_path, axis):
+    root = write_world(tmp_path / "home", [*ROOM, LOOSE.replace(box("0.4 0.4 0.8"), shape("mesh", "<uri>b.dae</uri>"))])
+    dae = trimesh.exchange.dae.export_collada(trimesh.creation.box((0.4, 0.6, 0.8))).decode()
+    dae = dae.replace("<up_axis>Y_UP</up_axis>", "")
+    assert "<up_axis>" not in dae and "</asset>" in dae
+    up = f"<up_axis>{axis}</up_axis></asset>" if axis else "</asset>"
+    (root / "worlds" / "b.dae").write_text(dae.replace("</asset>", up))
+    np.testing.assert_allclose(np.ptp(read_sdf(root).cads["chair_1"].vertices, axis=0), [0.4, 0.6, 0.8], atol=1e-6)
+
+
 def test_a_height_map_is_the_floor(tmp_path):
     ground = model(
         "hills", shape("heightmap", "<uri>file://hills.png</uri><size>4 3 0.1</size><pos>0 0 -0.1</pos>"), "0 0 0 0 0 0"
