@@ -28,7 +28,7 @@ sync: .venv/.complete
 	@$(PYTHON3) -m venv .venv || { echo "make: cannot make .venv; on Debian: apt install python3-venv" >&2; exit 2; }
 	@$(PY) -m pip install --disable-pip-version-check --quiet --no-compile --require-hashes -r requirements.lock
 	@$(PY) -m compileall -qq -j 0 .venv/lib || true  # on all cores, where pip takes one; some files are no Python 3
-	@$(PY) -m pip install --disable-pip-version-check --quiet --no-deps -e .
+	@$(PY) -m pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation -e .
 	@touch $@
 	@$(PY) --version
 
@@ -63,7 +63,9 @@ $(DEMO)/figures/.complete: $(DEMO)/scores.txt
 
 # A test oracle that comes as source only: where no C++ compiler is, its comparison is skipped.
 .venv/.oracles: .venv/.complete
-	@$(PY) -m pip install --disable-pip-version-check --quiet scikit-fmm==2025.6.23 \
+	@$(PY) -m pip install --disable-pip-version-check --quiet --require-hashes -r tests/oracles-build.lock \
+	  && $(PY) -m pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation --require-hashes \
+	    -r tests/oracles.lock \
 	  || echo "scikit-fmm cannot be built here: the comparison of geodesics with fast marching will be skipped"
 	@touch $@
 
@@ -101,6 +103,10 @@ check: lint types docs test
 lock:
 	uv pip compile pyproject.toml --extra dev --extra warp --extra docs --universal --python-version 3.11 --generate-hashes \
 	  --no-emit-index-url --no-header -o requirements.lock
+	printf 'meson-python\nninja\nwheel\n' | uv pip compile - --universal --python-version 3.11 --generate-hashes \
+	  --no-emit-index-url --no-header --no-annotate -o tests/oracles-build.lock
+	echo 'scikit-fmm==2025.6.23' | uv pip compile - --no-deps --generate-hashes \
+	  --no-emit-index-url --no-header --no-annotate -o tests/oracles.lock
 
 clean-demo:
 	rm -rf $(DEMO)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import inspect
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -64,8 +64,33 @@ def read_notes(path: Path) -> dict[str, str]:
     return {key.decode(): value.decode() for key, value in found.items()}
 
 
-def read_rows(paths: Sequence[Path]) -> pa.Table:
-    """The rows of several files as one table; a column that a file lacks is empty there.
+@dataclasses.dataclass(frozen=True)
+class Columns:
+    """Columns that files of rows must have, by the kind of their values."""
+
+    text: tuple[str, ...]
+    whole: tuple[str, ...]
+    numbers: tuple[str, ...]
+    may_be_empty: tuple[str, ...] = ()
+
+    def check(self, rows: pa.Table, path: Path) -> None:
+        """Refuse rows that lack one, have values of another kind in it, or none."""
+        again = "evaluate the run again"
+        for kind, names in (("text", self.text), ("whole numbers", self.whole), ("numbers", self.numbers)):
+            for name in names:
+                if name not in rows.column_names:
+                    raise FileError(f"{path}: has no column '{name}', expected {kind} there; {again}")
+                is_whole, column = pa.types.is_integer(rows[name].type), rows[name]
+                is_number = kind == "numbers" and pa.types.is_floating(column.type)
+                right = pa.types.is_string(column.type) if kind == "text" else is_whole or is_number
+                if not right and not (column.null_count == len(rows) and name in self.may_be_empty):
+                    raise FileError(f"{path}: column '{name}' holds {column.type}, expected {kind}; {again}")
+                if column.null_count and name not in self.may_be_empty:
+                    raise FileError(f"{path}: column '{name}' is empty in {column.null_count:,} rows; {again}")
+
+
+def read_rows(paths: Sequence[Path], check: Callable[[pa.Table, Path], None] | None = None) -> pa.Table:
+    """The rows of several files as one table, each checked; a column that a file lacks is empty there.
 
     An episode that stands in several files (`IDENTITY`) is taken once, from the last of them by name.
 
@@ -76,6 +101,8 @@ def read_rows(paths: Sequence[Path]) -> pa.Table:
     for path in sorted(paths):
         with readable(path, FileError, "evaluate the run again", " as Parquet"):
             tables.append(pq.read_table(path).replace_schema_metadata(None))
+        if check:
+            check(tables[-1], path)
     try:
         rows = pa.concat_tables(tables, promote_options="permissive")
     except (pa.ArrowInvalid, pa.ArrowTypeError) as error:

@@ -16,7 +16,7 @@ from train.figures import cli, curves, paths, scores, style, tables
 from train.figures.cli import chosen_split
 from train.scoring.claims import claims
 from train.scoring.row_files import paths_beside
-from train.scoring.rows import BY_CATEGORY
+from train.scoring.rows import BY_CATEGORY, COLUMNS
 
 
 def xy(line) -> np.ndarray:
@@ -276,7 +276,7 @@ def test_tables_of_policies_that_never_learned_alone(tmp_path, capsys):
     assert "| TurtleBot | namo:0.5 | unseen | 20 | 0.950 [" in printed
     write_parquet(rows.drop_columns("policy"), tmp_path / "y.parquet")
     assert figures.main([str(tmp_path), "--tables"]) == 2
-    assert "no rows of policies; evaluate some first" in capsys.readouterr().err
+    assert "has no column 'policy', expected text there; evaluate the run again" in capsys.readouterr().err
 
 
 def test_unseen_scenes_are_shown_where_there_are_any():
@@ -369,3 +369,28 @@ def test_a_scene_in_place_of_a_run_is_refused(tmp_path, capsys):
     np.savez(tmp_path / "maps.npz", height=np.zeros((2, 2)))  # an archive, but no recorded paths
     assert figures.main([str(tmp_path), "-o", str(tmp_path / "figures")]) == 2
     assert "nothing to draw" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("column", [*COLUMNS.text, *COLUMNS.whole, *COLUMNS.numbers])
+def test_a_damaged_column_is_one_line_that_names_it(tmp_path, column, capsys):
+    rows, path = paper_like(("fetch",)), tmp_path / "rows.parquet"
+    at, text = rows.column_names.index(column), column in COLUMNS.text
+    other = pa.array([1.5] * len(rows)) if text else pa.array(["a"] * len(rows))
+    empty = rows[column].combine_chunks().to_pylist()
+    empty[3] = None
+    for damaged, told in (
+        (rows.drop_columns(column), f"has no column '{column}', expected"),
+        (rows.set_column(at, column, other), f"column '{column}' holds {other.type}, expected"),
+        (rows.set_column(at, column, pa.array(empty, rows[column].type)), f"column '{column}' is empty in 1 rows"),
+    ):
+        write_parquet(damaged, path)
+        for words in ([], ["--tables"]):
+            assert figures.main([str(tmp_path), "-o", str(tmp_path / "out"), *words]) == 2
+            assert capsys.readouterr().err.startswith(f"train.figures: {path}: {told}")
+
+
+def test_categories_of_another_kind_are_one_line(tmp_path, capsys):
+    rows = paper_like(("fetch",))
+    write_parquet(rows.append_column("by_category", pa.array([1] * len(rows))), tmp_path / "rows.parquet")
+    assert figures.main([str(tmp_path), "--tables"]) == 2
+    assert "rows.parquet: column 'by_category' holds int64, expected list" in capsys.readouterr().err

@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow as pa
 
 from interactive_nav_common.files import write_arrays
-from interactive_nav_common.rows import read_rows, write_parquet
+from interactive_nav_common.rows import Columns, read_rows, write_parquet
 from interactive_nav_common.untrusted.reading import read_npz
 from interactive_nav_common.versions import versions
 from topological_nav.errors import RunError
@@ -68,6 +68,13 @@ def play_contest(contest: Contest, scenes: Sequence[ContestScene], tell: Tell = 
     return pa.concat_tables([_rows(contest.out, stem, len(scene.episodes)) for scene, _, stem in plan])
 
 
+COLUMNS = Columns(
+    text=("contender", "sight", "domain", "policy", "scene", "split"),
+    whole=("episode", "runs", "contact_runs"),
+    numbers=("success", "spl", "within", "contact", "aadc_s", "contact_s", "duration_s", "path_m", "goal_m"),
+)
+
+
 def _stem(scene: ContestScene, contender: str) -> str:
     asked = json.dumps(scene.asked(contender), sort_keys=True)
     return f"{scene.scene.name}-{contender}-{hashlib.sha256(asked.encode()).hexdigest()[:8]}"
@@ -88,7 +95,7 @@ def _rows(out: Path, stem: str, count: int) -> pa.Table:
 
     An episode that two commands played at the same time counts as the first of the files has it.
     """
-    rows = read_rows(_files(out, stem))
+    rows = read_rows(_files(out, stem), COLUMNS.check)
     number, first = np.unique(rows["episode"].to_numpy(), return_index=True)
     return rows.take(first[number < count])
 

@@ -20,6 +20,7 @@ from train.figures.paths import side_by_side, spread_episodes, trajectories
 from train.figures.scores import efficiency_plane, effort_terms, frontier, ins_over_alpha, robots_plane, seen_and_unseen
 from train.figures.tables import document
 from train.scoring.row_files import PATHS
+from train.scoring.rows import check_rows
 from train.scoring.statistics import run_means
 
 from matplotlib.figure import Figure  # isort: skip
@@ -43,7 +44,7 @@ class Results:
             raise FileError(
                 f"{root}: nothing to draw (no metrics.jsonl, no rows, no recorded paths); expected a run folder"
             )
-        self.rows = read_rows(self.tables) if self.tables else pa.table({})
+        self.rows = read_rows(self.tables, check_rows) if self.tables else pa.table({})
         self.swept = set(self.rows.column_names) >= SWEPT and len(self._cells()) > 1
         """Learned runs of several cells or seeds."""
 

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from rich.table import Table
 
 from interactive_nav.types import OF_OBJECTS
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.rows import Columns
 from interactive_nav_common.statistics import RESAMPLES, mean_text
 
 if TYPE_CHECKING:
@@ -33,6 +38,14 @@ TYPES: dict[str, pa.DataType] = {
 """Of the constant columns, which are empty where they mean nothing (a baseline has no seed)."""
 
 
+COLUMNS = Columns(
+    text=("run", "robot", "policy", "scene", "split", "algorithm"),
+    whole=("episode", "seed"),
+    numbers=("k_int", *SCORES, "kinematic_effort", "dynamic_effort"),
+    may_be_empty=("algorithm", "seed", "k_int"),
+)
+
+
 BY_CATEGORY = pa.list_(
     pa.struct(
         {
@@ -48,6 +61,17 @@ BY_CATEGORY = pa.list_(
 """Of the column `by_category`: how many objects of each category that a scene has were there and were touched, and,
 summed over them, control steps in contact, path lengths of their centres of mass, and largest net forces of the
 steps."""
+
+
+def check_rows(rows: pa.Table, path: Path) -> None:
+    """Refuse damaged rows of episodes; tables of something else, which have few of their columns, pass."""
+    needed = {*COLUMNS.text, *COLUMNS.whole, *COLUMNS.numbers}
+    if 2 * len(needed & set(rows.column_names)) < len(needed):
+        return
+    COLUMNS.check(rows, path)
+    dataclasses.replace(COLUMNS, may_be_empty=()).check(rows.filter(pc.field("policy") == "learned"), path)
+    if "by_category" in rows.column_names and not rows["by_category"].type.equals(BY_CATEGORY):
+        raise FileError(f"{path}: column 'by_category' holds {rows['by_category'].type}, expected {BY_CATEGORY}")
 
 
 def episode_table(

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import socket
-import subprocess
-import sys
 import urllib.error
 import urllib.request
 
@@ -14,7 +11,6 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from converters.__main__ import main
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.untrusted.guard import bind, guarded_server, is_local, refusal
 
@@ -89,37 +85,3 @@ def test_a_port_in_use_is_one_line_and_not_another_port():
     for host, number in (("127.0.0.1", 99_999), ("203.0.113.7", 0), ("no such host", 0)):
         with pytest.raises(ConfigError, match="cannot be listened on"):
             bind(host, number)
-
-
-def test_without_viser_the_command_names_what_to_install(scan2cad_raw, tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "viser", None)
-    assert main(["annotate", str(scan2cad_raw), "-o", str(tmp_path / "mine"), "--port", "0"]) == 2
-    expected = "annotate needs viser, which is not installed; pip install 'interactive-nav[annotate]'"
-    assert expected in capsys.readouterr().err
-
-
-def test_two_people_in_one_folder_and_a_missing_scan_are_one_line(scan2cad_raw, tmp_path, capsys):
-    pytest.importorskip("viser", reason=NEEDS)
-    words = [
-        sys.executable,
-        "-m",
-        "converters",
-        "annotate",
-        str(scan2cad_raw),
-        "-o",
-        str(tmp_path / "mine"),
-        "--port",
-        "0",
-    ]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as first:
-        try:
-            assert first.stdout is not None
-            assert any("Ctrl-C ends it" in line for line in first.stdout)
-            assert main(words[3:]) == 2
-            assert "works there; wait for it or choose another folder (-o)" in capsys.readouterr().err
-        finally:
-            first.terminate()
-    assert first.returncode == 143
-    with contextlib.suppress(SystemExit):
-        assert main(["annotate", str(tmp_path / "no.ply"), "-o", str(tmp_path / "other")]) == 2
-    assert "no.ply" in capsys.readouterr().err
