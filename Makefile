@@ -103,7 +103,7 @@ check: lint types docs test
 lock:
 	uv pip compile pyproject.toml --extra dev --extra warp --extra docs --universal --python-version 3.11 --generate-hashes \
 	  --no-emit-index-url --no-header -o requirements.lock
-	printf 'meson-python\nninja\nwheel\n' | uv pip compile - --universal --python-version 3.11 --generate-hashes \
+	printf 'meson-python\nninja\nwheel\n' | uv pip compile - -c requirements.lock --universal --python-version 3.11 --generate-hashes \
 	  --no-emit-index-url --no-header --no-annotate -o tests/oracles-build.lock
 	echo 'scikit-fmm==2025.6.23' | uv pip compile - --no-deps --generate-hashes \
 	  --no-emit-index-url --no-header --no-annotate -o tests/oracles.lock
