@@ -22,7 +22,7 @@ MAY_IMPORT = {
     "benchmarks": set(PACKAGES) - {"benchmarks", "docs"},
     "docs": set(PACKAGES),
 }
-CHECKOUT_KIB = 35_328
+CHECKOUT_KIB = 34_816
 """Most that tracked files may take."""
 MODULES_A_FOLDER, LINES_A_FILE, LINES_A_FUNCTION = 12, 400, 60
 
