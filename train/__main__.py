@@ -27,6 +27,9 @@ def parser() -> argparse.ArgumentParser:
     source.add_argument("--config", metavar="NAME|PATH", help=f"a preset ({known}) or a YAML file")
     source.add_argument("--resume", metavar="RUN_DIR", help="continue this run folder with its own config")
     made.add_argument("--robot", metavar="NAME|FILE", help="as env.robot=...: a name, a file, or path.py:function")
+    made.add_argument(
+        "--checkpoint", default="last", metavar="best|last|STEPS", help="continue from it (default: last)"
+    )
     made.add_argument("overrides", nargs="*", metavar="key=value", help="settings to change, see below")
     return made
 
@@ -50,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Heavy: after the config is known to be right.
     from train.runs.run import train_run
 
-    _, _, stopped_by = train_run(config, SafeConsole())
+    _, _, stopped_by = train_run(config, SafeConsole(), resume_from=arguments.checkpoint)
     return 128 + stopped_by if stopped_by else 0
 
 

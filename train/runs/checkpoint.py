@@ -1,10 +1,12 @@
-"""Snapshots in, checkpoint folders out, and back: whole or not there at all, whatever happens in between."""
+"""Write snapshots as checkpoint folders, and read them: each is whole, and its files are those that were written."""
 
+import contextlib
 import dataclasses
 import hashlib
 import json
 import os
 import shutil
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ import numpy as np
 
 from interactive_nav_common.config import Natural
 from interactive_nav_common.errors import FileError
-from interactive_nav_common.files import writing
+from interactive_nav_common.files import check_name, writing
 from interactive_nav_common.records import Reader
 from interactive_nav_common.untrusted.reading import read_npz
 from train.errors import CheckpointError
@@ -44,6 +46,10 @@ class CheckpointMeta:
     action_size: int
     began_together: int = 0
     """Env steps at which all environments last began new episodes."""
+    sha256: dict[str, str] = dataclasses.field(default_factory=dict)
+    """File name -> SHA-256 of its content; empty in checkpoints of earlier releases."""
+    scenes: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Scene name -> digest of the task in it (`Scene.task_digest`)."""
 
 
 def save(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, env_state_limit_mb: float) -> Path:
@@ -63,6 +69,7 @@ def save(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, env_state_l
                 with open(partial / ENV_STATE, "wb") as file:
                     np.savez(file, *leaves)
                     _flush(file)
+            meta = dataclasses.replace(meta, sha256={p.name: _sha256(p) for p in sorted(partial.iterdir())})
             _write(partial / META, json.dumps(dataclasses.asdict(meta), indent=1).encode())
             if final.exists():
                 _remove(final)
@@ -81,15 +88,28 @@ def save(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, env_state_l
 
 
 def list_checkpoints(root: Path) -> list[CheckpointMeta]:
-    """All whole checkpoints, oldest first."""
-    found = []
+    """Return all checkpoints with a readable `meta.json`, oldest first."""
+    every = []
     for path in sorted(root.glob("[0-9]*")):
-        try:
-            found.append(read_meta(path))
-        except CheckpointError:
-            if (path / META).is_file():  # else it went meanwhile
-                raise
-    return found
+        with contextlib.suppress(CheckpointError):
+            every.append(read_meta(path))
+    return every
+
+
+def verify(folder: Path) -> CheckpointMeta:
+    """Return what a checkpoint is of, if its files are those that were written.
+
+    Raises:
+        CheckpointError: a file is missing or differs from the digest in `meta.json`.
+    """
+    meta = read_meta(folder)
+    for name, digest in meta.sha256.items():
+        path = folder / check_name(name, f"{folder / META}: a file", CheckpointError)
+        if name == ENV_STATE and not path.exists():
+            continue  # kept for the newest checkpoint only
+        if not path.is_file() or _sha256(path) != digest:
+            raise CheckpointError(f"{path}: damaged: its SHA-256 is not that in {META}; remove this checkpoint")
+    return meta
 
 
 def best_checkpoint(checkpoints: list[CheckpointMeta]) -> CheckpointMeta | None:
@@ -99,21 +119,46 @@ def best_checkpoint(checkpoints: list[CheckpointMeta]) -> CheckpointMeta | None:
 
 
 def find(root: Path, which: str) -> tuple[Path, CheckpointMeta]:
-    """A checkpoint's folder by `best`, `last` or its env steps; while none has a score, the last is the best."""
-    every = list_checkpoints(root)
-    if not every:
+    """Return a checkpoint's folder by `best`, `last` or its env steps; while none has a score, the last is the best.
+
+    `best` and `last` pass over damaged checkpoints with a warning.
+
+    Raises:
+        CheckpointError: there is none, none is intact, or the one named by its steps is damaged.
+    """
+    paths = [path for path in sorted(root.glob("[0-9]*")) if path.name.isdigit() and (path / META).exists()]
+    if not paths:
         raise CheckpointError(f"{root}: holds no checkpoint; train the run first, until its first checkpoint")
-    if which == "last":
-        chosen = every[-1]
-    elif which == "best":
-        chosen = best_checkpoint(every) or every[-1]
-    else:
-        named = [c for c in every if str(c.env_steps) == which.lstrip("0")]
+    if which not in ("best", "last"):
+        named = [path for path in paths if path.name.lstrip("0") == which.lstrip("0")]
         if not named:
-            steps = ", ".join(str(c.env_steps) for c in every)
+            steps = ", ".join(path.name.lstrip("0") or "0" for path in paths)
             raise CheckpointError(f"{root}: no checkpoint {which!r}; expected best, last or one of {steps}")
-        chosen = named[0]
-    return root / f"{chosen.env_steps:012d}", chosen
+        return named[0], verify(named[0])
+    intact, faults = {}, []
+    for path in reversed(paths):
+        try:
+            intact[verify(path).env_steps] = path
+        except CheckpointError as error:
+            faults.append(error)
+    if not intact:
+        raise faults[0]
+    metas = [read_meta(path) for path in reversed(intact.values())]
+    chosen = (best_checkpoint(metas) if which == "best" else None) or metas[-1]
+    for error in faults:
+        warnings.warn(f"{error}; the checkpoint at {chosen.env_steps} steps is used", stacklevel=2)
+    return intact[chosen.env_steps], chosen
+
+
+def set_aside(root: Path, after: int) -> list[Path]:
+    """Rename the checkpoints beyond so many env steps to `aside-*`, where no command takes them for the run's."""
+    later = [path for path in sorted(root.glob("[0-9]*")) if path.name.isdigit() and int(path.name) > after]
+    with writing(root, GOES_ON):
+        for path in later:
+            target = root / f"aside-{path.name}"
+            shutil.rmtree(target, ignore_errors=True)
+            path.rename(target)
+    return later
 
 
 def read_meta(folder: Path) -> CheckpointMeta:
@@ -141,13 +186,13 @@ def keep_policy(folder: Path, target: Path, step: float = policy_file.STEP) -> N
         policy_file.write(folder / LEARNER, meta.algorithm, target / policy_file.POLICY, step)
     else:
         shutil.copy2(folder / policy_file.POLICY, target)
-    shutil.copy2(folder / META, target / META)
+    kept = dataclasses.replace(meta, sha256={policy_file.POLICY: _sha256(target / policy_file.POLICY)})
+    _write(target / META, json.dumps(dataclasses.asdict(kept), indent=1).encode())
 
 
 def weights_digest(folder: Path) -> str:
     """SHA-256 of a checkpoint's weights."""
-    path = folder / (LEARNER if is_whole(folder) else policy_file.POLICY)
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return _sha256(folder / (LEARNER if is_whole(folder) else policy_file.POLICY))
 
 
 def load_learner(folder: Path, template: Any) -> Any:
@@ -170,6 +215,10 @@ def load_learner(folder: Path, template: Any) -> Any:
             raise CheckpointError(
                 f"{path}: {jax.tree_util.keystr(name)} has shape {np.shape(got)}, "
                 f"expected {np.shape(expected)}; use the config that the checkpoint was trained with"
+            )
+        if jnp.issubdtype(jnp.asarray(got).dtype, jnp.inexact) and not np.isfinite(got).all():
+            raise CheckpointError(
+                f"{path}: {jax.tree_util.keystr(name)} has values that are not finite; use another checkpoint"
             )
         return jnp.asarray(got, jnp.asarray(expected).dtype)
 
@@ -216,6 +265,10 @@ def _remove(folder: Path) -> None:
     gone = folder.with_name(f".partial-gone-{folder.name}")
     os.replace(folder, gone)
     shutil.rmtree(gone)
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _write(path: Path, data: bytes) -> None:

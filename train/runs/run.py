@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import json
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -80,8 +81,17 @@ def config_to_play(
 class FolderCallbacks:
     """Learner callbacks that write a run folder and show progress."""
 
-    def __init__(self, folder: RunFolder, config: TrainConfig, env: Any, display: TrainingDisplay, stops: list[int]):
-        self._folder, self._config, self._env = folder, config, env
+    def __init__(
+        self,
+        folder: RunFolder,
+        config: TrainConfig,
+        env: Any,
+        display: TrainingDisplay,
+        stops: list[int],
+        resume_from: str = "last",
+    ):
+        self._folder, self._config, self._env, self._resume_from = folder, config, env, resume_from
+        self._scenes = {scene.name: scene.task_digest for scene in getattr(env, "scenes", ())}
         self._display, self._stops = display, stops
         self._wall_before_s = 0.0
         self._began_together = 0
@@ -93,17 +103,28 @@ class FolderCallbacks:
         return self._wall_before_s + time.perf_counter() - self._began
 
     def restore(self, template: Snapshot) -> Snapshot | None:
-        """The newest checkpoint of the folder."""
+        """Return the newest intact checkpoint of the folder, or the one that was asked for; None: there is none."""
         checkpoint.remove_partial(self._folder.checkpoints)
-        if not checkpoint.list_checkpoints(self._folder.checkpoints):
+        if self._resume_from == "last" and not any(self._folder.checkpoints.glob("[0-9]*")):
             return None
-        path, meta = checkpoint.find(self._folder.checkpoints, "last")
+        with warnings.catch_warnings(record=True) as passed_over:
+            path, meta = checkpoint.find(self._folder.checkpoints, self._resume_from)
+        for warning in passed_over:
+            self._display.console.print(str(warning.message), style="yellow", markup=False, soft_wrap=True)
         if not checkpoint.is_whole(path):
             raise CheckpointError(
                 f"{path}: holds the policy alone, as `train.sweep --export` writes it, expected all of the learner to "
                 "go on from; train into another folder (run.out_dir, run.name)"
             )
         check_fits(meta, path, self._config.env, self._env)
+        for name, digest in meta.scenes.items():
+            if self._scenes.get(name, digest) != digest:
+                raise CheckpointError(
+                    f"{path}: scene '{name}' has changed since: masses, places or maps differ; restore its folder, or "
+                    "set run.name to begin another run"
+                )
+        for later in checkpoint.set_aside(self._folder.checkpoints, meta.env_steps):
+            self._display.console.print(f"{later}: renamed to aside-{later.name}", markup=False, soft_wrap=True)
         self._wall_before_s = meta.wall_s
         learner = checkpoint.load_learner(path, template.learner)
         env_state = checkpoint.load_env_state(path, template.env_state)
@@ -173,6 +194,7 @@ class FolderCallbacks:
             observations=self._config.env.sensors.observations,
             observation_size=checkpoint.plain_size(self._env.observation_size),
             action_size=int(self._env.action_size),
+            scenes=self._scenes,
         )
         checkpoint.save(self._folder.checkpoints, snapshot, meta, run.keep_checkpoints, run.env_state_limit_mb)
 
@@ -215,6 +237,7 @@ def train_run(
     config: TrainConfig,
     console: Console,
     build_env: Callable[[EnvConfig], Any] = make_env,
+    resume_from: str = "last",
 ) -> tuple[TrainResult, RunFolder, int | None]:
     """Trains as configured, beginning or continuing the run folder.
 
@@ -222,6 +245,8 @@ def train_run(
         config: as loaded; sizes may still be `auto`.
         console: for progress.
         build_env: config -> one environment.
+        resume_from: the checkpoint that an existing run continues from: `last`, `best` or env steps. Later ones are
+            renamed.
 
     Returns:
         The result, the folder, and the signal that ended it early, if one did.
@@ -244,11 +269,11 @@ def train_run(
         raise
     busy = f"{folder.path}: {{holder}} trains this run; wait until it ends, or set run.name to begin another run"
     with locked(folder.lock, busy):
-        return _train_in(folder, config, env, console)
+        return _train_in(folder, config, env, console, resume_from)
 
 
 def _train_in(
-    folder: RunFolder, config: TrainConfig, env: Any, console: Console
+    folder: RunFolder, config: TrainConfig, env: Any, console: Console, resume_from: str
 ) -> tuple[TrainResult, RunFolder, int | None]:
     """Trains in a folder that nobody else writes to."""
     exists = folder.open(config)
@@ -263,7 +288,7 @@ def _train_in(
         told = f"{each:,} steps for each environment, and an episode has up to {limit:,}: none that fails comes to its"
         console.print(f"{told} end; lower env.episode_steps or train longer", style="yellow", soft_wrap=True)
     with stop_signals() as stops, TrainingDisplay(console) as display:
-        callbacks = FolderCallbacks(folder, config, env, display, stops)
+        callbacks = FolderCallbacks(folder, config, env, display, stops, resume_from)
         try:
             result = ALGORITHMS[config.algorithm].train(AutoResetEnv(env), config, callbacks)
         finally:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shutil
 from typing import Any
 
 import flax.serialization
@@ -155,8 +156,8 @@ def test_training_does_not_go_on_from_it(tmp_path):
     _, folder, _ = train_run(config, Console(quiet=True), build_env=build_toy)
     path, _ = checkpoint.find(folder.checkpoints, "last")
     checkpoint.keep_policy(path, tmp_path / "kept")
-    path.joinpath(checkpoint.LEARNER).unlink()
-    (tmp_path / "kept" / policy_file.POLICY).rename(path / policy_file.POLICY)
+    shutil.rmtree(path)
+    (tmp_path / "kept").rename(path)
     assert json.loads((path / checkpoint.META).read_text())["env_steps"] == 512
     longer = dataclasses.replace(config, run=dataclasses.replace(config.run, num_timesteps=2048))
     with pytest.raises(CheckpointError, match="holds the policy alone"):
