@@ -307,12 +307,6 @@ def convert_building(
         warn: told what is wrong with the source as soon as it is read; all warnings stand in the result too.
         floors: that it must have; None: any number.
         annotations: Scan2CAD's file, in place of the source's own; its models are those of `config.library`.
-
-    Raises:
-        SceneRejected: bad input, or another number of floors.
-        StageFailed: a stage broke.
-        FileError: `target` exists already (`overwrite`), or cannot be written.
-        OSError: the disk is full or gone.
     """
     clock = Clock(report or (lambda stage, share: None))
     if config.library is None and (source / "cad").is_dir():
@@ -347,9 +341,5 @@ def convert_building(
 def convert(
     source: Path, target: Path, config: ConvertConfig, report: Report | None = None, cache: Path | None = None
 ) -> Converted:
-    """Converts a raw folder of one floor; arguments and errors of `convert_building`.
-
-    Raises:
-        SceneRejected: bad input, or several floors.
-    """
+    """Converts a raw folder of one floor; arguments and errors of `convert_building`."""
     return convert_building(source, target, config, report, cache, floors=1)[0]

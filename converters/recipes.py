@@ -108,9 +108,6 @@ def building_of(tier: str, settings: dict[str, Any], split: str, where: str) -> 
         settings: by name: those of `BuildingConfig`, or of `HomeConfig` and its shell.
         split: train or test; decides the CAD models.
         where: named in errors.
-
-    Raises:
-        GenerationError: an unknown tier or setting, a wrong type, or values that are refused.
     """
     if tier not in (SPARSE, *TIERS):
         raise GenerationError(f"{where}: tier is {tier!r}, expected one of {', '.join((SPARSE, *TIERS))}")
@@ -127,11 +124,7 @@ def building_of(tier: str, settings: dict[str, Any], split: str, where: str) -> 
 
 
 def check_conversion(settings: dict[str, Any], where: str) -> None:
-    """Refuses settings of a conversion that do not exist, or are no whole numbers.
-
-    Raises:
-        GenerationError: one of these.
-    """
+    """Refuses settings of a conversion that do not exist, or are no whole numbers."""
     _refuse_unknown(settings, _CONVERSION, where)
     for key, value in settings.items():
         if not isinstance(value, int) or isinstance(value, bool) or value < 0:
@@ -145,9 +138,6 @@ def parse_recipes(data: Any, where: str) -> Recipes:
         data: the decoded file: `scenes` {name: {split, seed, tier, building}}, `conversion`, and `shared`, which only
             holds anchors.
         where: file named in errors.
-
-    Raises:
-        GenerationError: an unknown or missing key, a wrong type, or a building that is refused.
     """
     found = _RECIPES.record(data, _File, where)
     conversion = found.conversion or {}
@@ -161,11 +151,7 @@ def parse_recipes(data: Any, where: str) -> Recipes:
 
 
 def load_recipes(path: Path) -> Recipes:
-    """Reads a recipe file.
-
-    Raises:
-        GenerationError: no such file, not YAML, or wrong content.
-    """
+    """Reads a recipe file."""
     try:
         text = read_bytes(path)
     except OSError as error:
@@ -229,9 +215,6 @@ def make_scene(recipe: SceneRecipe, conversion: dict[str, Any], folder: Path, jo
 
     Returns:
         Names of the gates that fail.
-
-    Raises:
-        FileError: it cannot be written; an older one is untouched.
     """
     with part_folder(folder, overwrite=True) as work:
         config = ConvertConfig(format="gibson", split=recipe.split, jobs=jobs, **conversion)
@@ -255,9 +238,6 @@ def chosen(
         names: of scenes; empty: all.
         overwrite: those too that are there.
         tell: told one line for each that is there and kept.
-
-    Raises:
-        GenerationError: an unknown name.
     """
     known = [r.name for r in recipes.scenes]
     for name in names:
@@ -290,10 +270,6 @@ def make_scenes(
 
     Returns:
         Name -> gates that fail, of the scenes made now.
-
-    Raises:
-        GenerationError: a building that cannot be generated.
-        SceneRejected, StageFailed: a conversion failed.
     """
     weight = [sum(r.building.floor_area_m2) for r in todo]
     failed: dict[str, list[str]] = {}

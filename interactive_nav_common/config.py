@@ -96,11 +96,7 @@ class Settings:
 
     @classmethod
     def of(cls, **settings: Any) -> Self:
-        """The defaults but for these settings, wherever they stand.
-
-        Raises:
-            ConfigError: there is no such setting (the message names the nearest one), or it cannot be this.
-        """
+        """The defaults but for these settings, wherever they stand."""
         return replace(cls(), **settings)
 
 
@@ -137,11 +133,7 @@ def _check(name: str, value: Any, hint: Any) -> None:
 
 
 def replace(config: Config, **changes: Any) -> Config:
-    """As `dataclasses.replace`, with settings of flat sections by their own names.
-
-    Raises:
-        ConfigError: there is no such setting (the message names the nearest one), or it cannot be this.
-    """
+    """As `dataclasses.replace`, with settings of flat sections by their own names."""
     places, own, inner = _places(type(config)), {}, {}
     for name, value in changes.items():
         if name not in places:
@@ -179,11 +171,7 @@ def to_dict(config: Any) -> dict[str, Any]:
 
 
 def nested(settings: Iterable[tuple[str, Any]], where: str = "settings") -> dict[str, Any]:
-    """Dotted names taken apart; mappings among the values are merged.
-
-    Raises:
-        ConfigError: a section that was given a value; the message begins with `where`.
-    """
+    """Dotted names taken apart; mappings among the values are merged."""
     whole: dict[str, Any] = {}
     for name, value in settings:
         *sections, last = str(name).split(".")
@@ -204,9 +192,6 @@ def read_words(words: Sequence[str], example: str = "ppo.learning_rate=1e-4") ->
     """`dotted.name=value` words as a nested mapping; values are read as YAML.
 
     All words at once, so that two values that only fit together may both change.
-
-    Raises:
-        ConfigError: a word without `=`, or a section that was given a value.
     """
     settings = []
     for word in words:
@@ -244,9 +229,6 @@ def overlay(base: Config, plain: Any, where: str, prefix: str = "", known: Seque
         where: file or word the values come from, for messages.
         prefix: dotted name of `base` inside the whole, with its dot.
         known: dotted names elsewhere that a wrong key may have meant.
-
-    Raises:
-        ConfigError: an unknown key, a wrong type or a value out of range.
     """
     plain = {} if plain is None else plain
     if not isinstance(plain, Mapping):
@@ -271,11 +253,7 @@ def overlay(base: Config, plain: Any, where: str, prefix: str = "", known: Seque
 
 
 def overridden(config: Config, words: Sequence[str]) -> Config:
-    """The config with `name=value` words laid over it; values are read as YAML.
-
-    Raises:
-        ConfigError: a word without `=`, an unknown name, or a value that the setting cannot have.
-    """
+    """The config with `name=value` words laid over it; values are read as YAML."""
     return overlay(config, read_words(words, "seed=1"), "setting")
 
 
@@ -286,9 +264,6 @@ def refuse_unused(arguments: argparse.Namespace, names: str, why: str) -> None:
         arguments: of a command line, its `key=value` words in `settings`; what is None, False or empty was not given.
         names: `--options` and settings.
         why: with what they change nothing.
-
-    Raises:
-        ConfigError: one of them was given.
     """
     words = {word.partition("=")[0] for word in getattr(arguments, "settings", ())}
     for name in names.split():

@@ -134,11 +134,7 @@ def missing(user: str, package: str, extra: str, otherwise: str = "") -> str:
 
 
 def optional(module: str, line: str, kind: type[UserError] = MissingPackage) -> Any:
-    """A module of an optional package.
-
-    Raises:
-        UserError: of this kind, with the line and what the import said; it cannot be imported.
-    """
+    """A module of an optional package."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -34,11 +34,7 @@ def cache_folder() -> Path:
 
 
 def check_name(name: str, what: str, error: type[UserError] = FileError) -> str:
-    """A name that comes from a file or a user and becomes one part of a path.
-
-    Raises:
-        UserError: of the kind `error`; it is no such name, or would lead elsewhere.
-    """
+    """A name that comes from a file or a user and becomes one part of a path."""
     good = name.isprintable() and name[:1] not in ("", ".") and not set("/\\") & set(name)
     if not good or len(name.encode()) > LONGEST_NAME:
         shown = repr(name if len(name) <= 40 else f"{name[:37]}...")
@@ -51,11 +47,7 @@ def check_name(name: str, what: str, error: type[UserError] = FileError) -> str:
 
 @contextlib.contextmanager
 def writing(place: object, remedy: str, what: str = "cannot be written") -> Iterator[None]:
-    """Says in one line what could not be written in the block, why, and what helps.
-
-    Raises:
-        FileError: the system refused.
-    """
+    """Says in one line what could not be written in the block, why, and what helps."""
     try:
         yield
     except OSError as error:
@@ -68,9 +60,6 @@ def whole_file(path: str | Path) -> Iterator[Path]:
 
     Each writer has its own temporary file, locked while it writes: of two that write one path at the same time, the
     last one stands.
-
-    Raises:
-        FileError: it cannot be written; what stood at `path` is untouched.
     """
     path = Path(path)
     partial, lock = path.with_name(f"{PARTIAL}{secrets.token_hex(4)}-{path.name[-40:]}"), None
@@ -114,32 +103,20 @@ def append_text(path: Path, text: str) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Writes a text file (UTF-8) whole or not at all.
-
-    Raises:
-        FileError: it cannot be written.
-    """
+    """Writes a text file (UTF-8) whole or not at all."""
     with whole_file(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
 
 def write_arrays(path: str | Path, **arrays: Any) -> None:
-    """Writes arrays as a packed npz file, whole or not at all.
-
-    Raises:
-        FileError: it cannot be written.
-    """
+    """Writes arrays as a packed npz file, whole or not at all."""
     with whole_file(path) as partial, open(partial, "wb") as file:
         np.savez_compressed(file, **arrays)
 
 
 @contextlib.contextmanager
 def whole_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
-    """An empty folder beside `target`, which becomes it once the block has filled it.
-
-    Raises:
-        FileError: `target` is there and may not be replaced, or cannot be written; nothing is changed then.
-    """
+    """An empty folder beside `target`, which becomes it once the block has filled it."""
     with part_folder(target, overwrite) as part:
         yield part
         publish({part: target}, overwrite)
@@ -152,10 +129,6 @@ def part_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
     Args:
         target: of the folder, where it shall stand in the end.
         overwrite: a folder that stands there may be replaced.
-
-    Raises:
-        FileError: `target` is there and may not be replaced, another process is about to put something there, or it
-            cannot be written.
     """
     if target.parent.is_dir():
         remove_stale(target)
@@ -188,9 +161,6 @@ def publish(folders: Mapping[Path, Path], overwrite: bool = True) -> None:
     Args:
         folders: finished folder -> target, on one file system.
         overwrite: an older target is replaced; without, only an empty one.
-
-    Raises:
-        FileError: one could not be renamed; what stood at the targets stands there again.
     """
     placed: list[Path] = []
     moved: list[tuple[Path, Path]] = []

@@ -24,9 +24,6 @@ def take_lock(path: Path) -> int | None:
 
     Returns:
         The descriptor, or None where another holds the lock.
-
-    Raises:
-        FileError: the file cannot be made, or its file system has no locks.
     """
     is_folder = path.is_dir()
     descriptor = _open(path, os.O_RDONLY if is_folder else os.O_CREAT | os.O_RDWR)
@@ -81,9 +78,6 @@ def locked(path: Path, busy: str) -> Iterator[None]:
     Args:
         path: of the lock file.
         busy: what to say where it is held, with `{holder}` in it.
-
-    Raises:
-        FileError: another process holds it, or it cannot be made.
     """
     descriptor = take_lock(path)
     if descriptor is None:
@@ -120,11 +114,7 @@ LOCK = ".lock"
 
 @contextlib.contextmanager
 def alone_in(out: Path) -> Iterator[None]:
-    """Makes a folder and keeps other processes out of it for the block.
-
-    Raises:
-        FileError: it cannot be made, or another one works there.
-    """
+    """Makes a folder and keeps other processes out of it for the block."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -64,11 +64,7 @@ class Reader:
     """All numbers must be finite and below 2**64; measured scores may be none."""
 
     def json(self, path: Path, absent: Any = None) -> Any:
-        """The decoded file; `absent`, unless None, where there is none.
-
-        Raises:
-            UserError: it cannot be read, is not JSON, or holds such a number.
-        """
+        """The decoded file; `absent`, unless None, where there is none."""
         try:
             return self.decoded(read_bytes(path), "JSON", str(path))
         except OSError as error:
@@ -91,9 +87,6 @@ class Reader:
         """A decoded mapping as a record: lists become tuples, mappings records where the types say so.
 
         `where` is named in errors; with `others`, keys that the record lacks are passed over.
-
-        Raises:
-            UserError: no mapping, an unknown or missing key, a value of another type or out of bounds.
         """
         if not isinstance(data, dict):
             raise self.error(f"{where}: got {shown(data)}, expected a mapping; {self.remedy}")
@@ -110,11 +103,7 @@ class Reader:
         return cls(**{key: self.typed(value, fields[key][0], f"{where}: {key}") for key, value in data.items()})
 
     def typed(self, value: Any, hint: Any, where: str) -> Any:
-        """A decoded value as its type wants it.
-
-        Raises:
-            UserError: it is of another type or out of bounds.
-        """
+        """A decoded value as its type wants it."""
         origin, arguments = typing.get_origin(hint), typing.get_args(hint)
         if hint is Any or (origin in (types.UnionType, typing.Union) and value is None and type(None) in arguments):
             return value
@@ -175,11 +164,7 @@ METRICS, PACKED_METRICS = "metrics.jsonl", "metrics.jsonl.gz"
 
 
 def read_packaged(path: Path, hint: Any) -> Any:
-    """A YAML table that comes with the package, as the type `hint`.
-
-    Raises:
-        FileError: it is damaged.
-    """
+    """A YAML table that comes with the package, as the type `hint`."""
     reader = Reader(FileError, "install the package again", finite=False)
     return reader.typed(reader.decoded(path.read_bytes(), "YAML", str(path), PACKAGED), hint, str(path))
 
@@ -202,11 +187,7 @@ def mean_over_episodes(lines: Sequence[dict[str, Any]], name: str) -> float | No
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The lines of a metrics.jsonl, packed or not; an unfinished last line (a killed run) is left out.
-
-    Raises:
-        FileError: it cannot be read.
-    """
+    """The lines of a metrics.jsonl, packed or not; an unfinished last line (a killed run) is left out."""
     with readable(path, FileError, "expected the metrics of a run"):
         everything = read_bytes(path)
         everything = unpack(everything, "gzip") if path.suffix == ".gz" else everything

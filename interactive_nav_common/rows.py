@@ -31,9 +31,6 @@ def write_parquet(table: pa.Table, path: Path, notes: dict[str, str] | None = No
     """Writes rows, with notes beside them in the file, whole or not at all.
 
     A small one is a tenth smaller and takes thirty times as long to write: for files that are kept.
-
-    Raises:
-        FileError: the file cannot be written.
     """
     floats = [field.name for field in table.schema if pa.types.is_floating(field.type)]
     others = [field.name for field in table.schema if not pa.types.is_floating(field.type)]
@@ -72,12 +69,15 @@ class Columns:
     whole: tuple[str, ...]
     numbers: tuple[str, ...]
     may_be_empty: tuple[str, ...] = ()
+    may_be_missing: tuple[str, ...] = ()
 
     def check(self, rows: pa.Table, path: Path) -> None:
         """Refuse rows that lack one, have values of another kind in it, or none."""
         again = "evaluate the run again"
         for kind, names in (("text", self.text), ("whole numbers", self.whole), ("numbers", self.numbers)):
             for name in names:
+                if name not in rows.column_names and name in self.may_be_missing:
+                    continue
                 if name not in rows.column_names:
                     raise FileError(f"{path}: has no column '{name}', expected {kind} there; {again}")
                 is_whole, column = pa.types.is_integer(rows[name].type), rows[name]
@@ -93,9 +93,6 @@ def read_rows(paths: Sequence[Path], check: Callable[[pa.Table, Path], None] | N
     """The rows of several files as one table, each checked; a column that a file lacks is empty there.
 
     An episode that stands in several files (`IDENTITY`) is taken once, from the last of them by name.
-
-    Raises:
-        FileError: a file is not readable as Parquet, or columns do not fit each other.
     """
     tables = []
     for path in sorted(paths):

@@ -10,6 +10,8 @@ import faulthandler
 import json
 import os
 import resource
+import shutil
+import socket
 import sys
 import tempfile
 import zlib
@@ -259,7 +261,80 @@ def runs() -> dict[str, Target]:
     }
 
 
-GROUPS = {"scans": (scans, 12), "homes": (homes, 4), "scenes": (scenes, 5), "runs": (runs, 4)}
+def given() -> dict[str, Target]:
+    """What users write or hand over: settings, sweeps, robots, rows to draw."""
+    import warnings
+
+    import yaml
+
+    from interactive_nav.robots import get_robot
+    from interactive_nav.robots.reference import _LOADED
+    from tests.interactive_nav.robots.test_add_a_robot import _cart
+    from tests.interactive_nav.robots.urdf import cart
+    from tests.train.synthetic import baseline_rows, run_rows
+    from tests.train.toy_run import toy_config
+    from train import config_io
+    from train.figures import style, tables
+    from train.figures.cli import Results, chosen_split, figures_of
+    from train.scoring.rows import BY_CATEGORY
+    from train.sweep import spec
+
+    def rows(root: Path) -> None:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        parts = [
+            run_rows("fetch", a, k, s, 0.5, (0.9, 0.8)) for a in ("ppo", "sac") for k in (0.0, 1.0) for s in (0, 1)
+        ]
+        table = pa.concat_tables([*parts, baseline_rows("fetch")])
+        entry = {name: 1 for name in ("objects", "touched", "contact_steps", "displacement_m", "force_sum_n")}
+        told = pa.array([[{"category": "chair", **entry}]] * len(table), BY_CATEGORY)
+        table = table.append_column("by_category", told).append_column("structure_steps", pa.array([0.0] * len(table)))
+        pq.write_table(table, root / "rows.parquet")
+
+    def read_rows(root: Path) -> None:
+        found = Results(root)
+        if found.swept:
+            tables.document(found.rows, chosen_split(found.rows, "auto"))
+        for _, draw in figures_of(root):
+            draw()
+            style.plt.close("all")
+
+    def robots(root: Path) -> None:
+        motor, velocity = '<motor name="old" joint="fl"/>', '<velocity joint="fl" kv="1" ctrlrange="-8 8"/>'
+        sidecar = {
+            "max_wheel_speed_rad_s": 4,
+            "body_width_m": 0.5,
+            "camera": {"body": "base_link", "pos_m": [0.1, 0, 1]},
+        }
+        (root / "porter.urdf").write_text(cart())
+        (root / "porter.yaml").write_text(yaml.safe_dump(sidecar | {"torque_limits": {"left_joint": 2}}))
+        (root / "rover.xml").write_text(_cart().replace(motor, velocity))
+
+    def read_robots(root: Path) -> None:
+        _LOADED.clear()
+        for name in ("porter.urdf", "rover.xml"):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                get_robot(str(root / name))
+
+    def settings(root: Path) -> None:
+        config = yaml.safe_load(config_io.to_yaml(toy_config(root.parent)))
+        (root / "config.yaml").write_text(yaml.safe_dump(config))
+        shutil.copy(ROOT / "train" / "configs" / "sweeps" / "kint.yaml", root / "sweep.yaml")
+
+    def read_settings(root: Path) -> None:
+        config_io.load(str(root / "config.yaml"))
+        spec.load(str(root / "sweep.yaml"))
+
+    return {
+        "rows": Target(rows, read_rows),
+        "robots": Target(robots, read_robots),
+        "settings": Target(settings, read_settings),
+    }
+
+
+GROUPS = {"scans": (scans, 12), "homes": (homes, 4), "scenes": (scenes, 5), "runs": (runs, 4), "given": (given, 3)}
 """Name -> its targets, and how many there are."""
 
 
@@ -307,9 +382,41 @@ class Watch:
         return found
 
 
+SPECIAL = 0.06
+"""How often a file becomes something else than a file."""
+
+
+def damage(path: Path, good: bytes, seed: list[int]) -> None:
+    """Puts a damaged file in place of a good one, or a FIFO, a device, a folder, a socket, or a link to nowhere."""
+    rng = np.random.default_rng([*seed, 1])
+    if rng.random() >= SPECIAL:
+        path.write_bytes(mutated(path.name, good, np.random.default_rng(seed)))
+        return
+    path.unlink()
+    kind = ("fifo", "zero", "folder", "socket", "circle")[int(rng.integers(5))]
+    if kind == "fifo":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as made:
+            here = os.getcwd()
+            os.chdir(path.parent)  # an address has 108 bytes
+            made.bind(path.name)
+            os.chdir(here)
+    else:
+        path.symlink_to("/dev/zero" if kind == "zero" else path.name)
+
+
+def mend(path: Path, good: bytes) -> None:
+    """Puts the good file back."""
+    path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink(missing_ok=True)
+    path.write_bytes(good)
+
+
 def one(target: Target, root: Path, path: Path, good: bytes, seed: list[int], watch: Watch) -> str:
     """Reads with a file damaged and puts it back; says what came of it."""
-    path.write_bytes(mutated(path.name, good, np.random.default_rng(seed)))
+    damage(path, good, seed)
     faulthandler.dump_traceback_later(MOST_S, exit=True)
     watch.begin()
     try:
@@ -326,13 +433,14 @@ def one(target: Target, root: Path, path: Path, good: bytes, seed: list[int], wa
     finally:
         faulthandler.cancel_dump_traceback_later()
         outside = watch.end()
-        path.write_bytes(good)
+        mend(path, good)
     return f"OUTSIDE: {sorted(outside)}" if outside else told
 
 
 def main(group: str, first: int, last: int, only: str = "") -> int:
     """Reads each target of a group with the changes of seeds `first` up to `last`."""
-    targets = GROUPS[group][0]()
+    out, targets = os.fdopen(os.dup(1), "w"), GROUPS[group][0]()
+    os.dup2(2, 1)  # where MuJoCo prints its warnings
     resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES))
     with tempfile.TemporaryDirectory() as folder:
         base = Path(os.path.realpath(folder)) / "beside"
@@ -349,8 +457,8 @@ def main(group: str, first: int, last: int, only: str = "") -> int:
             for k in range(first, last):
                 seed = [zlib.crc32(name.encode()), k]
                 path = paths[k % len(paths)]
-                print(f"{name} {k} {path.relative_to(root)}: ", end="", flush=True)
-                print(one(target, root, path, path.read_bytes(), seed, watch), flush=True)
+                print(f"{name} {k} {path.relative_to(root)}: ", end="", flush=True, file=out)
+                print(one(target, root, path, path.read_bytes(), seed, watch), flush=True, file=out)
     return 0
 
 

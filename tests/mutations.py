@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import copy
+import functools
 import gzip
 import io
 import json
 import struct
 import xml.etree.ElementTree as ElementTree
 import zipfile
+import zlib
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import yaml
 
 SECRETS = tuple(f"secret.{ending}" for ending in ("obj", "png", "xml", "json", "npz", "glb", "yaml"))
@@ -82,7 +86,78 @@ def _jsonl(data: bytes, rng: np.random.Generator) -> bytes:
 
 def _yaml(data: bytes, rng: np.random.Generator) -> bytes:
     text = yaml.safe_dump(tree(yaml.safe_load(data), rng), sort_keys=False)
+    if rng.random() < 0.2:  # anchors, at the beginning or in place of a value
+        at = [k for k, c in enumerate(text) if c in "\n:"]
+        where = _pick(rng, at) if at else 0
+        return (text[: where + 1] + _pick(rng, ANCHORS)(int(rng.integers(1, 12))) + text[where + 1 :]).encode()
     return text.replace(f"'{DEEP}'", "[" * 2000 + "]" * 2000).encode()
+
+
+def _aliases(levels: int) -> str:
+    lists = (f"&l{k} [{', '.join([f'*l{k - 1}'] * 10)}]" for k in range(1, levels + 1))
+    return f" [&l0 [x, 1], {', '.join(lists)}]\n"
+
+
+def _merges(levels: int) -> str:
+    maps = (f"m{k}: &m{k} {{<<: [{', '.join([f'*m{k - 1}'] * 10)}]}}" for k in range(1, levels + 1))
+    return f" {{m0: &m0 {{seed: 1}}, {', '.join(maps)}}}\n"
+
+
+ANCHORS = (_aliases, _merges, lambda levels: f" &c{levels} {{a: *c{levels}}}\n", lambda levels: " &e" * levels + " 1\n")
+"""What a YAML file may hold that stands for more than it is."""
+
+
+def _parquet(data: bytes, rng: np.random.Generator) -> bytes:
+    rows = pq.read_table(io.BytesIO(data))
+    k, count = int(rng.integers(rows.num_columns)), rows.num_rows
+    name, column = rows.column_names[k], rows.column(k).combine_chunks()
+    some = pa.array(rng.random(count) < 0.5)
+    changed = {
+        "text": lambda: pa.array([_pick(rng, WORDS)] * count),
+        "numbers": lambda: pa.array([_pick(rng, FLOATS)] * count),
+        "whole": lambda: pa.array([_pick(rng, (-1, 0, 3, 2**63 - 1))] * count), "nulls": lambda: pa.nulls(count),
+        "gaps": lambda: pa.array([v if m else None for v, m in zip(column.to_pylist(), some.to_pylist(), strict=True)],
+                                 column.type),
+        "lists": lambda: pa.array([[1.0, 2.0]] * count), "flags": lambda: some,
+        "maps": lambda: pa.array([{"category": "chair", "objects": 1}] * count),
+        "bytes": lambda: pa.array([b"a"] * count),
+        "dictionary": lambda: column.dictionary_encode() if not pa.types.is_nested(column.type) else column,
+    }  # fmt: skip
+    kind = _pick(rng, ("drop", "drop", "rename", "empty", "few", "twice", *changed))
+    if kind in changed:
+        rows = rows.set_column(k, name, changed[kind]())
+    elif kind == "drop":
+        rows = rows.drop_columns(name)
+    elif kind == "rename":
+        rows = rows.rename_columns([_pick(rng, WORDS) if n == name else n for n in rows.column_names])
+    else:
+        rows = {"empty": rows.slice(0, 0), "few": rows.slice(0, 1), "twice": pa.concat_tables([rows, rows])}[kind]
+    out = io.BytesIO()
+    pq.write_table(rows, out)
+    return out.getvalue()
+
+
+FLOATS = (float("nan"), float("inf"), -1.0, 0.0, 1e308, 2.0)
+
+
+@functools.cache
+def _bomb(mib: int, window: int) -> tuple[bytes, int]:
+    """Zeros, packed a thousandfold, and their checksum."""
+    coder, block, crc, parts = zlib.compressobj(1, wbits=window), bytes(2**20), 0, []
+    for _ in range(mib):
+        parts.append(coder.compress(block))
+        crc = zlib.crc32(block, crc)
+    return b"".join([*parts, coder.flush()]), crc
+
+
+def _npz_bomb(name: str) -> bytes:
+    """An archive of one array that unpacks to more than a GiB."""
+    packed, crc = _bomb(1100, -15)
+    entry, size = f"{name}.npy".encode(), 1100 << 20
+    head = struct.pack("<HHHHHIIIHH", 20, 0, 8, 0, 0x21, crc, len(packed), size, len(entry), 0)
+    local = b"PK\3\4" + head + entry + packed
+    central = b"PK\1\2" + struct.pack("<H", 20) + head + struct.pack("<HHHII", 0, 0, 0, 0, 0) + entry
+    return local + central + b"PK\5\6" + struct.pack("<HHHHIIH", 0, 0, 1, 1, len(central), len(local), 0)
 
 
 def _xml(data: bytes, rng: np.random.Generator) -> bytes:
@@ -117,6 +192,8 @@ def _npz(data: bytes, rng: np.random.Generator) -> bytes:
     with np.load(io.BytesIO(data), allow_pickle=False) as stored:
         arrays = {name: stored[name] for name in stored.files}
     name = _pick(rng, list(arrays))
+    if rng.random() < 0.03:
+        return _npz_bomb(name)
     array, kind = arrays[name], _pick(rng, ("drop", "flat", "empty", "float", "nan", "text", "more", "huge", "rename"))
     changed = {
         "flat": lambda: array.ravel(), "empty": lambda: array[:0] if array.ndim else np.zeros(0),
@@ -149,7 +226,7 @@ def _zip(data: bytes, rng: np.random.Generator) -> bytes:
     kind = _pick(rng, ("change", "change", "change", "drop", "rename"))
     content = files.pop(name)
     if kind != "drop":
-        files[_pick(rng, WORDS) if kind == "rename" else name] = (
+        files[(_pick(rng, WORDS) or "x") if kind == "rename" else name] = (
             mutated(name, content, rng) if kind == "change" else content
         )
     out = io.BytesIO()
@@ -182,13 +259,15 @@ def _bytes(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 KINDS = {".json": _json, ".jsonl": _jsonl, ".yaml": _yaml, ".xml": _xml, ".world": _xml, ".sdf": _xml, ".urdf": _xml,
-         ".dae": _xml, ".npz": _npz, ".glb": _glb, ".sh3d": _zip}  # fmt: skip
+         ".dae": _xml, ".npz": _npz, ".parquet": _parquet, ".glb": _glb, ".sh3d": _zip}  # fmt: skip
 """Ending -> how such files are changed by structure; others line by line."""
 
 
 def mutated(name: str, data: bytes, rng: np.random.Generator) -> bytes:
     """The content of a file with one change; its name tells what it is made of."""
     ending = "." + name.rpartition(".")[2]
+    if ending == ".gz" and rng.random() < 0.05:
+        return _bomb(300, 31)[0]
     if ending == ".gz" and rng.random() < 0.7:
         return gzip.compress(mutated(name[:-3], gzip.decompress(data), rng), mtime=0)
     return (KINDS.get(ending, _lines) if rng.random() < 0.65 and ending != ".gz" else _bytes)(data, rng)

@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import inspect
 import json
+import os
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -40,7 +41,7 @@ def is_reference(robot: str) -> bool:
 def _split(reference: str) -> tuple[Path, str]:
     """Return a reference's file and, of a Python file, its `:function`."""
     path, colon, function = reference.rpartition(":") if ".py:" in reference else (reference, "", "")
-    return Path(path).resolve(), colon + function
+    return Path(os.path.realpath(path)), colon + function  # which takes a circle of links, too
 
 
 def _files(path: Path) -> list[Path]:

@@ -49,9 +49,6 @@ class RayLauncher(Launcher):
 
     Args:
         address: of the cluster, as `ray.init` takes it.
-
-    Raises:
-        ConfigError: Ray is not installed, or there is no such cluster.
     """
 
     def __init__(self, address: str):

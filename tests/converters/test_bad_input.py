@@ -185,7 +185,8 @@ def test_a_stage_cache_on_a_full_disk_costs_nothing(gibson_raw, tmp_path, monkey
 
 @pytest.mark.parametrize("stage", ["cut_furniture", "settle", "write_scene", "save_manifest"])
 @pytest.mark.parametrize(
-    ("sent", "code", "word"), [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
+    ("sent", "code", "word"),
+    [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated"), (signal.SIGHUP, 129, "terminated")],
 )
 def test_a_signal_in_any_stage_leaves_nothing(pristine, tmp_path, capsys, cached, monkeypatch, stage, sent, code, word):
     """The signal arrives while a stage works; the decomposition has a test with a process of its own."""

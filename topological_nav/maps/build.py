@@ -65,10 +65,6 @@ def build_map(
         config: of the map.
         progress: told what is drawn, images done and images in all; may raise to stop.
         parts: folder that drawn images are kept in, so that a map that was stopped goes on; None: they are not.
-
-    Raises:
-        RunError: a run is not finished, the second judges no passages, or they learned from different cameras.
-        SceneError, SpaceError: the scene cannot be used.
     """
     networks = load_networks(localiser_run, detector_run)
     localiser, detector = networks.localiser, networks.detector

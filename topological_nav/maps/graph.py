@@ -69,11 +69,7 @@ class TopologicalMap:
         return lengths(self.xy_w, self.edges)
 
     def plan(self, start: int, goal: int) -> Route:
-        """The cheapest way between two nodes, by Dijkstra's algorithm.
-
-        Raises:
-            MapError: no such node, or no way.
-        """
+        """The cheapest way between two nodes, by Dijkstra's algorithm."""
         for node in (start, goal):
             if not 0 <= node < len(self.xy_w):
                 raise MapError(f"node {node} is not in the map of '{self.scene}', expected 0 to {len(self.xy_w) - 1}")
@@ -241,9 +237,6 @@ def load_map(path: Path, digest: str | None = None) -> TopologicalMap:
     Args:
         path: of the file.
         digest: of the scene that it is to be used in; None: not checked.
-
-    Raises:
-        MapError: missing, damaged, of another format, or of another scene.
     """
     with read_npz(path, MapError, "build the map: python -m topological_nav map SCENE") as stored:
         header = json.loads(stored["header"].tobytes())

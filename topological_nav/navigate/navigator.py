@@ -61,9 +61,6 @@ class Navigator:
             sight: judges images.
             policy: drives along an edge. A member `period` says that it looks at every so manieth image only.
             config: settings.
-
-        Raises:
-            ConfigError: as many images a localisation as the map's nodes have no share of.
         """
         around = made.embeddings.shape[1]
         if config.match == "aligned" and around % config.images:

@@ -67,9 +67,6 @@ def figures_of(results: Path, split: str | None = "auto") -> Iterator[tuple[str,
     Args:
         results: a run folder, a sweep's folder, or any folder of their files.
         split: train or test scenes, None for all, auto: test where there are rows of them.
-
-    Raises:
-        FileError: there is nothing to draw.
     """
     found = Results(results)
     facts = {run: known for run in found.curves if (known := found.facts(run))}

@@ -250,9 +250,6 @@ def train_run(
 
     Returns:
         The result, the folder, and the signal that ended it early, if one did.
-
-    Raises:
-        UserError: see `train.errors`.
     """
     if config.run.wandb:
         tracking.import_wandb()

@@ -60,9 +60,6 @@ def load_policy(
         deterministic: take the mode of the actions.
         known: filled and used by calls for the same environment: policies of equal networks then share one function,
             and what is compiled for it.
-
-    Raises:
-        CheckpointError: no such checkpoint, or one of another robot or other observations than `env`'s.
     """
     path, meta = checkpoint.find(folder.checkpoints, which)
     check_fits(meta, path, dataclasses.replace(config.env, robot=env.robot.name), env)

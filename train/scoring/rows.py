@@ -38,11 +38,13 @@ TYPES: dict[str, pa.DataType] = {
 """Of the constant columns, which are empty where they mean nothing (a baseline has no seed)."""
 
 
+_OF_TRAINING = ("train_device", "train_commit", "train_env_steps", "checkpoint_steps", "train_wall_s")
 COLUMNS = Columns(
-    text=("run", "robot", "policy", "scene", "split", "algorithm"),
-    whole=("episode", "seed"),
-    numbers=("k_int", *SCORES, "kinematic_effort", "dynamic_effort"),
-    may_be_empty=("algorithm", "seed", "k_int"),
+    text=("run", "robot", "policy", "scene", "split", "algorithm", "device", *_OF_TRAINING[:2]),
+    whole=("episode", "seed", *_OF_TRAINING[2:4]),
+    numbers=("k_int", *SCORES, "kinematic_effort", "dynamic_effort", "structure_steps", *_OF_TRAINING[4:]),
+    may_be_empty=("algorithm", "seed", "k_int", *_OF_TRAINING),
+    may_be_missing=("device", "structure_steps", *_OF_TRAINING),
 )
 
 
@@ -65,11 +67,11 @@ steps."""
 
 def check_rows(rows: pa.Table, path: Path) -> None:
     """Refuse damaged rows of episodes; tables of something else, which have few of their columns, pass."""
-    needed = {*COLUMNS.text, *COLUMNS.whole, *COLUMNS.numbers}
+    needed = {*COLUMNS.text, *COLUMNS.whole, *COLUMNS.numbers} - {*COLUMNS.may_be_missing}
     if 2 * len(needed & set(rows.column_names)) < len(needed):
         return
     COLUMNS.check(rows, path)
-    dataclasses.replace(COLUMNS, may_be_empty=()).check(rows.filter(pc.field("policy") == "learned"), path)
+    dataclasses.replace(COLUMNS, may_be_empty=_OF_TRAINING).check(rows.filter(pc.field("policy") == "learned"), path)
     if "by_category" in rows.column_names and not rows["by_category"].type.equals(BY_CATEGORY):
         raise FileError(f"{path}: column 'by_category' holds {rows['by_category'].type}, expected {BY_CATEGORY}")
 

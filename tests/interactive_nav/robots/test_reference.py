@@ -208,3 +208,9 @@ def test_robots_with_a_name_leave_nothing_in_a_run(tmp_path):
     reference.keep("fetch", tmp_path / "robot")
     assert not (tmp_path / "robot").exists() and reference.kept(tmp_path / "robot") is None
     assert reference.identity("fetch") == robots.robot_name("fetch") == "fetch"
+
+
+def test_a_circle_of_links_is_one_line(tmp_path):
+    (tmp_path / "porter.urdf").symlink_to("porter.urdf")
+    with pytest.raises(ConfigError, match="porter.urdf does not exist, expected a URDF or MJCF file"):
+        get(str(tmp_path / "porter.urdf"))
