@@ -67,7 +67,8 @@ def readable(path: str | Path, kind: type[UserError], remedy: str, what: str = "
         what: it should be, such as ` as Parquet`.
     """
     try:
-        regular(path)
+        if os.path.exists(path):  # who reads tells whether it may be missing
+            regular(path)
         yield
     except UserError:
         raise

@@ -102,12 +102,12 @@ def read_rows(paths: Sequence[Path], check: Callable[[pa.Table, Path], None] | N
             check(tables[-1], path)
     try:
         rows = pa.concat_tables(tables, promote_options="permissive")
-    except (pa.ArrowInvalid, pa.ArrowTypeError) as error:
+        if not set(IDENTITY) <= set(rows.column_names):
+            return rows
+        order = rows.select(list(IDENTITY)).append_column("at", pa.array(np.arange(len(rows))))
+        last = order.group_by(list(IDENTITY)).aggregate([("at", "max")])["at_max"].to_numpy()
+    except pa.ArrowException as error:
         raise FileError(f"rows do not fit each other ({error}); draw their folders one by one") from None
-    if not set(IDENTITY) <= set(rows.column_names):
-        return rows
-    order = rows.select(list(IDENTITY)).append_column("at", pa.array(np.arange(len(rows))))
-    last = order.group_by(list(IDENTITY)).aggregate([("at", "max")])["at_max"].to_numpy()
     return rows.take(np.sort(last))
 
 

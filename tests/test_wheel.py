@@ -65,7 +65,7 @@ def test_what_it_knows_by_name(bare):
     assert [line.split()[0] for line in listed if line.endswith("not made")] == ["furnished"] * 11 + ["cluttered"] * 11
     assert [line.split()[2] for line in listed[:10]] == sorted(SPARSE[:8]) + SPARSE[8:]
     assert "alder: is there" in run(bare, "scenes", "make", "alder").stdout
-    assert run(bare, "check", "scenes_mjcf/alder").stdout.endswith("alder: 24 of 24 gates pass\n")
+    assert run(bare, "check", "scenes_mjcf/alder").stdout.endswith("alder: 25 of 25 gates pass\n")
     missing = run(bare, "train", "--config", "demo", "env.scenes=[cluttered/train]")
     assert missing.returncode == 2
     assert "make them with 'python -m converters scenes make cluttered'" in missing.stderr.replace("\n", "")

@@ -37,8 +37,10 @@ def unpack(data: bytes, kind: str) -> bytes:
     except (zlib.error, lzma.LZMAError, EOFError) as error:
         raise ValueError(f"it is not readable as packed with {kind}: {error}") from None
     if not decoder.eof:
-        what = f"it unpacks to more than {most >> 20} MiB" if len(content) >= most else "it is cut short"
-        raise ValueError(what)
+        how = f"unpacks to more than {most >> 20} MiB"
+        if len(content) < most:
+            how = f"is not readable as packed with {kind}: cut short"
+        raise ValueError(f"it {how}")
     return content
 
 

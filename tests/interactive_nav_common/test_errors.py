@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from rich.table import Table
 
-from interactive_nav_common.errors import ConfigError, UserError, reports_errors
+from interactive_nav_common.errors import ConfigError, UserError, readable, reports_errors
 from interactive_nav_common.progress import SafeConsole
 
 ROOT = Path(__file__).parents[2]
@@ -104,3 +104,8 @@ def test_names_with_markup_or_control_characters_are_printed_as_they_are():
     console.print("[bold]a[/b]\x1b]0;t\x07\nb", table)
     assert all(text in out.getvalue() for text in ("[bold]a[/b]\\x1b]0;t\\x07\nb", "[red]x[/]\\x1b[2J", "[/]\\u202e"))
     assert "\x1b" not in out.getvalue()
+
+
+def test_whether_a_file_may_be_missing_is_for_who_reads_it(tmp_path):
+    with readable(tmp_path / "none", ConfigError, "make it again"):
+        assert not (tmp_path / "none").is_file()

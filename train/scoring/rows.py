@@ -41,10 +41,10 @@ TYPES: dict[str, pa.DataType] = {
 _OF_TRAINING = ("train_device", "train_commit", "train_env_steps", "checkpoint_steps", "train_wall_s")
 COLUMNS = Columns(
     text=("run", "robot", "policy", "scene", "split", "algorithm", "device", *_OF_TRAINING[:2]),
-    whole=("episode", "seed", *_OF_TRAINING[2:4]),
+    whole=("episode", "seed", "evaluation_seed", *_OF_TRAINING[2:4]),
     numbers=("k_int", *SCORES, "kinematic_effort", "dynamic_effort", "structure_steps", *_OF_TRAINING[4:]),
     may_be_empty=("algorithm", "seed", "k_int", *_OF_TRAINING),
-    may_be_missing=("device", "structure_steps", *_OF_TRAINING),
+    may_be_missing=("device", "evaluation_seed", "structure_steps", *_OF_TRAINING),
 )
 
 
