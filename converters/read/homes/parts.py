@@ -243,7 +243,12 @@ def _on_floors(
     shown = whole.vertices, _shown(whole.vertices, whole.faces)
     if not planes or rest is planes:
         return rest, floors_m or (floor_level(*shown, str(source.root)),)
-    plane = max(planes, key=lambda p: p.pose[2, 3])
+    # A plane above most of what stands there is a ceiling.
+    base_m = float(np.median([_bounds(part)[0][2] for part in rest]))
+    low_planes = [p for p in planes if p.pose[2, 3] < base_m + PLINTH_M]
+    plane = max(low_planes, key=lambda p: p.pose[2, 3]) if low_planes else min(planes, key=lambda p: p.pose[2, 3])
+    if others := sum(abs(p.pose[2, 3] - plane.pose[2, 3]) > TOUCH_M for p in planes):
+        source.note(f"{others} more level planes at other heights than the floor: not read")
     ground_m = float(plane.pose[2, 3])
     check_extent(str(source.root), whole.vertices)
     height = shown[0][shown[1], 2].mean(axis=1)

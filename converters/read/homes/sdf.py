@@ -7,6 +7,7 @@ the elements that are read.
 
 import collections
 import dataclasses
+import math
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from urllib.parse import unquote
 import numpy as np
 import trimesh
 
+from converters.geometry.faces import face_vectors
 from converters.read.files import SourceFolder, read_image
 from converters.read.homes.parts import LEVEL, Part, home
 from converters.read.homes.sdf_frames import Model
@@ -180,7 +182,7 @@ class _Reader:
             for kind, found in shapes.items():
                 for element, mesh in self._shapes(model, link, kind):
                     matrix = grow @ model.place(element.find("pose"), at)
-                    level = element.find("geometry/plane") is not None and (pose @ matrix)[2, 2] > LEVEL
+                    level = element.find("geometry/plane") is not None and _looks_up(placed(mesh, pose @ matrix))
                     found.append((placed(mesh, matrix), pose @ matrix if level else None))
         planes = [at for _, at in shapes["collision"] if at is not None]
         for at in planes:
@@ -230,10 +232,12 @@ class _Reader:
             vertices, faces = height_field(height_m, (size_m[0] / 2, size_m[1] / 2))
             return TexturedMesh(vertices + at, faces, None, None)
         if shape.tag == "plane":
-            x, y = np.maximum(numbers(size, (1.0, 1.0)), 0.0) / 2
+            x, y = np.maximum(numbers(size, (1.0, 1.0)), 1e-3) / 2
             corners = np.array([(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)], float)
-            turn = trimesh.geometry.align_vectors((0, 0, 1), numbers(shape.findtext("normal"), (0.0, 0.0, 1.0)))
-            return placed(TexturedMesh(corners, np.array([(0, 1, 2), (0, 2, 3)]), None, None), np.asarray(turn))
+            a, b, c = numbers(shape.findtext("normal"), (0.0, 0.0, 1.0))
+            axis, angle = (-b, a, 0.0) if a or b else (1.0, 0.0, 0.0), math.atan2(math.hypot(a, b), c)
+            turn = trimesh.transformations.rotation_matrix(angle, axis)
+            return placed(TexturedMesh(corners, np.array([(0, 1, 2), (0, 2, 3)]), None, None), turn)
         return primitive(path, shape.tag, shape.findtext)
 
     def _coloured(self, mesh: TexturedMesh, element: ElementTree.Element) -> TexturedMesh:
@@ -275,6 +279,11 @@ class _Reader:
             remedy = f"download that model and unpack it as {self.root / 'models' / head}" if fuel else remedy
             raise SceneRejected(f"{path}: names '{uri}', which is not in {self.source.root}; {remedy}")
         return bare
+
+
+def _looks_up(plane: TexturedMesh) -> bool:
+    normal = face_vectors(plane.vertices, plane.faces)[0]
+    return bool(normal[2] > LEVEL * np.linalg.norm(normal))
 
 
 def _key(name: str) -> str:

@@ -209,6 +209,13 @@ def test_a_plane_has_no_end_and_is_the_floor(tmp_path, ground):
     assert np.ptp(raw.scan.vertices[:, 0]) == pytest.approx(4.2)
 
 
+def test_a_plane_above_the_home_is_no_floor(tmp_path):
+    roof = model("ceiling", shape("plane", PLANE.format(4)), "0 0 2.4 0 0 0")
+    raw = read_sdf(write_world(tmp_path / "home", [*ROOM, roof, LOOSE]))
+    assert raw.floor_height_m == 0.0 and places(raw) == {"chair_1": [1.0, 0.0, 0.4]}
+    assert "1 more level planes at other heights than the floor: not read" in raw.warnings
+
+
 def test_a_home_that_stands_higher_than_the_plane_keeps_its_floor(tmp_path):
     ground = model("ground", shape("plane", PLANE.format(100)), "0 0 -0.3 0 0 0")
     raw = read_sdf(
@@ -222,8 +229,11 @@ def test_a_home_that_stands_higher_than_the_plane_keeps_its_floor(tmp_path):
     assert raw.floor_height_m == pytest.approx(0.1) and floor_of(raw) == pytest.approx(4.2 * 3.2, rel=0.01)
 
 
-def test_a_tilted_plane_is_a_sheet_of_its_size(tmp_path):
-    ramp = model("ramp", shape("plane", PLANE.format(1)), "0 0 0.5 0.5 0 0")
+@pytest.mark.parametrize(
+    ("normal", "pose"), [("0 0 1", "0 0 0.5 0.5 0 0"), ("0 -0.479425538604203 0.8775825618903728", "0 0 0.5 0 0 0")]
+)
+def test_a_tilted_plane_is_a_sheet_of_its_size(tmp_path, normal, pose):
+    ramp = model("ramp", shape("plane", PLANE.format(1).replace("0 0 1", normal)), pose)
     raw = read_sdf(write_world(tmp_path / "home", [*ROOM, ramp]))
     top = raw.scan.vertices[:, 2][(raw.scan.vertices[:, 2] > 0.6) & (raw.scan.vertices[:, 2] < 2)]
     np.testing.assert_allclose(top, 0.5 + 0.5 * math.sin(0.5))
