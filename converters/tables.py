@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
+from rich.text import Text
 
 if TYPE_CHECKING:
     from converters.propose.report import Proposed
@@ -23,7 +24,7 @@ def gate_table(gates: tuple[Gate, ...]) -> Table:
     """One row a gate."""
     table = Table("gate", "value", "limit", "", title="Gates")
     for gate in gates:
-        verdict = "[green]PASS[/green]" if gate.passed else "[red]FAIL[/red]"
+        verdict = Text("PASS", "green") if gate.passed else Text("FAIL", "red")
         table.add_row(gate.name, f"{gate.value:.5g} {gate.limit.unit}", bounds(gate), verdict)
     return table
 
