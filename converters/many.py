@@ -48,13 +48,7 @@ SCHEMA = pa.schema(
 
 
 def digest_of(source: Path, config: ConvertConfig, scenes: Sequence[Path] = ()) -> str:
-    """Of the options that a conversion's result depends on, and of the names, sizes and times of its input files.
-
-    Args:
-        source: folder, or a file.
-        config: choices.
-        scenes: folders that were made from it: what a file names is known once it was read.
-    """
+    """Of the options that a conversion's result depends on, and of the names, sizes and times of its input files."""
     roots = [root for root in (source, config.library) if root is not None]
     paths = [(root, path) for root in roots for path in (root, *sorted(root.rglob("*"))) if path.is_file()]
     if source.is_file():
@@ -73,15 +67,6 @@ def convert_many(
     report: Callable[[str, float], None], tell: Callable[[str], None],
 ) -> list[str]:  # fmt: skip
     """Converts what has not been converted with these options; the row of each is written as it ends.
-
-    Args:
-        sources: raw folders; the scene of each is named after it.
-        into: folder of scene folders.
-        config: choices; `jobs` are decompositions side by side in all.
-        launcher: where.
-        side_by_side: sources at a time.
-        report: progress over all of them.
-        tell: told one line a source.
 
     Returns:
         Names of the sources without a scene, or with a gate that fails, whether tried now or before.

@@ -128,15 +128,6 @@ def run_side_by_side(
 ) -> list[str]:  # fmt: skip
     """Runs commands, several at a time; what was begun when a signal or an error comes is ended.
 
-    Args:
-        commands: by name of what each makes.
-        launcher: where; it is closed.
-        folder: seen from there, for what they print.
-        report: progress over all of them.
-        tell: told one line each.
-        ended: name, exit code and what was printed -> that line.
-        what: they make.
-
     Returns:
         Names of those that did not exit with 0.
     """
@@ -164,11 +155,6 @@ def run_side_by_side(
 def generate_scenes(wanted: Wanted, report: Report, tell: Callable[[str], None]) -> list[str]:
     """Makes the scenes that are not there yet, and lists them.
 
-    Args:
-        wanted: what the command line says.
-        report: progress over all of them.
-        tell: told one line a scene.
-
     Returns:
         Names of those that were not made, or do not pass every gate.
     """
@@ -194,12 +180,6 @@ def make_packaged(names: Sequence[str], jobs: int, report: Report, tell: Callabl
     """Makes scenes of the package's own sets in the cache folder, unless the package has them.
 
     What the cache has in a scene's place and is not the listed scene is replaced.
-
-    Args:
-        names: of scenes, of sets, or of splits of them.
-        jobs: scenes side by side.
-        report: progress over those of a set.
-        tell: told one line a scene.
 
     Returns:
         Names of those that were not made, do not pass every gate, or are not what the set lists.

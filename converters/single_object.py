@@ -138,11 +138,7 @@ def convert_object(
     follows from the hulls at that mass.
 
     Args:
-        path: of the mesh or URDF.
-        target: folder to make: `object.xml`, `object.json`, `assets/`.
         config: choices; they win over the URDF's values.
-        cache: folder of hulls by content; default `cache_folder()`.
-        warn: told what is wrong with the source as soon as it is read; all warnings stand in the result too.
 
     Returns:
         The content of `object.json`.

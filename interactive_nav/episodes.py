@@ -175,9 +175,7 @@ def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -
     """The file's episodes for `jax.vmap(env.reset_to)`, leaves [N, ...].
 
     Args:
-        file: of `load`.
         env: whose scenes must include the file's; their order may differ.
-        where: named in errors.
     """
     scene_of_digest = _check_fits(file, env, where)
     rows, count = file.episodes, len(file.objects)
@@ -250,11 +248,7 @@ def load(path: str | Path) -> EpisodeFile:
 
 
 def load_all(paths: Sequence[str | Path]) -> tuple[EpisodeFile, str]:
-    """Episodes of several files one after the other, as those of one; and the digest of the files.
-
-    Args:
-        paths: at least one.
-    """
+    """Episodes of several files one after the other, as those of one; and the digest of the files."""
     files = [load(path) for path in paths]
     first = files[0]
     for path, other in zip(paths, files, strict=True):

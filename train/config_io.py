@@ -27,9 +27,7 @@ def from_dict(plain: Any, base: TrainConfig | None = None, where: str = "config"
     """`base` with nested plain values laid over it.
 
     Args:
-        plain: nested mapping as read from YAML; names any part of the settings.
         base: what `plain` does not name; the defaults where None.
-        where: file or word the values come from, for messages.
     """
     return overlay(base or TrainConfig(), plain, where, known=list(flatten(TrainConfig())))
 

@@ -183,8 +183,6 @@ def with_annotations(raw: RawScene, path: Path, library_root: Path | None) -> Ra
     """The scene with a file's annotations in place of its own.
 
     Args:
-        raw: as read.
-        path: of the file.
         library_root: folder with `cad/`; None: the packaged furniture.
     """
     _, records = parse_annotations(read_json(path), path)

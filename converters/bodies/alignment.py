@@ -98,7 +98,6 @@ def least_squares(
     Args:
         p: (k, 3) CAD frame.
         q: (k, 3) scan frame, m.
-        round_model: one scale for both horizontal axes (what is round stays round).
         weights: (k,) of the squared distances, or None for equal ones.
     """
     _check_spread(p)

@@ -114,11 +114,8 @@ def decompose_all(
     Args:
         meshes: name -> (vertices (n, 3), faces (m, 3)).
         config: coacd's parameters.
-        jobs: processes side by side.
-        cache: folder of hulls by content; convex hulls that stand in for a failed decomposition are not stored.
         progress: called with the share that is done, 0 to 1.
         overrides: name -> parameters that differ from the config's.
-        strict: a model that coacd cannot decompose is an error.
     """
     changes = overrides or {}
     configs = {name: dataclasses.replace(config, **changes.get(name, {})) for name in meshes}  # pyright: ignore

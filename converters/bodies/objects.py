@@ -119,11 +119,6 @@ def place_object(
     """Scales a CAD model and its hulls, moves the origin to the middle of the base and states the world pose.
 
     Args:
-        name: body name.
-        annotation: of the object.
-        cad: its model, CAD frame.
-        hulls_cad: convex hulls, CAD frame, unscaled (a hull stays convex under any scale).
-        pose: upright, CAD frame -> scan frame.
         floor_height_m: of the scan frame; the world's z is the scan's less this.
         walls_yaw: main direction of the building, rad.
     """

@@ -47,11 +47,7 @@ def compare(
     """One row of the alignment report: residual of the annotated pose, and the re-solved pose beside it.
 
     Args:
-        annotation: with its keypoints.
-        placed: the annotated pose, upright: the one that the scene uses.
-        tilt_rad: what `upright` removed.
         pivot_cad: (3,) where the two poses' translations are compared.
-        name: body name.
     """
     row: dict[str, Any] = {
         "name": name,
@@ -100,8 +96,6 @@ def pose_difference(one: Alignment, other: Alignment, pivot_cad: np.ndarray, sym
     """Compares two poses of the same model at the pivot; turns that the symmetry allows do not count.
 
     Args:
-        one: the pose in question.
-        other: the reference.
         pivot_cad: (3,) point of the CAD frame where translations are compared.
         symmetry: Scan2CAD's word; unknown words count as none.
     """

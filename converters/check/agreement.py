@@ -59,7 +59,6 @@ def manifest_values(
     """Values of the gates on masses, friction and physics, and by gate the lines that name what is off.
 
     Args:
-        model: of `scene.xml`.
         objects: as `scene.json` lists them; one that the model lacks is another gate's matter.
     """
     ratios, friction, differs = [1.0], [1.0], differences(model, objects)

@@ -44,10 +44,6 @@ def collide_with(spec: mujoco.MjSpec, shape: str) -> mujoco.MjModel:
 
     The switch is thrown in the spec: a compiled model's bounding-volume trees hold colliding geoms only, so
     that setting `geom_contype` afterwards leaves contacts out.
-
-    Args:
-        spec: of a scene folder; changed in place.
-        shape: 'hull', 'box' or 'both'.
     """
     for geom in spec.geoms:
         for kind in ("hull", "box"):
@@ -86,12 +82,7 @@ def deepest_contact(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, 
 
 
 def physical_values(model: mujoco.MjModel, named: dict[str, str] | None = None) -> dict[str, float]:
-    """Drift (m), turn (deg), deepest penetration (m) and finiteness over `DRIFT_S` without a robot.
-
-    Args:
-        model: of a scene.
-        named: takes, for each of the first three, the bodies that have it.
-    """
+    """Drift (m), turn (deg), deepest penetration (m) and finiteness over `DRIFT_S` without a robot."""
     named = {} if named is None else named
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -194,11 +185,7 @@ def evaluate(
     """Return every gate in the table's order.
 
     Args:
-        spec: of the scene; changed in place.
-        maps: of the scene.
-        objects: from its manifest.
         kept: object -> share of its model's area that is drawn; older scenes do not say it.
-        shares: `scan_kept` and `floor_open` as the conversion measured them; older scenes have neither gate.
     """
     object_names = [o.name for o in objects]
     try:

@@ -32,12 +32,7 @@ def camera_axes() -> np.ndarray:
 
 
 def model_picture(name: str, pixels: int = PIXELS) -> np.ndarray:
-    """(pixels, pixels, 3) uint8 picture of a model, in the colours of its materials or texture, on white.
-
-    Args:
-        name: key of `LIBRARY`.
-        pixels: side of the picture.
-    """
+    """(pixels, pixels, 3) uint8 picture of a model, in the colours of its materials or texture, on white."""
     model = cad_model(name)
     if (own := model.surface) is not None:
         mesh = TexturedMesh(own.vertices, own.faces, own.uv[own.uv_faces], own.image)
@@ -59,10 +54,6 @@ def mesh_picture(mesh: TexturedMesh, axes: np.ndarray, pixels: int, one_sided: b
 
 def model_sheet(target: Path, names: Sequence[str] = ()) -> int:
     """Draws models into a PNG, whole or not at all.
-
-    Args:
-        target: the PNG.
-        names: of models or categories; empty: all models.
 
     Returns:
         How many models there are on it.

@@ -213,8 +213,6 @@ def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) ->
     """Reads the raw folder that a scene was made from.
 
     Args:
-        source: the raw folder, or the file of a mesh or a home.
-        manifest: of the scene.
         floor_height_m: of the scene's floor in the scan's frame: which one is drawn of several.
     """
     from converters.read import source as sources
@@ -276,8 +274,6 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
 
     Args:
         folder: of the scene, or of an object made by `python -m converters object`.
-        target: the PNG.
-        source: the raw folder that a scene was made from: scan and cut are drawn too.
     """
     if (folder / "object.json").is_file():
         if source is not None:

@@ -59,7 +59,6 @@ def over(axes_w: np.ndarray, low: np.ndarray, high: np.ndarray, pixel_m: float) 
     Args:
         axes_w: (3, 3) as a `Camera` has them.
         low: (2 or 3,) m along these axes, lower left corner of the picture.
-        high: its opposite.
         pixel_m: width of a pixel; the picture is some whole pixels large, from the lower left corner on.
     """
     columns, rows = np.ceil((high - low)[:2] / pixel_m).astype(int).tolist()
@@ -82,13 +81,7 @@ class Picture:
         return self._colours.reshape(*self._camera.shape, 3)
 
     def draw(self, mesh: TexturedMesh, one_sided: bool = False, below_m: float = np.inf) -> None:
-        """Draws a mesh.
-
-        Args:
-            mesh: in the world, with an image.
-            one_sided: faces that look away are left out, as MuJoCo does.
-            below_m: what lies higher is left out.
-        """
+        """Draws a mesh."""
         assert mesh.corner_uv is not None and mesh.texture is not None
         corners = mesh.vertices[mesh.faces]
         normal = face_vectors(mesh.vertices, mesh.faces)

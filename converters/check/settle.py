@@ -100,12 +100,6 @@ def push_apart(
 
     Without dynamics, so that nothing flies.
 
-    Args:
-        parts: as annotated or drawn.
-        most_m: farthest that an object slides.
-        hold: those of these objects that still overlap stay where they were, the worst first, and the others are
-            pushed anew.
-
     Returns:
         The objects apart, and those that were held: number -> what it overlaps.
     """
@@ -169,14 +163,7 @@ def _simulate(parts: SceneParts, shape: str, seconds: float) -> SceneParts:
 
 
 def settle(parts: SceneParts, drawn: bool = False, fitted: Collection[int] = ()) -> Settled:
-    """Sets objects on the floor, pushes them apart, then lets boxes and after them hulls come to rest.
-
-    Args:
-        parts: with the objects where they were annotated.
-        drawn: they were drawn there: they slide by `DRAWN_PUSH_M` at most, and what does not part is `held`. If
-            anything is, nothing else is done.
-        fitted: numbers of those that no person put there: what of them does not part is `held`, too.
-    """
+    """Sets objects on the floor, pushes them apart, then lets boxes and after them hulls come to rest."""
     hold = range(len(parts.objects)) if drawn else fitted
     result, held = push_apart(_on_floor(parts), DRAWN_PUSH_M if drawn else MAX_PUSH_M, hold)
     if not held:

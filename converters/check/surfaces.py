@@ -93,7 +93,6 @@ def surface_values(
     """Worst object's values of the gates on surfaces, and by gate the line that names it.
 
     Args:
-        model: of the scene.
         kept: object -> share of its model's area that is drawn, where it is known.
     """
     worst: dict[str, tuple[float, str]] = {"unseen_hulls": (0.0, ""), "unsolid_surface": (0.0, "")}

@@ -55,11 +55,8 @@ def from_the_south(
     """Everything, slantwise, `pixels` wide: walls are cut at `CUT_M`, and neither ceilings nor near walls hide a room.
 
     Args:
-        surfaces: by body, in the world.
-        maps: of the scene.
         low: (2,) least x and y, m.
         high: (2,) largest.
-        pixels: columns of the picture.
     """
     sin, cos = math.sin(ELEVATION_RAD), math.cos(ELEVATION_RAD)
     axes_w = np.array([[1.0, 0.0, 0.0], [0.0, sin, cos], [0.0, -cos, sin]])

@@ -56,8 +56,6 @@ def design_building(seed: int, config: BuildingConfig | HomeConfig | None = None
 
     Args:
         seed: 0 or more; the same seed gives the same building.
-        config: what to build; default: a small apartment.
-        max_plans: plans tried before giving up, of a building that is no home.
 
     Returns:
         The building.
@@ -115,10 +113,8 @@ def generate_building(
     It appears whole or not at all.
 
     Args:
-        out_dir: must not exist, or be an empty folder.
         seed: 0 or more; the same seed and configuration give the same bytes.
         progress: called with a stage's name and the share done, 0..1.
-        config: what to build; default: a small apartment.
     """
     out_dir = Path(out_dir)
     if out_dir.exists() and (not out_dir.is_dir() or any(out_dir.iterdir())):

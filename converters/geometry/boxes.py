@@ -132,7 +132,6 @@ def fit_box(hull: Hull, lowest_m: float, prefer_yaw: float = 0.0, round_fill: fl
         hull: body frame, m.
         lowest_m: height of the object's lowest point, body frame.
         prefer_yaw: direction of the walls in the body frame, rad.
-        round_fill: as `upright_box` has it.
     """
     box = upright_box(hull.vertices, prefer_yaw, round_fill)
     shadow = float(ConvexHull(hull.vertices[:, :2]).volume)  # scipy: `volume` of a planar hull is its area

@@ -62,9 +62,6 @@ class Ways:
 
         Counted are all pairs of places where the disc touches nothing and that it gets between with the movables away.
 
-        Args:
-            room_m: clearance with the movables as they stand.
-
         Returns:
             0 where nothing is in the way; 0 too where the disc fits nowhere.
         """
@@ -81,8 +78,6 @@ def must_push_shares(static_free: np.ndarray, free: Mapping[str, np.ndarray], ce
 
     Args:
         static_free: (rows, columns) bool, without movables.
-        free: robot -> the same without those that are in its way.
-        cell_m: side of a cell.
     """
     return {
         robot: Ways.of(static_free, cell_m, disc.radius_m).must_push_share(

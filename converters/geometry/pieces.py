@@ -24,7 +24,6 @@ def convex_pieces(
     Args:
         vertices: (n, 3).
         faces: (m, 3).
-        most: pieces that may be left.
         slack: how much joining may add, as a share of the mesh's bounding box.
 
     Returns:
@@ -69,7 +68,6 @@ def merge_pieces(points: list[np.ndarray], most: int, slack: float | None = None
 
     Args:
         points: (n, 3) of each piece.
-        most: pieces that may be left.
         slack: joins go on below `most` while a common box along the axes encloses at most this volume that neither
             piece's does, and boxes decide throughout: what is joined then looks like a box, which collides in its
             place; None: hulls decide, and `most` alone ends it.

@@ -104,7 +104,6 @@ def simplify_within(
     Args:
         vertices: (n, 3) m.
         faces: (m, 3).
-        most_m: farthest that a point of either surface may lie from the other.
         least: share of each part's area that stays.
 
     Returns:

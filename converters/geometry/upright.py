@@ -47,7 +47,6 @@ def find_up(vertices: np.ndarray, faces: np.ndarray, where: str) -> np.ndarray:
     Args:
         vertices: (n, 3) in any unit.
         faces: (m, 3), their front to the room.
-        where: file named in errors.
     """
     normal, area = _vectors(vertices, faces)
     if not area.sum() > 0:
@@ -143,7 +142,6 @@ def find_unit(vertices: np.ndarray, faces: np.ndarray, where: str) -> str:
     Args:
         vertices: (n, 3), z up.
         faces: (m, 3).
-        where: file named in errors.
     """
     low, high = _extent(vertices[faces, 2].mean(axis=1), face_areas(vertices, faces))
     fits = [word for word in ("m", "cm", "mm") if HEIGHTS_M[0] <= (high - low) * UNITS_M[word] <= HEIGHTS_M[1]]

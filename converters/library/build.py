@@ -172,10 +172,6 @@ def build(
 
     Args:
         files: `.sh3f` libraries.
-        target: folder.
-        jobs: models side by side.
-        report: progress.
-        selection: what to package.
 
     Returns:
         How many models.

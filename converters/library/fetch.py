@@ -34,8 +34,6 @@ def fetch(given: Path | None, target: Path, overwrite: bool = False) -> tuple[Pa
 
     Args:
         given: the Debian package, or a folder that holds the files somewhere; None: the package is downloaded.
-        target: folder to make.
-        overwrite: it may be replaced.
 
     Returns:
         Paths of the files.

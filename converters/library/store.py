@@ -178,12 +178,7 @@ def read_index(path: Path = PACKED) -> dict[str, Model]:
 
 @functools.cache
 def read_shape(name: str, path: Path = PACKED) -> Shape:
-    """A model's surface and hulls.
-
-    Args:
-        name: key of `read_index`.
-        path: of the archive.
-    """
+    """A model's surface and hulls."""
     buffer = io.BytesIO(_member(path, f"{name}.arrays"))
     try:
         bounds, *planes = (np.lib.format.read_array(buffer, allow_pickle=False) for _ in range(8))

@@ -80,7 +80,6 @@ def propose_instances(scan: ScanMesh, voxel_m: float = VOXEL_M) -> tuple[Proposa
 
     Args:
         scan: with NYU40 labels.
-        voxel_m: side of a voxel; gaps narrower than one do not part two things.
     """
     points, face = sample_faces(scan.vertices, scan.faces, voxel_m / 2)
     label = face_labels(scan.labels, scan.faces)[face]
@@ -137,8 +136,6 @@ def scan2cad_model(
     """One model of Scan2CAD's list, whose world is y up; arguments are z up.
 
     Args:
-        category: its class.
-        cad_id: in its library; "" where none is chosen.
         pose: scale (3,), yaw (rad) and translation (3,) m of the upright model.
         vertices: (n, 3) of the model, CAD frame.
         symmetry: Scan2CAD's word.
@@ -170,8 +167,6 @@ def as_scan2cad(scan_id: str, proposals: tuple[Proposal, ...], chosen: dict[int,
     has one key more, `proposal`, with what was measured.
 
     Args:
-        scan_id: name of the scan.
-        proposals: of it.
         chosen: proposal's index -> `Retrieval` (model and pose), where one was found.
     """
     models = []

@@ -212,8 +212,6 @@ def fit_model(proposal: Proposal, cad: CadModel, floor_m: float | None) -> _Fit:
     """The best pose of one model: many coarse starts, the best few refined.
 
     Args:
-        proposal: with its scan points.
-        cad: the model.
         floor_m: height of the floor in the scan frame for what stands on it, or None.
     """
     low, high = cad.vertices.min(axis=0), cad.vertices.max(axis=0)
@@ -246,14 +244,7 @@ def fits_label(cad: CadModel, label: int) -> bool:
 def retrieve(
     proposal: Proposal, library: Mapping[str, CadModel], floor_m: float | None, any_category: bool = False
 ) -> Retrieval | None:
-    """The model of the library that fits a proposal best; None when none is of its class.
-
-    Args:
-        proposal: from `propose_instances`.
-        library: cad_id -> model.
-        floor_m: height of the floor, scan frame; what stands on the floor is fitted down to it. Doors are not.
-        any_category: tries every model, whatever its class.
-    """
+    """The model of the library that fits a proposal best; None when none is of its class."""
     floor = None if proposal.category == "door" else floor_m
     fits = {
         cad_id: fit_model(proposal, cad, floor)

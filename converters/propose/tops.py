@@ -116,9 +116,7 @@ def _two_rectangles(plan: _Plan, shown_floor: np.ndarray | None, category: str) 
     """(rows, columns) part 1 or 2 of an outline that one straight cut turns into two rectangles; None: it is none.
 
     Args:
-        plan: of the piece.
         shown_floor: (rows, columns) bool: cells where the scan shows the floor; None: it shows none around the piece.
-        category: of the piece.
     """
     shape = plan.shape
     best, best_score = None, -math.inf
@@ -172,10 +170,7 @@ def split_tops(piece: Piece, floor_xy: np.ndarray, origin: np.ndarray, voxel_m: 
     """The tables, or desks, that a piece consists of.
 
     Args:
-        piece: of one class.
         floor_xy: (n, 2) places of floor that the scan shows, m.
-        origin: of the voxels.
-        voxel_m: side of a voxel.
     """
     category = LABEL_CATEGORIES[piece.label]
     if category not in TOPS_M:

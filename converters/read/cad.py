@@ -73,8 +73,6 @@ def clean_surface(
     here; their hulls are a voxel thicker.
 
     Args:
-        source: takes the warnings.
-        where: file named in them.
         vertices: (n, 3), equal positions joined.
         faces: (m, 3).
         colours: (m, 3) of the faces.

@@ -35,10 +35,6 @@ def read_gibson(root: Path, strict: bool = False) -> RawScene:
     """Reads mesh, texture, labels, floor heights, maps, alignments and CAD models.
 
     Without labels, floor, walls and ceiling are told by shape; without alignments the scene has structure only.
-
-    Args:
-        root: the folder.
-        strict: refuse what would be repaired with a warning.
     """
     source = SourceFolder(root, strict)
     mesh = read_scan_obj(source, MESH, "expected Gibson's textured z-up mesh")
@@ -131,8 +127,6 @@ def read_traversable(source: SourceFolder, number: int, mesh_xy: np.ndarray, flo
     """A floor's own traversable map, less its obstacles; absent maps are computed from the mesh alone.
 
     Args:
-        source: the folder.
-        number: of the floor, from the lowest.
         mesh_xy: (n, 2) vertices of the mesh, m.
         floor_xy: (k, 2) those of this floor's floor.
     """

@@ -54,10 +54,6 @@ def read_interactive_gibson(root: Path, strict: bool = False) -> RawScene:
     The furniture keeps its own mass, friction and collision meshes. A door's yaw is taken out of its mesh and
     goes into its pose, so that the leaf lies along its body's x axis; its hinge is assumed at the edge that stands
     at a wall, and turns as far as walls let it.
-
-    Args:
-        root: the folder.
-        strict: refuse what would be repaired with a warning.
     """
     source = SourceFolder(root, strict)
     mesh = read_scan_obj(source, MESH, "expected the scan without its furniture")
@@ -225,8 +221,6 @@ def plane_patch(
     """Squares of 0.1 m of a floor plane, where its cells are unseen, inside the mesh and on the map.
 
     Args:
-        plane: mesh, nearly level.
-        height_m: of the squares.
         seen: cells (column, row) that the scan shows already.
         given: map that the squares must lie on, or None.
         low: (2,) lower bounds of the mesh, m.

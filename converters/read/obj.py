@@ -79,9 +79,6 @@ def read_materials(
     """Image of every material of an OBJ's MTL files; a material without a usable texture gets its colour (Kd).
 
     Args:
-        source: the folder; takes warnings.
-        obj: path of the OBJ, inside the folder.
-        libraries: MTL names in the OBJ.
         moved: takes the (2, 2) scale and offset of the texture coordinates of materials that have them.
 
     Returns:
@@ -173,11 +170,6 @@ def texture_options(text: str) -> tuple[str, np.ndarray]:
 
 def read_painted_obj(source: SourceFolder, relative: str, remedy: str) -> tuple[ObjMesh, np.ndarray, list[np.ndarray]]:
     """Reads an OBJ with all its materials.
-
-    Args:
-        source: the folder; takes hashes and warnings.
-        relative: path of the OBJ in it.
-        remedy: ends the message where the file is missing.
 
     Returns:
         The mesh, (m,) image of each face, the images (h, w, 3) uint8: none where the file has no colour at all.

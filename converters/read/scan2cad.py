@@ -18,12 +18,7 @@ LICENCE = "ScanNet terms of use and ShapeNet terms of use: research only, no red
 
 
 def read_scan2cad(root: Path, strict: bool = False) -> RawScene:
-    """Reads `full_annotations.json`, `scan/<id>_vh_clean_2.ply`, its `.labels.ply` and `cad/`.
-
-    Args:
-        root: the folder.
-        strict: refuse what would be repaired with a warning.
-    """
+    """Reads `full_annotations.json`, `scan/<id>_vh_clean_2.ply`, its `.labels.ply` and `cad/`."""
     source = SourceFolder(root, strict)
     path = source.use(ANNOTATION, "expected Scan2CAD's annotation of one scan beside scan/ and cad/")
     scan_id, records = parse_annotations(read_json(path), path)

@@ -60,17 +60,7 @@ def read_source(
     source: Path, layout: str = "auto", strict: bool = False, up: str = "auto", unit: str = "auto",
     within: Path | None = None, mirror: bool = False,
 ) -> RawScene:  # fmt: skip
-    """Reads a raw folder in the given layout, or in the one that its files show; or a file of a home, or a mesh.
-
-    Args:
-        source: folder, or file.
-        layout: of `READERS`, or `auto`.
-        strict: refuse what would be repaired with a warning.
-        up: of a mesh file: its axis that points up, or `auto`.
-        unit: of a mesh file: its unit, or `auto`.
-        within: of an MJCF or Gazebo home: the folder that may be read; default its own.
-        mirror: of a mesh file: take -x for x.
-    """
+    """Reads a raw folder in the given layout, or in the one that its files show; or a file of a home, or a mesh."""
     about_mesh = (up, unit, mirror) != ("auto", "auto", False)
     chosen = READERS[layout][1] if layout != "auto" else None
     if source.is_file() and (chosen is None or chosen in [read for _, read in FILES.values()]):

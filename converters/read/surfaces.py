@@ -105,7 +105,6 @@ def structure_labels(vertices: np.ndarray, faces: np.ndarray, floor_height_m: fl
     Args:
         vertices: (n, 3) m, z up.
         faces: (m, 3).
-        floor_height_m: of the scan frame.
 
     Returns:
         (n,) int64.
@@ -157,11 +156,9 @@ def check_upright(
     """Refuses meshes that are not z up, or whose floor faces down, by the floor that they show.
 
     Args:
-        where: file named in errors.
         vertices: (n, 3) m.
         faces: (m, 3).
         labels: (n,) NYU40, or None: then the level faces at `height_m` are taken for floor.
-        height_m: of the floor; needed without labels.
     """
     check_extent(where, vertices)
     area = face_vectors(vertices, faces) / 2

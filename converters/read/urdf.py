@@ -55,9 +55,6 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = Fal
     """Reads a URDF whose links, if several, hang together by fixed joints.
 
     Args:
-        source: the folder; takes hashes and warnings.
-        relative: path of the URDF in it.
-        remedy: ends the message where the file is missing.
         hold: take joints that move as fixed where they are at 0.
     """
     path = source.use(relative, remedy)
@@ -114,13 +111,7 @@ def parse_xml(path: Path, kind: str) -> ElementTree.Element:
 
 
 def count_unread(root: ElementTree.Element, table: dict[str, str], unread: Counter[str]) -> None:
-    """Count the elements and attributes that a reader does not use.
-
-    Args:
-        root: element.
-        table: element -> the names of those within it that are read and, after `|`, that need not be.
-        unread: kind -> count.
-    """
+    """Count the elements and attributes that a reader does not use."""
     left = [(root, root.tag)]
     while left:
         element, row = left.pop()
@@ -245,8 +236,6 @@ def primitive(path: Path, kind: str, text: Callable[[str], str | None]) -> Textu
     """Build an uncoloured shape of `SHAPES`.
 
     Args:
-        path: named in errors.
-        kind: of shape.
         text: a dimension's name -> its text, m.
     """
     if kind not in SHAPES:

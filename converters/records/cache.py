@@ -65,7 +65,6 @@ class StageCache:
         Args:
             function: pure and named; of arrays, numbers, strings, None, tuples, lists, dicts and the converter's
                 dataclasses, and returns such.
-            arguments: left unchanged by the function.
         """
         if self.folder is None:
             return function(*arguments)

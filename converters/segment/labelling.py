@@ -54,8 +54,6 @@ def label_scan(raw: RawScene, scores: Scores, report: Report = lambda stage, sha
     """(n,) int64 NYU40 ids of the scan's vertices; its own labels are not looked at.
 
     Args:
-        raw: the read source.
-        scores: of `load_scores`.
         report: progress, (stage, share).
     """
     scan = raw.scan
@@ -90,9 +88,6 @@ def score_homes(seed: int, count: int, scores: Scores, report: Report) -> dict[s
     """IoU by class over the surfaces of whole generated buildings of all tiers, their furniture held out.
 
     Args:
-        seed: of the first; one whose home misses its shares gives way to the next.
-        count: of buildings.
-        scores: of `load_scores`.
         report: progress, (stage, share).
     """
     truth, found = [], []

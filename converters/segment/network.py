@@ -73,7 +73,6 @@ def dense(index: jax.Array, features: jax.Array, shape: tuple[int, int]) -> jax.
     Args:
         index: [N, K, 3] int; rows with a negative x are none.
         features: [N, K, FEATURES] int8.
-        shape: X, Y.
     """
     height = (index[..., 2:] + 0.5) * (VOXEL_M / 3) - BELOW_M / 3
     given = jnp.concatenate([jnp.ones_like(height), height, features.astype(jnp.float32) / 127], axis=-1)
@@ -99,13 +98,7 @@ def make_scores(net: VoxelNet, variables: Any) -> Scores:
 
 
 def score_voxels(voxels: Voxels, scores: Scores, report: Callable[[float], None] = lambda share: None) -> np.ndarray:
-    """(k, classes) scores of occupied voxels, tile by tile.
-
-    Args:
-        voxels: of one storey.
-        scores: of `make_scores`.
-        report: progress.
-    """
+    """(k, classes) scores of occupied voxels, tile by tile."""
     out = np.zeros((len(voxels.index), len(NAMES)), np.float32)
     extent = voxels.index[:, :2].max(axis=0, initial=0) + 1
     side = [min(TILE, int(-(-n // 16) * 16)) for n in extent]

@@ -53,13 +53,7 @@ def _of_item(item: Instance) -> list[Surface]:
 
 
 def building_surface(seed: int, tier: str, split: str) -> tuple[Surface, np.ndarray]:
-    """Structure and furniture of a generated building, with the class of each point.
-
-    Args:
-        seed: of the building.
-        tier: one of `TIERS`.
-        split: train or test: whose models.
-    """
+    """Structure and furniture of a generated building, with the class of each point."""
     # Not `recipes.building_of`, whose imports a machine for training alone lacks.
     sparse, homes = (TRAIN_MODELS, HOME_TRAIN_MODELS) if split == "train" else (TEST_MODELS, HOME_TEST_MODELS)
     config = BuildingConfig(models=sparse) if tier == "sparse" else home_config(tier, {}, homes)
@@ -155,10 +149,7 @@ def make_crop(surface: Surface, classes: np.ndarray, rng: np.random.Generator, s
     """Voxels of `worn`, each of the class that most of its points have.
 
     Args:
-        surface: of a building.
         classes: (n,) of its points.
-        rng: random stream.
-        side: voxels.
     """
     column, of = worn(surface, classes, rng, side * VOXEL_M)
     voxels = voxelise(column, 0.0)

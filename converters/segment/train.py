@@ -136,10 +136,7 @@ def train(out: Path, config: SegmentConfig, report: Callable[[str, float], None]
     """Trains, or goes on; what was learned is saved whatever ends it.
 
     Args:
-        out: folder of the run.
-        config: settings; `widths`, `side` and `seed` must be those that it was begun with.
         report: progress, (stage, share).
-        tell: told one line a save.
 
     Returns:
         IoU by class on what was held out, and `mean`.

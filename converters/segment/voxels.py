@@ -115,9 +115,7 @@ def at_vertices(scores: np.ndarray, surface: Surface, faces: np.ndarray, count: 
 
     Args:
         scores: (n, classes) of the surface's points.
-        surface: of the mesh.
         faces: (m, 3).
-        count: of the vertices.
     """
     out = np.zeros((count, scores.shape[1]))
     for k, column in enumerate(scores.T):

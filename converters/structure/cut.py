@@ -90,8 +90,6 @@ def cut_furniture(
         vertices_w: (n, 3) m, floor at z = 0.
         faces: (m, 3).
         labels: (n,) NYU40.
-        objects: placed by their annotations.
-        furnished: the scan shows them; else nothing is cut.
     """
     if not furnished:
         return CutResult(np.ones(len(faces), bool), np.full(len(faces), -1, np.int64))

@@ -42,7 +42,6 @@ def floor_outside(floor: np.ndarray, occupied: np.ndarray, furniture: np.ndarray
         floor: (rows, columns) bool.
         occupied: (rows, columns) bool, walls and other obstacles.
         furniture: (rows, columns) bool, footprints of movable objects.
-        resolution_m: side of a cell.
 
     Returns:
         (rows, columns) bool, a part of `floor`.

@@ -270,10 +270,6 @@ def fill_holes(
     """What furniture hid of floor and walls, and coloured points on it.
 
     Args:
-        planes: of the walls.
-        plan: of the floor.
-        objects: as annotated.
-        cloud: coloured points of the cleaned scan; each patch takes the colours seen around it in its plane.
         scan: vertices (n, 3) m and faces (m, 3) that are drawn.
 
     Returns:

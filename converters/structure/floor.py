@@ -67,7 +67,6 @@ def fit_floor(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, near_
         vertices: (n, 3) m, z up.
         faces: (m, 3).
         labels: (n,) NYU40.
-        near_m: the height as the source states it: only what lies within `GIVEN_NEAR_M` of it counts.
     """
     labelled = int((labels == FLOOR).sum())
     if labelled < MIN_LABELS:

@@ -241,11 +241,8 @@ def make_floor_plan(
         vertices_w: (n, 3) m, floor at z = 0, after the cut.
         faces: (m, 3) that stay.
         labels: (n,) NYU40.
-        objects: their footprints stand on floor that the scan could not see; door leaves need room to swing.
         given: the source's own traversable map, or None.
         yaw: of the grid: the building's `main_direction`, rad.
-        exact: leaves and walls lie where they are: what a leaf passes stays free of boxes, wall or unseen.
-        resolution_m: cell side.
     """
     grid = _grid_around(vertices_w[np.unique(faces)], yaw, resolution_m)
     shown = _shown(grid, vertices_w, faces, face_labels(labels, faces))

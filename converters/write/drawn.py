@@ -29,8 +29,6 @@ def as_it_is(mesh: TexturedMesh, most_faces: int, size: int) -> VisualMesh | Non
     """The surface with its own vertices and image; None where it has too many faces or too large an image.
 
     Args:
-        mesh: any.
-        most_faces: that are drawn.
         size: most pixels a side of the image, which must not repeat.
     """
     if mesh.texture is None or mesh.corner_uv is None or len(mesh.faces) > most_faces or max(mesh.texture.shape) > size:
@@ -56,9 +54,6 @@ def draw_objects(
     One that the scan shows takes the scan's colours, any other one its own.
 
     Args:
-        objects: all of one surface.
-        clouds: scan points (world) that show each.
-        most_faces: most that are drawn.
         size: of the texture, pixels.
     """
     first, own = objects[0], None

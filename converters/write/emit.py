@@ -206,7 +206,6 @@ def build_spec(parts: SceneParts, assets: Assets | None = None) -> mujoco.MjSpec
     """The scene as an `MjSpec`.
 
     Args:
-        parts: of the scene.
         assets: names of files in `assets/`; None keeps hulls inside the spec and leaves visuals out (settling).
     """
     spec = _empty_spec(parts.name)

@@ -59,8 +59,6 @@ def navigation_complexity(free: np.ndarray, cell_m: float, radius_m: float) -> f
 
     Args:
         free: [rows, columns] bool, True where nothing stands.
-        cell_m: its cells' side.
-        radius_m: of the disc.
 
     Returns:
         1 where there is no such pair.
@@ -95,11 +93,6 @@ def measure_scene(
     objects: Sequence[PlacedObject], maps: SceneMaps, surfaces: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, Any]:
     """Measures a scene.
-
-    Args:
-        objects: movables at rest, in the world.
-        maps: of the scene.
-        surfaces: vertices in the world and faces of everything that is seen.
 
     Returns:
         `movable_share`: share of the traversable floor below movables (built-in furniture is not part of that floor);

@@ -63,12 +63,7 @@ class Mesh(NamedTuple):
 
 
 def export_sh3d(folder: Path, target: Path) -> list[str]:
-    """Writes a scene's walls, rooms, doors and furniture as a drawing; returns a line each on what is in it, or is not.
-
-    Args:
-        folder: of the scene.
-        target: file to write, which must not be there.
-    """
+    """Writes a scene's walls, rooms, doors and furniture as a drawing; returns a line each on what is in it, or is not."""
     manifest = load_manifest(folder)
     if target.suffix != ".sh3d" or target.exists():
         state = "exists" if target.exists() else "has another ending"

@@ -115,10 +115,6 @@ def rooms_of(maps: SceneMaps, low: Any, high: Any, least_m2: float, slack_m: flo
     """(k) outlines of rooms, the largest first.
 
     Args:
-        maps: of the scene.
-        low: footprint of built-in furniture, which stands in rooms.
-        high: footprint of walls and of doors, which do not.
-        least_m2: of a room.
         slack_m: how far walls that lie across the map's axes leave free between its cells and themselves.
     """
     res, (x0, y0) = maps.resolution_m, maps.origin_w

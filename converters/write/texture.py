@@ -33,11 +33,9 @@ def colour_cloud(
     """Coloured points of some faces of the scan: their vertices, or a sampling of the texture.
 
     Args:
-        scan: colour source.
         vertices_w: (n, 3) the scan's vertices in the world, m.
         faces: (m, 3) the scan's faces.
         face_index: (k,) which of them to take.
-        spacing_m: of the points on a textured scan.
     """
     chosen = faces[face_index]
     if scan.texture is None or scan.corner_uv is None:
@@ -140,9 +138,6 @@ def quantise(image: np.ndarray, colours: int) -> Image.Image:
 def share_plain(visual: VisualMesh) -> VisualMesh:
     """The same picture in fewer bytes: faces of one colour look up one place, and what nobody looks up is blank.
 
-    Args:
-        visual: as baked; one with an image that is not square is left as it is.
-
     Returns:
         Vertices and faces as they were, with another `uv` and `uv_faces`, and an image of the same size.
     """
@@ -187,7 +182,6 @@ def bake_structure(
     Args:
         vertices: (n, 3) of the simplified scan with its patches, m.
         faces: (m, 3).
-        cloud: coloured points of scan and patches.
         size: of the texture, pixels.
         turned_m: how much farther a point counts for each unit between its normal and the surface's: both sides of a
             thin wall keep their colours.
@@ -223,8 +217,6 @@ def bake_object(
         vertices: (n, 3) CAD surface in the world, m.
         faces: (m, 3).
         face_colours: (m, 3) uint8 of the CAD materials.
-        cloud: scan points that were cut as this object.
-        low: vertices and faces of the simplified surface.
         size: of the texture, pixels.
 
     Returns:

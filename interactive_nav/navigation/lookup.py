@@ -56,7 +56,6 @@ def goal_field(tables: SceneTables, scene: jax.Array, goal_xy_w: jax.Array) -> G
     """Every corner's distance to a goal, and the next corner on the way: once an episode.
 
     Args:
-        tables: constants of the scenes.
         scene: [] i32.
         goal_xy_w: (2,) m, anywhere on free ground.
     """
@@ -95,9 +94,7 @@ def geodesic_at(tables: SceneTables, scene: jax.Array, goal: GoalField, xy: jax.
     """Geodesic distance to a goal from a world point, continuous.
 
     Args:
-        tables: constants of the scenes.
         scene: [] i32.
-        goal: of `goal_field`.
         xy: (2,) m, world.
 
     Returns:
@@ -145,12 +142,8 @@ def waypoints_at(
     """The next waypoints on the shortest path, at equal arc length, the goal repeated at its end.
 
     Args:
-        tables: constants of the scenes.
         scene: [] i32.
-        goal: of `goal_field`.
         xy: (2,) m, world.
-        count: number of waypoints.
-        spacing_m: arc length between them; the first lies this far ahead.
 
     Returns:
         (count, 2) f32, m, world.

@@ -132,12 +132,7 @@ def draw_episode(
     small object lies at the first of `CLUTTER_CANDIDATES` uniform places that is clear of what lies already.
 
     Args:
-        key: consumed.
-        tables: constants of the scenes.
         small_radius_m: [k] radii of the small objects' footprints.
-        robot_radius_m: footprint of the robot.
-        min_goal_distance_m: least planar distance from start to goal.
-        max_goal_distance_m: largest geodesic distance from start to goal.
         scene: [] i32; None: drawn.
         goal_clear: keep small objects off the robot's footprint at the goal.
         random_yaw: turn small objects at random; else yaw 0.

@@ -31,11 +31,6 @@ robot wide, so nothing is stepped over; a corner clipped between two samples is 
 def furniture_map(scene: Scene, poses: dict[str, tuple[np.ndarray, np.ndarray]], height_m: float) -> np.ndarray:
     """Cells of the scene's map over which furniture stands below a height.
 
-    Args:
-        scene: with its map.
-        poses: body name -> (position, quaternion w x y z), world; what has none does not count.
-        height_m: of the robot; what hangs higher does not count.
-
     Returns:
         [rows, columns] bool.
     """

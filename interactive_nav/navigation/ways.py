@@ -127,9 +127,7 @@ def grid_graph(
     Args:
         free: [rows, columns] bool.
         cost: [rows, columns] of a metre; a move's is the mean of the cells that it crosses.
-        step_m: side of a cell.
         moves: (row, column), one way each.
-        corners: the two cells beside a diagonal count in its mean.
     """
     rows, columns = free.shape
     index, pad = np.arange(rows * columns).reshape(rows, columns), 3
@@ -172,7 +170,6 @@ class PathGrid:
 
         Args:
             start: (row, column), the nearest free cell stands for it.
-            goal: likewise.
 
         Returns:
             [p, 2] (row, column), both ends included; [0, 2] where there is none.
@@ -196,7 +193,6 @@ class Ways:
     """Ways in every scene of an environment.
 
     Args:
-        env: one environment, not batched.
         weight: 0 takes the shortest way, whatever stands in it; between 0 and 1, a metre through an object of mass m
             and friction mu costs w / (1 - w) * mu m / m_0 metres of detour, its friction's work over the robot's
             weight; 1 goes through something only where no way is free. What the robot cannot push (friction above its
@@ -211,7 +207,6 @@ class Ways:
         """[p, 2] m, the world's frame, ending at the goal unless nothing may be touched; [0, 2] where there is none.
 
         Args:
-            scene: index.
             qpos: [nq] of the scene's model.
             start_xy_w: (2,) m.
             goal_xy_w: (2,) m.

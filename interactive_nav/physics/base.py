@@ -108,9 +108,6 @@ def summarise_forces(
 
     Args:
         force_w: [..., substeps, M + 1, 3] net force on each slot, the structure last, N.
-        xp: numpy or jax.numpy.
-        contacts: see `interactive_nav.scenes.contacts.combine`.
-        options: what F_t is: `force_part` and `force_sum`.
     """
     each = xp.sqrt((force_w**2).sum(-1)).max(-2)
     force, body = combine(force_w.sum(-2), contacts, options.force_part, options.force_sum, xp)

@@ -67,8 +67,6 @@ class MjxPhysics(Physics):
         """All substeps of a control step of one environment.
 
         Args:
-            model: filled with its scene.
-            data: at the start of the control step.
             control: (data, k) -> data with the actuators' controls of substep k.
 
         Returns:

@@ -112,9 +112,7 @@ class Nearness:
 
         Args:
             scene: [] i32.
-            state: of one environment, or, in NumPy, of many of one scene.
             reach_m: from the robot's centre.
-            boxes: of all slots.
             push_m: [..., M] m to where each may be pushed; negative where it may.
         """
         xp, gap = namespace(state.qpos), self.walls_m(scene, state) - reach_m

@@ -93,8 +93,6 @@ class Camera:
         """Prepares nothing that is not asked for.
 
         Args:
-            env: an `InteractiveNav`.
-            engine: of RGB: gl, warp, rays, or auto: gl where it works, else warp on an NVIDIA GPU, else rays.
             fov_deg: vertical field of view of the robot's camera; None: that of its observations.
         """
         self._env, self._painter, self._fov_deg = env, Painter(engine), fov_deg or env.sensors.lens.fov_deg
@@ -119,11 +117,8 @@ class Camera:
         """Pictures of where a state is now.
 
         Args:
-            state: of one environment, not a batch.
             width: pixels.
             height: pixels.
-            streams: of rgb, normals, depth, segmentation.
-            view: robot (through its camera), top (the whole scene from above) or follow (from behind the robot).
 
         Returns:
             rgb [H, W, 3] u8; normals [H, W, 3] f32, unit vectors in the camera's frame (right, up, towards the

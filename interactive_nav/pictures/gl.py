@@ -33,7 +33,6 @@ class GlPainter:
         """Makes a context.
 
         Args:
-            model: its offscreen buffer is at least as large as the pictures.
             width: of the pictures, pixels.
             height: pixels.
             sky: colour where nothing is hit; None: the model's.
@@ -68,10 +67,7 @@ class GlPainter:
         """Pictures of cameras.
 
         Args:
-            data: where everything stands.
             pose: of N cameras without roll, leaves [N, ...].
-            fov_deg: vertical field of view.
-            groups: of the geoms that are shown.
             depth: distances along the axis (m) rather than colours.
 
         Returns:

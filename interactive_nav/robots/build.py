@@ -320,13 +320,9 @@ def wheeled_robot(
     """The spec of a wheeled robot in a control mode.
 
     Args:
-        base: its driven joints and commands.
-        control_mode: one of `base.modes`.
-        prepare: edits the parsed file before it is attached (robots of users' own); its warnings come once.
         base_body: the file's body with the free joint.
         camera: its body without the robot's name.
         rolling: bodies of wheels without the robot's name; by default those of the driven wheels.
-        **figures: other fields of `RobotSpec`.
     """
     check_mode(base.name, control_mode, base.modes)
     prefix = f"{base.name}_"

@@ -33,13 +33,7 @@ def compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
 
 
 def read_file(path: Path, base_body: str = "") -> mujoco.MjSpec:
-    """Parse an MJCF or URDF file.
-
-    Args:
-        path: of the file.
-        base_body: link of a URDF that the user names as its base; massless links above it, such as `base_footprint`
-            and `odom`, are left out.
-    """
+    """Parse an MJCF or URDF file."""
     if not path.is_file():
         raise ConfigError(f"robot file {path} does not exist, expected an MJCF or URDF file")
     data = path.read_bytes()

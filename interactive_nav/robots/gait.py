@@ -182,10 +182,8 @@ def legged_robot(legs: Legged, control_mode: str = "native", **figures: Any) -> 
     """The spec of a legged robot in a control mode.
 
     Args:
-        legs: its body, joints and gait.
         control_mode: one of `legs.modes`; `native` is `legs.native` of each joint, `twist` the base's linear and
             angular velocity through the gait.
-        **figures: of `RobotSpec`, in place of those set here.
     """
     check_mode(legs.name, control_mode, legs.modes)
     joint_mode = legs.native if control_mode == "native" else control_mode

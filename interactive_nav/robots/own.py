@@ -223,23 +223,14 @@ def from_file(
     """A factory for `register` from a wheeled robot's own MJCF or URDF. Frame: x forward, y left, z up.
 
     Args:
-        path: MJCF (.xml) or URDF (.urdf) file; collision shapes are boxes, capsules, spheres, cylinders.
-        name: what `make` will call it; put in front of all its names.
-        base_body: the body (link) that carries everything else.
-        left_wheels: names of the driven wheel joints on the left.
-        right_wheels: and on the right, in the same order from front to back.
         max_wheel_speed_rad_s: of every driven wheel; the native action's range.
-        casters: bodies (links) that are spheres without friction on the floor.
         joints: other driven joints -> largest speed, rad/s (m/s for a slide); modes `whole_body`, `velocity`,
             `position`, `torque` drive them, others hold them at home.
-        home: joint -> position at the start of an episode; joints that nothing drives stay there.
         torque_limits: joint -> N m (N) where the file has no limit or a wrong one.
         camera: by default at the middle of the base's top, looking ahead.
         body_width_m: success distance; by default the model's width.
         track_m: effective distance of left and right wheels; by default theirs, or for several wheels a side
             (skid steer) track + wheelbase^2 / track, the value for Coulomb friction.
-        max_linear_m_s: of mode `twist`; by default what the wheels give.
-        max_angular_rad_s: likewise.
 
     Returns:
         control mode -> `RobotSpec`.

@@ -67,7 +67,6 @@ def set_servo(
     """Makes an actuator a servo of its joint, or a motor.
 
     Args:
-        actuator: of a joint.
         gains: stiffness and damping; without stiffness the control is a velocity, else a position; None: a force.
         control_range: least and largest control; None: any.
     """

@@ -35,12 +35,7 @@ def check_scene(
     """Raise for a scene with absurd poses, masses, walls or maps; warn where most furniture is out of reach.
 
     Args:
-        path: scene folder, named in messages.
-        manifest: of the scene.
-        maps: of the scene.
         walls: [n, 10] world centre, quaternion, half sizes, m.
-        movables: each a `interactive_nav.scenes.scene.Movable`.
-        model: compiled from `scene.xml`.
 
     Raises:
         SceneError: the first fault, with its remedy.

@@ -90,8 +90,6 @@ def part_of_contacts(force_c: Any, normal_w: Any, part: str, xp: Any) -> tuple[A
     Args:
         force_c: [..., c, 3] in the contacts' frames, normal first, N; 0 where there is no contact.
         normal_w: [..., c, 3] world frame.
-        part: `full` or `normal`.
-        xp: numpy or jax.numpy.
 
     Returns:
         The vector sum of the normal forces [..., 3], the sum of the chosen part's norms [...], and the sum of the
@@ -124,9 +122,6 @@ def combine(
     Args:
         net_w: [..., substeps, 3] the robot's full contact force on all but the floor, N.
         contacts: of `from_sensors`, leaves [..., substeps, (3)]; None: no option asks.
-        force_part: `full` or `normal`.
-        force_sum: `vector`, `contacts` or `last_substep`.
-        xp: numpy or jax.numpy.
 
     Returns:
         F_t [...], and [...] the largest force, over the substeps, of parts that do not roll on anything but the floor.

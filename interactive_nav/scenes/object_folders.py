@@ -48,13 +48,7 @@ class ConvertedObject(SmallObject):
 
 
 def small_objects(num_objects: int, split: str, folders: Sequence[str]) -> tuple[SmallObject, ...]:
-    """The small objects of an environment: the folders in turn where there are some, else the built-in ones.
-
-    Args:
-        num_objects: how many.
-        split: whose built-in models, train or test.
-        folders: of `NavConfig.objects`.
-    """
+    """The small objects of an environment: the folders in turn where there are some, else the built-in ones."""
     if not folders:
         return pick(num_objects, split)
     models = [load_object(folder) for folder in folders]

@@ -46,7 +46,6 @@ def foot_points(boxes: np.ndarray, count: int = FEET) -> np.ndarray:
 
     Args:
         boxes: [n, 10] centre, quaternion, half sizes; body frame, z up.
-        count: points wanted.
 
     Returns:
         [at most count, 3] m, body frame.

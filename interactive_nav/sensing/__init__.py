@@ -9,10 +9,8 @@ def make_renderer(tables: BoxTables, lens: Lens, name: str, backend: str, meshes
     """Builds a renderer.
 
     Args:
-        tables: what is drawn.
         lens: the camera's.
         name: warp (MJX-Warp's), rays (plain JAX), or auto: warp beside physics on warp, rays elsewhere.
-        backend: of the physics: warp, jax or native.
         meshes: whose visual meshes are drawn, by a Warp kernel whatever the name; None: boxes.
     """
     from interactive_nav.physics import resolve_backend

@@ -127,7 +127,6 @@ class Renderer(abc.ABC):
         """Draws a batch in several ways.
 
         Args:
-            names: of depth, segmentation, rgb, normals; others may come along.
             scene: [N] i32.
             qpos: [N, nq] f32.
             camera: leaves [N, ...].

@@ -278,7 +278,6 @@ def slab(eye: jax.Array, half: jax.Array, direction: jax.Array) -> tuple[jax.Arr
     Args:
         eye: the rays' origin along the faces' normal, from the box's centre, m.
         half: from the centre to a face, m.
-        direction: of the rays, along the normal.
     """
     # A ray in a face's plane would divide by 0.
     inverse = 1.0 / (direction + _TINY)

@@ -41,8 +41,6 @@ def make_mount(model: mujoco.MjModel, base_body: str, camera: RobotCamera, yaw_r
     """Finds the chain of bodies from a robot's base to its camera.
 
     Args:
-        model: with the robot.
-        base_body: the body with the free joint.
         camera: its body lies in the base's subtree.
         yaw_rad: how far it looks to the left of its body's x axis.
     """

@@ -22,10 +22,7 @@ def disturbed(noise: CameraNoise, lens: Lens, images: dict[str, jax.Array], key_
     """The images of one camera with its errors.
 
     Args:
-        noise: which.
-        lens: of the camera.
         images: as `Renderer.images` gives them: depth in m, rgb in [0, 1]; normals are needed for `depth_grazing_deg`.
-        key_of: streams of keys, of this step.
     """
     out = dict(images)
     if "rgb" in out:

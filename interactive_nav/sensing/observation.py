@@ -60,8 +60,6 @@ def advance_odometry(
     Args:
         pose: (3,) x, y (m), yaw (rad) reckoned so far.
         moved_w: (2,) m, true displacement.
-        yaw_rad: [] true yaw before the step.
-        turned_rad: [] true change of yaw.
         noise: (2,) relative error of the distance and of the angle of this step.
 
     Returns:

@@ -39,10 +39,7 @@ def draw_look(key: jax.Array, colours: float, light: float, classes: MaskClasses
     """An episode's look.
 
     Args:
-        key: consumed.
-        colours: standard deviation of the logarithm of each factor of a tint.
         light: that of brightness in stops, and of each component of the vector to the sun before it has length 1.
-        classes: the setting `segmentation_classes`.
     """
     tint, sun, bright = jax.random.split(key, 3)
     sun_w = _LIGHT_W + light * jax.random.normal(sun, (3,))

@@ -28,12 +28,7 @@ def episode_scores(
     """`EPISODE_METRICS` of an episode so far.
 
     Args:
-        nav: its bookkeeping.
-        rules: of the environment.
-        tables: of its scenes.
         mass_kg: m_0, of `score_mass_kg`.
-        success: [] bool.
-        broken: [] bool, its state is not finite.
     """
     masses = tables.mass_kg[nav.scene_index].at[0].set(mass_kg)
     paths = jnp.concatenate([nav.robot_path_m[None], nav.object_path_m])

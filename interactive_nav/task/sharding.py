@@ -28,12 +28,7 @@ class ShardedEnv(Wrapper):
     """Steps equal shares of a batch on each device."""
 
     def __init__(self, env: Env, devices: Sequence[Any] | None = None):
-        """Wraps an environment.
-
-        Args:
-            env: natively batched, such as `AutoResetEnv`; its `reset` takes keys and the environments' numbers.
-            devices: default: all devices of all processes.
-        """
+        """Wraps an environment."""
         super().__init__(env)
         self.mesh = Mesh(np.asarray(devices if devices is not None else jax.devices()), (AXIS,))
         self.sharding = NamedSharding(self.mesh, PartitionSpec(AXIS))
@@ -70,7 +65,6 @@ def start_distributed(coordinator: str, num_processes: int, process_id: int) -> 
 
     Args:
         coordinator: host:port of process 0, reachable from all.
-        num_processes: how many join.
         process_id: 0 to num_processes - 1.
     """
     if not 0 <= process_id < num_processes:

@@ -37,7 +37,6 @@ def draw_where(env: InteractiveNav, current: tuple, over: jax.Array) -> tuple:
     """New episodes where `over`, drawn for a part of the batch at a time: few end in one step.
 
     Args:
-        env: of one episode.
         current: physics, `nav` and `rng` of N environments; where an episode is over, its `rng` is consumed.
         over: [N] bool.
 

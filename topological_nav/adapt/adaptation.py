@@ -147,15 +147,6 @@ def adapt_features(
 ) -> dict[str, Any]:
     """Adapts a run's embedding to another domain, or goes on with it.
 
-    Args:
-        run: folder of a finished run.
-        source: dataset that it learned from.
-        target: dataset of the other domain; the same one, where only the camera differs.
-        out: the run folder, in the end one of the adapted network.
-        config: settings.
-        tell: told one line an epoch.
-        should_stop: asked after every epoch.
-
     Returns:
         The content of results.json: localisation before, with the target's statistics alone, and after.
     """

@@ -56,14 +56,6 @@ def passage_configurations(
 ) -> dict[str, Any]:
     """Scores a passage detector in another domain, learned from the source or not, fine-tuned or not.
 
-    Args:
-        run: folder of a finished run of passages.
-        target: dataset; its training passages fine-tune, its test passages test, half of each free.
-        out: the run folder, in the end one of configuration D.
-        config: settings.
-        tell: told one line an epoch.
-        should_stop: asked after every epoch.
-
     Returns:
         The content of results.json.
     """
@@ -99,13 +91,6 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
     """A map of images collected in the target domain: its dataset's training positions, no image drawn for the map.
 
     An edge is judged by the image of its node nearest to it in angle, 10 degrees off at most for 18 headings.
-
-    Args:
-        scene_folder: the scene: for the plan that the map is compared with and drawn on.
-        target: dataset of it.
-        localiser_run: run folder of a network whose embedding localises.
-        detector_run: run folder of a passage detector.
-        config: settings.
 
     Returns:
         `build.Built`; its scores tell how held-out images of the target are localised on it.

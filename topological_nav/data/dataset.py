@@ -124,10 +124,7 @@ def make_dataset(
     """Makes a dataset, or what is missing of it.
 
     Args:
-        scene_folders: scenes with different names.
         out: the dataset's folder.
-        config: what is drawn.
-        progress: told after every file.
 
     Returns:
         The content of dataset.json.

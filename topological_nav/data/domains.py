@@ -67,8 +67,6 @@ def as_seen(images: np.ndarray, config: DomainConfig, stream: int = 0) -> np.nda
 
     Args:
         images: [..., H, W, 3] u8.
-        config: the camera.
-        stream: of chance: different sets of images differ in noise.
 
     Returns:
         The same shape, u8. An image depends on the seed, the stream, its place in the set and itself alone.
@@ -89,7 +87,6 @@ def as_seen_from(images: np.ndarray, config: DomainConfig, xy_w: np.ndarray, hea
 
     Args:
         images: [N, H, W, 3] u8.
-        config: the camera.
         xy_w: [N, 2] m, where they were taken.
         heading_rad: [N].
 

@@ -108,14 +108,7 @@ def draw_missing(
     config: CameraConfig,
     progress: Progress,
 ) -> None:
-    """Draws the files of images that are not there yet.
-
-    Args:
-        scenes: of each its name, what loads it, and its files with the cameras of their sheets.
-        total: images in all.
-        config: how they are drawn and stored.
-        progress: told after every file.
-    """
+    """Draws the files of images that are not there yet."""
     lens = lens_of(config, get_robot(config.robot))
 
     def missing() -> Iterator[Callable[[], tuple[str, int]]]:

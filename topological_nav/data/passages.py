@@ -36,12 +36,6 @@ def draw_passages(space: FreeSpace, rooms: Rooms, config: DataConfig, rng: np.ra
 
     A room with fewer eligible places than sources gives them all. Surplus passages of the commoner label are left
     out at random, apart for training and testing, so that guessing scores one half in both.
-
-    Args:
-        space: of the scene.
-        rooms: of the scene.
-        config: counts, circle, margin and test share.
-        rng: draws all of it.
     """
     places = space.centres(config.passage_clearance_m)
     labels = rooms.of(places)

@@ -91,7 +91,6 @@ def in_order(tasks: Iterable[Callable[[], Result]], ahead: int) -> Generator[Res
 
     Args:
         tasks: taken one by one, in the caller's thread.
-        ahead: at most so many have been taken beyond the one whose result is told.
     """
     waiting: deque[Future[Result]] = deque()
     with ThreadPoolExecutor(THREADS) as pool:

@@ -144,14 +144,7 @@ def _terrain(spaces: Sequence[FreeSpace], fields: Sequence[np.ndarray]) -> Terra
 def simulate_drives(
     scene_folders: Sequence[Path], out: Path, config: DriveConfig, progress: Progress = lambda *_: None
 ) -> Drives:
-    """Drives all drives, or those that are missing.
-
-    Args:
-        scene_folders: scenes with different names.
-        out: the folder.
-        config: of the drives.
-        progress: told the number of drives that have ended, and of all.
-    """
+    """Drives all drives, or those that are missing."""
     scenes = load_scenes(scene_folders, config.engine)
     header = DRIVES.describe(config, [{"name": s.name, "digest": s.digest, "split": s.split} for s in scenes])
     with DRIVES.claimed(out, header):
@@ -179,13 +172,7 @@ def simulate_drives(
 
 
 def draw_drives(scene_folders: Sequence[Path], out: Path, progress: Progress = lambda *_: None) -> None:
-    """Draws what the robot saw on the kept drives, or what is missing of it.
-
-    Args:
-        scene_folders: as they were driven in, in the same order.
-        out: a folder whose drives have been simulated.
-        progress: told what is drawn, images done and images in all.
-    """
+    """Draws what the robot saw on the kept drives, or what is missing of it."""
     with alone_in(out):
         header, config = read_drives_header(out)
         drives, robot = load_drives(out), get_robot(config.robot)

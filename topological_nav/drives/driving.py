@@ -69,10 +69,8 @@ def load_policy(
     """The policy of a finished run.
 
     Args:
-        run_folder: of `train policy`, or an export of it.
         localiser: run folder of the room classifier that embeds its images; None: where it was when it learned, seen
             from the run folder.
-        detector: the same, of the passage detector.
     """
     run = Path(run_folder)
     about = read_description(run, "policy", "policy")
@@ -96,9 +94,6 @@ def local_policy(name: str, sight: Sight, config: NavigatorConfig, *seeing: tupl
     """What drives along edges.
 
     Args:
-        name: `PASSAGE_POLICY`, or the run folder of `train policy`.
-        sight: judges passages for the former.
-        config: of the navigator.
         seeing: the navigator's localiser and detector with their run folders; a trained policy sees through those of
             them that are adapted.
     """

@@ -52,10 +52,7 @@ def way_field(space: FreeSpace, goals_w: np.ndarray, config: ExpertConfig, limit
     of the nearest cell that it can be in and four times the distance there; so does what is farther than the limit.
 
     Args:
-        space: of the scene.
         goals_w: [G, 2] m; the nearest cell with room stands for each.
-        config: radius and costs.
-        limit_m: what is farther is not computed.
 
     Returns:
         [G, rows, columns] f32, m. Infinite nowhere: a goal without any room around it has a field of distances to it.
@@ -102,7 +99,6 @@ def window(velocity: jax.Array, config: ExpertConfig) -> tuple[jax.Array, jax.Ar
 
     Args:
         velocity: [2] commanded last, m/s and rad/s.
-        config: limits and counts.
     """
 
     def around(now, change, lattice):
@@ -132,8 +128,6 @@ def scan_gap(poses_b: jax.Array, points_b: jax.Array, half_m: jax.Array) -> jax.
     """[...] m from a rectangle at poses [..., 3] to the nearest of points [R, 2]; 0 inside, infinite without points.
 
     Args:
-        poses_b: x, y, yaw of its middle.
-        points_b: infinite where a beam met nothing.
         half_m: [2] half its length and width.
     """
     cos, sin = jnp.cos(poses_b[..., 2])[..., None], jnp.sin(poses_b[..., 2])[..., None]
@@ -172,14 +166,12 @@ def command(
     """The velocities to command now.
 
     Args:
-        terrain: of all scenes.
         scene: [] i32.
         goal: [] i32 node to drive to.
         pose_w: [3] x, y (m), yaw.
         velocity: [2] commanded last, m/s and rad/s.
         points_b: [R, 2] where the beams end, robot frame; infinite where nothing is met.
         half_m: [2] half the footprint's length and width.
-        config: of the expert.
 
     Returns:
         [2] linear (m/s) and angular (rad/s), and the gap [] (m) that they keep until the horizon.
@@ -243,7 +235,6 @@ def scan_points(ranges_m: jax.Array, config: ExpertConfig, lidar_xy_b: tuple[flo
 
     Args:
         ranges_m: [R], from the right to the left as `interactive_nav.sensing.sensors` orders them.
-        config: angle, count and range.
         lidar_xy_b: where the scanner sits, m.
     """
     step = config.lidar_fov_deg / config.lidar_rays

@@ -72,13 +72,7 @@ class Fleet:
     """Drives batches of a fixed size; compiled once."""
 
     def __init__(self, env: InteractiveNav, terrain: Terrain, config: DriveConfig):
-        """Takes what stays the same.
-
-        Args:
-            env: of `make_env`.
-            terrain: of its scenes, in the same order.
-            config: of the drives.
-        """
+        """Takes what stays the same."""
         self._env, self._terrain, self._config = env, terrain, config
         size = env.robot.size_m
         assert size is not None
@@ -87,10 +81,6 @@ class Fleet:
 
     def drive(self, tasks: Tasks, told: Callable[[int], None] = lambda _: None) -> dict[str, np.ndarray]:
         """Drives until all have arrived or run out of time.
-
-        Args:
-            tasks: the batch.
-            told: called now and then with the number of drives that have ended.
 
         Returns:
             Fields of `dataset.Drives`: those of control steps [B, T, ...], where rows after a drive's `steps` [B] mean

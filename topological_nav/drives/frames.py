@@ -48,16 +48,7 @@ def embed_drives(
     tell: Callable[[str], None] = lambda _: None,
     should_stop: Asked = go_on,
 ) -> Frames:
-    """Embeds the images of all kept drives.
-
-    Args:
-        folder: of the drives.
-        localiser_run: run folder of a room classifier.
-        detector_run: of a passage detector.
-        mirror: embed mirrored images too.
-        tell: told now and then how far it is.
-        should_stop: asked after every file of images.
-    """
+    """Embeds the images of all kept drives."""
     header, config = read_drives_header(folder)
     drives, networks = load_drives(folder), load_pair(localiser_run, detector_run)
     mine, theirs = {**header["settings"], "fov_deg": header["fov_deg"]}, seen_by(networks[0])

@@ -56,13 +56,6 @@ def train_policy(
 ) -> dict[str, Any]:
     """Trains a policy, or goes on with it.
 
-    Args:
-        frames: of `embed_drives`.
-        out: the run folder.
-        config: settings.
-        tell: told one line an epoch.
-        should_stop: asked after every epoch.
-
     Returns:
         The content of results.json.
     """

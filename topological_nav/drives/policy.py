@@ -48,7 +48,6 @@ class Policy(nn.Module):
         """One control step.
 
         Args:
-            memory: before it.
             x: [B, D] standardised embeddings.
 
         Returns:
@@ -131,8 +130,6 @@ def policy_loss(
         consistent: [B, T, D] f(u, a_hat), from the policy's.
         following: [B, T, D] u, the embedding of the next step.
         followed: [B, T] bool: there is a next step.
-        alpha: weight of the cross-entropies.
-        lam: lambda.
         jointly: 0 leaves the forward model's own error alone.
 
     Returns:

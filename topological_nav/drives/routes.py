@@ -33,10 +33,8 @@ def drivable(space: FreeSpace, nodes_w: np.ndarray, to_go_m: np.ndarray, config:
     """[E, 2] i32: the ordered pairs of nodes nearer than `edge_m` whose planned way is no long detour.
 
     Args:
-        space: of the scene.
         nodes_w: [N, 2] m.
         to_go_m: [N, rows, columns] of `expert.way_field`, one to each node.
-        config: lengths.
     """
     edges = near_pairs(nodes_w, config.edge_m)
     column, row = space.inner_cells(nodes_w).T
@@ -55,11 +53,8 @@ def draw_routes(
     for testing.
 
     Args:
-        space: of the scene.
         nodes_w: [N, 2] m.
         edges: [E, 2] of `drivable`.
-        config: counts and spreads.
-        rng: draws all of it.
     """
     if not len(edges):
         raise SpaceError(f"no two of {len(nodes_w)} nodes are joined by a way to drive; use a larger edge_m or detour")

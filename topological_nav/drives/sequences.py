@@ -47,8 +47,6 @@ def window_starts(steps: int, window: int, overlap: int) -> np.ndarray:
 
     Args:
         steps: of the drive, at least 1.
-        window: steps of a window.
-        overlap: less than that.
     """
     stride = max(window - overlap, 1)
     return np.arange(0, max(steps - window, 0) + 1, stride)
@@ -60,11 +58,7 @@ def make_sequences(
     """All windows of some drives.
 
     Args:
-        drives: of a folder.
         which: [k] indices of drives.
-        config: length of windows.
-        values: of `class_values`.
-        overlap_s: longest overlap.
     """
     window, overlap = config.steps, int(np.floor(overlap_s / CONTROL_S + 1e-9))
     rows, ends = [], []

@@ -88,8 +88,6 @@ class ActionPlayer:
         """Takes what acts.
 
         Args:
-            simulator: of the environment.
-            make_act: called for every batch of episodes.
             config: of the navigator: runs and time of episodes are everybody's.
         """
         self._simulator, self._make_act, self._config = simulator, make_act, config

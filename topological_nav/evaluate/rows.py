@@ -34,14 +34,7 @@ Tell = Callable[[str, int, int], None]
 
 
 def play_contest(contest: Contest, scenes: Sequence[ContestScene], tell: Tell = lambda *_: None) -> pa.Table:
-    """Plays what is missing, and returns all rows.
-
-    Args:
-        contest: who plays what.
-        scenes: of `contest_scenes`.
-        tell: told who plays where, episodes over and episodes in all, after every control step; may raise to stop,
-            which loses the batch that is being played.
-    """
+    """Plays what is missing, and returns all rows."""
     # Everything that can be refused is refused before the first episode.
     plan = [(scene, name, _stem(scene, name)) for scene in scenes for name in contest.contenders]
     missing = [_missing(contest.out, stem, len(scene.episodes)) for scene, _, stem in plan]

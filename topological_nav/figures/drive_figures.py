@@ -25,12 +25,7 @@ TURNS = LinearSegmentedColormap.from_list("turns", (BLUE, "0.6", VERMILION))
 
 @plt.rc_context(RC)  # type: ignore[reportCallIssue]
 def drives_figure(scene_folders: Sequence[Path], folder: Path) -> Figure:
-    """Every drive on the floor plans, kept ones coloured by turning, then images along some and the commands' shares.
-
-    Args:
-        scene_folders: as they were driven in, in order.
-        folder: of the drives.
-    """
+    """Every drive on the floor plans, kept ones coloured by turning, then images along some and the commands' shares."""
     header, config = read_drives_header(folder)
     drives, robot = load_drives(folder), get_robot(config.robot)
     lines = -(-len(scene_folders) // min(4, len(scene_folders)))

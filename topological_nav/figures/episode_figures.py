@@ -36,14 +36,7 @@ def journeys_figure(
     panels: Mapping[str, tuple[TopologicalMap | None, Mapping[int, np.ndarray], Mapping[int, Mapping[str, Any]]]],
     passable: float,
 ) -> Figure:
-    """Where contenders went in a scene, a panel each.
-
-    Args:
-        scene: its name.
-        space: its plan.
-        panels: contender -> its map, paths by episode, rows by episode.
-        passable: edges with at least this probability are drawn.
-    """
+    """Where contenders went in a scene, a panel each."""
     extent = np.ptp(space.centres(0.0), axis=0) + 0.8
     columns = len(panels) if extent[1] >= extent[0] or len(panels) == 1 else min(2, len(panels))
     lines = -(-len(panels) // columns)

@@ -89,13 +89,7 @@ class Driven:
         return figure
 
     def frame(self, step: int, plan: np.ndarray, pixels: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """[H, W, 3] u8: the plan with the path so far; beside it what the camera saw, if it did.
-
-        Args:
-            step: number of the control step.
-            plan: of `plan_picture`.
-            pixels: of `plan_picture`.
-        """
+        """[H, W, 3] u8: the plan with the path so far; beside it what the camera saw, if it did."""
         image = Image.fromarray(plan)
         draw = ImageDraw.Draw(image)
         if step:
@@ -118,14 +112,7 @@ class Driven:
 
 
 def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callable[[float], None]) -> Driven:
-    """Drives one of the episodes of a contest's only scene, as the contest's only contender.
-
-    Args:
-        contest: one scene, dense or sparse.
-        number: of the episode.
-        filmed: keep images.
-        progress: told the simulated time; may raise to stop.
-    """
+    """Drives one of the episodes of a contest's only scene, as the contest's only contender."""
     (venue,) = contest_scenes(contest)
     if not 0 <= number < len(venue.episodes):
         raise ConfigError(

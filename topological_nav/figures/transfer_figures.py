@@ -24,9 +24,6 @@ def features_figure(
 
     Args:
         source: [n, H, W, 3] u8.
-        target: the same many of the other domain.
-        lines: of metrics.jsonl.
-        results: of results.json.
     """
     figure, course, scores = _domains(source, target)
     course.axhline(0.5, color="0.5", linewidth=0.8, zorder=0, label="accuracy by chance")
@@ -83,12 +80,7 @@ def _bars(axis: Axes, at: np.ndarray, values: Sequence[float], width: float, col
 
 
 def export_figure(made: Exported, limit_mib: float) -> Figure:
-    """Three panels: distances of embeddings, probabilities of passages, sizes.
-
-    Args:
-        made: of `export.export`.
-        limit_mib: that it had to keep to.
-    """
+    """Three panels: distances of embeddings, probabilities of passages, sizes."""
     figure, ((left, middle, right),) = panels((13, 3.8), 1, 3)
     compared = made.compared
     rows = [("by precision, localiser", compared.embedding[0]), ("by precision, detector", compared.embedding[1])]

@@ -40,14 +40,7 @@ Epoch = Callable[[Learner, jax.Array, Any, jax.Array], tuple[Learner, dict[str, 
 def make_learner(
     module: nn.Module, image_shape: tuple[int, int], tx: optax.GradientTransformation, seed: int
 ) -> Learner:
-    """Fresh weights.
-
-    Args:
-        module: `Network` or `Contrast`.
-        image_shape: height and width.
-        tx: its state is made too.
-        seed: of the weights.
-    """
+    """Fresh weights."""
     made = initial(variable_shapes(module, image_shape), seed)
     return Learner(made["params"], made["batch_stats"], tx.init(made["params"]))
 
@@ -96,14 +89,6 @@ def labelled_epoch(
     """An epoch of classification; images [N, H, W, 3] u8, labels [N] i32, of passages [N, outputs].
 
     The last, incomplete batch is left out: order changes every epoch, so every image has its turn.
-
-    Args:
-        network: of rooms with as many outputs as classes, of passages with as many as lengths.
-        tx: optimiser.
-        batch: images an update; all where there are fewer.
-        smoothing: of one-hot labels, of rooms.
-        augment: vary the images; those of passages also by mirroring.
-        scored: of passages, the output whose accuracy is told.
     """
 
     def loss_of(params, stats, x, y, key):
@@ -184,7 +169,6 @@ def compiled_epoch(steps: Callable[..., Any], update: Callable[..., Any]) -> Epo
 
     Args:
         steps: images and key to a tree of arrays [S, ...], one row an update.
-        update: learner, images, labels and a row to the learner and a dict of numbers.
     """
     planned, one = jax.jit(steps), jax.jit(update, donate_argnums=0)
 

@@ -152,9 +152,7 @@ def augmented(key: jax.Array, images: jax.Array, flip: bool) -> jax.Array:
     """Images [N, H, W, 3] u8 to f32, each with its own brightness, contrast, colour and shift.
 
     Args:
-        key: random.
         images: grey levels 0 to 255.
-        flip: mirror half of them left to right.
     """
     n, height, width, _ = images.shape
     key_gain, key_offset, key_shift, key_flip = jax.random.split(key, 4)

@@ -20,13 +20,7 @@ def seen_by(network: Trained) -> dict[str, Any]:
 
 
 def need_task(about: dict[str, Any], task: str, who: str) -> None:
-    """Refuses a run of another task.
-
-    Args:
-        about: content of its network.json.
-        task: expected.
-        who: names it in the message, such as `FOLDER:`.
-    """
+    """Refuses a run of another task."""
     if about["task"] != task:
         raise RunError(f"{who} was trained for '{about['task']}', expected a run of 'train {task}'")
 

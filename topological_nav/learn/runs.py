@@ -73,15 +73,7 @@ def run_epochs(
     """Epochs of one phase of a run; those that the checkpoint holds are not run again.
 
     Args:
-        out: the run folder; `metrics.jsonl` there gets a line an epoch.
-        phase: its name in the metrics.
-        learner: what it starts with.
         epoch: learner, the epoch's number from 0 and its key to learner and means over the epoch, `loss` among them.
-        epochs: in all.
-        key: of all epochs.
-        tell: told one line an epoch.
-        should_stop: asked after every epoch.
-        checkpoint: its file; one that holds another phase is written over.
 
     Returns:
         The learner.
@@ -150,13 +142,7 @@ class _Description:
 
 
 def read_description(run: Path, kind: str, task: str) -> dict[str, Any]:
-    """The network.json of a finished run.
-
-    Args:
-        run: its folder.
-        kind: what it should hold, network or policy, for messages.
-        task: of the command that trains one.
-    """
+    """The network.json of a finished run."""
     path = run / DESCRIPTION
     if not path.is_file():
         raise RunError(f"{run}: holds no trained {kind}; finish it: python -m topological_nav train {task} -o {run}")

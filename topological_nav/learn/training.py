@@ -295,8 +295,6 @@ def localisation(
     Each scene on its own; `mean` weighs them by queries. See `localise.localisation_scores`.
 
     Args:
-        trained: embeds the nodes' images.
-        rooms: the nodes'.
         asked_by: embeds the queries; None: the same network.
         asked: the queries'; None: the same images. Scenes are those of both, by name.
     """

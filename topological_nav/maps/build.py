@@ -111,8 +111,6 @@ def localisation_check(
     """How well a map localises, in words, by all images of a place and by its first alone.
 
     Args:
-        sight: of the map.
-        made: the map.
         images: [P, K, ...] of P places.
         heading_rad: [K] along which they were taken.
         xy_w: [P, 2] m, where.
@@ -155,7 +153,6 @@ def drawn_for(data: DataConfig, supersample: int | None) -> DataConfig:
     """How a navigator's images are drawn: as networks learned, but so many times larger before they are averaged.
 
     Args:
-        data: what the networks learned from.
         supersample: as asked for; None: as they learned, on a CPU at most `CPU_SUPERSAMPLE`.
     """
     need_engine(data.engine)
@@ -174,15 +171,7 @@ class Pictures:
     """Level images of a scene, a chunk at a time, each kept in a file until they are not needed any more."""
 
     def __init__(self, scene: Scene, data: DataConfig, robot: RobotSpec, progress: Progress, parts: Path | None = None):
-        """Draws nothing yet.
-
-        Args:
-            scene: what is drawn.
-            data: how.
-            robot: whose camera draws.
-            progress: told what is drawn, images done and images in all.
-            parts: see `build_map`.
-        """
+        """Draws nothing yet."""
         self._scene, self._data, self._robot, self._progress, self._parts = scene, data, robot, progress, parts
         self._done, self.total = 0, 0
         self._of = json.dumps([scene.digest, to_dict(data)], sort_keys=True).encode()

@@ -26,13 +26,6 @@ def place_nodes(
     is covered again with less spacing. Then, where `connect` is set, nodes are added along the free way
     between parts of the map that no free edge joins which is shortest where room to the sides counts as well.
 
-    Args:
-        space: of the scene.
-        rooms: of the scene.
-        config: of the map.
-        margin_m: clearance that a free way has; nodes added to join parts need only this much.
-        points: looked up on a way.
-
     Returns:
         [N, 2] m, and what could not be had, in words.
     """

@@ -42,14 +42,7 @@ class NetworkSight:
     """A map, the network that embeds and the one that judges passages."""
 
     def __init__(self, made: TopologicalMap, localiser: Trained, detector: Trained, match: str = "aligned"):
-        """Checks that the map is of these networks.
-
-        Args:
-            made: the map.
-            localiser: its embedding localises.
-            detector: judges passages.
-            match: aligned or nearest, see `config.NavigatorConfig.match`.
-        """
+        """Checks that the map is of these networks."""
         for name, network in (("localiser", localiser), ("detector", detector)):
             used, own = made.about.get(name, ""), network.about["digest"]
             if used != own:
@@ -84,13 +77,7 @@ class TrueSight:
     summed = True
 
     def __init__(self, made: TopologicalMap, space: FreeSpace, margin_m: float = 0.225):
-        """Takes the plan.
-
-        Args:
-            made: the map; of it only where its nodes stand.
-            space: free space of its scene.
-            margin_m: clearance that it needs.
-        """
+        """Takes the plan."""
         self._xy, self._space, self._margin_m = made.xy_w.astype(float), space, margin_m
 
     def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
@@ -136,13 +123,7 @@ class PassagePolicy:
     """Looks (of 0.15 rad) that the first turn to the left lasts."""
 
     def __init__(self, sight: Sight, passable: float = 0.5, ahead_m: float = 1.0):
-        """Takes whose judgement it trusts.
-
-        Args:
-            sight: judges images.
-            passable: least probability of a free way.
-            ahead_m: how far it must be free: what it takes to stop and turn.
-        """
+        """Takes whose judgement it trusts."""
         self._sight, self._passable, self._ahead_m = sight, passable, ahead_m
 
     def start(self, batch: int) -> Any:

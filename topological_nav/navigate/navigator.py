@@ -352,7 +352,6 @@ class Pilot:
         """Finds the goals' nodes.
 
         Args:
-            navigator: of the scene.
             goal_images: [B, K, ...] taken at the goals.
             goal_heading_rad: [K] along which headings.
         """

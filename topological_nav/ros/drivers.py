@@ -46,7 +46,6 @@ class Driver(Protocol):
         Args:
             image: [H, W, 3] u8, level and straight ahead.
             heading_rad: yaw of the robot in the map's frame.
-            time_s: when the picture was taken; never falls.
         """
         ...
 
@@ -79,12 +78,7 @@ class PilotDriver:
     """The navigator as a driver: it is done where it arrived, or ran out of time."""
 
     def __init__(self, pilot: Pilot, lens: Lens):
-        """Takes what it needs.
-
-        Args:
-            pilot: a batch of one, its goal known to it.
-            lens: that its networks learned through.
-        """
+        """Takes what it needs."""
         self._pilot, self.lens = pilot, lens
 
     def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> Command:

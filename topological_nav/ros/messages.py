@@ -99,8 +99,6 @@ def seen_through(rgb: np.ndarray, fov_deg: float, lens: Lens) -> np.ndarray:
 
     Args:
         rgb: [H, W, 3] u8.
-        fov_deg: its vertical field of view.
-        lens: wanted.
 
     Returns:
         [h, w, 3] u8: the middle of the picture, averaged over each wanted pixel.
@@ -128,10 +126,6 @@ def scan_fields(
 
     Args:
         readings: [n] in [0, 1]: distances over `range_max_m`, 1 where nothing is nearer; from right to left.
-        fov_deg: that the beams are spread over, ahead in the middle.
-        range_min_m: least distance measured.
-        range_max_m: largest.
-        period_s: between scans.
 
     Returns:
         Ranges in m; positive infinity where nothing was met (REP-117).

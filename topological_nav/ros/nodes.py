@@ -73,14 +73,7 @@ class SimulatorNode:
     """Publishes what the sensors tell, drives as it is told."""
 
     def __init__(self, ros: Any, simulator: RosSimulator, pace: Pace, tell: Callable[[str], None] = lambda _: None):
-        """Announces its topics.
-
-        Args:
-            ros: of `debian.load`.
-            simulator: ready.
-            pace: of time.
-            tell: told a line now and then.
-        """
+        """Announces its topics."""
         self._ros, self._simulator, self._pace, self._tell = ros, simulator, pace, tell
         self._news = threading.Condition()
         self._command, self._commands, self._done = (0.0, 0.0), 0, False
@@ -234,11 +227,7 @@ class NavigatorNode:
         """Joins its topics.
 
         Args:
-            ros: of `debian.load`.
-            driver: of one episode.
-            heading_from: imu or odom.
             heading_offset_rad: added to it: yaw of that sensor's frame in the map's.
-            tell: told a line now and then.
         """
         self._ros, self._driver, self._offset, self._tell = ros, driver, heading_offset_rad, tell
         self._news = threading.Condition()

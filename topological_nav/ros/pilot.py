@@ -26,11 +26,7 @@ def topological_driver(
     """The navigator, with its goal.
 
     Args:
-        map_file: that it goes by.
-        seeing: run folders of what embeds images, judges passages and drives along edges.
-        goals: pictures taken at the goal, along headings evenly about it; as wide as what the networks learned from.
         goal_heading_rad: of the first, in the map's frame.
-        config: of the navigator.
     """
     networks, made = load_networks(seeing.localiser, seeing.detector), load_map(map_file)
     lens = lens_of(networks.camera, get_robot(networks.camera.robot))

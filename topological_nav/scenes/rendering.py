@@ -37,7 +37,6 @@ def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pit
     """Where the camera of a robot is that stands on the floor.
 
     Args:
-        robot: its camera is fixed to its base, whose frame lies on the floor.
         xy_w: [..., 2] m, of the base.
         heading_rad: [...], yaw of the base.
         pitch_rad: [...], how far up the camera looks beside its mount's own pitch.
@@ -71,15 +70,7 @@ class SceneRenderer:
     def __init__(
         self, scene: Scene, lens: Lens, supersample: int = 1, engine: str = "warp", small: Sequence[SmallObject] = ()
     ):
-        """Loads the scene's meshes; the first picture may compile.
-
-        Args:
-            scene: what is drawn.
-            lens: of the images returned.
-            supersample: images are drawn this many times larger along each side and averaged.
-            engine: warp or gl.
-            small: small objects, out of sight where they are not placed.
-        """
+        """Loads the scene's meshes; the first picture may compile."""
         need_engine(engine)
         self._lens, self._by = lens, supersample
         self._large = Lens(lens.width * supersample, lens.height * supersample, lens.fov_deg)
@@ -98,12 +89,7 @@ class SceneRenderer:
             self._painters[1] = self._gl_painter()
 
     def draw(self, pose: CameraPose, bodies: Bodies | None = None) -> np.ndarray:
-        """[N, H, W, 3] u8 images of cameras with leaves [N, ...].
-
-        Args:
-            pose: of the cameras.
-            bodies: where they are; those without a name here are at rest, names that nothing here has are left out.
-        """
+        """[N, H, W, 3] u8 images of cameras with leaves [N, ...]."""
         pos, axes = np.asarray(pose.pos_w, np.float32), np.asarray(pose.axes_w, np.float32)
         count, first = len(pos), 0
         geoms = self._geoms(count, bodies)
@@ -166,12 +152,7 @@ class SceneRenderer:
 
 
 def batch_sizes(lens: Lens, platform: str) -> tuple[int, ...]:
-    """Images a call of the engine, ascending; each is compiled when it is first needed.
-
-    Args:
-        lens: of the images as they are drawn.
-        platform: `jax.default_backend()`. On an accelerator: powers of two up to what `DEVICE_PIXELS` allows.
-    """
+    """Images a call of the engine, ascending; each is compiled when it is first needed."""
     if platform == "cpu":
         return CPU_IMAGES
     least, most = DEVICE_BATCH

@@ -55,9 +55,6 @@ def cluster(points: np.ndarray, method: str, count: int, seed: int) -> np.ndarra
 
     Args:
         points: coordinates, m.
-        method: kmeans, gmm (full covariances, five starts) or spectral (ten nearest neighbours).
-        count: of clusters.
-        seed: of their starts.
     """
     if method not in METHODS:
         raise ConfigError(f"method is '{method}', expected one of {', '.join(METHODS)}")
@@ -99,12 +96,8 @@ def find_rooms(
     """Clusters a scene's free positions.
 
     Args:
-        space: of the scene.
-        method: see `cluster`.
         num_rooms: their number; None: as known, else chosen.
         known: [k, 4] recorded rooms (x0, y0, x1, y1), if there are any.
-        seed: of positions and clustering.
-        clearance_m: of the positions.
     """
     centres = space.centres(clearance_m)
     rng = np.random.default_rng([seed, 1])

@@ -54,11 +54,7 @@ def make_env(scene: Scene, robot: str, backend: str, radius_m: float | None = No
     """The environment that evaluation steps, on past what it itself would call the end of an episode.
 
     Args:
-        scene: the only one.
-        robot: its name; it must know control mode `twist`.
-        backend: of physics.
         radius_m: footprint that planners keep clear; None: the robot's, which its corners reach.
-        objects: small objects that are strewn about.
     """
     need_engine(backend)
     config = NavConfig.of(
@@ -94,11 +90,7 @@ class Simulator:
     """A batch of robots in one environment; the state travels, so that it can be thinned out."""
 
     def __init__(self, env: Any):
-        """Compiles on the first call, and anew for every size of a batch.
-
-        Args:
-            env: of `make_env`, or any `InteractiveNav`.
-        """
+        """Compiles on the first call, and anew for every size of a batch."""
         self.env = env
         self._reset = jax.jit(jax.vmap(env.reset_to))
         self._strewn = jax.jit(jax.vmap(env.strew))

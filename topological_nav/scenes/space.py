@@ -52,7 +52,6 @@ class FreeSpace:
         Args:
             start_w: [..., 2] m.
             end_w: [..., 2] m.
-            points: looked up on each way, both ends included.
             margin_m: clearance that each needs; 0: its cell is free.
 
         Returns:
@@ -76,12 +75,7 @@ class FreeSpace:
 
 
 def free_space(scene: Scene, height_m: float) -> FreeSpace:
-    """The free space of a scene.
-
-    Args:
-        scene: its furniture stands at rest.
-        height_m: of the robot: what hangs higher is no obstacle.
-    """
+    """The free space of a scene."""
     maps = scene.maps
     rows, columns = maps.traversable.shape
     x = maps.origin_w[0] + (np.arange(columns) + 0.5) * maps.resolution_m
@@ -103,7 +97,6 @@ def spread(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarr
     Args:
         points: [n, 2].
         count: at least 0.
-        rng: draws the first.
     """
     if count <= 0 or not len(points):
         return np.zeros(0, int)

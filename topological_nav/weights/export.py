@@ -90,14 +90,8 @@ def export(
     """Writes an export, whole or not at all; one that stands at `out` is replaced.
 
     Args:
-        localiser: run folder of a room classifier.
-        detector: of a passage detector.
         policy: of a local policy that learned with both, or None.
         maps: folder of SCENE.npz, all made with both, or None.
-        images: by which exports are compared with runs, see `level_images`.
-        out: the folder.
-        config: limits.
-        progress: told what is drawn or done, how much of it and in all; may raise to stop.
     """
     out = _free_place(out)
     runs = {"rooms": Path(localiser), "passages": Path(detector)} | ({"policy": Path(policy)} if policy else {})
@@ -184,8 +178,6 @@ def compare(
     """What runs and exports make of the same images.
 
     Args:
-        networks: localiser and detector of the runs.
-        exported: of the export.
         driver: the run's policy, or None.
         exported_driver: the export's.
         images: [P, K, H, W, 3] u8; each place's images are also shown to the policies one after the other.
@@ -224,14 +216,7 @@ def compare(
 def level_images(
     source: Path, networks: tuple[Trained, Trained], places: int, progress: Progress = lambda *_: None
 ) -> np.ndarray:
-    """[P, K, H, W, 3] u8: level images around places of a dataset, or of a scene, which is drawn.
-
-    Args:
-        source: dataset folder, or scene folder.
-        networks: localiser and detector: a scene is drawn as they learned to see.
-        places: at most so many, of a dataset evenly from all.
-        progress: told what is drawn, images done and in all; may raise to stop.
-    """
+    """[P, K, H, W, 3] u8: level images around places of a dataset, or of a scene, which is drawn."""
     source = Path(source)
     if (source / "dataset.json").is_file():
         images = load_rooms(source).images[:, PITCHES.index("level")]

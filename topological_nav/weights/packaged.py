@@ -60,9 +60,6 @@ def choose(
 
     Args:
         localiser: run folder; None: not named.
-        detector: the same.
-        policy: the same, or `PASSAGE_POLICY`.
-        needs: rooms and passages, or the one that is looked at.
     """
     given = {"rooms": localiser, "passages": detector}
     missing = [task for task in needs if given[task] is None]

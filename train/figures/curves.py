@@ -25,11 +25,7 @@ SMOOTHED = 40
 
 
 def learning_curves(runs: Mapping[str, list[dict[str, Any]]]) -> Figure:
-    """Success, INS_0.5 and reward of training episodes over environment steps, a line a run.
-
-    Args:
-        runs: name -> lines of its metrics.jsonl.
-    """
+    """Success, INS_0.5 and reward of training episodes over environment steps, a line a run."""
     figure, (axes,) = style.panels((4 * len(CURVES), 3.2), 1, len(CURVES))
     for axis, (key, label) in zip(axes, CURVES, strict=True):
         for name, lines in runs.items():
@@ -54,10 +50,6 @@ def with_goal_rate(lines: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def common_curve(runs: Sequence[Sequence[Mapping[str, Any]]], key: str) -> tuple[np.ndarray, np.ndarray]:
     """Curves of several runs at the same steps.
-
-    Args:
-        runs: lines of metrics of each.
-        key: the metric; lines without it are left out.
 
     Returns:
         steps [T] that all runs have reached, values [runs, T], linear between logged points.
@@ -86,11 +78,7 @@ def running_mean(values: np.ndarray, width: int) -> np.ndarray:
 
 
 def cell_curves(cells: Mapping[style.Cell, Sequence[Sequence[Mapping[str, Any]]]]) -> Figure:
-    """Goals that training reached over env steps, a panel a robot: a line a cell, with its seeds' interval.
-
-    Args:
-        cells: (robot, algorithm, k_int) -> lines of metrics of each of its runs.
-    """
+    """Goals that training reached over env steps, a panel a robot: a line a cell, with its seeds' interval."""
     looks = style.Looks(cells)
     figure, (axes,) = style.panels((3.6 * len(looks.robots), 3.6), 1, len(looks.robots), sharey=True)
     seeds = set()

@@ -26,8 +26,6 @@ def trajectories(paths: Mapping[str, np.ndarray], most: int = 6, episodes: Seque
     """Top views: where each policy's robot went in the same episodes, and what it moved.
 
     Args:
-        paths: arrays that `train.evaluate` recorded.
-        most: episodes to draw.
         episodes: which; the first ones where None.
     """
     policies = [str(name) for name in paths["policies"]]

@@ -23,12 +23,7 @@ SPLITS = {"train": "seen (training) scenes", "test": "unseen (test) scenes", Non
 
 
 def frontier(rows: Mapping[str, Sequence[Any]], title: str) -> Figure:
-    """Mean P_eff and E_eff of each policy, with 95 % intervals, and the line of the swept planner's weights.
-
-    Args:
-        rows: columns policy, path_efficiency and effort_efficiency, one entry an episode.
-        title: of the figure.
-    """
+    """Mean P_eff and E_eff of each policy, with 95 % intervals, and the line of the swept planner's weights."""
     names = np.asarray(rows["policy"])
     scores = {name: np.asarray(rows[name], float) for name in ("path_efficiency", "effort_efficiency")}
     figure, ((axis,),) = style.panels((6.4, 5.2))

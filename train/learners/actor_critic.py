@@ -147,12 +147,7 @@ class ActorCritic(abc.ABC):
         """One step of critics and policy, each from the other's parameters before it.
 
         Args:
-            learner: before it.
-            critic_loss: (q_params, *seen_by_critic) -> ().
-            seen_by_critic: see there.
             actor_loss: (whole policy's parameters, normalizer_params, q_params, *seen_by_actor) -> ().
-            seen_by_actor: see there.
-            transitions: that are learned from.
 
         Returns:
             The learner's fields that change, its targets left out; scalar metrics, with the mean value that the critics

@@ -27,13 +27,7 @@ class Algorithm:
     """(agent, env, learner, env_state) -> both after one update, and what is told of it."""
 
     def train(self, env: Env, config: TrainConfig, callbacks: Callbacks) -> TrainResult:
-        """Trains a policy.
-
-        Args:
-            env: natively batched and resetting itself (`interactive_nav.task.wrappers.AutoResetEnv`).
-            config: resolved, see `train.config.resolve`.
-            callbacks: progress, files and signals.
-        """
+        """Trains a policy."""
         agent = self.make_agent(env, config)
         begin = self.start(agent, env, config.run.seed)
         restored = callbacks.restore(begin)

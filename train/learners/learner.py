@@ -110,13 +110,6 @@ def run_loop(
 
     Logs and checkpoints fall on fixed update counts, so a run that was killed and resumed takes the same
     updates as one that was not.
-
-    Args:
-        update_fn: one update; its env_state argument is donated.
-        start: where to begin.
-        steps_per_update: environment steps that one update takes.
-        run: lengths and intervals, in environment steps.
-        callbacks: see `Callbacks`.
     """
     total = whole_updates(run.num_timesteps, steps_per_update)
     log_every = whole_updates(run.log_every_steps, steps_per_update)

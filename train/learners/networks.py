@@ -246,17 +246,7 @@ def make_split(
     action_size: int = 0,
     squeeze: bool = False,
 ) -> Split:
-    """An encoder with a head behind it.
-
-    Args:
-        config: of the encoder.
-        size: of observations, with images.
-        images: whether this network looks at them.
-        prepare: normalisation, see `preprocess`.
-        head: module of features, and of the action where `action_size` is positive.
-        action_size: length of the action a critic takes.
-        squeeze: drop the last axis of the output (a value).
-    """
+    """An encoder with a head behind it."""
     assert isinstance(size, Mapping)
     encoder = make_encoder(config, size, images, prepare)
     features = jnp.zeros((1, images * config.image_features + ("state" in size) * config.state_features))
@@ -288,16 +278,7 @@ def make_ppo_networks(
     value_sizes: Sequence[int],
     normalize_observations: bool,
 ) -> PpoNetworks:
-    """Policy (mean and deviation of a Gaussian before tanh) and value network.
-
-    Args:
-        config: of the encoders; read where observations have images.
-        size: of observations.
-        action_size: number of actions.
-        policy_sizes: hidden layers, behind the encoder if there is one.
-        value_sizes: likewise.
-        normalize_observations: whether the vector is normalised.
-    """
+    """Policy (mean and deviation of a Gaussian before tanh) and value network."""
     prepare = preprocess(normalize_observations)
     if not isinstance(size, Mapping):
         plain = ppo_networks.make_ppo_networks(

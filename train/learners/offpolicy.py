@@ -140,13 +140,7 @@ def update(agent: ActorCritic, env: Env, learner: Any, data: OffPolicyData) -> t
 
 
 def start(agent: ActorCritic, env: Env, seed: int) -> Snapshot:
-    """The first state of learner, environments and replay, derived from the seed.
-
-    Args:
-        agent: see `ActorCritic`.
-        env: natively batched and resetting itself.
-        seed: of the run.
-    """
+    """The first state of learner, environments and replay, derived from the seed."""
     c = agent.config
     key_networks, key_env, key_updates = jax.random.split(jax.random.PRNGKey(seed), 3)
     env_state = reset_envs(agent, env, key_env)

@@ -43,9 +43,7 @@ def init(slots: int, observation: Any, action_size: int, vector_dtype: str = "fl
     """An empty ring.
 
     Args:
-        slots: steps of each environment to keep.
         observation: a batch of observations [envs, ...]; only shapes and types are read.
-        action_size: length of an action.
         vector_dtype: how vectors are stored, float32 or float16.
     """
 
@@ -89,7 +87,6 @@ def insert(
     """The ring with one step of every environment in place of its oldest.
 
     Args:
-        replay: the ring.
         observation: [envs, ...] before the step.
         action: [envs, A].
         reward: [envs].
@@ -130,11 +127,7 @@ def sample(replay: Replay, key: jax.Array, batch_size: int, n_steps: int, discou
     observation there; a window that begins with it has truncation 1, and the losses leave it out, as Brax's do.
 
     Args:
-        replay: the ring; with no more than `n_steps` slots filled what is drawn means nothing.
-        key: random key.
-        batch_size: how many.
         n_steps: at least 1.
-        discounting: g.
 
     Returns:
         Leaves [batch, ...]; vectors f32, images as stored; `extras["state_extras"]["truncation"]`.

@@ -173,13 +173,7 @@ def is_whole(folder: Path) -> bool:
 
 
 def keep_policy(folder: Path, target: Path, step: float = policy_file.STEP) -> None:
-    """Writes what evaluating a checkpoint needs to another folder: `policy.npz` and `meta.json`.
-
-    Args:
-        folder: of the checkpoint; one that holds `policy.npz` alone is copied as it is.
-        target: made.
-        step: see `policy_file.packed`.
-    """
+    """Writes what evaluating a checkpoint needs to another folder: `policy.npz` and `meta.json`."""
     meta = read_meta(folder)
     target.mkdir(parents=True)
     if is_whole(folder):

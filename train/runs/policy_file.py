@@ -30,10 +30,6 @@ _LEVELS = 127
 def acting_part(learner: Mapping[str, Any], algorithm: str) -> dict[str, Any]:
     """The leaves of a learner that its policy reads.
 
-    Args:
-        learner: nested dict of arrays, as `learner.msgpack` holds it.
-        algorithm: ppo, sac or ddpg.
-
     Returns:
         "params/policy/..." -> array.
     """
@@ -53,7 +49,6 @@ def packed(leaves: Mapping[str, Any], step: float = STEP) -> dict[str, np.ndarra
     Rounded weights hold no repetitions, which is all that zip's own methods would add: those take a tenth more.
 
     Args:
-        leaves: name -> array.
         step: of the rounding, in standard deviations of each output's weights.
     """
     out: dict[str, np.ndarray] = {}

@@ -56,10 +56,7 @@ def config_to_play(
     What a run learned on a GPU can be played without one: where its backend is not here, another one is taken.
 
     Args:
-        folder: of the run.
-        words: `env.key=value`; a backend that they name is taken as it is.
         scenes: folders or sets of scenes; None: those that it was trained on.
-        console: told of another backend.
     """
     if "env.backend=native" in words:
         # It simulates everything, and takes no sizes of windows; those that the run learned with do no harm.

@@ -135,12 +135,7 @@ class RunFolder:
 
 
 def claim(path: Path, needed_mb: float = 0.0) -> None:
-    """Makes a folder and makes sure that it can be written to.
-
-    Args:
-        path: made with its parents.
-        needed_mb: room that the run will need, beside some head room.
-    """
+    """Makes a folder and makes sure that it can be written to."""
     needed_mb += HEADROOM_MB
     with writing(path, "expected a writable folder (run.out_dir)"):
         path.mkdir(parents=True, exist_ok=True)

@@ -60,8 +60,6 @@ class Tracker:
 
     Args:
         folder: of the run; remembers the run's id, and holds its files.
-        config: of the run.
-        versions: packages, device and commit.
     """
 
     def __init__(self, folder: Path, config: TrainConfig, versions: dict[str, Any]):

@@ -72,12 +72,7 @@ def named(word: str) -> str:
 
 
 class BroughtPolicy(HostPolicy):
-    """A callable of the user's; see `docs/benchmark-your-policy.md`.
-
-    Args:
-        word: `name=module:factory`.
-        env: one environment, not batched.
-    """
+    """A callable of the user's; see `docs/benchmark-your-policy.md`."""
 
     def __init__(self, word: str, env: Any):
         self._name, _, place = word.partition("=")

@@ -155,7 +155,6 @@ def claims(rows: pa.Table, split: str | None) -> list[Finding]:
     Cells with fewer runs than others are not compared: of a sweep that goes on they are not finished.
 
     Args:
-        rows: of `train.evaluate`.
         split: of the scenes for all but the train and test claim; None: all.
     """
     runs = run_means(rows, split)

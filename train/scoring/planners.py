@@ -35,9 +35,6 @@ def velocity_towards(
     Args:
         twist: the robot's limits, of its control mode.
         bearing_rad: [...] of the point, 0 ahead, positive to the left.
-        cruise_m_s: speed straight ahead.
-        aligned_rad: beyond this bearing it turns on the spot.
-        xp: `numpy` or `jax.numpy`.
 
     Returns:
         Linear (m/s) and angular (rad/s) velocity [...].
@@ -80,7 +77,6 @@ class HostPolicy:
             state: of the environments, leaves [N, ...].
             episode: [N] the episode that each plays.
             running: [N] bool; the others get an action that means nothing.
-            step: control steps done.
         """
         raise NotImplementedError
 
@@ -89,7 +85,6 @@ class Planner(HostPolicy):
     """Plans and steers many episodes; the state in, actions out.
 
     Args:
-        env: one environment, not batched.
         weight: of `Ways`; 0 pushes what stands in the shortest way, None never pushes: the avoider.
     """
 

@@ -35,7 +35,6 @@ def steer(robot: RobotSpec, target_b: jax.Array) -> jax.Array:
     """Actions that lead to a point: turn towards it, and drive the faster the better aligned.
 
     Args:
-        robot: in a control mode with a twist map.
         target_b: (2,) x forward, y left, m, robot frame.
 
     Returns:

@@ -66,9 +66,6 @@ class BatchPlayer:
 
     What is compiled is kept: policies that are `jax.tree_util.Partial`s of one function share it, whatever their
     numbers, as do chunks of one size.
-
-    Args:
-        env: one environment, not batched, not resetting itself.
     """
 
     def __init__(self, env: Any):
@@ -94,15 +91,11 @@ class BatchPlayer:
         """Plays every episode to its end.
 
         Args:
-            policy: see `train.scoring.policies`, or one on the host.
             keys: [N, 2]; an episode is drawn, and its policy's chances are, from its own key alone.
-            record: for how many of the first episodes to return paths.
-            on_progress: told (episodes finished, steps taken in their batch) now and then.
             starts: of `interactive_nav.episodes.starts_of`, leaves [N, ...]: these episodes instead of drawn ones.
             scene_index: [N] i32, the scene of each drawn episode; None: drawn as well.
             batch: episodes played at a time; None: all. Where the device's memory does not hold so many, half as
                 many are tried.
-            on_note: told when it does not.
 
         Returns:
             The episodes in the order of their keys, whatever the batch.

@@ -80,7 +80,6 @@ def run_means(rows: pa.Table, split: str | None = None) -> list[RunMean]:
     """Means of each learned run over its episodes.
 
     Args:
-        rows: of `train.evaluate`.
         split: train or test scenes; None: all.
     """
     chosen = learned_rows(rows, split)
@@ -119,14 +118,6 @@ def contrast(
     """Compares two values of an axis.
 
     Each seed counts once: its score is the mean over the settings of the other axes that both sides have.
-
-    Args:
-        means: of runs.
-        axis: robot, algorithm or k_int.
-        left: value on the axis.
-        right: value to subtract.
-        score: of a run.
-        **where: only runs with these values.
 
     Returns:
         None where a side has no runs.

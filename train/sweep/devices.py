@@ -67,12 +67,7 @@ class Machine(Launcher):
         self._given: list[Share] = []
 
     def take(self, launch: LaunchConfig, factor: float = 1.0) -> Share | None:
-        """A share for a run; None where there is no room.
-
-        Args:
-            launch: of the run.
-            factor: this many times the usual share, at most a whole GPU.
-        """
+        """A share for a run; None where there is no room."""
         if not self._gpus:
             if len(self._given) >= self._slots:
                 return None

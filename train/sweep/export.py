@@ -46,11 +46,6 @@ UNSEEN_ONLY = {"by_category", "force_sum_n", "object_displacement_kg_m", "reward
 def export(folder: SweepFolder, out: Path, step: float = STEP) -> tuple[int, dict[tuple[Any, ...], str]]:
     """Copies a sweep's results; what is there already of the same runs is replaced.
 
-    Args:
-        folder: of the sweep.
-        out: `<out>/rows/episodes.parquet`, `<out>/rows/_paths` and `<out>/runs` are written.
-        step: to which the kept policies' weights are rounded, see `train.runs.policy_file`.
-
     Returns:
         Bytes of all that lies there; and by cell the run whose checkpoint was kept: that of the highest mean INS_0.5
         over its rows, on test scenes where there are any.

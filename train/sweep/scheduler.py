@@ -55,11 +55,7 @@ class Outcome:
     """Runs left to somebody else who works on them."""
 
     def exit_code(self, done: str) -> int:
-        """0: every run got to `done`, or is worked on elsewhere; 1: not; 3: stopped by the time limit; 128 + signal.
-
-        Args:
-            done: state to reach, trained or done; unfinished: as far as each is, it is to be evaluated.
-        """
+        """0: every run got to `done`, or is worked on elsewhere; 1: not; 3: stopped by the time limit; 128 + signal."""
         if self.stopped_by:
             return 128 + self.stopped_by
         enough = {"done": (), "trained": ("trained",), "unfinished": ("trained", "stopped", "waiting")}[done]
@@ -75,13 +71,6 @@ class Scheduler:
     """Decides what runs next.
 
     Args:
-        folder: of the sweep.
-        launcher: where jobs run.
-        display: for people.
-        stages: train, evaluate or both.
-        redo: evaluate again what is evaluated.
-        unfinished: evaluate what is not trained to its end as well, as far as it is.
-        programs: what to run.
         clock: seconds.
     """
 
@@ -113,9 +102,7 @@ class Scheduler:
         """Works until nothing is left, the time is over, or a signal asks to stop; a second one does not wait.
 
         Args:
-            stops: signals, as they come.
             time_limit_s: after it all runs are stopped, with their checkpoints; None: no limit.
-            poll_s: between two looks.
         """
         began, deadline, killed = self._clock(), None, False
         timed_out = False

@@ -199,7 +199,6 @@ def select(sweep: Sweep, where: Sequence[str], shard: str | None) -> Sweep:
     """The part of a sweep that one machine takes.
 
     Args:
-        sweep: expanded.
         where: `setting=value[,value]` words; a run must match them all.
         shard: `I/N`, every N-th run beginning with the I-th (from 0); None: all.
     """

@@ -34,14 +34,7 @@ def door_leaf(
     the leaf lies inside the opening.
 
     Args:
-        doorway: where.
-        model: a door model, hinge edge at its lowest x.
         high_side: it opens into the room on the high side of the doorway's axis.
-        high_jamb: it hangs on the jamb with the higher coordinate.
-        open_rad: how far it should stand open; the wall beside the hinge may allow less.
-        plan: for the wall that ends its swing.
-        lift_m: gap below the leaf.
-        wall_gap_m: left between the fully open leaf and the wall beside it; the handle stands in it.
         proud_m: how far before the wall's face the hinge line stands.
 
     Returns:

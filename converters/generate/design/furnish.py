@@ -132,16 +132,7 @@ def _seat_at(
 def _narrow(
     state: _Room, cfg: BuildingConfig, gap_m: tuple[float, float], rng: np.random.Generator, used: set[int], local: bool
 ) -> Instance | None:
-    """Tries to put a chair before a doorway so that the way through narrows to the wanted gap.
-
-    Args:
-        state: what stands so far.
-        cfg: models.
-        gap_m: least and largest width left.
-        rng: random stream.
-        used: doorways that have a chair already; extended in place.
-        local: judge the way through this doorway only, not round through other rooms.
-    """
+    """Tries to put a chair before a doorway so that the way through narrows to the wanted gap."""
     plan = state.plan
     low, high = gap_m
     before = free_grid(plan, state.placed)
@@ -288,13 +279,6 @@ def furnish_plan(
     plan: Plan, cfg: BuildingConfig, rng: np.random.Generator, effort: Effort, max_tries: int = 10
 ) -> list[Instance] | None:
     """Places the furniture.
-
-    Args:
-        plan: the floor plan.
-        cfg: how many of what.
-        rng: random stream.
-        effort: work left, spent in place; without any, nothing is found.
-        max_tries: attempts.
 
     Returns:
         Doors, sofas, desks, tables, chairs; None where this plan cannot take them.

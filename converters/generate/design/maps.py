@@ -35,9 +35,6 @@ def fill(image: np.ndarray, rect: Rect, value) -> None:
 def floor_maps(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
     """Draws both maps.
 
-    Args:
-        plan: the floor plan; its horizontal coordinates are whole centimetres.
-
     Returns:
         `floor_0` and `floor_trav_0`, each (size, size) uint8 of 0 and 255, row = y / 0.01 + size / 2.
     """

@@ -341,9 +341,6 @@ def make_plan(cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 20
     """Draws a plan.
 
     Args:
-        cfg: what to build.
-        rng: random stream.
-        max_tries: layouts drawn before giving up.
         parts: how large each room is against the others, the corridor's weight (if there is to be one) first, which
             does not count; default: as many as `cfg` says, about equal.
 

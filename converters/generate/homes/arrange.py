@@ -232,12 +232,6 @@ def _shorter(group: Group, fewer: int) -> tuple[Satellite, ...]:
 def arrange(name: str, show: Showroom, rng: np.random.Generator, fewer: int = 0) -> Arrangement | None:
     """Chooses models for a group and stands them against each other.
 
-    Args:
-        name: key of `TABLES.groups`, or a category that stands alone anywhere.
-        show: the models.
-        rng: random stream.
-        fewer: pieces that a row does without.
-
     Returns:
         The group; None where there is no model of its anchor.
     """

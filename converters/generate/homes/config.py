@@ -95,13 +95,7 @@ def home_fields() -> dict[str, Any]:
 
 
 def home_config(tier: str, settings: dict[str, Any], models: tuple[str, ...] = HOME_TRAIN_MODELS) -> HomeConfig:
-    """A tier's home with some settings changed.
-
-    Args:
-        tier: key of `TIERS`.
-        settings: by name, of `home_fields`.
-        models: names of the CAD models that may be used.
-    """
+    """A tier's home with some settings changed."""
     if tier not in TIERS:
         raise GenerationError(f"tier is '{tier}': expected one of {', '.join(TIERS)}")
     own = {f.name for f in dataclasses.fields(HomeConfig)}

@@ -214,10 +214,7 @@ class Floor:
 
         Args:
             boxes: (4,) u0, v0, u1, v1.
-            places: of the group.
             low: corner of the layer's window.
-            sums: its running sums.
-            gap_m: by which the rectangle is grown.
         """
         c, s = np.array([1, 0, -1, 0])[places.side], np.array([0, 1, 0, -1])[places.side]
         corners = [places.origin + np.stack([s * u + c * v, -c * u + s * v], 1) for u, v in (boxes[:2], boxes[2:])]
@@ -230,14 +227,7 @@ class Floor:
         return sums[r1, c1] - sums[r0, c1] - sums[r1, c0] + sums[r0, c0] + out
 
     def fitting(self, arrangement: Arrangement, room: int, places: Places, strict: bool = True) -> np.ndarray:
-        """(n, pieces) bool: which pieces of a group have room at each place.
-
-        Args:
-            arrangement: the group.
-            room: where.
-            places: of the group.
-            strict: doorways, sweeps and the floor before other furniture stay free.
-        """
+        """(n, pieces) bool: which pieces of a group have room at each place."""
         low, sums = self._room_sums(room)
         fits = np.ones((len(places.side), len(arrangement.pieces)), bool)
         for k, piece in enumerate(arrangement.pieces):
@@ -269,11 +259,6 @@ class Floor:
 
     def reach(self, room: int, radius_m: float, boxes: list[Rect] | None = None) -> tuple[bool, float]:
         """What a disc reaches of a room with the furniture where it stands.
-
-        Args:
-            room: where.
-            radius_m: of the disc.
-            boxes: of further furniture.
 
         Returns:
             Whether it gets from each doorway of the room to each other one inside of the room, and the area, m2, in

@@ -97,11 +97,7 @@ class Passages:
         return [s for s in self.home.floor.standing if s.item.model.category in TABLES.light]
 
     def trial(self, change: Callable[[], bool]) -> bool:
-        """Keeps a change of what stands where that is nearer to what is asked for; undoes it otherwise.
-
-        Args:
-            change: changes the home; False where it could not.
-        """
+        """Keeps a change of what stands where that is nearer to what is asked for; undoes it otherwise."""
         floor, cfg = self.home.floor, self.home.cfg
         shares, standing, room_m = self.shares, list(floor.standing), self.room_m
         if change() and floor.share > cfg.furniture_share - SHARE_TOLERANCE:
@@ -154,9 +150,6 @@ def _ridge(room_m: np.ndarray) -> np.ndarray:
 
 def adjust(home: Home) -> dict[str, float]:
     """Moves light pieces until the shares that must be pushed lie in the ranges asked for.
-
-    Args:
-        home: changed in place; how full it is stays as it is, within its tolerance.
 
     Returns:
         Robot -> share of pairs between which it must push.

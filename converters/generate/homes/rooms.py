@@ -82,10 +82,6 @@ def _misfit(rooms: list[Rect], uses: list[str], near: np.ndarray) -> float:
 def assign_uses(plan: Plan, wanted: list[str]) -> tuple[list[str], float]:
     """Says what each room of a plan is used as.
 
-    Args:
-        plan: the floor plan; its corridor is a hall.
-        wanted: uses of its other rooms, as many as there are.
-
     Returns:
         The use of each room, key of `USES`, and how badly it suits, 0 being perfect.
     """

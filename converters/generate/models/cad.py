@@ -105,9 +105,6 @@ def cad_model(name: str) -> CadModel:
     The CAD origin is a little off the box centre, by an amount that depends on the name: ShapeNet's models
     are so too.
 
-    Args:
-        name: key of `LIBRARY`.
-
     Returns:
         The model in its CAD frame: bounding box diagonal 1, y up.
     """

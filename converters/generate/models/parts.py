@@ -193,14 +193,7 @@ def fronts(low, high, z, columns, rows, material, handle="bar", metal="steel") -
     """Doors or drawers before a carcass, with handles: a grid of slabs from `low` to `high` (x, y), their backs at z.
 
     Args:
-        low: corner on the left below.
-        high: corner on the right above.
         z: of the carcass's face.
-        columns: side by side.
-        rows: one over another.
-        material: of the slabs.
-        handle: bar (level), pull (upright, beside the gap between a pair), knob, or empty.
-        metal: of the handles.
     """
     parts = []
     width, height = (high[0] - low[0]) / columns, (high[1] - low[1]) / rows

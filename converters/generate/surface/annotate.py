@@ -38,9 +38,7 @@ def pose_in_world(item: Instance, scan_to_world_m: np.ndarray, floor_height_m: f
     """The exact pose of a piece of furniture.
 
     Args:
-        item: furniture, heights above the floor.
         scan_to_world_m: (3,) translation of the scan's `trs`.
-        floor_height_m: the floor in the scan frame.
 
     Returns:
         (3,) translation and rotation of T * R * S, CAD frame -> world (y up).
@@ -75,14 +73,6 @@ def pick_keypoints(item: Instance, scan_owned: np.ndarray, n: int, rng: np.rando
 def annotate_items(items: list[Instance], scan: Scan, floor_height_m: float, cfg: BuildingConfig, seed: int,
              rng: np.random.Generator) -> list[dict[str, Any]]:  # fmt: skip
     """Writes down what an annotator would.
-
-    Args:
-        items: the furniture.
-        scan: its scan (z from the floor).
-        floor_height_m: the floor in the scan frame.
-        cfg: annotation noise.
-        seed: names the scan.
-        rng: random stream.
 
     Returns:
         The content of `alignments.json`: a list of one scan.

@@ -158,10 +158,6 @@ def _packed(laid: list[_Laid]) -> tuple[int, float, list[np.ndarray], np.ndarray
 def assemble(charts: list[Chart], light: Light) -> tuple[Scan, Atlas]:
     """Joins patches into one mesh and paints its sheet.
 
-    Args:
-        charts: the patches. Those that have one image, the very same array, share its texels.
-        light: what falls on them.
-
     Returns:
         The mesh, no vertex in two patches, and its atlas.
     """

@@ -118,7 +118,6 @@ def framed(at: np.ndarray, half: np.ndarray, frame: np.ndarray, rng: np.random.G
         at: (n, 2) places, right and up, -1..1 on the picture.
         half: (2,) half its width and height, m.
         frame: (3,) colour of its rim.
-        rng: random stream of this picture.
     """
     sky, land = PRINTS[rng.integers(len(PRINTS))] + rng.uniform(-0.05, 0.05, (2, 3))
     sun, horizon = rng.uniform(-0.6, 0.6), rng.uniform(-0.3, 0.2)
@@ -193,10 +192,6 @@ def finishes(
 
     Args:
         rooms: x0, y0, x1, y1 of each.
-        uses: keys of `converters.generate.homes.rooms.USES`, one a room; none where the building has none: then paint
-            on all walls, boards on the floors, and tiles on a quarter of them.
-        rng: random stream.
-        pictures: some are painted on the walls.
     """
     wood, along = WOODS[rng.integers(len(WOODS))], int(rng.integers(2))
     if uses:

@@ -181,12 +181,6 @@ def model_building(plan: Plan, items: Sequence[Instance], uses: Sequence[str],
                    rng: np.random.Generator) -> tuple[Scan, Atlas]:  # fmt: skip
     """Models and paints the structure.
 
-    Args:
-        plan: the floor plan, with what is built in.
-        items: what can be moved: not drawn, but nothing is hung behind it.
-        uses: of the rooms: keys of `converters.generate.homes.rooms.USES`.
-        rng: random stream.
-
     Returns:
         The mesh, no vertex in faces of two labels, and its atlas.
     """

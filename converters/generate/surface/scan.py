@@ -127,9 +127,6 @@ def compact(vertices: np.ndarray, faces: np.ndarray, min_faces: int) -> tuple[np
 def nearest_solids(points: np.ndarray, solids: list[Solid], reach_m: float = 0.12) -> tuple[np.ndarray, np.ndarray]:
     """For each of (n, 3) points the solid whose surface is nearest, and the label of the nearest one of another class.
 
-    Args:
-        reach_m: how far a solid may be to count.
-
     Returns:
         index (n,) int64 of the nearest solid; other (n,) int64 label of the nearest other class
             within 0.05 m, or 0.

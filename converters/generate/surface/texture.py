@@ -69,7 +69,6 @@ def pack_rows(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
 
     Args:
         sizes: (n, 2) int width and height, texels.
-        width: of the sheet.
 
     Returns:
         (n, 2) lower corner of each, and the height used.
@@ -185,11 +184,9 @@ def paint(scan: Scan, rooms: list[Room], uses: Sequence[str], points: np.ndarray
     Args:
         scan: the mesh; the nearest solid's material decides.
         rooms: x0, y0, x1, y1 of each; each has its own walls and floor.
-        uses: of the rooms, as `finishes` takes them.
         points: (n, 3).
         ids: (n,) face of each point.
         normals: (m, 3) of faces.
-        rng: random stream.
 
     Returns:
         (n, 3) float in 0..1.

@@ -61,9 +61,7 @@ def read_scan(name: str, root: Path, strict: bool = False) -> RawScene:
     """Reads the folder of one scene.
 
     Args:
-        name: of `COLLECTIONS`.
         root: the scene's folder, as its collection lays it out.
-        strict: refuse what would be repaired with a warning.
     """
     source, about = SourceFolder(root, strict), COLLECTIONS[name]
     library = optional("scenezoo", missing(f"{root}: {name}", "scenezoo", "datasets"), SceneRejected)

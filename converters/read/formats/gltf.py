@@ -58,12 +58,7 @@ class _Layer:
 
 
 def read_gltf(source: SourceFolder, path: Path) -> list[TexturedMesh]:
-    """Return the meshes of the default scene in its own frame.
-
-    Args:
-        source: the folder; takes hashes and warnings.
-        path: of a GLB or glTF file in the folder.
-    """
+    """Return the meshes of the default scene in its own frame."""
     file = _File(source, path)
     meshes = file.meshes()
     for what, count in sorted(file.unused.items()):

@@ -56,14 +56,7 @@ def _tag(path: Path) -> str:
 
 
 def read_mjcf(root: Path, strict: bool = False, chosen: Path | None = None, within: Path | None = None) -> RawScene:
-    """Reads a folder's only MJCF file, its `scene.xml`, or the chosen one.
-
-    Args:
-        root: folder.
-        strict: refuse what would be repaired with a warning.
-        chosen: file.
-        within: folder that may be read; default `root`.
-    """
+    """Reads a folder's only MJCF file, its `scene.xml`, or the chosen one."""
     source = SourceFolder(within or root, strict, REMEDY)
     mains = [chosen] if chosen else mains_of(root)
     if len(mains) != 1:

@@ -111,14 +111,7 @@ def category_of(name: str) -> Category | None:
 
 
 def home(source: SourceFolder, layout: str, parts: list[Part], floors_m: tuple[float, ...] = ()) -> RawScene:
-    """The record of a home that is made of parts.
-
-    Args:
-        source: takes warnings.
-        layout: of the source.
-        parts: at least one.
-        floors_m: heights of its storeys' floors from the lowest up; empty: it has one, which is found.
-    """
+    """The record of a home that is made of parts."""
     parts, floors_m = _on_floors(source, parts, floors_m)
     parts = _by_size(source, parts, weighed=layout == "sdf")
     bounds = [_bounds(part) for part in parts]
@@ -160,12 +153,7 @@ def home(source: SourceFolder, layout: str, parts: list[Part], floors_m: tuple[f
 
 
 def built_in(raw: RawScene, beside: Mapping[int, str]) -> RawScene:
-    """A source in which some of its pieces are structure, as they stand; a scan shows them already.
-
-    Args:
-        raw: of `home`, or a scan.
-        beside: number of an annotation -> what it cannot be parted from.
-    """
+    """A source in which some of its pieces are structure, as they stand; a scan shows them already."""
     told = [f"{raw.annotations[k].cad_id} (from {other})" for k, other in beside.items()]
     words = f"{len(told)} pieces cannot be parted from what they stand in, and are built in: {', '.join(told)}"
     stay = tuple(a for k, a in enumerate(raw.annotations) if k not in beside)

@@ -61,14 +61,7 @@ def root_of(world: Path) -> Path:
 
 
 def read_sdf(root: Path, strict: bool = False, chosen: Path | None = None, within: Path | None = None) -> RawScene:
-    """Reads the only world of a folder, or the chosen one.
-
-    Args:
-        root: folder.
-        strict: refuse what would be repaired with a warning.
-        chosen: file.
-        within: folder that may be read; default `root`.
-    """
+    """Reads the only world of a folder, or the chosen one."""
     source = SourceFolder(within or root, strict)
     worlds = [chosen] if chosen else worlds_of(root)
     if len(worlds) != 1:

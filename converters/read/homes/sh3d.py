@@ -75,13 +75,7 @@ FOREIGN = {word: category for category, words in _TABLES["words"].items() for wo
 
 
 def read_sh3d(root: Path, strict: bool = False, chosen: Path | None = None) -> RawScene:
-    """Reads the only drawing of a folder, or the chosen one.
-
-    Args:
-        root: folder, or the file.
-        strict: refuse what would be repaired with a warning.
-        chosen: file.
-    """
+    """Reads the only drawing of a folder, or the chosen one."""
     files = [chosen] if chosen else [root] if root.is_file() else sorted(root.glob(f"*{ENDING}"))
     if len(files) != 1 or not files[0].is_file():
         raise SceneRejected(

@@ -23,8 +23,6 @@ def unpack(path: Path, folder: Path, budget: list[int] | None = None) -> None:
     """Writes the files of an archive into an empty folder.
 
     Args:
-        path: of the archive.
-        folder: where to.
         budget: bytes that may still be written, of this archive and those within it; counted down.
     """
     budget = [UNPACKED] if budget is None else budget

@@ -165,12 +165,7 @@ class Models:
         return dataclasses.replace(mesh, vertices=mesh.vertices - [0, 0, mesh.vertices[:, 2].min()]), group
 
     def solid(self, element: ElementTree.Element, surface: TexturedMesh) -> TexturedMesh | None:
-        """The hulls that a drawing of ours brings beside a piece's model, in the piece's frame; None without them.
-
-        Args:
-            element: the piece.
-            surface: what `surface` made of it.
-        """
+        """The hulls that a drawing of ours brings beside a piece's model, in the piece's frame; None without them."""
         model, folder = self.model(element), (element.get("model") or "").rpartition("/")[0]
         path = model_path(self.source.root, f"{folder}/{HULLS}", self.budget) if folder else None
         if model is None or path is None or element.find("transformation") is not None:

@@ -33,10 +33,7 @@ class Sheet:
         """A flat region with holes.
 
         Args:
-            region: shapely polygons.
             place: (n, 2) of the region -> (n, 3).
-            look: of it.
-            turned: it is seen from behind.
         """
         image, size = look
         for tile, low in _tiles(region, size):

@@ -79,13 +79,7 @@ class Wall:
 
 
 def read_walls(elements: list[ElementTree.Element], base_m: dict[str | None, float], note: Any) -> list[Wall]:
-    """The walls of a drawing, mitred where they are joined.
-
-    Args:
-        elements: `<wall>`.
-        base_m: level -> height of its floor.
-        note: takes a word on what is dropped.
-    """
+    """The walls of a drawing, mitred where they are joined."""
     walls: list[Wall] = []
     pieces: dict[str, list[int]] = {}
     for element in elements:
@@ -202,9 +196,6 @@ def wall_part(
     """A wall without its openings, with its baseboards.
 
     Args:
-        wall: with its corners.
-        openings: any.
-        looks: of `left`, `right` and `top`.
         boards: side -> thickness and height, m, and look.
     """
     sheet = Sheet()
@@ -310,17 +301,7 @@ def level_parts(
     shafts: Any,
     above: Any,
 ) -> list[Part]:
-    """Floors and ceilings of one level; of rooms that overlap the later one is seen.
-
-    Args:
-        rooms: of the level.
-        walls: of the level; doorways through them have a floor too.
-        openings: any.
-        floor_m: height.
-        ceiling_m: height.
-        shafts: plan of the stairs that come up through the floor.
-        above: plan of those that go up through the ceiling.
-    """
+    """Floors and ceilings of one level; of rooms that overlap the later one is seen."""
     sheet, taken, tops = Sheet(), shafts, above
 
     def level(height: float) -> Callable[[np.ndarray], np.ndarray]:

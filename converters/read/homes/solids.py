@@ -20,7 +20,6 @@ def height_field(height_m: np.ndarray, half_m: tuple[float, float]) -> tuple[np.
 
     Args:
         height_m: [rows along y, columns along x].
-        half_m: of its sides along x and y.
     """
     rows, columns = height_m.shape
     x, y = np.meshgrid(np.linspace(-half_m[0], half_m[0], columns), np.linspace(-half_m[1], half_m[1], rows))

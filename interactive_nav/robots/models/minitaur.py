@@ -61,13 +61,7 @@ def _leg_angles(command, state, xp):
 
 
 def minitaur(control_mode: str = "native") -> RobotSpec:
-    """Minitaur's spec.
-
-    Args:
-        control_mode: `native` or `position`, eight desired motor angles; `velocity` or `torque` of the motors;
-            `leg`, swing of the four legs, then their extension; or `twist`, linear and angular velocity of the
-            base through a scripted trot.
-    """
+    """Minitaur's spec."""
     parts = (("motor", LEGS.home[0]), ("knee", _KNEE_HOME_RAD))
     home = tuple((joint.replace("motor", part), value) for joint in LEGS.joints for part, value in parts)
     figures: dict[str, Any] = {"home_qpos": home}
