@@ -63,7 +63,7 @@ class Mesh(NamedTuple):
 
 
 def export_sh3d(folder: Path, target: Path) -> list[str]:
-    """Writes a scene's walls, rooms, doors and furniture as a drawing; returns a line each on what is in it, or is not."""
+    """Write a scene's walls, rooms, doors and furniture as a drawing; return a line for each part, also if left out."""
     manifest = load_manifest(folder)
     if target.suffix != ".sh3d" or target.exists():
         state = "exists" if target.exists() else "has another ending"

@@ -25,7 +25,7 @@ TURNS = LinearSegmentedColormap.from_list("turns", (BLUE, "0.6", VERMILION))
 
 @plt.rc_context(RC)  # type: ignore[reportCallIssue]
 def drives_figure(scene_folders: Sequence[Path], folder: Path) -> Figure:
-    """Every drive on the floor plans, kept ones coloured by turning, then images along some and the commands' shares."""
+    """Draw all drives on the floor plans, coloured by turning, images along some, and the shares of commands."""
     header, config = read_drives_header(folder)
     drives, robot = load_drives(folder), get_robot(config.robot)
     lines = -(-len(scene_folders) // min(4, len(scene_folders)))
