@@ -72,12 +72,7 @@ def flatten_feet(hull: Hull) -> Hull:
 
 
 def with_feet(hulls: tuple[Hull, ...], vertices: np.ndarray) -> tuple[Hull, ...]:
-    """Adds a low hull for each foot that no hull has: voxels lose legs of open surfaces, and the object would tip.
-
-    Args:
-        hulls: body frame, flat at z = 0 where they stand.
-        vertices: (n, 3) of the model, body frame.
-    """
+    """Adds a low hull for each foot that no hull has: voxels lose legs of open surfaces, and the object would tip."""
     stands = [h.vertices[h.vertices[:, 2] < FOOT_M, :2] for h in hulls]
     known = shapely.union_all([shapely.MultiPoint(p).convex_hull for p in stands if len(p)])
     base = vertices[vertices[:, 2] < FOOT_M, :2]

@@ -61,12 +61,7 @@ def kept_share(vertices: np.ndarray, faces: np.ndarray, drawn: tuple[np.ndarray,
 
 
 def body_shares(drawn: tuple[np.ndarray, np.ndarray], hulls: list[np.ndarray]) -> tuple[float, float]:
-    """Of the hulls' outer sides what lies off the drawn mesh, and of the drawn mesh what lies outside of the hulls.
-
-    Args:
-        drawn: vertices (n, 3) m and faces (m, 3).
-        hulls: corners (n, 3) m of each.
-    """
+    """Of the hulls' outer sides what lies off the drawn mesh, and of the drawn mesh what lies outside of the hulls."""
     solids = [ConvexHull(hull) for hull in hulls]
 
     def outside(points: np.ndarray, of: list[ConvexHull], by_m: float) -> np.ndarray:

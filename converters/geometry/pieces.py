@@ -64,14 +64,7 @@ def box_volume(points: np.ndarray) -> float:
 
 
 def merge_pieces(points: list[np.ndarray], most: int, slack: float | None = None) -> list[np.ndarray]:
-    """Joins pairs of convex pieces, each time the pair whose common hull encloses least that neither does.
-
-    Args:
-        points: (n, 3) of each piece.
-        slack: joins go on below `most` while a common box along the axes encloses at most this volume that neither
-            piece's does, and boxes decide throughout: what is joined then looks like a box, which collides in its
-            place; None: hulls decide, and `most` alone ends it.
-    """
+    """Joins pairs of convex pieces, each time the pair whose common hull encloses least that neither does."""
     pieces, size = list(points), hull_volume if slack is None else box_volume
     volume = [size(p) for p in pieces]
 

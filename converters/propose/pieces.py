@@ -101,9 +101,6 @@ def _basins(mask: np.ndarray) -> np.ndarray:
 
     A basin that meets a higher one where the distance is at least `NECK_SHARE` of its own greatest joins it.
 
-    Args:
-        mask: (rows, columns) bool.
-
     Returns:
         (rows, columns) number of the basin from 1 on, 0 outside.
     """

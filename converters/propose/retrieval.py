@@ -209,11 +209,7 @@ def _judge(pose: Alignment, surface: np.ndarray, points: np.ndarray, tree: KDTre
 
 
 def fit_model(proposal: Proposal, cad: CadModel, floor_m: float | None) -> _Fit:
-    """The best pose of one model: many coarse starts, the best few refined.
-
-    Args:
-        floor_m: height of the floor in the scan frame for what stands on it, or None.
-    """
+    """The best pose of one model: many coarse starts, the best few refined."""
     low, high = cad.vertices.min(axis=0), cad.vertices.max(axis=0)
     coarse = _thin(proposal.points, COARSE_POINTS)
     coarse_tree, coarse_surface = KDTree(coarse), _surface(cad, COARSE_POINTS)

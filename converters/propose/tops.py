@@ -113,11 +113,7 @@ def _two_levels(plan: _Plan) -> np.ndarray | None:
 
 
 def _two_rectangles(plan: _Plan, shown_floor: np.ndarray | None, category: str) -> np.ndarray | None:
-    """(rows, columns) part 1 or 2 of an outline that one straight cut turns into two rectangles; None: it is none.
-
-    Args:
-        shown_floor: (rows, columns) bool: cells where the scan shows the floor; None: it shows none around the piece.
-    """
+    """(rows, columns) part 1 or 2 of an outline that one straight cut turns into two rectangles; None: it is none."""
     shape = plan.shape
     best, best_score = None, -math.inf
     margin, notch = (math.ceil(v / plan.cell_m) for v in (PART_DEPTH_M, NOTCH_M))

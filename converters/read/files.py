@@ -310,9 +310,6 @@ def _corner_indices(corners: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
 def _fans(sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cuts polygons into triangles around their first corner.
 
-    Args:
-        sizes: (p,) corners of each polygon, at least 3.
-
     Returns:
         (m, 3) indices into the list of corners, (m,) polygon of each triangle.
     """
@@ -324,14 +321,7 @@ def _fans(sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _unfold(vertices: np.ndarray, index: np.ndarray, corner: np.ndarray, face: np.ndarray) -> None:
-    """Cuts polygons anew, in place, whose fans cover what they do not: door frames, rings and other hollow outlines.
-
-    Args:
-        vertices: (n, 3).
-        index: (c,) vertex of each corner.
-        corner: (m, 3) corners of each triangle; changed.
-        face: (m,) polygon of each, rising.
-    """
+    """Cuts polygons anew, in place, whose fans cover what they do not: door frames, rings and other hollow outlines."""
     a, b, c = (vertices[index[corner[:, k]]] for k in range(3))
     normal = np.cross(b - a, c - a)
     whole = np.stack([np.bincount(face, normal[:, k]) for k in range(3)], axis=1)

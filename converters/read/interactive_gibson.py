@@ -220,12 +220,6 @@ def plane_patch(
 ) -> TexturedMesh | None:
     """Squares of 0.1 m of a floor plane, where its cells are unseen, inside the mesh and on the map.
 
-    Args:
-        seen: cells (column, row) that the scan shows already.
-        given: map that the squares must lie on, or None.
-        low: (2,) lower bounds of the mesh, m.
-        high: (2,) its upper bounds.
-
     Returns:
         The squares with the plane's texture, or None where none is needed.
     """

@@ -146,11 +146,7 @@ def worn(surface: Surface, classes: np.ndarray, rng: np.random.Generator, side_m
 
 
 def make_crop(surface: Surface, classes: np.ndarray, rng: np.random.Generator, side: int) -> Crop:
-    """Voxels of `worn`, each of the class that most of its points have.
-
-    Args:
-        classes: (n,) of its points.
-    """
+    """Voxels of `worn`, each of the class that most of its points have."""
     column, of = worn(surface, classes, rng, side * VOXEL_M)
     voxels = voxelise(column, 0.0)
     votes, known = np.zeros((len(voxels.index), len(NAMES)), np.int32), (voxels.of_point >= 0) & (of < len(NAMES))

@@ -42,11 +42,7 @@ def shadow(objects: Sequence[PlacedObject], maps: SceneMaps, height_m: float = m
 
 
 def specific_surface_1_m(surfaces: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Area of meshes over the volume of the convex hull of all of them, 1/m.
-
-    Args:
-        surfaces: vertices (n, 3) in the world and faces (m, 3) of each.
-    """
+    """Area of meshes over the volume of the convex hull of all of them, 1/m."""
     area_m2 = sum(float(face_areas(vertices, faces).sum()) for vertices, faces in surfaces)
     return area_m2 / float(ConvexHull(np.vstack([vertices for vertices, _ in surfaces])).volume)
 
@@ -56,9 +52,6 @@ def navigation_complexity(free: np.ndarray, cell_m: float, radius_m: float) -> f
 
     Ways lead through the middles of cells of `NAVIGATION_CELL_M`, along rows, columns and diagonals, in the largest
     region that a disc's middle may be in.
-
-    Args:
-        free: [rows, columns] bool, True where nothing stands.
 
     Returns:
         1 where there is no such pair.

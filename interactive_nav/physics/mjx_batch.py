@@ -66,9 +66,6 @@ class MjxPhysics(Physics):
     def _substep_all(self, model: mjx.Model, data: mjx.Data, control: Callable) -> tuple[mjx.Data, Any, jax.Array]:
         """All substeps of a control step of one environment.
 
-        Args:
-            control: (data, k) -> data with the actuators' controls of substep k.
-
         Returns:
             The last data; the forces [substeps, M + 1, 3] on slots and structure with what `from_sensors` gives of
             each substep, or None; and the bits of Warp's OverflowType.

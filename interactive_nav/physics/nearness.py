@@ -108,13 +108,7 @@ class Nearness:
         return xp.where(used > 0, xp.linalg.norm(outside, axis=-1), FAR_M)
 
     def _walls_gap_m(self, scene: Array, state: PhysicsState, reach_m: float, boxes: Boxes, push_m: Array) -> Array:
-        """[..., W] m to where each wall can be met: within `reach_m` of the robot, or `TOUCH_M` of what it may push.
-
-        Args:
-            scene: [] i32.
-            reach_m: from the robot's centre.
-            push_m: [..., M] m to where each may be pushed; negative where it may.
-        """
+        """[..., W] m to where each wall can be met: within `reach_m` of the robot, or `TOUCH_M` of what it may push."""
         xp, gap = namespace(state.qpos), self.walls_m(scene, state) - reach_m
         xpos, xmat, half, used = (xp.asarray(t)[scene] for t in self._walls)
         walls = Boxes(xpos, xp.pad(xmat, ((0, 0), (0, 0), (0, 1))), xp.pad(half, ((0, 0), (0, 1))))

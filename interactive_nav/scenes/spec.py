@@ -44,9 +44,6 @@ def foot_points(boxes: np.ndarray, count: int = FEET) -> np.ndarray:
     A rigid body touches a plane at vertices of its convex hull only. Boxes against the floor would make four
     contacts each (a chair of twelve boxes has 16 where 4 carry it), and the solver's cost grows with them.
 
-    Args:
-        boxes: [n, 10] centre, quaternion, half sizes; body frame, z up.
-
     Returns:
         [at most count, 3] m, body frame.
     """

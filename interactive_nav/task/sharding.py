@@ -62,10 +62,6 @@ def start_distributed(coordinator: str, num_processes: int, process_id: int) -> 
 
     Every process runs the same script with its own `process_id`; afterwards `jax.devices()` are the devices
     of all of them and `ShardedEnv` spreads over all.
-
-    Args:
-        coordinator: host:port of process 0, reachable from all.
-        process_id: 0 to num_processes - 1.
     """
     if not 0 <= process_id < num_processes:
         raise ConfigError(f"process_id is {process_id}, expected 0 to {num_processes - 1}")

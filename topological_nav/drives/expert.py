@@ -125,11 +125,7 @@ def arcs(linear: jax.Array, angular: jax.Array, times_s: jax.Array) -> jax.Array
 
 
 def scan_gap(poses_b: jax.Array, points_b: jax.Array, half_m: jax.Array) -> jax.Array:
-    """[...] m from a rectangle at poses [..., 3] to the nearest of points [R, 2]; 0 inside, infinite without points.
-
-    Args:
-        half_m: [2] half its length and width.
-    """
+    """[...] m from a rectangle at poses [..., 3] to the nearest of points [R, 2]; 0 inside, infinite without points."""
     cos, sin = jnp.cos(poses_b[..., 2])[..., None], jnp.sin(poses_b[..., 2])[..., None]
     points_b = jnp.expand_dims(points_b, range(poses_b.ndim - 1))
     met = jnp.isfinite(points_b).all(-1)

@@ -44,9 +44,6 @@ def window_starts(steps: int, window: int, overlap: int) -> np.ndarray:
 
     A drive that is shorter than a window has one, which its end cuts short; at the end of a longer one, what is left
     over is left out.
-
-    Args:
-        steps: of the drive, at least 1.
     """
     stride = max(window - overlap, 1)
     return np.arange(0, max(steps - window, 0) + 1, stride)

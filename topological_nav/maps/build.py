@@ -108,13 +108,7 @@ def build_map(
 def localisation_check(
     sight: Sight, made: TopologicalMap, images: np.ndarray, heading_rad: np.ndarray, xy_w: np.ndarray
 ) -> dict[str, str]:
-    """How well a map localises, in words, by all images of a place and by its first alone.
-
-    Args:
-        images: [P, K, ...] of P places.
-        heading_rad: [K] along which they were taken.
-        xy_w: [P, 2] m, where.
-    """
+    """How well a map localises, in words, by all images of a place and by its first alone."""
     count, around = images.shape[:2]
     each = sight.distances(images.reshape(-1, *images.shape[2:]), np.tile(heading_rad, count))
     each = each.reshape(count, around, -1)

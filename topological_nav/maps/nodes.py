@@ -128,12 +128,7 @@ def _stations(space: FreeSpace, way: np.ndarray, edge_m: float, margin_m: float,
 
 
 def _lattice(index: dict[tuple[int, int], int], cost: np.ndarray) -> csr_array:
-    """Cells that share a side, so that the straight way between their centres is as free as they are.
-
-    Args:
-        index: (column, row) -> number of a cell.
-        cost: [cells] of a step within each; a step between two costs their mean.
-    """
+    """Cells that share a side, so that the straight way between their centres is as free as they are."""
     pairs = [(i, index.get(side, -1)) for (x, y), i in index.items() for side in ((x + 1, y), (x, y + 1))]
     first, second = np.array([pair for pair in pairs if pair[1] >= 0], int).reshape(-1, 2).T
     between = 0.5 * (cost[first] + cost[second])

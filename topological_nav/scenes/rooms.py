@@ -93,12 +93,7 @@ def choose_count(points: np.ndarray, method: str, seed: int, most: int = MAX_ROO
 def find_rooms(
     space: FreeSpace, method: str, num_rooms: int | None, known: np.ndarray | None, seed: int, clearance_m: float
 ) -> Rooms:
-    """Clusters a scene's free positions.
-
-    Args:
-        num_rooms: their number; None: as known, else chosen.
-        known: [k, 4] recorded rooms (x0, y0, x1, y1), if there are any.
-    """
+    """Clusters a scene's free positions."""
     centres = space.centres(clearance_m)
     rng = np.random.default_rng([seed, 1])
     points = centres[np.sort(rng.choice(len(centres), min(CLUSTERED, len(centres)), replace=False))]

@@ -180,9 +180,6 @@ class BatchPlayer:
 def going_on(over: np.ndarray) -> np.ndarray:
     """Places of a batch that go on once those of `over` have ended: all that run, then as many others as fill it.
 
-    Args:
-        over: [N] bool.
-
     Returns:
         [n] i64, n the smallest of N's sizes (see `FEWEST`) that holds all that run. So all batches of N episodes have
         the same few, and what is compiled for one serves the next.

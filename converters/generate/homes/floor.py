@@ -210,12 +210,7 @@ class Floor:
     def hindered(
         self, boxes: np.ndarray, places: Places, low: np.ndarray, sums: np.ndarray, gap_m: float = 0.0
     ) -> np.ndarray:
-        """(n,) how many cells of a layer lie in a rectangle of the group's frame, for all places.
-
-        Args:
-            boxes: (4,) u0, v0, u1, v1.
-            low: corner of the layer's window.
-        """
+        """(n,) how many cells of a layer lie in a rectangle of the group's frame, for all places."""
         c, s = np.array([1, 0, -1, 0])[places.side], np.array([0, 1, 0, -1])[places.side]
         corners = [places.origin + np.stack([s * u + c * v, -c * u + s * v], 1) for u, v in (boxes[:2], boxes[2:])]
         lowest, highest = np.minimum(*corners) - gap_m - low, np.maximum(*corners) + gap_m - low

@@ -37,9 +37,6 @@ def _trs(translation: np.ndarray, rotation: Rotation, scale: np.ndarray) -> dict
 def pose_in_world(item: Instance, scan_to_world_m: np.ndarray, floor_height_m: float) -> tuple[np.ndarray, Rotation]:
     """The exact pose of a piece of furniture.
 
-    Args:
-        scan_to_world_m: (3,) translation of the scan's `trs`.
-
     Returns:
         (3,) translation and rotation of T * R * S, CAD frame -> world (y up).
     """

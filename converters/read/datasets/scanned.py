@@ -58,11 +58,7 @@ def reader(name: str) -> Callable[[Path, bool], RawScene]:
 
 
 def read_scan(name: str, root: Path, strict: bool = False) -> RawScene:
-    """Reads the folder of one scene.
-
-    Args:
-        root: the scene's folder, as its collection lays it out.
-    """
+    """Reads the folder of one scene."""
     source, about = SourceFolder(root, strict), COLLECTIONS[name]
     library = optional("scenezoo", missing(f"{root}: {name}", "scenezoo", "datasets"), SceneRejected)
     for path in sorted(p for mark in about.marks for p in root.glob(mark)):
