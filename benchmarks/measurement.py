@@ -12,7 +12,7 @@ from typing import Any
 import jax
 
 from interactive_nav_common.versions import commit, package_versions
-from interactive_nav_common.words import add_words, read_commands
+from interactive_nav_common.words import Parser, add_words, read_commands
 
 RESULTS = Path("benchmarks/results")
 SCENE = "scenes_mjcf/apartment_0"
@@ -26,7 +26,7 @@ def command_line(description: str | None, rows: str = "", settings: bool = False
 
     With `settings` it makes an environment, by `--set key=value`.
     """
-    made = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made = Parser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     if settings:
         add_words(made, TABLE["settings"].words)
         made.add_argument(

@@ -21,7 +21,7 @@ from rich.console import Console
 
 from converters.generating import GENERATING
 from converters.records.errors import StageFailed
-from converters.segmenting import SEGMENTING, label_unlabelled, propose_unproposed
+from converters.segmenting import SEGMENTING, label_unlabelled, next_step, propose_unproposed
 from converters.tables import alignment_table, bounds, gate_table, proposal_tables
 from interactive_nav_common.config import read_words, refuse_unused
 from interactive_nav_common.errors import UserError, printable, reports_errors
@@ -85,6 +85,9 @@ def _convert(arguments: argparse.Namespace, console: Console) -> int:
             + (f"gates that fail: {', '.join(failed)}" if failed else "every gate passes"),
             soft_wrap=True,
         )
+    layout, moves = results[0].manifest.source["format"], any(result.manifest.objects for result in results)
+    if not moves and (word := next_step(arguments, layout)):
+        console.print(word, soft_wrap=True, highlight=False)
     return 0 if all(g.passed for result in results for g in result.gates) else 1
 
 

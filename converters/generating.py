@@ -10,7 +10,7 @@ from rich.console import Console
 from interactive_nav_common.config import read_words, refuse_unused
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.progress import stage_progress
-from scenes_mjcf.sets import PACKAGED, in_cache, is_listed, packaged_set
+from scenes_mjcf.sets import HERE, PACKAGED, in_cache, is_listed, packaged_set
 
 
 def _generate(arguments: argparse.Namespace, console: Console) -> None:
@@ -52,12 +52,14 @@ def _make_scenes(arguments: argparse.Namespace, console: Console) -> int:
 
 
 def _list_scenes(arguments: argparse.Namespace, console: Console) -> None:
-    for name, folder in PACKAGED.items():
-        for scene, member in packaged_set(name).scenes.items():
-            place = next((p for p in (folder / scene, in_cache(folder / scene)) if p.exists()), None)
-            other = place and place == in_cache(folder / scene) and not is_listed(place, member)
-            what = "in the cache is another scene of this name: make it again" if other else place or "not made"
-            print(f"{name:<10} {member.split:<6} {scene:<15} {what}")
+    listed = {f / scene: (name, m) for name, f in PACKAGED.items() for scene, m in packaged_set(name).scenes.items()}
+    for scene, (name, member) in listed.items():
+        place = next((p for p in (scene, in_cache(scene)) if p.exists()), None)
+        other = place and place == in_cache(scene) and not is_listed(place, member)
+        what = "in the cache is another scene of this name: make it again" if other else place or "not made"
+        print(f"{name:<10} {member.split:<6} {scene.name:<15} {what}")
+    for scene in sorted({path.parent for path in HERE.rglob("scene.json")} - set(listed)):
+        print(f"{'-':<10} {'-':<6} {scene.relative_to(HERE).as_posix():<15} {scene}")
 
 
 def _models(arguments: argparse.Namespace, console: Console) -> None:

@@ -2,25 +2,30 @@
 
 import argparse
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from converters.records.errors import SceneRejected
 from interactive_nav_common.files import write_arrays, write_text
 from interactive_nav_common.progress import stage_progress
 
+UNFIT = ("bed", "cabinet", "lamp")
+"""Classes of furniture that `propose` does not look for."""
+
 
 def _beside(source: Path, ending: str) -> Path:
-    """Of a file beside a source's mesh: labels, where the readers look for them, or proposals."""
+    """Return the place of labels, where the readers look for them, or of proposals beside a source's mesh."""
     from converters.read.gibson import MESH
+    from converters.read.meshes import beside
     from converters.read.source import detect_format
 
     if not source.is_file() and (layout := detect_format(source)) != "gibson":
         raise SceneRejected(f"{source}: is of layout {layout}, expected a mesh file or a folder of layout gibson")
-    mesh = source if source.is_file() else source / MESH
-    return mesh.with_name(f"{mesh.stem}.{ending}")
+    return beside(source, ending) if source.is_file() else (source / MESH).with_suffix(f".{ending}")
 
 
 def _read(arguments: argparse.Namespace) -> Any:
@@ -47,10 +52,12 @@ def label_unlabelled(arguments: argparse.Namespace, console: Console) -> None:
 
 def propose_unproposed(arguments: argparse.Namespace, console: Console) -> Path | None:
     """The next step of it: beside the mesh, the models that fit, unless they are there; None where alignments are."""
+    from converters.propose.pieces import MIN_VOXELS
     from converters.propose.proposals import as_scan2cad
-    from converters.propose.report import retrieve_sure
+    from converters.propose.report import given_up, retrieve_sure
     from converters.read.gibson import ALIGNMENTS
     from converters.read.storeys import split_storeys
+    from converters.segment.voxels import NAMES, classes_of
 
     source, target = arguments.source, _beside(arguments.source, "proposals.json")
     if (source / ALIGNMENTS).exists():
@@ -62,11 +69,33 @@ def propose_unproposed(arguments: argparse.Namespace, console: Console) -> Path 
     with stage_progress(console) as report:
         floors = split_storeys(_read(arguments))
         fitted = [retrieve_sure(floor, library, lambda share: report("propose", share)) for floor in floors]
-    found, models = (sum(part, ()) for part in zip(*fitted, strict=True))
-    text = json.dumps(as_scan2cad(source.stem, found, dict(enumerate(models))), indent=1, allow_nan=False)
+    pairs = [(p, sure.get(k)) for found, sure in fitted for k, p in enumerate(found)]
+    placed, models = [p for p, model in pairs if model], [model for _, model in pairs if model]
+    text = json.dumps(as_scan2cad(source.stem, tuple(placed), dict(enumerate(models))), indent=1, allow_nan=False)
     write_text(target, text + "\n")
     console.print(f"{target}: {len(models)} models", soft_wrap=True)
+    counts = np.bincount(np.concatenate([classes_of(floor.scan.labels) for floor in floors]), minlength=len(NAMES))
+    unfit = [name for name in UNFIT if counts[NAMES.index(name)] >= MIN_VOXELS]
+    told = given_up([p for p, model in pairs if model is None], ())
+    told += (f"labelled, and never given a model: {', '.join(unfit)}",) if unfit else ()
+    for line in (*told, *((f"{_annotate(source)} places models by hand",) if told else ())):
+        console.print(f"{source}: {line}", soft_wrap=True, highlight=False)
     return target
+
+
+def _annotate(source: Path) -> str:
+    return f"'python -m converters annotate {shlex.quote(str(source))} -o DIR'"
+
+
+def next_step(arguments: argparse.Namespace, layout: str) -> str:
+    """Return what else makes furniture of a scan move, or "" for homes and for scans that people annotated."""
+    from converters.read.gibson import ALIGNMENTS
+
+    people = (arguments.source / ALIGNMENTS).exists() or (arguments.annotations and not arguments.segment)
+    if layout not in ("mesh", "gibson") or people:
+        return ""
+    first = "" if arguments.segment else "add --segment to recognise furniture in the scan, or "
+    return f"no movable object: {first}place models by hand with {_annotate(arguments.source)}"
 
 
 def _label(arguments: argparse.Namespace, target: Path, weights: Path | None, console: Console) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.records import read_packaged
-from interactive_nav_common.words import TYPED
+from interactive_nav_common.words import TYPED, version
 
 PROGRAMS = read_packaged(Path(__file__).with_name("programs.yaml"), dict[str, tuple[str, str]])
 """Command -> module that is run, and what it does."""
@@ -19,8 +19,11 @@ PROGRAMS = read_packaged(Path(__file__).with_name("programs.yaml"), dict[str, tu
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs a program as `python -m` does; its exit code, 2 on a user's error, 128 + signal when stopped."""
     words = list(sys.argv[1:] if argv is None else argv)
+    if words[:1] == ["--version"]:
+        print(version())
+        return 0
     if not words or words[0] in ("-h", "--help"):
-        print("usage: interactive-nav COMMAND ...   (interactive-nav COMMAND --help says more)\n")
+        print("usage: interactive-nav COMMAND ...   (interactive-nav COMMAND --help says more; --version)\n")
         print("\n".join(f"  {name:<16} {about}" for name, (_, about) in PROGRAMS.items()))
         return 0 if words else 2
     if words[0] not in PROGRAMS:

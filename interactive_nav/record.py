@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import imageio_ffmpeg
+import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
@@ -63,10 +64,6 @@ class Compositor:
             scene: the folder that it was played in.
             height: rows of the view from behind; a multiple of 12, so that every part has whole, even pixels.
             views: of `VIEWS`, side by side in place of the view from behind and the robot's camera.
-
-        Raises:
-            ReplayError: the scene is not the one that the replay was recorded in.
-            ConfigError: a height that does not divide.
         """
         check_height(height)
         check_scene(replay, scene)
@@ -79,7 +76,8 @@ class Compositor:
         self._yaw = gaussian_filter1d(yaw, _CAMERA_LAG_S / replay.control_dt_s, mode="nearest")
         self._target = gaussian_filter1d(replay.body_pos_w[:, 0], 0.2 / replay.control_dt_s, axis=0, mode="nearest")
         self._cameras = {view: self._positions(view) for view in self.views if view in BEHIND_M}
-        self._font = ImageFont.load_default(size=height / 24)
+        # Pillow's own font has spaces of 0.2 em, which round to nothing between some letters of small sizes.
+        self._font = ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf"), height / 28)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -211,10 +209,6 @@ def write_video(
 
     Returns:
         The number of different frames.
-
-    Raises:
-        ReplayError: another ending.
-        FileError: it cannot be written.
     """
     check_format(path)
     steps = [*range(0, compositor.replay.num_steps, every), compositor.replay.num_steps]
@@ -272,11 +266,7 @@ def _write_frames(frames: Iterator[np.ndarray], path: Path, rate: float, hold_s:
 
 
 def replay_of(run: Path, episode: int, policy: str, out: str) -> Path:
-    """Where a run keeps the replay of an episode.
-
-    Raises:
-        ReplayError: it has none; the message says who plays one.
-    """
+    """Where a run keeps the replay of an episode."""
     path = replay_path(run, policy, episode)
     if not path.is_file():
         words = f"{run} --episode {episode} --policy {policy} -o {out}"
@@ -290,11 +280,7 @@ def add_picture_words(made: argparse.ArgumentParser) -> None:
 
 
 def check_picture_words(arguments: argparse.Namespace) -> None:
-    """Refuses what cannot be drawn, before anything is played.
-
-    Raises:
-        ConfigError: the message says what.
-    """
+    """Refuses what cannot be drawn, before anything is played."""
     check_format(Path(arguments.out))
     check_height(arguments.height)
     if arguments.every < 1 or arguments.episode < 0:
@@ -304,11 +290,7 @@ def check_picture_words(arguments: argparse.Namespace) -> None:
 
 
 def record(source: Path, arguments: argparse.Namespace, console: Console) -> None:
-    """Draws a replay as the words of `add_picture_words` say.
-
-    Raises:
-        UserError: the replay or its scene cannot be read, or the video not be written.
-    """
+    """Draws a replay as the words of `add_picture_words` say."""
     replay, out = load(source), Path(arguments.out)
     compositor = Compositor(replay, load_scene(replay.scene), arguments.height, arguments.views)
     with progress_bar(console, "frames", -(-replay.num_steps // arguments.every) + 1, transient=True) as update:

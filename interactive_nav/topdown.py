@@ -64,12 +64,7 @@ def shadow(boxes: np.ndarray, pos_w: np.ndarray, quat_w: np.ndarray) -> Any:
 
 
 def draw(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "time") -> None:
-    """Draws one replay, its path coloured by "time" (first step dark, last bright) or "contact".
-
-    Raises:
-        ReplayError: the scene is not the one that the replay was recorded in.
-        ConfigError: another `colour_by`.
-    """
+    """Draws one replay, its path coloured by "time" (first step dark, last bright) or "contact"."""
     if colour_by not in COLOUR_BY:
         raise ConfigError(f"colour_by is {colour_by!r}, expected one of {', '.join(COLOUR_BY)}")
     check_scene(replay, scene)

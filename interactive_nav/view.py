@@ -4,8 +4,10 @@ A window where the machine has a screen, else a page in the browser (mjviser, an
 """
 
 import contextlib
+import functools
 import importlib
 import importlib.util
+import itertools
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -18,7 +20,7 @@ import numpy as np
 from interactive_nav.geodesic import cell_centres, clearance
 from interactive_nav.navigation.tables import furniture_map
 from interactive_nav.pictures.camera import BEHIND_M
-from interactive_nav.pictures.scene_model import furnished_spec
+from interactive_nav.pictures.scene_model import cast, furnished_spec
 from interactive_nav.robots import RobotSpec, get_robot, robot_names
 from interactive_nav.scenes.objects import SPLITS, VISUAL_GROUP, SmallObject, add_shapes, body_names, pick
 from interactive_nav.scenes.scene import Scene, load_scene
@@ -29,6 +31,8 @@ from interactive_nav_common.words import program
 
 GAP_M = 0.03
 """Least gap between what is placed at random."""
+FIRST_VIEWS = (4.0, 3.0, 2.0, 1.2), (-35.0, -50.0, -20.0, -70.0), range(90, 450, 15)
+"""Views of the robot in order of preference: m between its outline and the camera, elevation and azimuth, degrees."""
 
 
 class ViewError(UserError):
@@ -57,13 +61,7 @@ def has_browser_viewer() -> bool:
 def choose_viewer(
     wanted: str, window: Callable[[], bool] = can_open_window, browser: Callable[[], bool] = has_browser_viewer
 ) -> str:
-    """'window' or 'browser'.
-
-    Args:
-        wanted: auto, window or browser; auto takes a window where there is a screen.
-        window: tells whether a window can open.
-        browser: tells whether the browser's viewer is installed.
-    """
+    """Return 'window' or 'browser'; of `auto`, a window where there is a screen."""
     if wanted in ("auto", "window") and window():
         return "window"
     if wanted == "window":
@@ -75,17 +73,7 @@ def choose_viewer(
 
 
 def place_discs(scene: Scene, radii_m: Sequence[float], height_m: float, rng: np.random.Generator) -> np.ndarray:
-    """Random places where discs keep clear of walls, furniture and each other.
-
-    Args:
-        scene: with its furniture where scene.xml has it.
-        radii_m: of the discs, in the order in which they are placed.
-        height_m: furniture above this does not count.
-        rng: random stream.
-
-    Returns:
-        (n, 2) world x, y, m.
-    """
+    """Return random places (n, 2), m, where discs keep clear of walls, furniture below a height and each other."""
     maps = scene.maps
     poses = {m.name: (m.pos_w, m.quat_w) for m in scene.movables}
     room_m = clearance(maps.traversable & ~furniture_map(scene, poses, height_m), maps.resolution_m)
@@ -103,14 +91,7 @@ def place_discs(scene: Scene, radii_m: Sequence[float], height_m: float, rng: np
 
 
 def build_model(folder: Path, robot: RobotSpec | None, small: Sequence[SmallObject], seed: int = 0) -> mujoco.MjModel:
-    """The scene as stored, with textures and hulls, a robot and small objects at random free places.
-
-    Args:
-        folder: of the scene.
-        robot: or None.
-        small: small objects.
-        seed: of the places.
-    """
+    """Return the scene as stored, with textures and hulls, a robot and small objects at random free places."""
     scene = load_scene(folder)
     rng = np.random.default_rng(seed)
     radii = [robot.footprint_radius_m] if robot else []
@@ -149,16 +130,37 @@ def _show_robot(model: mujoco.MjModel, robot: RobotSpec) -> None:
         model.geom_group[own] = VISUAL_GROUP
 
 
+def aim_at_robot(model: mujoco.MjModel, data: mujoco.MjData, robot: RobotSpec) -> None:
+    """Set the free camera with which viewers open so that as little as possible hides the robot."""
+    is_robot = model.body_rootid[model.geom_bodyid] == model.body(robot.base_body).id
+    parts_w = data.geom_xpos[is_robot & (model.geom_group <= VISUAL_GROUP)]
+    model.stat.center[:], best = (parts_w.min(0) + parts_w.max(0)) / 2, -1.0
+    for away_m, elevation, azimuth in itertools.product(*FIRST_VIEWS):
+        camera = robot.footprint_radius_m + away_m, elevation, azimuth
+        ways = parts_w - (eye_w := model.stat.center - _ahead(*camera))
+        met = cast(model, data, eye_w, ways / np.linalg.norm(ways, axis=1)[:, None], range(VISUAL_GROUP + 1))[0]
+        if (seen := float(np.mean((met >= 0) & is_robot[met]))) > best:
+            best = seen
+            model.stat.extent, model.vis.global_.elevation, model.vis.global_.azimuth = camera[0] / 1.5, *camera[1:]
+        if best == 1.0:
+            return
+
+
+def _ahead(distance_m: float, elevation_deg: float, azimuth_deg: float) -> np.ndarray:
+    """Return the way (3,) from a free camera to the point that it looks at, m."""
+    up, turn = np.radians((elevation_deg, azimuth_deg))
+    return distance_m * np.array([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)])
+
+
 def open_window(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Opens MuJoCo's own viewer; returns when its window is closed."""
     importlib.import_module("mujoco.viewer").launch(model, data)
 
 
 def open_browser(model: mujoco.MjModel, data: mujoco.MjData, host: str, port: int) -> None:
-    """Serve mjviser's page until Ctrl-C: the whole scene, or the view of the camera `vis.global.cameraid`."""
-    mjviser = importlib.import_module("mjviser")
-    model.stat.extent /= 3  # mjviser looks from three extents away, and follows a body of its choice
-    (server, address), camera = guarded_server(host, port, "view", "view"), model.vis.global_.cameraid
+    """Serve mjviser's page until Ctrl-C: it opens as the window does, or keeps to the camera `vis.global.cameraid`."""
+    mjviser, first = importlib.import_module("mjviser"), model.vis.global_
+    (server, address), camera = guarded_server(host, port, "view", "view"), first.cameraid
     print(f"{address} (Ctrl-C ends it)", flush=True)
 
     def draw(scene: Any) -> None:
@@ -170,7 +172,15 @@ def open_browser(model: mujoco.MjModel, data: mujoco.MjData, host: str, port: in
                 client.camera.fov = np.radians(model.cam_fovy[camera])
 
     viewer = mjviser.Viewer(model, data, render_fn=draw, server=server)
-    viewer.scene.camera_tracking_enabled = False
+    viewer.scene.camera_tracking_enabled = False  # it follows a body of its choice
+    # mjviser looks at the model's centre, from a place in spherical coordinates around the world's origin.
+    x, y, z = model.stat.center - _ahead(1.5 * model.stat.extent, first.elevation, first.azimuth)
+    viewer.scene.create_scene_gui = functools.partial(
+        viewer.scene.create_scene_gui,
+        camera_distance=float(np.linalg.norm((x, y, z))),
+        camera_azimuth=float(np.degrees(np.arctan2(-y, -x))),
+        camera_elevation=float(np.degrees(np.arctan2(z, np.hypot(x, y)))),
+    )
     viewer.run()
 
 
@@ -180,16 +190,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     table = Path(__file__).with_name("words.yaml")
     made = program(table, "view", robots=", ".join(robot_names()), splits=SPLITS)
     arguments = made.parse_args(argv)
-    robot = get_robot(arguments.robot) if arguments.robot else None
+    robot = None if arguments.robot == "none" else get_robot(arguments.robot)
     small = pick(arguments.objects, arguments.small_objects)
     if arguments.view != "whole" and robot is None:
-        raise ViewError(f"--view {arguments.view} is of a robot, and none is in the scene; add --robot NAME")
+        raise ViewError(f"--view {arguments.view} is of a robot, and none is in the scene; leave out --robot none")
     model = build_model(arguments.scene, robot, small, arguments.seed)
     if arguments.view != "whole":
         model.vis.global_.cameraid = model.camera(arguments.view).id
     viewer = choose_viewer(arguments.viewer)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
+    if robot is not None:
+        aim_at_robot(model, data, robot)
     if viewer == "window":
         open_window(model, data)
     else:

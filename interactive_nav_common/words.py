@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import importlib
+import importlib.metadata
 import importlib.util
 import itertools
 import os
 import sys
+import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
@@ -23,6 +26,8 @@ from interactive_nav_common.errors import UserError
 from interactive_nav_common.records import read_packaged
 
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
+
+PROJECT = "interactive-nav"
 
 
 def positive(text: str) -> int:
@@ -95,12 +100,23 @@ TYPED: dict[str, str] = {}
 """`python -m MODULE` -> what was typed instead of it; filled by programs that run others."""
 
 
+@functools.cache
+def version() -> str:
+    """Return the name and version of the installed package, or of the checkout."""
+    try:
+        return f"{PROJECT} {importlib.metadata.version(PROJECT)}"
+    except importlib.metadata.PackageNotFoundError:
+        text = Path(__file__).parents[1].joinpath("pyproject.toml").read_text(encoding="utf-8")
+        return f"{PROJECT} {tomllib.loads(text)['project']['version']}"
+
+
 class Parser(argparse.ArgumentParser):
-    """Shows what was typed; says which option, of its own or of its commands, a wrong one looks like."""
+    """Show what was typed, and the version; say which option, of its own or of its commands, a wrong one looks like."""
 
     def __init__(self, *arguments: Any, **about: Any) -> None:
         super().__init__(*arguments, **about)
         self.prog = TYPED.get(self.prog, self.prog)
+        self.add_argument("--version", action="version", version=version(), help="print the version and exit")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As argparse does; a setting behind `--scenes A` (env.x=1) is a setting, not one more scene."""

@@ -59,9 +59,6 @@ class SceneSet:
 def scene_digest(folder: Path) -> str:
     """SHA-256 of what a scene is made of, the same on every machine that makes it: its map, and its bodies, joints and
     geoms with numbers rounded to 0.1 mm (the last digits of fitted boxes differ between processors), but no windows.
-
-    Raises:
-        SceneError: the folder's files cannot be read.
     """
     try:
         tree = ElementTree.parse(folder / "scene.xml")
@@ -84,11 +81,7 @@ def _rounded(text: str) -> str:
 
 
 def read_set(path: Path) -> SceneSet:
-    """Reads and checks a set's file.
-
-    Raises:
-        SceneError: it cannot be read, or breaks the schema.
-    """
+    """Reads and checks a set's file."""
     scenes = _SETS.record(_SETS.json(path), SceneSet, str(path))
     for name in scenes.scenes:
         check_name(name, f"{path}: scenes: a name", SceneError)
@@ -119,11 +112,7 @@ def is_listed(folder: Path, member: Member) -> bool:
 
 
 def installed(path: str | Path) -> Path:
-    """A path as it is; else, where nothing is there, the package's or the cache's of the same name.
-
-    Raises:
-        SceneError: the cache has another scene there than the package's set lists.
-    """
+    """A path as it is; else, where nothing is there, the package's or the cache's of the same name."""
     found = Path(path)
     roots = () if found.exists() or found.is_absolute() else (HERE.parent, cache_folder())
     place = next((root / found for root in roots if (root / found).exists()), found)
@@ -194,9 +183,6 @@ def scene_folders(words: Sequence[str | Path]) -> tuple[str, ...]:
 
     Returns:
         Scene folders, as written where a word names no set.
-
-    Raises:
-        SceneError: a set that cannot be read, whose scenes were not made, or that has none in the split.
     """
     found: list[str] = []
     for word in map(str, words):

@@ -173,6 +173,17 @@ def test_links_lead_to_files(page):
     assert [link for link in links if not (page.parent / link).exists()] == []
 
 
+def test_pages_that_the_readme_names_are_links():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    named = re.findall(r"(\[)?`((?:docs|benchmarks)/[\w./-]+\.md|CITATION\.cff)`(\]\(\S+?\))?", text)
+    assert len(named) > 12 and [name for first, name, link in named if (first, link) != ("[", f"]({name})")] == []
+
+
+def test_nobody_is_sent_to_an_address_that_does_not_exist():
+    pages = [*PAGES, ROOT / "CITATION.cff", ROOT / "pyproject.toml", ROOT / "CONTRIBUTING.md"]
+    assert [p.name for p in pages if re.search(r"example\.(org|com|net)", p.read_text(encoding="utf-8"))] == []
+
+
 ROOMS = (*HOUSE, "interactive_nav_common", "results", "scenes_mjcf", "tests")
 A_PATH = re.compile(rf"(?<![\w./$-])(?:{'|'.join(ROOMS)})/[\w./-]*\w(?![\w$<{{*-])")
 MADE = re.compile(r"scenes_mjcf/(?:furnished|cluttered)/\w+_\d|scenes_mjcf/(?:my_|homes\d)|docs/_build|/[A-Z]+(?:/|$)")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -60,3 +63,14 @@ def test_help_shows_what_was_typed(command):
         [sys.executable, "-m", "interactive_nav", command, "--help"], capture_output=True, text=True, check=True
     )
     assert done.stdout.startswith(f"usage: interactive-nav {command} [")
+
+
+@pytest.mark.parametrize("module", sorted(programs(ROOT)))
+def test_every_program_prints_its_version(module, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [module, "--version"])
+    package = (ROOT / module.replace(".", "/")).is_dir()
+    main = importlib.import_module(f"{module}.__main__" if package else module).main
+    with contextlib.suppress(SystemExit):
+        main()
+    number = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert capsys.readouterr().out == f"interactive-nav {number}\n"

@@ -212,6 +212,15 @@ def cached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache" / "package" / "furnished"
 
 
+def test_every_packaged_home_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenes", "list"]) == 0
+    rows = [line.split(maxsplit=3) for line in capsys.readouterr().out.splitlines()]
+    here = {name: place for _, _, name, place in rows}
+    homes = [*TRAIN, "rowan", "willow", "apartment_0", "aws_house", "drawn/flat"]
+    assert {name: here[name] for name in homes} == {name: str(ROOT / "scenes_mjcf" / name) for name in homes}
+    assert [row[:3] for row in rows][:1] == [["sparse", "train", "alder"]] and len(rows) == len(here)
+
+
 def test_a_scene_in_the_cache_is_found(cached: Path) -> None:
     shutil.copytree(ROOT / "scenes_mjcf" / "alder", cached / "one")
     assert scene_folders(["furnished/test"]) == ("cache/package/furnished/one",)

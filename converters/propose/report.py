@@ -1,8 +1,9 @@
 """A raw folder in; `proposals.json` (Scan2CAD's shape) and `proposals.png` out, and retrieval's report."""
 
+import collections
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -49,22 +50,29 @@ def floor_of(raw: RawScene) -> float:
 
 def retrieve_sure(
     raw: RawScene, library_root: Path | None, progress: Callable[[float], None]
-) -> tuple[tuple[Proposal, ...], tuple[Retrieval, ...]]:
-    """Furniture without an annotation, and the model that a library has for each, as far as that is sure."""
+) -> tuple[tuple[Proposal, ...], dict[int, Retrieval]]:
+    """Return the furniture without an annotation, and by its index the model of a library where that is sure."""
     found = propose_instances(raw.scan)
     found = tuple(found[k] for k in without_annotation(found, raw.annotations, raw.cads))
     retrieved = auto_align(found, read_library(library_root), floor_of(raw), progress) if found else {}
-    sure = [k for k in sorted(retrieved) if retrieved[k].confidence >= MIN_CONFIDENCE]
-    return tuple(found[k] for k in sure), tuple(retrieved[k] for k in sure)
+    return found, {k: retrieved[k] for k in sorted(retrieved) if retrieved[k].confidence >= MIN_CONFIDENCE}
+
+
+def given_up(found: Sequence[Proposal], sure: Container[int]) -> tuple[str, ...]:
+    """Return one line that counts the furniture for which no model is sure, or none."""
+    counts = collections.Counter(p.category for k, p in enumerate(found) if k not in sure)
+    listed = ", ".join(f"{count} {category}" for category, count in sorted(counts.items()))
+    return (f"no sure model, so part of the structure: {listed}",) if listed else ()
 
 
 def with_retrieved(raw: RawScene, library_root: Path | None, progress: Callable[[float], None]) -> RawScene:
-    """Adds to the annotations what `retrieve_sure` finds."""
-    _, sure = retrieve_sure(raw, library_root, progress)
+    """Add to the annotations what `retrieve_sure` finds, and to the warnings what it gives up."""
+    found, sure = retrieve_sure(raw, library_root, progress)
     return dataclasses.replace(
         raw,
-        annotations=raw.annotations + tuple(as_annotation(r) for r in sure),
-        cads=raw.cads | {r.cad.cad_id: r.cad for r in sure},
+        annotations=raw.annotations + tuple(as_annotation(r) for r in sure.values()),
+        cads=raw.cads | {r.cad.cad_id: r.cad for r in sure.values()},
+        warnings=raw.warnings + given_up(found, sure),
     )
 
 

@@ -57,9 +57,14 @@ UP_AXES = {
 """COLLADA's word -> turn to z up."""
 
 
-def labels_beside(path: Path) -> Path:
-    """Where the labels of a mesh file lie, if it has any."""
-    return path.with_name(f"{path.stem}.labels.npz")
+def beside(path: Path, ending: str) -> Path:
+    """Return the place of a file about a mesh file, such as `scan.obj.labels.npz` with the ending `labels.npz`.
+
+    A file without the suffix (`scan.labels.npz`) is taken where no other mesh could be meant.
+    """
+    full, short = path.with_name(f"{path.name}.{ending}"), path.with_name(f"{path.stem}.{ending}")
+    meshes = [p for p in path.parent.iterdir() if p.stem == path.stem and p.suffix.lower() in SUFFIXES]
+    return short if short.is_file() and not full.is_file() and len(meshes) == 1 else full
 
 
 class SourceResolver(Resolver):
@@ -159,7 +164,7 @@ def _joined(path: Path, parts: list[TexturedMesh]) -> TexturedMesh:
 def read_single_mesh(
     path: Path, strict: bool = False, up: str = "auto", unit: str = "auto", mirror: bool = False
 ) -> RawScene:
-    """Reads a scan that is one mesh file. Without `labels_beside` structure is told by shape.
+    """Reads a scan that is one mesh file. Without labels beside it structure is told by shape.
 
     Args:
         path: of the file; what it names must lie in its folder.
@@ -187,8 +192,8 @@ def read_single_mesh(
             "turn the order of each face's corners if only that is wrong"
         )
     floor_m = floor_level(mesh.vertices, mesh.faces, str(path))
-    if labels_beside(path).is_file():
-        given = source.use(source.inside(labels_beside(path)), "")
+    if (beside_it := beside(path, "labels.npz")).is_file():
+        given = source.use(source.inside(beside_it), "")
         mesh, labels = labelled(mesh, read_labels(given), given)
     else:
         mesh = with_own_corners(welded(mesh))

@@ -92,11 +92,7 @@ class Replay:
 
     @property
     def small(self) -> tuple[SmallObject, ...]:
-        """The small objects.
-
-        Raises:
-            SceneError: a folder of `objects` is not there or no object.
-        """
+        """The small objects."""
         return small_objects(self.num_objects, self.small_objects, self.objects)
 
     @property
@@ -227,22 +223,14 @@ def replay_path(run: Path, policy: str, episode: int) -> Path:
 
 
 def save(replay: Replay, path: str | Path) -> None:
-    """Writes a replay as npz, whole or not at all.
-
-    Raises:
-        FileError: it cannot be written.
-    """
+    """Writes a replay as npz, whole or not at all."""
     fields = {f.name: getattr(replay, f.name) for f in dataclasses.fields(Replay)}
     header = {name: value for name, value in fields.items() if name not in _ARRAYS} | {"format": FORMAT}
     write_arrays(path, header=np.array(json.dumps(header)), **{name: fields[name] for name in _ARRAYS})
 
 
 def load(path: str | Path) -> Replay:
-    """Reads a replay.
-
-    Raises:
-        ReplayError: the file is missing, damaged, or of another format.
-    """
+    """Reads a replay."""
     path = Path(path)
     if not path.is_file():
         raise ReplayError(f"{path}: no such file, expected a replay (npz)")

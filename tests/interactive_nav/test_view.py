@@ -7,6 +7,7 @@ import sys
 import types
 import urllib.error
 import urllib.request
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -16,6 +17,9 @@ from interactive_nav import view
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import load_scene
+from tests.gl_program import drawn, need_gl
+
+ROOT = Path(__file__).parents[2]
 
 
 def yes() -> bool:
@@ -80,17 +84,23 @@ def test_the_chosen_viewer_is_given_the_model(room, monkeypatch):
     assert opened == [(7, "127.0.0.1", 9000)]
 
 
-def test_the_browsers_page_opens_on_the_whole_scene(room, monkeypatch):
-    """With a stand-in for mjviser 0.0.14, which looks from 3 x extent at the centre, or a body."""
+def test_the_browsers_page_opens_where_the_window_does(room, monkeypatch):
+    """With a stand-in for mjviser 0.0.14: at the centre, from spherical coordinates around the world's origin."""
     seen = {}
 
     class Viewer:
         def __init__(self, model, data, render_fn, server):
-            self.scene = types.SimpleNamespace(camera_tracking_enabled=True)
-            seen.update(distance_m=3 * model.stat.extent, host=server.get_host(), time=data.time)
+            def create_scene_gui(camera_distance, camera_azimuth, camera_elevation):
+                turn, up = np.radians((camera_azimuth, camera_elevation))
+                flat = -np.cos(up) * np.array([np.cos(turn), np.sin(turn)])
+                seen.update(eye_w=camera_distance * np.array([*flat, np.sin(up)]), at_w=model.stat.center.copy())
+
+            self.scene = types.SimpleNamespace(camera_tracking_enabled=True, create_scene_gui=create_scene_gui)
+            seen.update(host=server.get_host(), time=data.time)
             self._server = server
 
         def run(self):
+            self.scene.create_scene_gui()
             seen["tracking"] = self.scene.camera_tracking_enabled
             page = urllib.request.Request(
                 f"http://127.0.0.1:{self._server.get_port()}", headers={"Host": "evil.example"}
@@ -102,9 +112,49 @@ def test_the_browsers_page_opens_on_the_whole_scene(room, monkeypatch):
     pytest.importorskip("viser", reason="viser is not installed (pip install 'viser>=1.1,<1.2')")
     monkeypatch.setitem(sys.modules, "mjviser", types.SimpleNamespace(Viewer=Viewer))
     model = view.build_model(room, None, [])
-    extent = float(model.stat.extent)
+    model.stat.center[:] = 3.0, -2.0, 0.5
+    model.vis.global_.azimuth, model.vis.global_.elevation = 120.0, -30.0
     view.open_browser(model, mujoco.MjData(model), "127.0.0.1", 0)
-    assert seen == {"distance_m": pytest.approx(extent), "host": "127.0.0.1", "time": 0.0, "tracking": False}
+    assert (seen["host"], seen["time"], seen["tracking"]) == ("127.0.0.1", 0.0, False)
+    np.testing.assert_allclose(seen["at_w"], [3.0, -2.0, 0.5])
+    away_m = 1.5 * model.stat.extent  # along x -1/2, along y sqrt(3)/2 of the level share, sqrt(3)/2; down by 1/2
+    ahead = np.array([-np.sqrt(3) / 4, 3 / 4, -1 / 2])
+    np.testing.assert_allclose(seen["eye_w"], seen["at_w"] - away_m * ahead, atol=1e-5)
+
+
+FIRST_PICTURE = """
+import os, sys
+os.environ["MUJOCO_GL"] = "egl"
+import numpy as np
+import mujoco
+from interactive_nav import view
+shown = []
+view.choose_viewer, view.open_window = lambda wanted: "window", lambda *what: shown.extend(what)
+assert view.main([sys.argv[2], "--seed", sys.argv[4], "--robot", sys.argv[3]]) == 0
+model, data = shown
+camera = mujoco.MjvCamera()
+mujoco.mjv_defaultFreeCamera(model, camera)
+picture = mujoco.Renderer(model, 480, 640)
+picture.enable_segmentation_rendering()
+picture.update_scene(data, camera)
+geom, kind = np.moveaxis(picture.render(), -1, 0)
+root = model.body_rootid[model.geom_bodyid[np.where(kind == mujoco.mjtObj.mjOBJ_GEOM, geom, 0)]]
+np.savez(sys.argv[1], robot=root == model.body(sys.argv[3] + "_base").id, eye=picture.scene.camera[0].pos)
+picture.close()
+"""
+
+
+@pytest.mark.parametrize(
+    ("scene", "robot", "seed"), [("alder", "turtlebot", 0), ("apartment_0", "fetch", 0), ("drawn/flat", "turtlebot", 1)]
+)
+def test_a_window_opens_where_the_robot_is_in_sight(tmp_path, monkeypatch, scene, robot, seed):
+    need_gl()
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    made = drawn(FIRST_PICTURE, tmp_path, ROOT / "scenes_mjcf" / scene, robot, str(seed))
+    rows, columns = np.nonzero(made["robot"])
+    assert len(rows) > 2000  # a TurtleBot at 4 m is 60 pixels high and 50 wide
+    assert abs(rows.mean() - 240) < 80 and abs(columns.mean() - 320) < 80
+    assert 0.3 < made["eye"][2] < 4.5
 
 
 @pytest.mark.parametrize(("name", "back_m", "high_m"), [("follow", 1.8, 1.8), ("eye", 2.6, 1.5)])
@@ -125,8 +175,8 @@ def test_views_from_behind_look_at_the_robots_middle_as_films_do(two_rooms, monk
 
 
 def test_a_view_of_a_robot_needs_one(room, capsys):
-    assert view.main([str(room), "--view", "eye"]) == 2
-    assert "--view eye is of a robot, and none is in the scene; add --robot NAME" in capsys.readouterr().err
+    assert view.main([str(room), "--view", "eye", "--robot", "none"]) == 2
+    assert "--view eye is of a robot, and none is in the scene; leave out --robot none" in capsys.readouterr().err
 
 
 def test_the_browsers_page_looks_through_the_robots_camera(two_rooms, monkeypatch):
@@ -135,7 +185,9 @@ def test_the_browsers_page_looks_through_the_robots_camera(two_rooms, monkeypatc
 
     class Viewer:
         def __init__(self, model, data, render_fn, server):
-            self.scene = types.SimpleNamespace(camera_tracking_enabled=True, update_from_mjdata=lambda data: None)
+            self.scene = types.SimpleNamespace(
+                update_from_mjdata=lambda data: None, create_scene_gui=lambda **where: None
+            )
             self._draw = render_fn
 
         def run(self):

@@ -15,7 +15,7 @@ from converters.__main__ import main
 from converters.generate import GenerationError
 from converters.propose.proposals import scan2cad_model
 from converters.propose.retrieval import read_library
-from converters.read.meshes import labels_beside
+from converters.read.meshes import beside
 from converters.read.source import read_source
 from converters.records.errors import SceneRejected
 from converters.records.raw import ScanMesh
@@ -183,9 +183,9 @@ def test_labels_of_a_room_are_read_back(room):
     raw = read_source(room)
     labels = label_scan(raw, by_normal)
     assert len(labels) == len(raw.scan.vertices) and set(labels.tolist()) == {1, 2}
-    np.savez(labels_beside(room), label=labels)
+    np.savez(beside(room, "labels.npz"), label=labels)
     assert np.array_equal(read_source(room).scan.labels, labels)
-    np.savez(labels_beside(room), label=labels[:-1])
+    np.savez(beside(room, "labels.npz"), label=labels[:-1])
     with pytest.raises(SceneRejected, match="labels for the"):
         read_source(room)
 
@@ -195,7 +195,7 @@ def test_the_command_writes_what_the_reader_takes_and_replaces_nothing(room, tmp
     write_weights(tmp_path / "w.npz", net, jax.jit(net.init)(jax.random.key(0), jnp.zeros((1, 8, 8, 8, FEATURES + 2))))
     words = ["segment", str(room), "--weights", str(tmp_path / "w.npz")]
     assert main(words) == 0
-    with np.load(labels_beside(room)) as file:
+    with np.load(beside(room, "labels.npz")) as file:
         assert np.array_equal(read_source(room).scan.labels, file["label"])
     assert main(words) == 2
     assert "give --overwrite" in capsys.readouterr().err
@@ -210,17 +210,17 @@ def test_one_command_makes_a_scene_of_an_unlabelled_mesh_by_the_packaged_weights
     for there, label in ((scan.vertices[:, 2] < -1.2, 2), (np.abs(scan.vertices[:, 2]) < 0.9, 1)):
         assert (scan.labels[there] == label).mean() > 0.8, label
     assert json.loads((tmp_path / "scene" / "scene.json").read_text())["objects"] == []
-    before = labels_beside(room).read_bytes()
+    before = beside(room, "labels.npz").read_bytes()
     main(["convert", str(room), str(tmp_path / "scene"), "--segment", "structure_texture=64", "--overwrite"])
-    assert "is there, kept" in capsys.readouterr().out and labels_beside(room).read_bytes() == before
+    assert "is there, kept" in capsys.readouterr().out and beside(room, "labels.npz").read_bytes() == before
 
 
 def test_models_that_one_command_fitted_are_kept_and_edited(room, tmp_path, capsys):
     floor_m = float(read_source(room).scan.vertices[:, 2].min())
-    np.savez(labels_beside(room), label=np.where(read_source(room).scan.vertices[:, 2] < floor_m + 0.05, 2, 1))
+    np.savez(beside(room, "labels.npz"), label=np.where(read_source(room).scan.vertices[:, 2] < floor_m + 0.05, 2, 1))
     words = ["convert", str(room), str(tmp_path / "scene"), "--segment", "--overwrite", "structure_texture=64"]
     main(words)
-    kept = room.with_name(f"{room.stem}.proposals.json")
+    kept = room.with_name("room.ply.proposals.json")
     (scan,) = json.loads(kept.read_text())
     assert scan["aligned_models"] == [] and f"{kept.name}: 0 models" in capsys.readouterr().out.replace("\n", "")
     chair = read_library(None)["Scopia_kids_desk_chair"]
@@ -237,6 +237,41 @@ def test_models_that_one_command_fitted_are_kept_and_edited(room, tmp_path, caps
         model["proposal"] = {"retrieval_confidence": wrong}
         kept.write_text(json.dumps([scan | {"aligned_models": [model]}]))
         assert main(words) == 2 and "aligned_models[0]" in capsys.readouterr().err
+
+
+def test_files_beside_a_mesh_carry_its_whole_name_and_shorter_names_are_read_where_one_mesh_could_be_meant(room):
+    labels = np.ones(len(read_source(room).scan.vertices), np.uint8)
+    labels[:7] = 2
+    np.savez(room.with_name("room.labels.npz"), label=labels)
+    assert np.array_equal(read_source(room).scan.labels, labels)
+    assert beside(room, "proposals.json").name == "room.ply.proposals.json"
+    other = room.with_name("room.obj")
+    trimesh.load(room).export(other)
+    assert [beside(path, "labels.npz").name for path in (room, other)] == ["room.ply.labels.npz", "room.obj.labels.npz"]
+    assert any("room.ply: has no labels" in warning for warning in read_source(room).warnings)
+    other.unlink()
+    np.savez(room.with_name("room.ply.labels.npz"), label=3 - labels)
+    assert np.array_equal(read_source(room).scan.labels, 3 - labels)
+
+
+def test_a_scene_in_which_nothing_moves_names_the_next_step_and_segment_what_it_gave_up(room, tmp_path, capsys):
+    words = ["convert", str(room), str(tmp_path / "scene"), "structure_texture=64", "--overwrite"]
+    hand = f"'python -m converters annotate {room} -o DIR'"
+    assert main(words) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    first = "no movable object: add --segment to recognise furniture in the scan, or place models by hand with "
+    assert last == first + hand
+    x, _, z = read_source(room).scan.vertices.T
+    labels = np.where(z < z.min() + 0.05, 2, 1)
+    labels[(x > x.max() - 0.05) & (z > z.min() + 0.1)] = 5
+    labels[(x < x.min() + 0.05) & (z > z.min() + 0.1)] = 4
+    np.savez(beside(room, "labels.npz"), label=labels)
+    assert main([*words, "--segment"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    for line in ("no sure model, so part of the structure: 1 chair", "labelled, and never given a model: bed"):
+        assert f"{room}: {line}" in said
+    assert f"{room}: {hand} places models by hand" in said
+    assert said[-1] == f"no movable object: place models by hand with {hand}"
 
 
 @pytest.mark.heavy

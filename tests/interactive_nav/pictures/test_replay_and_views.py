@@ -1,6 +1,7 @@
 """Replays against the environment's own bookkeeping; rays against geometry by hand; videos and maps read back."""
 
 import dataclasses
+import itertools
 import json
 import math
 import subprocess
@@ -264,6 +265,23 @@ def test_parts_of_a_frame(compositor, played):
     assert (depth == depth[..., :1]).all()  # grey
     np.testing.assert_array_equal(frame[120:, -1], np.broadcast_to([24, 28, 36], (20, 3)))
     assert (frame[:120, :160].std((0, 1)) > 5).all()
+
+
+@pytest.mark.parametrize("height", [240, 360, 720])
+def test_words_of_a_caption_stand_apart_within_the_frame(played, room, height):
+    film = record.Compositor(played, load_scene(room), height=height)
+    for step in (0, 20, played.num_steps):
+        strip = film._caption(step)
+        inked = (strip[len(strip) // 2 :] > 120).any((0, 2))
+        assert not inked[-height // 60 :].any()
+        gaps = [
+            len(list(run)) for ink, run in itertools.groupby(inked[inked.argmax() : -inked[::-1].argmax()]) if not ink
+        ]
+        # Spaces are 0.32 em, the letters at most 0.15 em from each other.
+        words = {0: "0.0 s reward 0.00 force 0.0 N", 20: "2.0 s reward 0.0 force 0.0 N touches nothing"}
+        end = "6.0 s did not reach the goal P_eff 0.0 E_eff 0.0 INS_0.5 0.0"
+        count = len(words.get(step, end).split())
+        assert sum(gap >= 0.2 * height / 28 + 0.9 for gap in gaps) in (count - 1, count), (step, gaps)
 
 
 FILM = """

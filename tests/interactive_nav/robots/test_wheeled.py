@@ -376,6 +376,9 @@ def test_pictures_need_no_display():
 
 
 def test_command_prints_the_table_and_the_study_renders(tmp_path, capsys):
+    assert main([]) == 0
+    assert "descriptions of TTbot" in " ".join(get_robot("ttbot").source.split())
+    assert "brief" not in capsys.readouterr().out
     assert main(["--robots", "husky"]) == 0
     text = capsys.readouterr().out
     assert "skid steer" in text and "0.67" in text and "-7.5..7.5 N m" in text
