@@ -172,11 +172,14 @@ class _Drawing:
             else:
                 rooms.append(room)
         shafts = {e: _footprint(e) for e in pieces if e.get("staircaseCutOutShape")}
-        for base in sorted(set(self.base_m.values())):
+        bases = sorted(set(self.base_m.values()))
+        ground = min((self.base_m.get(r.level, 0.0) for r in rooms), default=bases[0])
+        for base, above in zip(bases, [*bases[1:], math.inf], strict=True):
             mine = [w for w in walls if w.base_m == base]
             here = [r for r in rooms if self.base_m.get(r.level, 0.0) == base]
             high = max([self.high_m[r.level] for r in here], default=HEIGHT_M)
-            if base == min(self.base_m.values()) or not here:  # higher up, what no room covers is open to below
+            # Higher up, floor that no room covers is open to below; foundations have no room to stand in.
+            if (here and base == ground) or (not here and above - base > STOREY_M):
                 bare = enclosed(mine, here)
                 if here and bare:
                     area = sum(shapely.area(room.plan) for room in bare)

@@ -360,6 +360,15 @@ def test_what_walls_enclose_without_a_room_is_floor_on_the_ground(tmp_path):
     assert seen(raw, (3.0, -1.5, 2.62), (0, 0, 1)) == () and seen(raw, (3.0, -1.5, 0.0), (0, 0, 1)) != ()
 
 
+def test_a_foundation_below_the_ground_floor_has_no_floor(tmp_path):
+    levels = "".join(f"<level id='{k}' elevation='{z}' height='250'/>" for k, z in (("base", 0), ("ground", 124)))
+    walls = [e.replace("<wall ", "<wall level='base' ") for e in HOME[:4]]
+    walls += [e.replace("<wall ", "<wall level='ground' ") for e in HOME[:4]]
+    raw = read_sh3d(write_home(tmp_path, [levels, *walls, HOME[4].replace("<room ", "<room level='ground' ")]))
+    assert raw.floor_height_m == pytest.approx(1.24)
+    assert seen(raw, (2.0, -1.5, 1.24), (0, 0, 1)) == (16, 32, 48) and seen(raw, (2.0, -1.5, 0.0), (0, 0, 1)) == ()
+
+
 def test_pieces_that_stand_far_apart_are_refused(tmp_path):
     far = wall("far", "990000 0", "990300 0")
     assert "expected a building of at most 100 m" in refusal(write_home(tmp_path, [*HOME[:5], far]))
