@@ -18,6 +18,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from converters.records.errors import SceneRejected
 from converters.segment.voxels import BELOW_M, FEATURES, LAYERS, NAMES, VOXEL_M, Voxels
 from interactive_nav_common.files import write_arrays
+from interactive_nav_common.untrusted.reading import read_npz
 
 WEIGHTS = Path(__file__).with_name("weights.npz")
 """The package's own."""
@@ -138,14 +139,10 @@ def write_weights(path: Path, net: VoxelNet, variables: Any) -> None:
 
 
 def read_weights(path: Path = WEIGHTS) -> tuple[VoxelNet, dict[str, Any]]:
-    """What `write_weights` wrote."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: np.asarray(file[name]) for name in file.files}
+    """Read what `write_weights` wrote."""
+    remedy = "give weights.npz of 'python -m converters segment-train'"
+    with read_npz(path, SceneRejected, remedy) as file:
+        arrays = {name: np.asarray(file[name]) for name in file.files}
         net = VoxelNet(tuple(int(w) for w in arrays.pop("widths")))
         params = {n: jnp.asarray(v * arrays.get(f"{n}@", 1), jnp.float32) for n, v in arrays.items() if n[-1] != "@"}
         return net, {"params": unflatten_dict(params, sep="/")}
-    except (OSError, KeyError, ValueError) as error:
-        raise SceneRejected(
-            f"{path}: no readable weights ({error}); give weights.npz of 'python -m converters segment-train'"
-        ) from error
