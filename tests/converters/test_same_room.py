@@ -26,7 +26,9 @@ def room() -> trimesh.Trimesh:
             parts.append(trimesh.creation.box((LEG_M, LEG_M, 0.68)).apply_translation((x, y, 0.34)))
     parts.append(trimesh.creation.box((0.35, 0.35, 0.45)).apply_translation((-1.2, -0.8, 0.225)))
     joined = trimesh.util.concatenate(parts)
-    vertices, faces = trimesh.remesh.subdivide_to_size(joined.vertices, joined.faces, 0.15)
+    vertices, faces = trimesh.remesh.subdivide_to_size(  # pyright: ignore[reportAssignmentType]
+        joined.vertices, joined.faces, 0.15
+    )
     return trimesh.Trimesh(vertices, faces, process=True)
 
 

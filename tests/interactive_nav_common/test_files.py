@@ -241,7 +241,7 @@ def test_what_comes_from_the_future_was_left_by_a_killed_writer(tmp_path):
     partial.write_text("")
     part.mkdir()
     for path in (partial, part):
-        os.utime(path, (time.time() + 1e6,) * 2)
+        os.utime(path, (time.time() + 1e6, time.time() + 1e6))
     remove_partial(tmp_path)
     remove_stale(tmp_path / "scene")
     assert list(tmp_path.iterdir()) == []

@@ -103,7 +103,7 @@ def test_objects_beyond_the_mapped_floor_are_named():
     free = np.zeros((20, 100), bool)
     free[:, :40] = True  # 2 x 1 m from the origin on, of a map of 5 m
     maps = dataclasses.replace(maps_of(free), origin_w=(0.0, 0.0))
-    distance = ndimage.distance_transform_edt(~maps.traversable, sampling=maps.resolution_m)
+    distance = np.asarray(ndimage.distance_transform_edt(~maps.traversable, sampling=maps.resolution_m))
     assert objects_off(spec.compile(), maps, distance) == ("far", "beyond", "between")
 
 

@@ -54,7 +54,9 @@ def write_layout(root: Path, pillar_m: float, inwards: bool) -> Path:
     if inwards:
         pillar.invert()
     whole = trimesh.util.concatenate([room, pillar])
-    vertices, faces = trimesh.remesh.subdivide_to_size(whole.vertices, whole.faces, 0.1)
+    vertices, faces = trimesh.remesh.subdivide_to_size(  # pyright: ignore[reportAssignmentType]
+        whole.vertices, whole.faces, 0.1
+    )
     lines = [f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in vertices] + [f"f {a} {b} {c}" for a, b, c in faces + 1]
     (root / "mesh_z_up_cleaned.obj").write_text("\n".join(lines) + "\n")
     (root / "floors.txt").write_text("0.0\n")

@@ -254,7 +254,7 @@ def test_files_beside_a_mesh_carry_its_whole_name_and_shorter_names_are_read_whe
     assert np.array_equal(read_source(room).scan.labels, 3 - labels)
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_a_scene_in_which_nothing_moves_names_the_next_step_and_segment_what_it_gave_up(room, tmp_path, capsys):
     words = ["convert", str(room), str(tmp_path / "scene"), "structure_texture=64", "--overwrite"]
     hand = f"'python -m converters annotate {room} -o DIR'"

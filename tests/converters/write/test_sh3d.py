@@ -180,7 +180,9 @@ def test_the_example_is_what_its_drawing_becomes(tmp_path, hull_cache):
     rest, found = (np.array([spec.body(o.name).pos for o in own.objects]) for spec in specs)
     assert len(rest) == 16 and np.abs(rest - found).max() < 0.01
     walls, same = (np.array([[*g.pos, *g.size] for g in spec.geoms if g.name.startswith("wall_")]) for spec in specs)
-    assert walls.shape == same.shape == (23, 6) and np.abs(walls - same).max() < 0.01
+    # The packaged flat was converted when small loose parts were dropped: handles of the counter take a row of cells.
+    assert walls.shape == same.shape == (23, 6)
+    assert np.abs(walls[:, None] - same[None]).max(axis=-1).min(axis=1).max() < 0.051
     export_sh3d(made.folder, tmp_path / "again.sh3d")
     windows, back = ([np.array([*w.middle, *w.half[[0, 2]], w.yaw]) for w in read_sh3d(p).windows]
                      for p in (DRAWN.with_suffix(".sh3d"), tmp_path / "again.sh3d"))  # fmt: skip
@@ -224,7 +226,7 @@ def test_one_mesh_is_written_once(tmp_path):
         ),
         (lambda f: (f / "assets" / "structure_visual.obj").write_text("v 0 0 0"), "home.sh3d", "structure_visual.obj"),
         (lambda f: (f / "assets" / "structure.png").unlink(), "home.sh3d", "structure.png"),
-        (lambda f: (f / "scene.xml").write_text("<mujoco"), "home.sh3d", "MuJoCo refuses it"),
+        (lambda f: (f / "scene.xml").write_text("<mujoco"), "home.sh3d", "not readable as MJCF"),
         (lambda f: None, "home.xml", "expected a new file that ends in .sh3d"),
         (lambda f: (f.parent / "home.sh3d").write_text("kept"), "home.sh3d", "exists, expected a new file"),
     ],

@@ -272,7 +272,7 @@ def test_words_of_a_caption_stand_apart_within_the_frame(played, room, height):
     film = record.Compositor(played, load_scene(room), height=height)
     for step in (0, 20, played.num_steps):
         strip = film._caption(step)
-        inked = (strip[len(strip) // 2 :] > 120).any((0, 2))
+        inked = np.asarray((strip[len(strip) // 2 :] > 120).any((0, 2)))
         assert not inked[-height // 60 :].any()
         gaps = [
             len(list(run)) for ink, run in itertools.groupby(inked[inked.argmax() : -inked[::-1].argmax()]) if not ink

@@ -134,7 +134,7 @@ def test_a_scene_with_no_room_is_refused(tmp_path):
     ("spoil", "message"),
     [
         (lambda d: (d / "scene.xml").unlink(), "scene.xml: no such file"),
-        (lambda d: (d / "scene.xml").write_text("<mujoco>"), "MuJoCo cannot compile it"),
+        (lambda d: (d / "scene.xml").write_text("<mujoco>"), "not readable as MJCF"),
         (lambda d: _rename(d, "chair_0", "chair_7"), "no body named 'chair_7', which its JSON file lists"),
         (lambda d: _empty(d), "traversable map is empty"),
     ],

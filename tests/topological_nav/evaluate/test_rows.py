@@ -18,7 +18,10 @@ def twice(tmp_path):
     (tmp_path / "tracks").mkdir()
     for first, path_m in ((0, [5.0, 6.0, 7.0]), (2, [9.0, 8.0])):
         episodes = np.arange(first, first + len(path_m))
-        table = pa.table({"episode": episodes, "path_m": path_m})
+        others = {name: ["a"] * len(episodes) for name in rows.COLUMNS.text}
+        others |= {name: np.zeros(len(episodes), int) for name in rows.COLUMNS.whole}
+        others |= {name: np.zeros(len(episodes)) for name in rows.COLUMNS.numbers}
+        table = pa.table({**others, "episode": episodes, "path_m": path_m})
         write_parquet(table, tmp_path / "rows" / f"{STEM}-{first:04d}.parquet")
         tracks = {str(n): np.full((2, 2), value, np.float32) for n, value in zip(episodes, path_m, strict=True)}
         np.savez_compressed(tmp_path / "tracks" / f"{STEM}-{first:04d}.npz", **tracks)  # type: ignore[arg-type]

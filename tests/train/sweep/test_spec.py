@@ -116,7 +116,7 @@ def test_machines_can_share_a_sweep():
         ('"{env.robot}_ppo"', '"{env.robot}_pop"', "no preset 'turtlebot_pop', did you mean 'turtlebot_ppo'?"),
         ("name: small", "name: a/b", "name is 'a/b', expected one folder name"),
         ("run.seed: [0, 1]", "run.seed: [0, 1, 1]", "two runs are named 'turtlebot-k_int1-seed1'"),
-        ("  - {env.k_int: 0.0, run.seed: 1}", "  {}", "skip: got {}, expected a list"),
+        ("  - {env.k_int: 0.0, run.seed: 1}", "  {}", "skip: got {} (dict), expected a list"),
         ("ppo.learning_rate: 1e-4", "ppo.num_envs: 1000", "expected a multiple of ppo.num_envs"),
         ("- {env.k_int: 0.0, run.seed: 1}", "- {env.robot: turtlebot}", "no run is left of the grid"),
     ],

@@ -105,7 +105,7 @@ def test_colours_of_vertices_times_the_materials(tmp_path, colours, material):
 
 def test_trimeshs_own_files_keep_the_colours_that_trimesh_shows(tmp_path):
     solid = trimesh.creation.box((1, 1, 1))
-    solid.visual.vertex_colors = [10, 200, 30, 255]
+    solid.visual = trimesh.visual.ColorVisuals(solid, vertex_colors=[10, 200, 30, 255])
     solid.export(tmp_path / "m.glb")
     assert colour(read(tmp_path)[0]) == (10, 200, 30)
     solid.visual = trimesh.visual.TextureVisuals(np.zeros((8, 2)), image=Image.new("RGB", (2, 2), (10, 200, 30)))

@@ -484,7 +484,7 @@ def test_walls_without_thickness_are_thin_and_rooms_that_cross_themselves_keep_a
     ("ends", "more"), [(("0 0", "90000 0"), ""), (("0 0", "300 0"), f"arcExtent='{2 * math.pi - 1e-4}'")]
 )
 def test_walls_that_are_larger_than_a_building_are_named(tmp_path, ends, more):
-    assert refusal(write_home(tmp_path, [*HOME, wall("far", *ends, more)])).endswith(
+    assert refusal(write_home(tmp_path, [*HOME, wall("far", ends[0], ends[1], more)])).endswith(
         "<wall> far: is larger than 100 m; mend the drawing"
     )
 
