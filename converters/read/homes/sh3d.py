@@ -164,7 +164,7 @@ class _Drawing:
             part = wall_part(wall, openings, looks, boards)
             low = wall.height_m.max() < LOW_M
             parts += [] if part is None else [dataclasses.replace(part, low=low)]
-        rooms, floors_m = [], set()
+        rooms, floors_m, bases = [], set(), sorted(set(self.base_m.values()))
         for e in self._seen("room"):
             room = read_room(e, self.models.look)
             if room is None:
@@ -172,14 +172,12 @@ class _Drawing:
             else:
                 rooms.append(room)
         shafts = {e: _footprint(e) for e in pieces if e.get("staircaseCutOutShape")}
-        bases = sorted(set(self.base_m.values()))
         ground = min((self.base_m.get(r.level, 0.0) for r in rooms), default=bases[0])
         for base, above in zip(bases, [*bases[1:], math.inf], strict=True):
             mine = [w for w in walls if w.base_m == base]
             here = [r for r in rooms if self.base_m.get(r.level, 0.0) == base]
             high = max([self.high_m[r.level] for r in here], default=HEIGHT_M)
-            # Higher up, floor that no room covers is open to below; foundations have no room to stand in.
-            if (here and base == ground) or (not here and above - base > STOREY_M):
+            if (here and base == ground) or (not here and above - base > STOREY_M):  # else open to below, or too low
                 bare = enclosed(mine, here)
                 if here and bare:
                     area = sum(shapely.area(room.plan) for room in bare)
