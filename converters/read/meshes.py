@@ -21,7 +21,7 @@ from trimesh.visual import ColorVisuals
 
 from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.geometry.upright import AXES, UNITS_M, faces_away, find_unit, find_up, turn_upright
-from converters.read.files import SourceFolder, check_mesh, read_labels
+from converters.read.files import SourceFolder, as_number, check_mesh, read_labels
 from converters.read.formats.gltf import read_gltf
 from converters.read.obj import (
     TexturedMesh,
@@ -41,7 +41,10 @@ from interactive_nav_common.errors import readable
 
 SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".dae", ".off")
 """Of files that may be a scan."""
-COLLADA_UNUSED = ("animation", "camera", "controller", "light", "lines", "linestrips", "trifans", "tristrips")
+COLLADA_UNUSED = (
+    *("animation", "camera", "controller", "light", "lines", "linestrips", "trifans", "tristrips", "emission"),
+    "colours of vertices beside a material",
+)
 PLY_USED = {"element vertex", "element face"} | {
     f"property {name}"
     for name in (
@@ -139,8 +142,13 @@ def _read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedM
 def _unused(path: Path) -> dict[str, int]:
     """Count what trimesh's readers pass over."""
     if path.suffix.lower() == ".dae":
-        elements = collections.Counter(e.tag.rpartition("}")[2] for e in ElementTree.parse(path).iter())
-        return {tag: elements[tag] for tag in COLLADA_UNUSED if elements[tag]}
+        root = ElementTree.parse(path).getroot()
+        elements = collections.Counter(e.tag.rpartition("}")[2] for e in root.iter())
+        glow = ((e.findtext("{*}color") or "1").split()[:3] for e in root.iterfind(".//{*}emission"))
+        elements["emission"] = sum(any(as_number(value) > 0 for value in colour) for colour in glow)
+        painted = (e for e in root.iter() if e.get("material") and e.find("{*}input[@semantic='COLOR']") is not None)
+        elements["colours of vertices beside a material"] = sum(1 for _ in painted)
+        return {what: count for what, count in elements.items() if count and what in COLLADA_UNUSED}
     content = path.read_bytes()
     if path.suffix.lower() == ".ply":
         lines = [line.split() for line in content.partition(b"end_header")[0].decode("latin-1").splitlines()]

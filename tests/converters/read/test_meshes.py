@@ -137,6 +137,30 @@ DAE = """<?xml version="1.0"?>
 """
 
 
+def test_emission_and_vertex_colours_beside_a_material_are_reported(tmp_path):
+    source = dae(tmp_path, "")
+    path = next(tmp_path.rglob("*.dae"))
+    relative = source.inside(path)
+    text = path.read_text()
+    read_surface(source, relative, "")
+    assert not any("not used" in w for w in source.warnings)
+    glow = "<emission><color sid='emission'>{} 0 0 1</color></emission>"
+    lit = text.replace("<lambert>", "<lambert>" + glow.format(0.5)).replace(
+        "<p>", '<input semantic="COLOR" source="#p" offset="0"/><p>'
+    )
+    path.write_text(lit)
+    source = SourceFolder(tmp_path)
+    read_surface(source, relative, "")
+    assert {w for w in source.warnings if "not used" in w} == {
+        f"{relative}: not used: 1 emission",
+        f"{relative}: not used: 1 colours of vertices beside a material",
+    }
+    path.write_text(text.replace("<lambert>", "<lambert>" + glow.format("0.000000")))
+    source = SourceFolder(tmp_path)
+    read_surface(source, relative, "")
+    assert not any("not used" in w for w in source.warnings)
+
+
 def dae(root: Path, asset: str, texture: str = "../images/t%20t.png") -> SourceFolder:
     pytest.importorskip("collada")
     (root / "models").mkdir(exist_ok=True)
