@@ -135,7 +135,7 @@ class RobotSpec:
     source: str = ""
     """Where the figures come from."""
     reference: str = ""
-    """The file, or the function of a Python file, from which `get_robot` builds it again; empty if its name suffices."""
+    """The file, or the function of a Python file, that `get_robot` builds it from again; empty if its name suffices."""
 
     @property
     def action_size(self) -> int:
