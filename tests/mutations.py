@@ -104,7 +104,7 @@ def _merges(levels: int) -> str:
 
 
 ANCHORS = (_aliases, _merges, lambda levels: f" &c{levels} {{a: *c{levels}}}\n", lambda levels: " &e" * levels + " 1\n")
-"""What a YAML file may hold that stands for more than it is."""
+"""YAML whose aliases expand to far more than the file holds."""
 
 
 def _parquet(data: bytes, rng: np.random.Generator) -> bytes:

@@ -172,13 +172,13 @@ def _joined(path: Path, parts: list[TexturedMesh]) -> TexturedMesh:
 def read_single_mesh(
     path: Path, strict: bool = False, up: str = "auto", unit: str = "auto", mirror: bool = False
 ) -> RawScene:
-    """Reads a scan that is one mesh file. Without labels beside it structure is told by shape.
+    """Read a scan that is one mesh file; without labels beside it, structure is recognised by its shape.
 
     Args:
         path: of the file; what it names must lie in its folder.
         strict: refuse what would be repaired with a warning.
-        up: word of `AXES`, or `auto`: found.
-        unit: word of `UNITS_M`, or `auto`: told by the height.
+        up: word of `AXES`, or `auto` to detect it.
+        unit: word of `UNITS_M`, or `auto` to infer it from the height.
         mirror: take -x for x.
     """
     source = SourceFolder(path.parent, strict)

@@ -30,7 +30,7 @@ LEARNER, ENV_STATE, META = "learner.msgpack", "env_state.npz", "meta.json"
 
 @dataclasses.dataclass(frozen=True)
 class CheckpointMeta:
-    """What a checkpoint is of; `meta.json`."""
+    """The content of `meta.json`: which run, robot, observations and step a checkpoint belongs to."""
 
     env_steps: Natural
     wall_s: float
@@ -138,16 +138,18 @@ def find(root: Path, which: str) -> tuple[Path, CheckpointMeta]:
     intact, faults = {}, []
     for path in reversed(paths):
         try:
-            intact[verify(path).env_steps] = path
+            meta = verify(path)
+            intact[meta.env_steps] = path, meta
         except CheckpointError as error:
-            faults.append(error)
+            if (path / META).exists() or not intact:  # else the run that trains removed it meanwhile
+                faults.append(error)
     if not intact:
         raise faults[0]
-    metas = [read_meta(path) for path in reversed(intact.values())]
+    metas = [meta for _, meta in reversed(intact.values())]
     chosen = (best_checkpoint(metas) if which == "best" else None) or metas[-1]
     for error in faults:
         warnings.warn(f"{error}; the checkpoint at {chosen.env_steps} steps is used", stacklevel=2)
-    return intact[chosen.env_steps], chosen
+    return intact[chosen.env_steps]
 
 
 def set_aside(root: Path, after: int) -> list[Path]:
@@ -162,7 +164,7 @@ def set_aside(root: Path, after: int) -> list[Path]:
 
 
 def read_meta(folder: Path) -> CheckpointMeta:
-    """What a checkpoint is of."""
+    """Read `meta.json` of a checkpoint."""
     reader = Reader(CheckpointError, "remove this checkpoint", finite=False)
     return reader.record(reader.json(folder / META), CheckpointMeta, str(folder / META))
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import shutil
 import types
+import warnings
 
 import flax.serialization
 import numpy as np
@@ -124,3 +126,18 @@ def test_an_exported_policy_has_a_digest_of_its_own(tmp_path):
     flip(kept / "policy.npz")
     with pytest.raises(CheckpointError, match="policy.npz: damaged"):
         checkpoint.verify(kept)
+
+
+def test_a_checkpoint_that_training_removes_meanwhile_is_no_fault(three, monkeypatch):
+    """An evaluation looks while a run trains: the oldest checkpoint goes between listing and reading."""
+    verify = checkpoint.verify
+
+    def slow(folder):
+        if folder.name.endswith("100"):
+            shutil.rmtree(folder)
+        return verify(folder)
+
+    monkeypatch.setattr(checkpoint, "verify", slow)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert checkpoint.find(three, "last")[1].env_steps == 300
