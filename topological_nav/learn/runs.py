@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import yaml
 
-from interactive_nav_common.errors import readable
+from interactive_nav_common.errors import readable, regular
 from interactive_nav_common.files import append_text, whole_file, write_text
 from interactive_nav_common.locks import alone_in
 from interactive_nav_common.records import Reader, read_metrics
@@ -129,7 +129,7 @@ def packed(content: bytes) -> bytes:
 def weights_content(run: Path) -> bytes:
     """The msgpack of a run's weights, whether it was exported or not."""
     path = run / PACKED_WEIGHTS
-    return unpack(path.read_bytes(), "xz") if path.is_file() else (run / WEIGHTS).read_bytes()
+    return unpack(path.read_bytes(), "xz") if path.is_file() else regular(run / WEIGHTS).read_bytes()
 
 
 @dataclasses.dataclass(frozen=True)

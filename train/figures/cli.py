@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from interactive_nav_common.errors import FileError, reports_errors
+from interactive_nav_common.errors import FileError, reports_errors, regular
 from interactive_nav_common.records import METRICS, PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_rows
 from interactive_nav_common.untrusted.reading import read_npz
@@ -55,7 +55,7 @@ class Results:
     def facts(self, run: Path) -> tuple[tuple[str, str, float], int] | None:
         """(cell, seed) of a run folder; None where it does not say."""
         try:
-            kept = json.loads((run / "summary.json").read_text())
+            kept = json.loads(regular(run / "summary.json").read_text())
             return (kept["robot"], kept["algorithm"], float(kept["k_int"])), int(kept["seed"])
         except (OSError, ValueError, KeyError, TypeError):
             return None

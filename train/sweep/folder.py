@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from interactive_nav_common.errors import FileError
+from interactive_nav_common.errors import FileError, regular
 from interactive_nav_common.files import remove_partial, write_text
 from interactive_nav_common.locks import is_locked
 from interactive_nav_common.records import RUNS
@@ -176,7 +176,7 @@ def _read(files: tuple[str, ...]) -> tuple[Any, str]:
 def _tail(path: Path) -> list[str]:
     """The last lines of a file; none where there is none."""
     try:
-        with open(path, "rb") as file:
+        with open(regular(path), "rb") as file:
             file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL_BYTES))
             return file.read().decode(errors="replace").splitlines()
     except OSError:

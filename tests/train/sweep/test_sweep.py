@@ -466,3 +466,8 @@ def test_unfinished_runs_can_be_evaluated_as_far_as_they_are(tmp_path):
     set_fates(tmp_path, {})
     outcome, _, folder = sweep(path)
     assert {s.state for s in outcome.states} == {"done"} and all(p.stat().st_mtime_ns > t for p, t in before.items())
+
+
+def test_a_fifo_in_place_of_metrics_does_not_block(tmp_path):
+    os.mkfifo(tmp_path / "metrics.jsonl")
+    assert last_line(tmp_path / "metrics.jsonl") == {}
