@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from interactive_nav_common.errors import FileError, reports_errors, regular
+from interactive_nav_common.errors import FileError, regular, reports_errors
 from interactive_nav_common.records import METRICS, PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_rows
 from interactive_nav_common.untrusted.reading import read_npz
