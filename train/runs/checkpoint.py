@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav_common.config import Natural
-from interactive_nav_common.errors import FileError
+from interactive_nav_common.errors import FileError, regular
 from interactive_nav_common.files import check_name, writing
 from interactive_nav_common.records import Reader
 from interactive_nav_common.untrusted.reading import read_npz
@@ -199,7 +199,7 @@ def load_learner(folder: Path, template: Any) -> Any:
         learner = policy_file.read(path, template)
     else:
         try:
-            learner = flax.serialization.from_bytes(template, path.read_bytes())
+            learner = flax.serialization.from_bytes(template, regular(path).read_bytes())
         except Exception as error:  # msgpack and flax raise many kinds for a damaged or foreign file
             raise CheckpointError(
                 f"{path}: not a checkpoint of this learner ({' '.join(str(error).split())[:200]}); "
@@ -264,7 +264,7 @@ def _remove(folder: Path) -> None:
 
 
 def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return hashlib.sha256(regular(path).read_bytes()).hexdigest()
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -14,6 +14,7 @@ import flax.serialization
 import flax.traverse_util
 import numpy as np
 
+from interactive_nav_common.errors import regular
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.untrusted.reading import read_npz, unpack
 from train.errors import CheckpointError
@@ -84,7 +85,7 @@ def unpacked(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def write(source: Path, algorithm: str, target: Path, step: float = STEP) -> None:
     """A `learner.msgpack` as a `policy.npz`."""
-    learner = flax.serialization.msgpack_restore(source.read_bytes())
+    learner = flax.serialization.msgpack_restore(regular(source).read_bytes())
     with whole_file(target) as partial, open(partial, "wb") as file:
         np.savez(file, **packed(acting_part(learner, algorithm), step))  # type: ignore[arg-type]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import os
 import shutil
 import types
 import warnings
@@ -141,3 +142,11 @@ def test_a_checkpoint_that_training_removes_meanwhile_is_no_fault(three, monkeyp
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert checkpoint.find(three, "last")[1].env_steps == 300
+
+
+def test_a_fifo_in_place_of_the_learner_is_refused(three):
+    path = three / "000000000300" / checkpoint.LEARNER
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(CheckpointError, match="no regular file but a FIFO"):
+        checkpoint.load_learner(path.parent, LEARNER)
