@@ -25,7 +25,7 @@ from converters.segmenting import SEGMENTING, label_unlabelled, next_step, propo
 from converters.tables import alignment_table, bounds, gate_table, proposal_tables
 from interactive_nav_common.config import read_words, refuse_unused
 from interactive_nav_common.errors import UserError, printable, reports_errors
-from interactive_nav_common.progress import SafeConsole, stage_progress, warn_once
+from interactive_nav_common.jobs.progress import SafeConsole, stage_progress, warn_once
 from interactive_nav_common.signals import STOPS, interrupts_heard, number_of
 from interactive_nav_common.words import Command, Commands, Parser, add_words, read_commands
 from scenes_mjcf.schema import CATEGORIES

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from interactive_nav_common.config import read_words, refuse_unused
 from interactive_nav_common.errors import FileError
-from interactive_nav_common.progress import stage_progress
+from interactive_nav_common.jobs.progress import stage_progress
 from scenes_mjcf.sets import HERE, PACKAGED, in_cache, is_listed, packaged_set
 
 

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from converters.records.errors import SceneRejected
 from interactive_nav_common.files import write_arrays, write_text
-from interactive_nav_common.progress import stage_progress
+from interactive_nav_common.jobs.progress import stage_progress
 
 UNFIT = ("bed", "cabinet", "lamp")
 """Classes of furniture that `propose` does not look for."""

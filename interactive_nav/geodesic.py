@@ -1,169 +1,17 @@
-"""Occupancy grids in, geodesic distances and shortest paths out; two solvers.
+"""Build the graph of convex corners that holds every geodesic distance and shortest path of an occupancy grid.
 
-The environment's is `corner_graph`: among blocked squares a shortest path is straight but where it bends
-round a corner, so the corners' mutual distances, and which corners each place sees, hold every distance
-from anywhere to anywhere (`interactive_nav.navigation.lookup` looks them up inside jit).
-
-`distance_field` is for any map and goal inside jit: shortest paths on a grid whose nodes are the free
-cells' centres and whose edges are the 32 moves of `STENCIL`, each allowed only where every cell that it
-crosses is free. The largest gap between the moves' directions is 18.4 degrees, so in open space a distance
-is at most 1/cos(9.2 deg) - 1 = 1.3 % too long, where an 8-connected grid errs by up to 8.2 %.
+Among blocked squares a shortest path is straight except where it bends round a corner, so the corners' mutual
+distances, and which corners each place sees, give every distance from anywhere to anywhere
+(`interactive_nav.navigation.lookup` looks them up inside jit).
 """
 
 import dataclasses
-import functools
-import math
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-import scipy.ndimage
 import scipy.sparse
 import scipy.sparse.csgraph
 
-
-def _moves() -> tuple[tuple[int, int], ...]:
-    base = [(0, 1), (1, 1), (1, 2), (1, 3), (2, 3)]
-    moves = set()
-    for a, b in base:
-        for r, c in ((a, b), (b, a)):
-            moves |= {(sr * r, sc * c) for sr in (1, -1) for sc in (1, -1)}
-    return tuple(sorted(moves))
-
-
-STENCIL = _moves()
-"""(row, column) moves; 32 of them, with their negatives."""
-
-
-@functools.cache
-def crossed_cells(move: tuple[int, int]) -> tuple[tuple[int, int], ...]:
-    """Cells (row, column offsets) that the segment between two cell centres passes through or touches.
-
-    Both end cells are included. A diagonal through a corner includes the two cells beside the corner,
-    so that a path cannot slip between two blocked cells.
-    """
-    dr, dc = move
-    cells = set()
-    lo_r, hi_r, lo_c, hi_c = min(0, dr), max(0, dr), min(0, dc), max(0, dc)
-    length = math.hypot(dr, dc)
-    for r in range(lo_r, hi_r + 1):
-        for c in range(lo_c, hi_c + 1):
-            # Distance of the cell's centre from the line against the cell's half width along the normal.
-            distance = abs(r * dc - c * dr) / length
-            reach = 0.5 * (abs(dr) + abs(dc)) / length
-            if distance <= reach + 1e-9:
-                cells.add((r, c))
-    return tuple(sorted(cells))
-
-
-def _shifted(xp, array, dr: int, dc: int, fill):
-    """out[r, c] = array[r + dr, c + dc], `fill` outside."""
-    rows, columns = array.shape[-2:]
-    pad = 4
-    padded = xp.pad(array, ((pad, pad), (pad, pad)), constant_values=fill)
-    return padded[pad + dr : pad + dr + rows, pad + dc : pad + dc + columns]
-
-
-def _edge_masks(xp, free):
-    """For each move, [rows, columns] bool: whether it may start at the cell."""
-    masks = []
-    for move in STENCIL:
-        mask = free
-        for r, c in crossed_cells(move):
-            mask = mask & _shifted(xp, free, r, c, False)
-        masks.append(mask)
-    return masks
-
-
-def distance_field(
-    traversable,
-    resolution: float,
-    goal_xy,
-    origin: tuple[float, float] = (0.0, 0.0),
-    radius_m: float = 0.0,
-    max_iterations: int = 10_000,
-):
-    """Geodesic distance of every cell centre to a goal, jit-able and vmap-able over goals and maps.
-
-    Args:
-        traversable: [rows along y, columns along x] bool, static structure only.
-        resolution: cell side, m.
-        goal_xy: (2,) world x, y, m. The goal's cell takes its distance from the goal point itself.
-        origin: world x, y of the outer corner of cell [0, 0], m.
-        radius_m: body radius, m; cells nearer than this to a blocked cell are not free. Needs a
-            concrete (not traced) map when positive.
-        max_iterations: bound on relaxation sweeps; one sweep advances a front by 1 to 3 cells.
-
-    Returns:
-        [rows, columns] float32, m; inf where unreachable, and everywhere if the goal lies in a blocked
-        cell or outside the map.
-
-    Raises:
-        ValueError: the map is not two-dimensional, or the resolution is not positive.
-    """
-    if getattr(traversable, "ndim", 0) != 2:
-        raise ValueError(f"traversable has shape {getattr(traversable, 'shape', None)}, expected [rows, columns]")
-    if resolution <= 0:
-        raise ValueError(f"resolution is {resolution} m, expected a positive cell side")
-    if radius_m > 0:
-        traversable = clearance(np.asarray(traversable), resolution) >= radius_m
-    free = jnp.asarray(traversable, bool)
-    rows, columns = free.shape
-    goal = jnp.asarray(goal_xy, jnp.float32)
-    x = origin[0] + (jnp.arange(columns) + 0.5) * resolution
-    y = origin[1] + (jnp.arange(rows) + 0.5) * resolution
-    own = (jnp.abs(x - goal[0])[None, :] <= resolution / 2) & (jnp.abs(y - goal[1])[:, None] <= resolution / 2)
-    straight = jnp.hypot(x[None, :] - goal[0], y[:, None] - goal[1])
-    start = jnp.where(own & free, straight, jnp.inf)
-    masks = _edge_masks(jnp, free)
-    lengths = [resolution * math.hypot(*move) for move in STENCIL]
-
-    def unfinished(carry):
-        _, changed, i = carry
-        return changed & (i < max_iterations)
-
-    def body(carry):
-        field, _, i = carry
-        new = field
-        for move, mask, length in zip(STENCIL, masks, lengths, strict=True):
-            candidate = _shifted(jnp, field, *move, jnp.inf) + length
-            new = jnp.where(mask, jnp.minimum(new, candidate), new)
-        return new, jnp.any(new < field), i + 1
-
-    field, _, _ = jax.lax.while_loop(unfinished, body, (start, jnp.asarray(True), 0))
-    return field
-
-
-def clearance(traversable: np.ndarray, resolution_m: float) -> np.ndarray:
-    """[rows, columns] metres from each cell's centre to the border of the nearest cell that is blocked, or lies beyond
-    the map (0 if blocked itself): a disc of no larger radius may stand there."""
-    padded = np.pad(np.asarray(traversable, bool), 1)
-    distance = np.asarray(scipy.ndimage.distance_transform_edt(padded), float)[1:-1, 1:-1]
-    return np.maximum(distance - 0.5, 0.0) * resolution_m
-
-
-def sampled_clearance(traversable: np.ndarray, resolution_m: float, cell_m: float) -> np.ndarray:
-    """[ceil(rows * resolution / cell), ...] metres: `clearance` at the centres of `cell_m` squares, bilinear."""
-    rows, columns = (math.ceil(n * resolution_m / cell_m - 1e-9) for n in traversable.shape)
-    r = (np.arange(rows) + 0.5) * cell_m / resolution_m - 0.5
-    c = (np.arange(columns) + 0.5) * cell_m / resolution_m - 0.5
-    grid = np.meshgrid(r, c, indexing="ij")
-    return scipy.ndimage.map_coordinates(clearance(traversable, resolution_m), grid, order=1, cval=0.0)
-
-
-def cell_centres(cells: np.ndarray, cell_m: float, origin_w: tuple[float, float]) -> np.ndarray:
-    """[n, 2] m, world: centres of the cells [rows along y, columns along x] that are set, row by row."""
-    rows, columns = np.nonzero(cells)
-    return np.asarray(origin_w) + (np.stack([columns, rows], -1) + 0.5) * cell_m
-
-
-def largest_component(free: np.ndarray) -> np.ndarray:
-    """The largest 4-connected component of a [rows, columns] bool map (all False if there is none)."""
-    labels, count = scipy.ndimage.label(free)  # type: ignore[misc]
-    if count == 0:
-        return np.zeros_like(free)
-    sizes = np.bincount(labels.ravel())[1:]
-    return labels == 1 + int(np.argmax(sizes))
+from interactive_nav_common.grids import clearance, largest_component, nearest_cell, sampled_clearance
 
 
 def navigation_grid(
@@ -321,7 +169,7 @@ def _nodes(free: np.ndarray, ratio: int) -> tuple[np.ndarray, np.ndarray]:
     r, c = np.nonzero(has_node)
     own = best[has_node]
     points = np.stack([c * ratio + own % ratio + 0.5, r * ratio + own // ratio + 0.5], -1)
-    _, nearest = scipy.ndimage.distance_transform_edt(~has_node, return_indices=True)  # type: ignore[misc]
+    nearest = nearest_cell(has_node)
     index = np.full(has_node.shape, -1, np.int64)
     index[has_node] = np.arange(len(points))
     return index[nearest[0], nearest[1]], points

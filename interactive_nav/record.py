@@ -39,7 +39,7 @@ from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav.sensing.base import CameraPose, Lens, look_along
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.files import whole_file
-from interactive_nav_common.progress import SafeConsole, progress_bar
+from interactive_nav_common.jobs.progress import SafeConsole, progress_bar
 from interactive_nav_common.rotations import yaw_from_quat
 from interactive_nav_common.words import add_words, program, read_commands
 

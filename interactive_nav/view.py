@@ -17,7 +17,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from interactive_nav.geodesic import cell_centres, clearance
 from interactive_nav.navigation.tables import furniture_map
 from interactive_nav.pictures.camera import BEHIND_M
 from interactive_nav.pictures.scene_model import cast, furnished_spec
@@ -26,6 +25,7 @@ from interactive_nav.scenes.objects import SPLITS, VISUAL_GROUP, SmallObject, ad
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav.sensing.base import look_along
 from interactive_nav_common.errors import UserError, missing, reports_errors
+from interactive_nav_common.grids import cell_centres, clearance
 from interactive_nav_common.untrusted.guard import guarded_server
 from interactive_nav_common.words import program
 

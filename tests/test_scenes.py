@@ -13,8 +13,8 @@ from PIL import Image
 
 from converters.check.gates import LIMITS, eroded, free_space_values, judge
 from converters.generate.models.cad import TEST_MODELS, TRAIN_MODELS, cad_model
-from converters.geometry.density import label_pieces
 from converters.recipes import load_recipes
+from interactive_nav_common.grids import label
 from scenes_mjcf.schema import SceneManifest, load_manifest, load_maps
 
 ROOT = Path(__file__).parents[1]
@@ -98,11 +98,11 @@ def test_gates_pass_and_mujoco_loads_it(name):
 def test_robots_reach_all_rooms_through_the_static_structure(name):
     maps = load_maps(SCENES / name)
     for radius_m in (0.18, 0.30):  # TurtleBot, Fetch
-        pieces, count = label_pieces(eroded(maps.traversable, maps.resolution_m, radius_m), np.ones((3, 3)))
+        pieces, count = label(eroded(maps.traversable, maps.resolution_m, radius_m))
         size = np.bincount(pieces.ravel())[1:] * maps.resolution_m**2
         # Slivers between a cupboard and a corner may be cut off; a room may not.
         assert count and size.sum() - size.max() < 0.5
-    pieces, _ = label_pieces(eroded(maps.traversable, maps.resolution_m, 0.45), np.ones((3, 3)))
+    pieces, _ = label(eroded(maps.traversable, maps.resolution_m, 0.45))
     assert np.bincount(pieces.ravel())[1:].max() * maps.resolution_m**2 > 5.0  # JackRabbot
 
 

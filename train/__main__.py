@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from interactive_nav_common.errors import reports_errors
-from interactive_nav_common.progress import SafeConsole
+from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.words import Parser
 from train import config_io
 from train.config import TrainConfig

@@ -16,7 +16,7 @@ from interactive_nav.episodes import EpisodeFile, EpisodeFileError, load_all
 from interactive_nav.types import FAILURES
 from interactive_nav_common.config import refuse_unused, replace
 from interactive_nav_common.errors import ConfigError, reports_errors
-from interactive_nav_common.progress import SafeConsole
+from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.rows import write_parquet
 from interactive_nav_common.signals import STOPS, interrupts_heard, number_of
 from interactive_nav_common.words import program

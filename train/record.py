@@ -12,7 +12,7 @@ from typing import Any
 from interactive_nav.pictures.replay import replay_path
 from interactive_nav.record import add_picture_words, check_picture_words, record
 from interactive_nav_common.errors import reports_errors
-from interactive_nav_common.progress import SafeConsole
+from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.words import program
 from train import replay
 from train.config import EnvConfig

@@ -18,7 +18,7 @@ from interactive_nav.episodes import load, starts_of
 from interactive_nav.pictures import replay
 from interactive_nav_common.config import refuse_unused
 from interactive_nav_common.errors import ConfigError, reports_errors
-from interactive_nav_common.progress import SafeConsole
+from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.words import program
 from scenes_mjcf.sets import installed
 from train.config import EnvConfig

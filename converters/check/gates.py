@@ -13,8 +13,8 @@ from scipy.spatial.distance import pdist
 
 from converters.check.agreement import manifest_values, wall_values
 from converters.check.surfaces import surface_values
-from converters.geometry.density import clearance_m, label_pieces
 from converters.records.gate import Gate, Limit
+from interactive_nav_common.grids import clearance, largest_component
 from interactive_nav_common.records import read_packaged
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, SceneObject, load_manifest, load_maps
 
@@ -110,19 +110,14 @@ def physical_values(model: mujoco.MjModel, named: dict[str, str] | None = None) 
 
 def eroded(traversable: np.ndarray, resolution_m: float, radius_m: float) -> np.ndarray:
     """Cells whose middle is at least the radius from all that is not traversable, map edge included."""
-    return clearance_m(traversable, resolution_m) >= radius_m
+    return clearance(traversable, resolution_m) >= radius_m
 
 
 def _largest_piece(maps: SceneMaps) -> tuple[np.ndarray, np.ndarray]:
     """Cells where the disc's middle may be, all of them hanging together; and every cell's distance to them, m."""
-    free = eroded(maps.traversable, maps.resolution_m, ROBOT_RADIUS_M)
-    pieces, count = label_pieces(free, np.ones((3, 3)))
-    if not count:
-        return free, np.full(free.shape, np.inf)
-    piece = pieces == int(np.argmax(np.bincount(pieces.ravel())[1:])) + 1
+    piece = largest_component(eroded(maps.traversable, maps.resolution_m, ROBOT_RADIUS_M))
     distance = ndimage.distance_transform_edt(~piece, sampling=maps.resolution_m)
-    assert isinstance(distance, np.ndarray)
-    return piece, distance
+    return piece, np.asarray(distance) if piece.any() else np.full(piece.shape, np.inf)
 
 
 def free_space_values(maps: SceneMaps) -> dict[str, float]:

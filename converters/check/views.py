@@ -11,9 +11,9 @@ from PIL import Image
 from converters.check.object_preview import geom_outline
 from converters.check.render import Camera, Picture, looking_at, over
 from converters.check.surfaces import geom_surface
-from converters.geometry.density import clearance_m
 from converters.geometry.faces import face_vectors
 from converters.records.visual import TexturedMesh
+from interactive_nav_common.grids import clearance
 from scenes_mjcf.schema import SceneMaps
 
 ELEVATION_RAD = math.radians(53.0)
@@ -99,7 +99,7 @@ def _vantage(
     model: mujoco.MjModel, data: mujoco.MjData, surfaces: dict[str, TexturedMesh], maps: SceneMaps
 ) -> tuple[np.ndarray, np.ndarray]:
     """Place (2,) and heading (2,) with most objects, the larger and nearer the better, before no wall."""
-    clear = clearance_m(maps.traversable, maps.resolution_m)
+    clear = clearance(maps.traversable, maps.resolution_m)
     rows, columns = np.nonzero(clear >= min(FREE_M, 0.8 * float(clear.max())))
     some = np.unique(np.linspace(0, len(rows) - 1, PLACES).astype(int))
     places = np.array(maps.origin_w) + maps.resolution_m * (np.stack([columns, rows], axis=1)[some] + 0.5)

@@ -9,7 +9,8 @@ import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
-from scipy import ndimage
+
+from interactive_nav_common.grids import clearance, label
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,24 +26,6 @@ ROBOTS = {"turtlebot": Disc(0.18, 0.41), "fetch": Disc(0.31, 1.12)}
 """Robots whose shares that must be pushed are told, as their specifications have them."""
 
 
-def clearance_m(free: np.ndarray, cell_m: float) -> np.ndarray:
-    """Distance in metres from each free cell's middle to the nearest cell that is not free; 0 where it is not.
-
-    What lies beyond the raster is not free.
-    """
-    padded = np.pad(free, 1)
-    distance = np.asarray(ndimage.distance_transform_edt(padded))[1:-1, 1:-1]
-    return distance * cell_m - cell_m / 2 * free
-
-
-def label_pieces(mask: np.ndarray, structure: np.ndarray | None = None) -> tuple[np.ndarray, int]:
-    """Numbered connected pieces and how many there are (`scipy.ndimage.label`, its type stated)."""
-    numbered = np.zeros(mask.shape, np.int32)
-    count = ndimage.label(mask, structure, output=numbered)
-    assert isinstance(count, int)
-    return numbered, count
-
-
 @dataclasses.dataclass(frozen=True)
 class Ways:
     """Where a disc gets on a floor without movables."""
@@ -55,7 +38,7 @@ class Ways:
     @classmethod
     def of(cls, static_free: np.ndarray, cell_m: float, radius_m: float) -> Ways:
         """Of a floor with nothing on it but what is fixed."""
-        return cls(cell_m, radius_m, label_pieces(clearance_m(static_free, cell_m) >= radius_m)[0])
+        return cls(cell_m, radius_m, label(clearance(static_free, cell_m) >= radius_m)[0])
 
     def must_push_share(self, room_m: np.ndarray) -> float:
         """Share of the pairs of places between which the disc finds no way that avoids everything.
@@ -65,7 +48,7 @@ class Ways:
         Returns:
             0 where nothing is in the way; 0 too where the disc fits nowhere.
         """
-        now = label_pieces((room_m >= self.radius_m) & (self.region > 0))[0]
+        now = label((room_m >= self.radius_m) & (self.region > 0))[0]
         here = now > 0
         with_movables = np.bincount(now[here]).astype(float)
         without = np.bincount(self.region[here]).astype(float)
@@ -80,8 +63,6 @@ def must_push_shares(static_free: np.ndarray, free: Mapping[str, np.ndarray], ce
         static_free: (rows, columns) bool, without movables.
     """
     return {
-        robot: Ways.of(static_free, cell_m, disc.radius_m).must_push_share(
-            clearance_m(free[robot] & static_free, cell_m)
-        )
+        robot: Ways.of(static_free, cell_m, disc.radius_m).must_push_share(clearance(free[robot] & static_free, cell_m))
         for robot, disc in ROBOTS.items()
     }

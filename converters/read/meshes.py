@@ -44,6 +44,7 @@ SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".dae", ".off")
 COLLADA_UNUSED = (
     *("animation", "camera", "controller", "light", "lines", "linestrips", "trifans", "tristrips", "emission"),
     "colours of vertices beside a material",
+    "textures that do not repeat",
 )
 PLY_USED = {"element vertex", "element face"} | {
     f"property {name}"
@@ -146,6 +147,8 @@ def _unused(path: Path) -> dict[str, int]:
         elements = collections.Counter(e.tag.rpartition("}")[2] for e in root.iter())
         glow = ((e.findtext("{*}color") or "1").split()[:3] for e in root.iterfind(".//{*}emission"))
         elements["emission"] = sum(any(as_number(value) > 0 for value in colour) for colour in glow)
+        modes = (e.text or "" for tag in ("wrap_s", "wrap_t") for e in root.iterfind(f".//{{*}}{tag}"))
+        elements["textures that do not repeat"] = sum(mode.strip() not in ("", "WRAP") for mode in modes)
         painted = (e for e in root.iter() if e.get("material") and e.find("{*}input[@semantic='COLOR']") is not None)
         elements["colours of vertices beside a material"] = sum(1 for _ in painted)
         return {what: count for what, count in elements.items() if count and what in COLLADA_UNUSED}
@@ -154,6 +157,9 @@ def _unused(path: Path) -> dict[str, int]:
         lines = [line.split() for line in content.partition(b"end_header")[0].decode("latin-1").splitlines()]
         words = [f"{line[0]} {line[-1] if line[0] == 'property' else line[1]}" for line in lines if len(line) > 2]
         return collections.Counter(w for w in words if w.startswith(("property", "element")) and w not in PLY_USED)
+    if path.suffix.lower() == ".stl" and len(content) == 84 + 50 * int.from_bytes(content[80:84], "little"):
+        colours = np.frombuffer(content, np.uint8, offset=84).reshape(-1, 50)[:, 48:]
+        return {"colours of faces": count} if (count := int(colours.any(axis=1).sum())) else {}
     if path.suffix.lower() == ".off":
         rows = [line.partition("#")[0].split() for line in content.decode("latin-1").splitlines()]
         body = [row for row in rows if row][1:]

@@ -9,6 +9,7 @@ import dataclasses
 import math
 import os
 import unicodedata
+from collections.abc import Callable
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -26,10 +27,12 @@ GREY = (170, 170, 170)
 """Colour of what has none."""
 MAX_TEXTURE_PX = 8192
 """Textures of several materials are joined in an image of at most this width; wider ones are shrunk."""
-UNUSED = ("ke", "map_ke", "map_ka", "map_d", "map_tr")
-"""Statements of an MTL that change what viewers show, unless their numbers are 0."""
-NUMBERED = {"-o": 0.0, "-s": 1.0, "-t": 0.0}
-"""Options of a texture that take one to three numbers, and what the absent ones are; -mm takes two, others one word."""
+UNUSED = ("ke", "map_ke", "map_ka", "map_d", "map_tr", "d", "tr")
+"""Statements of an MTL that change what viewers show, unless their numbers are 0 (of `d`: 1)."""
+NUMBERED = {"-o": 0.0, "-s": 1.0, "-t": 0.0, "-mm": 1.0}
+"""Options of a texture that take one to three numbers (-mm: two), and the value of absent ones; others take a word."""
+UNUSED_OPTIONS = ("-cc", "-imfchan", "-t")
+"""Options of a texture that change what viewers show."""
 SMALL_IMAGE = 10_000
 """Numbers in an image that is compared with others to be kept once."""
 
@@ -74,15 +77,11 @@ def use_found(source: SourceFolder, folder: Path, name: str, by: str) -> Path | 
 
 
 def read_materials(
-    source: SourceFolder, obj: Path, libraries: tuple[str, ...], moved: dict[str, np.ndarray] | None = None
-) -> dict[str, np.ndarray]:
-    """Image of every material of an OBJ's MTL files; a material without a usable texture gets its colour (Kd).
+    source: SourceFolder, obj: Path, libraries: tuple[str, ...]
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Return the image of every material of an OBJ's MTL files, and the `texture_options` of those that have any.
 
-    Args:
-        moved: takes the (2, 2) scale and offset of the texture coordinates of materials that have them.
-
-    Returns:
-        Material -> (h, w, 3) uint8; (1, 1, 3) for a plain colour.
+    An image is (h, w, 3) uint8; a material without a usable texture has one pixel of its colour (Kd).
     """
     where = source.relative(obj) or obj.name
     each = [[n] if find_file(source, obj.parent, n) else n.split() for n in libraries]  # a line may name several
@@ -95,21 +94,24 @@ def read_materials(
             f"{where}: its material file {', '.join(libraries) or '(none named)'} is missing; it stays grey"
         )
     result: dict[str, np.ndarray] = {}
+    placings: dict[str, np.ndarray] = {}
     for path in paths:
         text = read_text(path)
-        lines = [line.split() for line in text.split("\n") if line.lower().lstrip().startswith(UNUSED)]
-        words = [line[0] for line in lines if any(as_number(word) != 0 for word in line[1:])]
-        for word, count in sorted(collections.Counter(words).items()):
-            source.note(f"{source.relative(path)}: not used: {count} {word}")
+        unused: collections.Counter[str] = collections.Counter()
+        for key, *words in (line.split() for line in text.split("\n") if line.lower().lstrip().startswith(UNUSED)):
+            unused[key] += key.lower() in UNUSED and any(as_number(word) != (key == "d") for word in words)
         for name, (colour, named) in parse_mtl(text).items():
             result[name] = np.array(colour, np.uint8).reshape(1, 1, 3)
             if named:
-                image_name, placing = texture_options(named)
+                image_name, placing = texture_options(named, unused)
                 image = read_texture(source, path, image_name)
-                if moved is not None and (placing != [[1, 1], [0, 0]]).any():
-                    moved[name] = placing
+                if image is not None and (placing != PLAIN).any():
+                    (base, gain), placings[name] = placing[3], placing
+                    image = np.clip(np.round(255 * base + gain * image.astype(float)), 0, 255).astype(np.uint8)
                 result[name] = result[name] if image is None else image
-    return result
+        for word, count in sorted((+unused).items()):
+            source.note(f"{source.relative(path)}: not used: {count} {word}")
+    return result, placings
 
 
 def read_texture(source: SourceFolder, by: Path, name: str) -> np.ndarray | None:
@@ -150,26 +152,72 @@ def parse_mtl(text: str) -> dict[str, tuple[tuple[int, int, int], str]]:
     return result
 
 
-def texture_options(text: str) -> tuple[str, np.ndarray]:
-    """Split the value of a `map_Kd`: name of the file, and (2, 2) the scale and the offset of its coordinates."""
-    placing = np.array([[1.0, 1.0], [0.0, 0.0]])
+PLAIN = np.array([[1.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 1.0]])
+"""`texture_options` of a texture without options."""
+
+
+def texture_options(text: str, unused: collections.Counter[str]) -> tuple[str, np.ndarray]:
+    """Split the value of a `map_Kd` into the name of its file and its options; count those that are not read.
+
+    The options (4, 2) are the scale and the offset of texture coordinates, 1 or 0 (they are clamped or repeat), and the
+    base and the gain of the image.
+    """
+    placing = PLAIN.copy()
     while (words := text.split(None, 1))[0].startswith("-") and len(words) > 1:
         option, text = words[0].lower(), words[1]
+        unused[option] += option in UNUSED_OPTIONS
         values: list[float] = []
-        while option in NUMBERED and len(values) < 3 and math.isfinite(as_number(text.split(None, 1)[0])):
+        most = 2 if option == "-mm" else 3
+        while option in NUMBERED and len(values) < most and math.isfinite(as_number(text.split(None, 1)[0])):
             first, *rest = text.split(None, 1)
             values, text = [*values, float(first)], "".join(rest)
             if not text:
                 return "", placing
         if option not in NUMBERED:
-            text = text.split(None, 2 if option == "-mm" else 1)[-1]
+            word, text = [*text.split(None, 1), "", ""][:2]
+            placing[2] = word.lower() == "on" if option == "-clamp" else placing[2]
         elif option != "-t":
-            placing[int(option == "-o")] = [*values, NUMBERED[option], NUMBERED[option]][:2]
+            placing[("-s", "-o", "", "-mm").index(option)] = [*values, NUMBERED[option], NUMBERED[option]][:2]
     return text, placing
 
 
-def read_painted_obj(source: SourceFolder, relative: str, remedy: str) -> tuple[ObjMesh, np.ndarray, list[np.ndarray]]:
-    """Reads an OBJ with all its materials.
+def wrapped(
+    uv: np.ndarray, images: list[np.ndarray], modes: tuple[str, str]
+) -> tuple[np.ndarray, list[np.ndarray], bool]:
+    """Return texture coordinates and images that show by repeating what other ways of wrapping show.
+
+    Args:
+        uv: (m, 3, 2) of faces, origin at the lower left.
+        images: (h, w, 3) of one size.
+        modes: along u and v: `repeat`, `mirror` or `clamp`.
+
+    Returns:
+        The coordinates, the images, and whether a face lies across an edge at which its texture is clamped: it shows
+        the texture up to there, stretched.
+    """
+    across = False
+    for k, mode in enumerate(modes):
+        beyond = (uv[..., k] < -1e-3) | (uv[..., k] > 1 + 1e-3)
+        if mode == "repeat" or not beyond.any():
+            continue
+        uv, axis = uv.copy(), 1 - k
+        if mode == "mirror":
+            images = [np.concatenate([i, np.flip(i, axis)][:: 1 - 2 * k], axis) for i in images]
+            uv[..., k] /= 2
+        else:
+            half = 0.5 / images[0].shape[axis]
+            uv[..., k] = np.clip(uv[..., k], half, 1 - half)
+            across = across or bool((beyond.any(axis=1) & ~beyond.all(axis=1)).any())
+    return uv, images, across
+
+
+def read_painted_obj(
+    source: SourceFolder, relative: str, remedy: str, builtin: Callable[[str], np.ndarray] | None = None
+) -> tuple[ObjMesh, np.ndarray, list[np.ndarray]]:
+    """Read an OBJ with all its materials.
+
+    Args:
+        builtin: return the image of a material that is in no file; the default warns, and takes grey.
 
     Returns:
         The mesh, (m,) image of each face, the images (h, w, 3) uint8: none where the file has no colour at all.
@@ -178,26 +226,31 @@ def read_painted_obj(source: SourceFolder, relative: str, remedy: str) -> tuple[
     mesh = read_obj(path)
     for word, count in sorted(mesh.unused.items()):
         source.note(f"{relative}: not used: {count} {word}")
-    if mesh.corner_uv is None and not mesh.libraries and mesh.colours is None:
+    if builtin is None and mesh.corner_uv is None and not mesh.libraries and mesh.colours is None:
         source.note(f"{relative}: has no texture; it stays grey")
         return mesh, np.zeros(len(mesh.faces), np.int64), []
-    moved: dict[str, np.ndarray] = {}
-    images = read_materials(source, path, mesh.libraries, moved) if mesh.libraries or mesh.colours is None else {}
+    no_file = not mesh.libraries and (builtin is not None or mesh.colours is not None)
+    images, placings = ({}, {}) if no_file else read_materials(source, path, mesh.libraries)
     grey = np.array(GREY, np.uint8).reshape(1, 1, 3)
-    chosen = [images.get(name, grey) for name in mesh.materials]
+    chosen = [images[name] if name in images else grey if builtin is None else builtin(name) for name in mesh.materials]
     absent = sorted({n for n in mesh.materials if n not in images})
-    if images and absent:
+    if images and absent and builtin is None:
         source.repaired(f"{relative}: material '{absent[0]}' is in no material file; it stays grey")
     number = mesh.material.copy()
     if (number < 0).any():
         # Faces before any `usemtl`: with one material in the file they mean that one.
-        only = next(iter(images.values())) if len(images) == 1 else grey
+        only = next(iter(images.values())) if len(images) == 1 else grey if builtin is None else builtin("")
         number[number < 0] = len(chosen)
         chosen.append(only)
     uv = np.zeros((len(mesh.faces), 3, 2)) if mesh.corner_uv is None else mesh.corner_uv.copy()
-    for name, (scale, offset) in moved.items():
-        of = np.array([n == name for n in mesh.materials] + [False])[mesh.material]
-        uv[of] = uv[of] * scale + offset
+    for k, name in enumerate(mesh.materials):
+        of = mesh.material == k
+        if name in placings and of.any():
+            scale, offset, clamped, _ = placings[name]
+            modes = ("clamp", "clamp") if clamped.any() else ("repeat", "repeat")
+            uv[of], _, across = wrapped(uv[of] * scale + offset, [chosen[k]], modes)
+            if across:
+                source.note(f"{relative}: faces of '{name}' lie across a texture's edge: stretched there")
     plain = np.array([image.shape[:2] == (1, 1) for image in chosen])[number]
     if mesh.colours is not None and plain.any():
         # Viewers differ in what colours of vertices do to a texture: there they are left out.

@@ -31,7 +31,10 @@ READ = {
     "contact": "lateral_friction | rolling_friction spinning_friction stiffness damping inertia_scaling contact_cfm "
     "contact_erp",
     "material": "color",
-}
+    "origin": "@xyz @rpy", "mass": "@value", "mesh": "@filename @scale", "box": "@size", "sphere": "@radius",
+    "cylinder": "@radius @length", "capsule": "@radius @length", "cone": "@radius @length", "ellipsoid": "@radii",
+    "parent": "@link", "child": "@link", "color": "@rgba", "lateral_friction": "@value",
+}  # fmt: skip
 """Element -> the names within it (@ before attributes) that are read and, after `|`, that change nothing seen."""
 MOST_KINDS = 30
 """Of elements that are reported as not read."""
@@ -115,8 +118,6 @@ def count_unread(root: ElementTree.Element, table: dict[str, str], unread: Count
     left = [(root, root.tag)]
     while left:
         element, row = left.pop()
-        if row not in table and not len(element):
-            continue
         used, _, more = table.get(row, "").partition("|")
         known = {*used.split(), *more.split(), *table["any"].split()}
         unread.update(f"{key}= of <{element.tag}>" for key in element.attrib if f"@{key}" not in known)

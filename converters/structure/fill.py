@@ -16,7 +16,6 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from converters.bodies.objects import PlacedObject, to_world
-from converters.geometry.density import label_pieces
 from converters.geometry.faces import (
     count_samples,
     face_areas,
@@ -31,6 +30,7 @@ from converters.records.raw import CEILING, FLOOR, STRUCTURE_LABELS
 from converters.records.visual import ColourCloud
 from converters.structure.floor import LIFT_M
 from converters.structure.maps import FloorPlan
+from interactive_nav_common.grids import label
 from interactive_nav_common.rotations import yaw_matrix
 
 WALL_TOLERANCE_M, FLOOR_TOLERANCE_M = 0.04, 0.05
@@ -183,7 +183,7 @@ class Shown:
         """Vertices (k, 3) m and faces (j, 3) that cover hidden cells; they look along the normal."""
         rearmost = ndimage.minimum_filter(self.depth_m, OVERLAP)
         rearmost = np.where(np.isfinite(rearmost), rearmost, 0.0) - BEHIND_M
-        pieces, count = label_pieces((_grown(hidden, OVERLAP) & self.seen) | _grown(hidden, FREE))
+        pieces, count = label((_grown(hidden, OVERLAP) & self.seen) | _grown(hidden, FREE))
         done = [(np.zeros((0, 3)), np.zeros((0, 3), np.int64))]
         for k in range(1, count + 1):
             cells = np.argwhere(pieces == k)[:, ::-1] * self.cell_m + self.low
@@ -254,7 +254,7 @@ def hidden_wall(plan: FloorPlan, shown: Shown, objects: tuple[PlacedObject, ...]
         mask = doors if placed.hinge is not None else shadow
         mask[: int(max(index[:, 1].max() + margin, 0)) + 1, left : right + 1] = True
     hidden = shadow & ~doors & _extent(plan, shown) & ~shown.seen
-    pieces, count = label_pieces(hidden, np.ones((3, 3)))
+    pieces, count = label(hidden)
     for k in range(1, count + 1):
         border = _grown(pieces == k, 1) & (pieces == 0)
         border[:OVERLAP] = False

@@ -17,11 +17,11 @@ from scipy import ndimage
 from shapely import MultiPoint, contains_xy
 
 from converters.bodies.objects import PlacedObject, to_world
-from converters.geometry.density import label_pieces
 from converters.geometry.faces import beyond_block, face_labels, face_vectors, sampled, unit_normals
 from converters.records.errors import SceneRejected
 from converters.records.raw import CEILING, DOOR, FLOOR, STRUCTURE_LABELS, UNLABELLED, GivenMap
 from converters.structure.enclosure import beyond_obstacles, floor_outside
+from interactive_nav_common.grids import label
 from interactive_nav_common.rotations import yaw_matrix
 
 RESOLUTION_M = 0.05
@@ -161,7 +161,7 @@ def swept_by_door(grid: Grid, placed: PlacedObject, margin_m: float = LEAF_MARGI
 
 
 def _drop_small(mask: np.ndarray, least_cells: int) -> np.ndarray:
-    pieces, _ = label_pieces(mask, np.ones((3, 3)))
+    pieces, _ = label(mask)
     size = np.bincount(pieces.ravel())
     size[0] = 0
     return (size >= least_cells)[pieces]
@@ -174,7 +174,7 @@ def _fill_holes(floor: np.ndarray, occupied: np.ndarray, resolution_m: float) ->
     """
     known = floor | occupied
     enclosed = np.asarray(ndimage.binary_fill_holes(known), bool) & ~known
-    holes, count = label_pieces(enclosed)
+    holes, count = label(enclosed)
     result = floor.copy()
     for k in range(1, count + 1):
         hole = holes == k
@@ -189,8 +189,8 @@ def _bridge(floor: np.ndarray, occupied: np.ndarray, resolution_m: float) -> np.
     """Adds unseen regions, up to `BRIDGE_M` wide, in which nothing stands and which part two pieces of floor."""
     line = np.ones((1, round(BRIDGE_M / resolution_m) + 1))
     between = np.logical_or(ndimage.binary_closing(floor, line), ndimage.binary_closing(floor, line.T))
-    pieces, _ = label_pieces(_drop_small(floor, math.ceil(MIN_FREE_M2 / resolution_m**2)), np.ones((3, 3)))
-    gaps, count = label_pieces(between & ~floor & ~occupied)
+    pieces, _ = label(_drop_small(floor, math.ceil(MIN_FREE_M2 / resolution_m**2)))
+    gaps, count = label(between & ~floor & ~occupied)
     for k in range(1, count + 1):
         beside = pieces[np.asarray(ndimage.binary_dilation(gaps == k, np.ones((3, 3))), bool)]
         if np.count_nonzero(np.unique(beside)) > 1:
@@ -203,7 +203,7 @@ def _without_insides(free: np.ndarray, shown: _Shown, resolution_m: float) -> np
 
     What stands around a room faces it; the sides of a solid face away from its inside.
     """
-    pieces, count = label_pieces(free)
+    pieces, count = label(free)
     size = np.bincount(pieces.ravel(), minlength=count + 1) * resolution_m**2
     size[0] = 0.0
     facing, around = np.zeros((2, count + 1))

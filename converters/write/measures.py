@@ -16,10 +16,11 @@ from scipy.sparse import csgraph
 from scipy.spatial import ConvexHull
 
 from converters.bodies.objects import PlacedObject, to_world
-from converters.geometry.density import ROBOTS, clearance_m, label_pieces, must_push_shares
+from converters.geometry.density import ROBOTS, must_push_shares
 from converters.geometry.faces import face_areas
 from converters.structure.maps import Grid
 from converters.write.emit import SceneParts
+from interactive_nav_common.grids import clearance, label
 from scenes_mjcf.schema import SceneMaps
 
 NAVIGATION_CELL_M = 0.1
@@ -57,7 +58,7 @@ def navigation_complexity(free: np.ndarray, cell_m: float, radius_m: float) -> f
         1 where there is no such pair.
     """
     step = max(round(NAVIGATION_CELL_M / cell_m), 1)
-    region = label_pieces((clearance_m(free, cell_m) >= radius_m)[step // 2 :: step, step // 2 :: step])[0]
+    region = label((clearance(free, cell_m) >= radius_m)[step // 2 :: step, step // 2 :: step])[0]
     if not region.any():
         return 1.0
     mask = region == 1 + np.bincount(region.ravel())[1:].argmax()

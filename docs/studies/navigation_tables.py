@@ -17,11 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.measurement import command_line, timed
-from interactive_nav.geodesic import CornerGraph, clearance, corner_graph, navigation_grid
+from interactive_nav.geodesic import CornerGraph, corner_graph, navigation_grid
 from interactive_nav.navigation import lookup
 from interactive_nav.navigation.tables import navigation_tables
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.types import SceneTables
+from interactive_nav_common.grids import clearance
 
 RADIUS_M, FINE_M, CELL_M = 0.18, 0.05, 0.1
 POINTS, BATCH = 800, 64

@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.config import TaskRules
-from interactive_nav.geodesic import CornerGraph, cell_centres, corner_graph, navigation_grid, sampled_clearance
+from interactive_nav.geodesic import CornerGraph, corner_graph, navigation_grid
 from interactive_nav.navigation.lookup import geodesic_at, goal_field
 from interactive_nav.navigation.placement import CLEARANCE_M
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import World
 from interactive_nav.types import SceneTables
+from interactive_nav_common.grids import cell_centres, sampled_clearance
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.schema import SceneError
 

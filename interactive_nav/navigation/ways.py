@@ -4,19 +4,24 @@ Ways are found by Dijkstra on a grid, round everything that can be moved or, at 
 movable obstacles; Stilman and Kuffner 2005, Interactive Gibson section II-D).
 """
 
-import math
-from collections.abc import Iterable
 from typing import Any
 
 import mujoco
 import numpy as np
 import scipy.ndimage
-import scipy.sparse
 import scipy.sparse.csgraph
 import scipy.spatial
 
-from interactive_nav.geodesic import crossed_cells, largest_component, sampled_clearance
 from interactive_nav.navigation.tables import friction_share
+from interactive_nav_common.grids import (
+    MOVES_16,
+    follow,
+    grid_graph,
+    label,
+    largest_component,
+    nearest_cell,
+    sampled_clearance,
+)
 
 CELL_M = 0.05
 MARGIN_M = 0.02
@@ -28,7 +33,6 @@ START_OFF_M = 0.3
 """The free cell that stands for a start lies this near."""
 FORCED_COST = 1e3
 """Metres of detour that a metre through an object is worth at weight 1: it is pushed only where no way is free."""
-MOVES = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
 
 
 class Footprints:
@@ -119,35 +123,6 @@ class _SceneGrid:
         return int(np.clip(r, 0, self.shape[0] - 1)), int(np.clip(c, 0, self.shape[1] - 1))
 
 
-def grid_graph(
-    free: np.ndarray, cost: np.ndarray, step_m: float, moves: Iterable[tuple[int, int]], corners: bool = True
-) -> scipy.sparse.csr_matrix:
-    """Undirected graph of cells: a move is there where every cell that it crosses is free.
-
-    Args:
-        free: [rows, columns] bool.
-        cost: [rows, columns] of a metre; a move's is the mean of the cells that it crosses.
-        moves: (row, column), one way each.
-    """
-    rows, columns = free.shape
-    index, pad = np.arange(rows * columns).reshape(rows, columns), 3
-    open_, price = np.pad(free, pad), np.pad(cost, pad)
-    first, second, weight = [], [], []
-    for move in moves:
-        ok, mean, cells = np.ones(free.shape, bool), np.zeros(free.shape), crossed_cells(move)
-        priced = cells if corners or abs(move[0]) != abs(move[1]) else ((0, 0), move)
-        for r, c in cells:
-            part = (slice(pad + r, pad + r + rows), slice(pad + c, pad + c + columns))
-            ok &= open_[part]
-            mean += price[part] / len(priced) if (r, c) in priced else 0.0
-        at = np.nonzero(ok)
-        first.append(index[at])
-        second.append(index[at[0] + move[0], at[1] + move[1]])
-        weight.append(step_m * math.hypot(*move) * mean[at])
-    entries = (np.concatenate(weight), (np.concatenate(first), np.concatenate(second)))
-    return scipy.sparse.csr_matrix(entries, shape=(rows * columns,) * 2)
-
-
 class PathGrid:
     """Ways over one grid by Dijkstra over 16 moves; the graph is made once.
 
@@ -161,9 +136,9 @@ class PathGrid:
         self._any = bool(free.any())
         if not self._any:
             return
-        _, self._nearest = scipy.ndimage.distance_transform_edt(~free, return_indices=True)  # type: ignore[misc]
+        self._nearest = nearest_cell(free)
         self._index = np.arange(rows * columns).reshape(rows, columns)
-        self._graph = grid_graph(free, cost, CELL_M, MOVES, corners=False)
+        self._graph = grid_graph(free, cost, CELL_M, MOVES_16, corners=False)
 
     def path(self, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray:
         """The cheapest one between two cells.
@@ -181,12 +156,7 @@ class PathGrid:
         _, previous = scipy.sparse.csgraph.dijkstra(
             self._graph, directed=False, indices=target, return_predecessors=True
         )
-        path = [source]
-        while path[-1] != target:
-            if previous[path[-1]] < 0:
-                return np.zeros((0, 2), np.int64)
-            path.append(previous[path[-1]])
-        return np.stack(np.unravel_index(path, self._shape), -1)
+        return np.stack(np.unravel_index(np.array(follow(previous, source, target), np.int64), self._shape), -1)
 
 
 class Ways:
@@ -225,10 +195,10 @@ class Ways:
         free, _ = self._costs(grid, qpos)
         if not free.any():
             return False
-        nearest: np.ndarray = scipy.ndimage.distance_transform_edt(~free, return_distances=False, return_indices=True)  # type: ignore
+        nearest = nearest_cell(free)
         ends = np.stack([nearest[:, *grid.cell(xy)] for xy in (start_xy_w, goal_xy_w)])
         # No move cuts a corner, so what the moves join is joined by cells that share sides.
-        region, _ = scipy.ndimage.label(free)  # type: ignore[misc]
+        region, _ = label(free)
         one = region[tuple(ends[0])] == region[tuple(ends[1])]
         return bool(one and self._near(grid.middles_w(ends), start_xy_w, goal_xy_w))
 

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from interactive_nav.robots import get_robot, robot_names
 from interactive_nav_common.errors import reports_errors
-from interactive_nav_common.progress import SafeConsole
+from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.words import program
 
 

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from scipy import ndimage
 
-from interactive_nav.geodesic import clearance, largest_component
+from interactive_nav_common.grids import clearance, largest_component
 from scenes_mjcf.agreement import differences
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps
 

@@ -20,10 +20,10 @@ from converters.generate.design.doors import wall_behind_m
 from converters.generate.design.furnish import SIDE_WALL_M
 from converters.generate.design.space import GRID_M, passes, room_mask, static_grid, without
 from converters.generate.models.cad import HOME_TEST_MODELS, TEST_MODELS, TRAIN_MODELS
-from converters.geometry.density import clearance_m
 from converters.pipeline import ConvertConfig
 from converters.recipes import chosen, load_recipes, make_scenes, parse_recipes
 from interactive_nav_common.errors import FileError
+from interactive_nav_common.grids import clearance
 
 SCENES = Path(__file__).parents[2] / "scenes_mjcf"
 TINY = """
@@ -337,6 +337,6 @@ def test_a_blocker_leaves_a_doorway_too_narrow_for_a_robot():
         masks = [room_mask(empty, plan.rooms[i]) for i in d.rooms]
         here = masks[0] | masks[1] | room_mask(empty, d.rect)
         width = 2 * recipe.building.robot_radius_m
-        assert passes(clearance_m(empty & here, GRID_M), masks, width)
-        blocked += any(not passes(clearance_m(without(empty, [c]) & here, GRID_M), masks, width) for c in chairs)
+        assert passes(clearance(empty & here, GRID_M), masks, width)
+        blocked += any(not passes(clearance(without(empty, [c]) & here, GRID_M), masks, width) for c in chairs)
     assert blocked >= recipe.building.n_blockers == 1

@@ -240,7 +240,7 @@ def test_the_original_small_objects_rest(sample_data, tmp_path, hull_cache, name
     about = convert_object(source, tmp_path / "out", ObjectConfig(category=category), hull_cache)
     assert about["mass_kg"] == pytest.approx(mass_kg, abs=1e-5) and about["friction"] == friction
     assert about["hull_source"] == "collision mesh" and 1 <= about["n_hulls"] <= 16
-    assert about["warnings"] == [
+    assert [w for w in about["warnings"] if "rpy= of <mesh>: not read" not in w] == [
         f"model_{name}.mtl: names the texture 'texture_{name}.png', which is missing; the material's plain colour is "
         "taken"
     ]

@@ -6,7 +6,7 @@ import io
 
 from converters.check.gates import judge
 from converters.tables import gate_table
-from interactive_nav_common.progress import SafeConsole
+from interactive_nav_common.jobs.progress import SafeConsole
 
 
 def test_verdicts_are_words_without_markup():

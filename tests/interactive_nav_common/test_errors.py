@@ -12,7 +12,7 @@ import pytest
 from rich.table import Table
 
 from interactive_nav_common.errors import ConfigError, UserError, readable, reports_errors
-from interactive_nav_common.progress import SafeConsole
+from interactive_nav_common.jobs.progress import SafeConsole
 
 ROOT = Path(__file__).parents[2]
 
@@ -60,7 +60,7 @@ def test_a_long_value_is_cut_out_of_a_message():
 PRINTS = """
 import sys
 from interactive_nav_common.errors import reports_errors
-from interactive_nav_common.progress import SafeConsole
+from interactive_nav_common.jobs.progress import SafeConsole
 
 @reports_errors("program")
 def main():

@@ -10,7 +10,7 @@ from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.config import overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import write_text
-from interactive_nav_common.progress import SafeConsole
+from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.signals import stop_signals
 from scenes_mjcf.sets import scene_folders
 from topological_nav.commands.maps import build

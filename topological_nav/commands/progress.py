@@ -4,7 +4,7 @@ import sys
 import time
 from contextlib import contextmanager
 
-from interactive_nav_common.progress import SafeConsole, progress_bar
+from interactive_nav_common.jobs.progress import SafeConsole, progress_bar
 from topological_nav.errors import Asked, Progress, Stopped
 
 

@@ -15,8 +15,7 @@ import numpy as np
 import scipy.ndimage
 from scipy.sparse.csgraph import dijkstra
 
-from interactive_nav.geodesic import STENCIL
-from interactive_nav.navigation.ways import grid_graph
+from interactive_nav_common.grids import MOVES_32, grid_graph, nearest_cell
 from interactive_nav_common.rotations import wrap_angle
 from topological_nav.config import ExpertConfig
 from topological_nav.scenes.space import FreeSpace
@@ -66,9 +65,7 @@ def way_field(space: FreeSpace, goals_w: np.ndarray, config: ExpertConfig, limit
         xy = np.asarray(space.origin_w) + np.stack([c, r], -1) * space.resolution_m
         return np.linalg.norm(xy - goals_w[:, None, None], axis=-1).astype(np.float32)
     cost = 1.0 + config.near_cost * np.clip(1.0 - room / config.near_m, 0.0, 1.0)
-    moves = [move for move in STENCIL if move > (0, 0)]  # the other way is the same edge
-    graph = grid_graph(free, cost, space.resolution_m, moves)
-    _, nearest = scipy.ndimage.distance_transform_edt(~free, return_indices=True)  # type: ignore[misc]
+    graph, nearest = grid_graph(free, cost, space.resolution_m, MOVES_32), nearest_cell(free)
     column, row = space.inner_cells(goals_w).T
     source = nearest[0][row, column] * columns + nearest[1][row, column]
     far = dijkstra(graph, directed=False, indices=source, limit=limit_m).reshape(-1, rows, columns)

@@ -13,7 +13,7 @@ from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.progress import SafeConsole
+from interactive_nav_common.jobs.progress import SafeConsole
 from topological_nav.config import PASSAGE_POLICY, DataConfig, EvaluationConfig, MapConfig
 from topological_nav.data.domains import as_seen_from, preset
 from topological_nav.data.folders import lens_of

@@ -8,9 +8,9 @@ import dataclasses
 import numpy as np
 import shapely
 
-from interactive_nav.geodesic import cell_centres, clearance
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.topdown import shadow
+from interactive_nav_common.grids import cell_centres, clearance
 from topological_nav.errors import SpaceError
 
 _FREE_M = 1e-6

@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.console import Console
 
-from interactive_nav_common.progress import progress_bar
+from interactive_nav_common.jobs.progress import progress_bar
 
 
 class TrainingDisplay:

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from interactive_nav.episodes import EpisodeFile, starts_of
 from interactive_nav_common.files import write_arrays
-from interactive_nav_common.progress import progress_bar
+from interactive_nav_common.jobs.progress import progress_bar
 from interactive_nav_common.versions import versions
 from train.config import TrainConfig
 from train.learners.algorithms import ALGORITHMS

@@ -8,7 +8,7 @@ from pathlib import Path
 from interactive_nav_common.config import refuse_unused
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.jobs.processes import Launcher
-from interactive_nav_common.progress import SafeConsole
+from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.signals import stop_signals
 from interactive_nav_common.words import program
 from train.config_io import known_in

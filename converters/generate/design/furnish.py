@@ -17,7 +17,7 @@ from converters.generate.design.instance import Instance, place
 from converters.generate.design.plan import Plan, Rect, doorway_zone
 from converters.generate.design.space import GRID_M, free_grid, passes, room_mask, rooms_joined, without
 from converters.generate.models.cad import CadModel, Models
-from converters.geometry.density import clearance_m
+from interactive_nav_common.grids import clearance
 
 SIDE_WALL_M = 0.35
 """A side wall this close behind the hinge leaves no way through behind an open leaf."""
@@ -142,7 +142,7 @@ def _narrow(
         here = masks[0] | masks[1] | room_mask(before, d.rect) if local else np.ones_like(before)
         if not state.effort.spend(CHECK_PLACES):
             return None
-        if int(k) in used or not passes(clearance_m(before & here, GRID_M), masks, max(high, 2 * cfg.robot_radius_m)):
+        if int(k) in used or not passes(clearance(before & here, GRID_M), masks, max(high, 2 * cfg.robot_radius_m)):
             continue
         model, scale = state.models.draw("chair", rng, cfg.passage_chairs)
         for _ in range(25):
@@ -156,7 +156,7 @@ def _narrow(
             if not state.fits(item, d.rooms[side], zones=False) or any(item.footprint.intersects(s) for s in sweeps):
                 continue
             state.effort.spend(CHECK_PLACES)
-            room_m = clearance_m(without(before, [item]) & here, GRID_M)
+            room_m = clearance(without(before, [item]) & here, GRID_M)
             if passes(room_m, masks, low) and not passes(room_m, masks, high):
                 used.add(int(k))
                 state.add(item, d.rooms[side])

@@ -10,7 +10,7 @@ import shapely
 from converters.generate.design.instance import Instance
 from converters.generate.design.maps import floor_maps
 from converters.generate.design.plan import Plan, Rect
-from converters.geometry.density import clearance_m, label_pieces
+from interactive_nav_common.grids import clearance, label
 
 GRID_M = 0.05
 
@@ -58,7 +58,7 @@ def room_mask(grid: np.ndarray, room: Rect) -> np.ndarray:
 
 def rooms_joined(grid: np.ndarray, plan: Plan, radius_m: float, least_m2: float = 0.4) -> bool:
     """True where a disc of `radius_m` reaches `least_m2` or more of every room from every other."""
-    region = label_pieces(clearance_m(grid, GRID_M) >= radius_m)[0]
+    region = label(clearance(grid, GRID_M) >= radius_m)[0]
     if not region.any():
         return False
     main = region == 1 + np.argmax(np.bincount(region.ravel())[1:])
@@ -73,5 +73,5 @@ def passes(room_m: np.ndarray, masks: list[np.ndarray], width_m: float) -> bool:
         masks: two of (n, n) bool.
         width_m: the disc's diameter.
     """
-    region = label_pieces(room_m >= width_m / 2)[0]
+    region = label(room_m >= width_m / 2)[0]
     return bool(set(np.unique(region[masks[0]])) & set(np.unique(region[masks[1]])) - {0})

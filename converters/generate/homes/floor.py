@@ -14,7 +14,8 @@ from converters.generate.design.instance import Instance
 from converters.generate.design.plan import Plan, Rect, doorway_zone
 from converters.generate.homes.arrange import Arrangement
 from converters.generate.homes.groups import LOW_M
-from converters.geometry.density import ROBOTS, clearance_m, label_pieces
+from converters.geometry.density import ROBOTS
+from interactive_nav_common.grids import clearance, label
 from scenes_mjcf.categories import CATEGORIES
 
 CELL_M = 0.025
@@ -276,7 +277,7 @@ class Floor:
         free &= ~own | (self.covered[rows, columns] == 0)
         for box in boxes or []:
             free[here(box)] = False
-        region = label_pieces(clearance_m(free, CELL_M) >= radius_m)[0]
+        region = label(clearance(free, CELL_M) >= radius_m)[0]
         at = []
         for doorway in doorways:
             x, y = doorway.rect.centre

@@ -17,7 +17,8 @@ from converters.generate.homes.config import SHARE_TOLERANCE, Range
 from converters.generate.homes.floor import CELL_M, Standing
 from converters.generate.homes.furnish import Home, clutter_category, settle
 from converters.generate.homes.groups import TABLES, Group
-from converters.geometry.density import ROBOTS, Ways, clearance_m, must_push_shares
+from converters.geometry.density import ROBOTS, Ways, must_push_shares
+from interactive_nav_common.grids import clearance
 
 MOST_MOVES = 400
 """Moves tried."""
@@ -62,7 +63,7 @@ class Passages:
         self.ways = {
             robot: [Ways.of(static, CELL_M, disc.radius_m + more) for more in DOUBT_M] for robot, disc in ROBOTS.items()
         }
-        self.room_m = {robot: np.minimum(clearance_m(floor.free(robot), CELL_M), FAR_M) for robot in self.ways}
+        self.room_m = {robot: np.minimum(clearance(floor.free(robot), CELL_M), FAR_M) for robot in self.ways}
         """Robot -> clearance of the floor as the furniture stands, up to `FAR_M`."""
         self.shares = self.measure(self.room_m)
 
@@ -84,7 +85,7 @@ class Passages:
             )
             inner = tuple(slice(n.start - a.start, n.stop - a.start) for n, a in zip(near, around, strict=True))
             for robot, room_m in out.items():
-                room_m[near] = np.minimum(clearance_m(floor.free(robot)[around], CELL_M), FAR_M)[inner]
+                room_m[near] = np.minimum(clearance(floor.free(robot)[around], CELL_M), FAR_M)[inner]
         return out
 
     def miss(self, shares: dict[str, Shares] | None = None) -> float:

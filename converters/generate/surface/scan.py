@@ -17,9 +17,9 @@ from converters.generate.design.instance import Instance
 from converters.generate.design.plan import Plan
 from converters.generate.design.space import GRID_M, cell_centres, free_grid, room_mask
 from converters.generate.surface.volume import Solid, Volume, fuse, solid_from_box, solid_from_mesh, surface_nets
-from converters.geometry.density import clearance_m
 from converters.geometry.faces import compacted, loose_parts, vertex_normals
 from converters.records.raw import FLOOR, WALL
+from interactive_nav_common.grids import clearance
 from scenes_mjcf.categories import TABLE
 
 NYU40 = {"wall": WALL, "floor": FLOOR, "cabinet": 3} | {c.name: c.labels[0] for c in TABLE if c.labels}
@@ -68,7 +68,7 @@ def building_solids(plan: Plan, items: list[Instance]) -> list[Solid]:
 
 def camera_positions(plan: Plan, items: list[Instance], rng: np.random.Generator) -> np.ndarray:
     """(n, 3) places where the camera stood: two to four a room, at eye height, and one in each doorway."""
-    free = clearance_m(free_grid(plan, items), GRID_M)
+    free = clearance(free_grid(plan, items), GRID_M)
     centres = cell_centres(free)
     out = []
     for room in plan.rooms:

@@ -19,7 +19,7 @@ import trimesh
 from PIL import Image
 
 from converters.read.files import SourceFolder, check_mesh
-from converters.read.obj import join_textures, read_texture, textured_by_face, use_found
+from converters.read.obj import join_textures, read_texture, textured_by_face, use_found, wrapped
 from converters.records.errors import SceneRejected
 from converters.records.limits import NUMBERS, PIXELS, check_count
 from converters.records.visual import TexturedMesh
@@ -41,6 +41,7 @@ COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 TRIANGLES, STRIP, FAN = 4, 5, 6
 TRIMESH_GREY = 0.4
+WRAPPING = {33071: "clamp", 33648: "mirror"}
 TINTS = 16
 """Copies of a texture, in different colours of vertices, that a primitive may need."""
 
@@ -55,13 +56,15 @@ class _Layer:
     """Attribute."""
     matrix: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(3))
     """(3, 3) of the texture's coordinates, their origin at the upper left."""
+    modes: tuple[str, str] = ("repeat", "repeat")
+    """How the texture wraps along its two coordinates."""
 
 
 def read_gltf(source: SourceFolder, path: Path) -> list[TexturedMesh]:
     """Return the meshes of the default scene in its own frame."""
     file = _File(source, path)
     meshes = file.meshes()
-    for what, count in sorted(file.unused.items()):
+    for what, count in sorted((+file.unused).items()):
         source.note(f"{file.where}: not used: {count} {what}")
     return meshes
 
@@ -102,7 +105,6 @@ class _File:
         for key in ("animations", "cameras", "skins"):
             self.unused[key] += len(self.tree.get(key, []))
         self.unused["scenes besides the default one"] += max(len(self.tree.get("scenes", [])) - 1, 0)
-        self.unused = +self.unused
         self.srgb = "trimesh" in str(self.tree.get("asset", {}).get("generator"))
         for name in set(self.tree.get("extensionsUsed", [])) - READ:
             self.unused[f"extension {name}"] += 1
@@ -255,6 +257,8 @@ class _File:
         more = material.get("extensions", {})
         pbr, gloss = material.get("pbrMetallicRoughness", {}), more.get("KHR_materials_pbrSpecularGlossiness")
         base = ("baseColorFactor", "baseColorTexture") if gloss is None else ("diffuseFactor", "diffuseTexture")
+        alpha = pbr.get("baseColorFactor", (1.0,))[-1] < 1 or "baseColorTexture" in pbr
+        self.unused["transparency of materials"] += alpha and material.get("alphaMode", "OPAQUE") != "OPAQUE"
         strength = more.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
         layers = [self._layer(pbr if gloss is None else gloss, *base, np.ones(3))]
         emitted = self._layer(material, "emissiveFactor", "emissiveTexture", np.zeros(3))
@@ -267,13 +271,17 @@ class _File:
         if texture not in at or not colour.any():
             return _Layer(colour)
         info = at[texture]
-        image = self._image(self.tree["textures"][info["index"]])
+        of = self.tree["textures"][info["index"]]
+        image, sampler = self._image(of), self.tree["samplers"][of["sampler"]] if "sampler" in of else {}
+        modes = [WRAPPING.get(sampler.get(key, 0), "repeat") for key in ("wrapS", "wrapT")]
         moved = info.get("extensions", {}).get("KHR_texture_transform", {})
         turn = moved.get("rotation", 0.0)
         scale, c, s = np.diag([*moved.get("scale", (1.0, 1.0)), 1.0]), np.cos(turn), np.sin(turn)
         matrix = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ scale
         matrix[:2, 2] = moved.get("offset", (0.0, 0.0))
-        return _Layer(colour, image, f"TEXCOORD_{moved.get('texCoord', info.get('texCoord', 0))}", matrix)
+        return _Layer(
+            colour, image, f"TEXCOORD_{moved.get('texCoord', info.get('texCoord', 0))}", matrix, (modes[0], modes[1])
+        )
 
     def _image(self, texture: Any) -> np.ndarray | None:
         """Return a texture's image (h, w, 3) uint8; None and a warning where it cannot be read."""
@@ -317,6 +325,8 @@ class _File:
             palette = row.getpalette() or []
             colours, number = np.reshape(palette, (-1, 3)), np.asarray(row)
         images = [self._mixed(layers, colour / 255) for colour in colours]
+        uv, images, across = wrapped(uv, images, first.modes)
+        self.unused["faces across the edge of a clamped texture (it is stretched there)"] += across
         return TexturedMesh(vertices, faces, *join_textures(uv, number.reshape(-1), images))
 
     def _mixed(self, layers: list[_Layer], light: np.ndarray) -> np.ndarray:

@@ -40,13 +40,14 @@ from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh
 from converters.read.storeys import storey_of
 from converters.read.surfaces import check_extent
+from converters.read.urdf import count_unread, report_unread
 from converters.records.errors import SceneRejected
 from converters.records.limits import DRAWN, UNPACKED, check_count
 from converters.records.raw import Lamp, RawScene
 from interactive_nav_common.records import read_packaged
 
 ENDING = ".sh3d"
-PIECES = ("pieceOfFurniture", "doorOrWindow", "light")
+PIECES = ("pieceOfFurniture", "doorOrWindow", "light", "shelfUnit")
 DROPPED = {
     "dimensionLine": "dimensions",
     "label": "labels",
@@ -137,6 +138,9 @@ class _Drawing:
         self.high_m.setdefault(None, number(root, "wallHeight", 100 * HEIGHT_M) / 100)
         for tag, what in DROPPED.items():
             self.dropped[what] += len(root.findall(tag))
+        unread: collections.Counter[str] = collections.Counter()
+        count_unread(root, _TABLES["read"], unread)
+        report_unread(source, "the drawing", unread)
 
     def scene(self) -> RawScene:
         """All of it."""

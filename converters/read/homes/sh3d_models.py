@@ -18,7 +18,7 @@ from converters.read.files import SourceFolder, read_image, read_obj
 from converters.read.homes.sh3d_archive import called, colour, metres, model_path, number
 from converters.read.homes.sh3d_sheet import WHITE, Look
 from converters.read.meshes import read_surface
-from converters.read.obj import GREY, TexturedMesh, join_textures, read_materials
+from converters.read.obj import GREY, TexturedMesh, join_textures, read_painted_obj
 from converters.read.urdf import placed
 from converters.records.errors import SceneRejected
 from converters.records.limits import EXTENT_M, GEOMS, check_count
@@ -92,16 +92,13 @@ class Models:
             none = np.zeros(len(mesh.faces), np.int64)
             back = mesh.vertices @ Y_UP_TO_Z_UP
             return Model(back, mesh.faces, uv, none, [image], ("",), np.full(len(none), ""))
-        file = self.source.use(path, "")
-        mesh = read_obj(file)
+        mesh, number, images = read_painted_obj(
+            self.source, path, "", lambda n: colour(f"ff{BUILT_IN.get(re.sub(r'[.][0-9]+$', '', n), '')}", GREYS)
+        )
         check_count(path, len(mesh.faces), GEOMS, "faces", "simplify the model")
-        own = read_materials(self.source, file, mesh.libraries) if mesh.libraries else {}
-        names = (*mesh.materials, "")
-        built = {n: colour(f"ff{BUILT_IN.get(re.sub(r'[.][0-9]+$', '', n), '')}", GREYS) for n in names}
-        images = [own.get(n, built[n]) for n in names]
-        number = np.where(mesh.material < 0, len(mesh.materials), mesh.material)
-        uv = np.zeros((len(mesh.faces), 3, 2)) if mesh.corner_uv is None else mesh.corner_uv
-        return Model(mesh.vertices, mesh.faces, uv, number, images, names, np.array((*mesh.groups, ""))[mesh.group])
+        assert mesh.corner_uv is not None
+        names, groups = (*mesh.materials, "", "")[: len(images)], np.array((*mesh.groups, ""))
+        return Model(mesh.vertices, mesh.faces, mesh.corner_uv, number, images, names, groups[mesh.group])
 
     def look(self, element: ElementTree.Element, colour_key: str, texture: str, default: np.ndarray = WHITE) -> Look:
         """Colour of an element, or its texture: the child `<texture attribute=...>`."""

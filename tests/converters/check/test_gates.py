@@ -28,6 +28,7 @@ from converters.check.gates import (
 )
 from converters.check.settle import settle
 from converters.records.errors import StageFailed
+from interactive_nav.geodesic import navigation_grid
 from scenes_mjcf.schema import SceneMaps, load_manifest, load_maps, save_maps
 
 
@@ -72,6 +73,18 @@ def test_free_space_of_two_rooms_and_a_slit():
     # The larger room but for 6 cells in each of two corners, and what the disc covers of the slit.
     assert values["connected_share"] == pytest.approx((2400 - 12) / 3620, abs=0.003)
     assert values["start_goal"] == pytest.approx(np.hypot(31, 51) * 0.05)
+
+
+@pytest.mark.parametrize(("overlap", "share"), [(4, 0.499), (5, 0.502), (6, 0.997)])
+def test_rooms_that_share_only_a_corner_are_apart_for_the_gate_as_for_the_environment(overlap, share):
+    free = np.zeros((130, 130), bool)
+    free[5:65, 5:65] = True
+    free[65 - overlap : 125 - overlap, 65 - overlap : 125 - overlap] = True
+    fits = eroded(free, 0.05, 0.18)
+    # With 5 cells the two pieces of the eroded floor touch diagonally: a disc cannot get from one to the other.
+    assert ndimage.label(fits, np.ones((3, 3)))[1] == (1 if overlap >= 5 else 2)
+    assert free_space_values(maps_of(free))["connected_share"] == pytest.approx(share, abs=1e-3)
+    assert navigation_grid(free, 0.05, 0.18, 0.05).sum() == fits.sum() / (1 if overlap == 6 else 2)
 
 
 def test_a_piece_too_narrow_for_the_robot_counts_against_the_share_and_is_named():

@@ -18,7 +18,7 @@ from converters.generate.design.instance import Instance, place
 from converters.generate.design.maps import floor_maps, image_size
 from converters.generate.design.space import GRID_M, free_grid, passes, room_mask, static_grid
 from converters.generate.models.cad import TEST_MODELS, cad_model
-from converters.geometry.density import clearance_m
+from interactive_nav_common.grids import clearance
 
 SEEDS = range(8)
 LARGE = BuildingConfig(
@@ -129,8 +129,8 @@ def test_some_chair_narrows_the_way_between_two_rooms(seed):
     narrowed = 0
     for d in b.plan.doorways:
         masks = [room_mask(grid, b.plan.rooms[i]) for i in d.rooms]
-        assert passes(clearance_m(empty, GRID_M), masks, high)
-        narrowed += not passes(clearance_m(grid, GRID_M), masks, high)
+        assert passes(clearance(empty, GRID_M), masks, high)
+        narrowed += not passes(clearance(grid, GRID_M), masks, high)
     assert narrowed >= 1
 
 

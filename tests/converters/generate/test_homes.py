@@ -257,7 +257,7 @@ def test_the_clearance_after_moves_is_that_of_the_whole_floor_measured_again():
         passages._narrow(home, found)
         passages._clear(home, found)
     for robot, room_m in found.room_m.items():
-        whole = passages.clearance_m(home.floor.free(robot), passages.CELL_M)
+        whole = passages.clearance(home.floor.free(robot), passages.CELL_M)
         np.testing.assert_allclose(room_m, np.minimum(whole, passages.FAR_M))
         assert (home.floor.below[robot] < 9).all()  # nothing was taken away that was not there
 

@@ -235,6 +235,24 @@ def test_colours_of_an_off_file_are_said(tmp_path, text, what):
     assert source.warnings == [f"m.off: not used: {each}" for each in what]
 
 
+def test_colours_of_an_stl_file_are_reported(tmp_path):
+    triangle = np.array([(0, 0, 1), (0, 0, 0), (1, 0, 0), (0, 1, 0)], "<f4").tobytes()
+    (tmp_path / "m.stl").write_bytes(b" " * 80 + struct.pack("<I", 2) + (triangle + b"\0\0") + (triangle + b"\x1f\x80"))
+    source = SourceFolder(tmp_path)
+    assert len(read_surface(source, "m.stl", "").faces) == 2
+    assert source.warnings == ["m.stl: not used: 1 colours of faces"]
+
+
+def test_textures_of_a_collada_file_that_do_not_repeat_are_reported(tmp_path):
+    image(tmp_path / "images/t t.png")
+    source = dae(tmp_path, "")
+    path = tmp_path / "models/m.dae"
+    more = "<extra><sampler2D><wrap_s>WRAP</wrap_s><wrap_t>CLAMP</wrap_t></sampler2D></extra>"
+    path.write_text(path.read_text().replace("</COLLADA>", f"{more}</COLLADA>"))
+    read_surface(source, "models/m.dae", "")
+    assert source.warnings == ["models/m.dae: not used: 1 textures that do not repeat"]
+
+
 def test_what_of_a_collada_file_is_not_used_is_said(tmp_path):
     image(tmp_path / "images/t t.png")
     source = dae(tmp_path, "")

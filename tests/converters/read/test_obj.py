@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import unicodedata
 
 import numpy as np
@@ -9,7 +10,15 @@ import pytest
 from PIL import Image
 
 from converters.read.files import SourceFolder, read_obj
-from converters.read.obj import TexturedMesh, join_meshes, join_textures, parse_mtl, read_scan_obj, texture_options
+from converters.read.obj import (
+    TexturedMesh,
+    join_meshes,
+    join_textures,
+    parse_mtl,
+    read_scan_obj,
+    texels,
+    texture_options,
+)
 from converters.records.errors import SceneRejected
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
@@ -99,17 +108,49 @@ def test_mtl_options_and_colours():
 @pytest.mark.parametrize(
     ("text", "name", "placing"),
     [
-        ("wood.png", "wood.png", [[1, 1], [0, 0]]),
-        ("my wood 2.png", "my wood 2.png", [[1, 1], [0, 0]]),
-        ("-clamp on -s 2 3 1 my wood.png", "my wood.png", [[2, 3], [0, 0]]),
-        ("-s 2 -o 0.5 -0.25 wood.png", "wood.png", [[2, 1], [0.5, -0.25]]),
-        ("-mm 0 1 -bm 0.5 -blendu off -imfchan r -texres 512 -t 1 1 1 a.png", "a.png", [[1, 1], [0, 0]]),
+        ("wood.png", "wood.png", [[1, 1], [0, 0], [0, 0], [0, 1]]),
+        ("my wood 2.png", "my wood 2.png", [[1, 1], [0, 0], [0, 0], [0, 1]]),
+        ("-clamp on -s 2 3 1 my wood.png", "my wood.png", [[2, 3], [0, 0], [1, 1], [0, 1]]),
+        ("-clamp off -s 2 -o 0.5 -0.25 wood.png", "wood.png", [[2, 1], [0.5, -0.25], [0, 0], [0, 1]]),
+        ("-mm 0.1 0.5 -bm 0.5 -imfchan r -texres 512 -t 1 1 1 a.png", "a.png", [[1, 1], [0, 0], [0, 0], [0.1, 0.5]]),
     ],
 )
 def test_options_of_a_texture(text, name, placing):
-    found, where = texture_options(text)
+    unused = collections.Counter()
+    found, where = texture_options(text, unused)
     assert found == name
     np.testing.assert_array_equal(where, placing)
+    assert +unused == ({"-imfchan": 1, "-t": 1} if "-imfchan" in text else {})
+
+
+@pytest.mark.parametrize(
+    ("options", "expected", "notes"),
+    [
+        # The left half of the image is red, the right half green; u is 1.2 at two corners and 1.3 at the third.
+        ("", (200, 0, 0), []), ("-clamp on ", (0, 200, 0), []), ("-clamp on -o -1 ", (200, 0, 0), []),
+        ("-mm 0.2 0.5 ", (151, 51, 51), []),
+        ("-clamp on -o -0.25 ", (0, 200, 0), ["m.obj: faces of 'a' lie across a texture's edge: stretched there"]),
+        ("-cc on ", (200, 0, 0), ["m.mtl: not used: 1 -cc"]),
+    ],
+)  # fmt: skip
+def test_a_clamped_or_changed_texture_is_shown_so(tmp_path, options, expected, notes):
+    Image.fromarray(np.array([[(200, 0, 0), (0, 200, 0)]], np.uint8)).save(tmp_path / "a.png")
+    (tmp_path / "m.mtl").write_text(f"newmtl a\nd 1\nTr 0\nmap_Kd {options}a.png\n")
+    text = "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 1.2 0.5\nvt 1.2 0.5\nvt 1.3 0.5\nusemtl a\nf 1/1 2/2 3/3\n"
+    (tmp_path / "m.obj").write_text(text)
+    source = SourceFolder(tmp_path)
+    mesh = read_scan_obj(source, "m.obj", "")
+    assert mesh.texture is not None and mesh.corner_uv is not None
+    assert texels(mesh.texture, mesh.corner_uv[0]).tolist() == [list(expected)] * 3
+    assert source.warnings == notes
+
+
+def test_transparency_of_materials_is_reported(tmp_path):
+    (tmp_path / "m.mtl").write_text("newmtl a\nKd 1 0 0\nd 0.4\nnewmtl b\nd 1.0\ndisp wood.png\nTr 0.5\n")
+    (tmp_path / "m.obj").write_text(SQUARE.replace("v 0 0 0", "mtllib m.mtl\nusemtl a\nv 0 0 0") + "f 1 2 3\n")
+    source = SourceFolder(tmp_path)
+    read_scan_obj(source, "m.obj", "")
+    assert source.warnings == ["m.mtl: not used: 1 Tr", "m.mtl: not used: 1 d"]
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 
 from converters.bodies.objects import PlacedObject
 from converters.geometry.boxes import convex_hull
-from converters.geometry.density import ROBOTS, Disc, Ways, clearance_m, must_push_shares
+from converters.geometry.density import ROBOTS, Disc, Ways, must_push_shares
 from converters.write.measures import measure_scene, navigation_complexity, shadow, specific_surface_1_m
 from interactive_nav.robots import get_robot
+from interactive_nav_common.grids import clearance
 from scenes_mjcf.schema import SceneMaps, load_manifest
 
 CELL_M = 0.05
@@ -75,7 +76,7 @@ def test_pairs_that_walls_part_do_not_count():
     static = two_rooms(gap=0)
     free = static.copy()
     free[:20, :20] = False
-    assert Ways.of(static, CELL_M, 0.18).must_push_share(clearance_m(free, CELL_M)) == 0.0
+    assert Ways.of(static, CELL_M, 0.18).must_push_share(clearance(free, CELL_M)) == 0.0
 
 
 def test_a_gap_between_the_robots_widths_bars_the_larger_one_only():

@@ -8,7 +8,6 @@ import pytest
 from scipy import stats
 
 import interactive_nav
-from interactive_nav import geodesic
 from interactive_nav.config import NavConfig
 from interactive_nav.navigation.placement import CLEARANCE_M, draw_episode, miss_m
 from interactive_nav.navigation.tables import build_tables
@@ -17,6 +16,7 @@ from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
 from interactive_nav.types import EpisodeStart
 from scenes_mjcf.schema import SceneError
+from tests.interactive_nav.test_geodesic import field_to
 
 DRAWS = 10_000
 CONFIG = NavConfig.of(num_objects=10)
@@ -168,9 +168,8 @@ def test_a_largest_distance_holds(built):
     drawn = jax.tree.map(np.asarray, jax.jit(jax.vmap(draw))(jax.random.split(jax.random.PRNGKey(1), 200)))
     free = np.asarray(tables.free[0])
     origin = tuple(np.asarray(tables.grid_origin_w[0]).tolist())
-    field = jax.jit(lambda goal: geodesic.distance_field(free, tables.fine_m, goal, origin))  # the other solver
     for i in range(0, 200, 40):
-        distances = np.asarray(field(drawn.goal_xy_w[i]))
+        distances = field_to(drawn.goal_xy_w[i], free, tables.fine_m, origin)  # the other solver
         c, r = np.floor((drawn.start_xy_w[i] - origin) / tables.fine_m).astype(int)
         assert distances[r, c] <= 2.0 * 1.02 + 0.05
     assert np.linalg.norm(drawn.start_xy_w - drawn.goal_xy_w, axis=-1).min() >= 1.0

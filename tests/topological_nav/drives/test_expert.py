@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import shapely
 
-from interactive_nav.geodesic import clearance
+from interactive_nav_common.grids import clearance
 from topological_nav.config import ExpertConfig
 from topological_nav.drives import expert
 from topological_nav.scenes.space import FreeSpace

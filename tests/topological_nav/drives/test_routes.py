@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from interactive_nav.geodesic import clearance
+from interactive_nav_common.grids import clearance
 from topological_nav.config import DriveConfig
 from topological_nav.drives.expert import way_field
 from topological_nav.drives.routes import draw_routes, drivable

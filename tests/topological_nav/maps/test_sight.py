@@ -15,7 +15,7 @@ from topological_nav.scenes.space import FreeSpace
 
 def two_rooms_space() -> FreeSpace:
     """6 x 4 m in cells of 0.1 m, walls of 0.1 m around, and along x = 0 up to y = 1."""
-    from interactive_nav.geodesic import clearance
+    from interactive_nav_common.grids import clearance
 
     free = np.zeros((42, 62), bool)
     free[1:-1, 1:-1] = True

@@ -144,6 +144,40 @@ def test_a_texture_with_coordinates_of_its_own_that_are_moved(tmp_path, moved, e
     assert colour(mesh) == expected and warnings == []
 
 
+@pytest.mark.parametrize(
+    ("sampler", "at", "expected"),
+    [
+        ({}, (1.25, 0.25), RED), ({"wrapS": 33648}, (1.25, 0.25), GREEN), ({"wrapS": 33071}, (1.25, 0.25), GREEN),
+        ({"wrapT": 33648}, (1.25, 0.25), RED), ({"wrapS": 33648}, (-0.25, 0.25), RED),
+        ({"wrapS": 33071}, (-0.25, 0.25), RED), ({}, (-0.25, 0.25), GREEN),
+        ({}, (0.25, 1.75), BLUE), ({"wrapT": 33648}, (0.25, 1.75), RED), ({"wrapT": 33071}, (0.25, 1.25), BLUE),
+        ({"wrapS": 33648, "wrapT": 33648}, (1.75, 1.25), BLUE), ({"wrapS": 33648, "wrapT": 33071}, (1.25, 9), WHITE),
+        ({"wrapS": 33071}, (0.75, 0.25), GREEN),
+    ],
+)  # fmt: skip
+def test_textures_repeat_are_mirrored_or_end(tmp_path, sampler, at, expected):
+    glb = Glb()
+    attributes = {"POSITION": glb.accessor(TRIANGLE), "TEXCOORD_0": glb.accessor(np.full((3, 2), at, np.float32))}
+    texture = glb.image()
+    glb.tree["samplers"], glb.tree["textures"][0]["sampler"] = [sampler], 0
+    glb.save(tmp_path, attributes, {"pbrMetallicRoughness": {"baseColorTexture": texture}})
+    mesh, warnings = read(tmp_path)
+    assert colour(mesh) == expected and warnings == []
+
+
+def test_a_face_across_the_edge_of_a_clamped_texture_and_transparency_are_reported(tmp_path):
+    glb = Glb()
+    uv = np.array([(0.5, 0.25), (1.5, 0.25), (0.5, 0.75)], np.float32)
+    attributes = {"POSITION": glb.accessor(TRIANGLE), "TEXCOORD_0": glb.accessor(uv)}
+    texture = glb.image()
+    glb.tree["samplers"], glb.tree["textures"][0]["sampler"] = [{"wrapS": 33071}], 0
+    glb.save(tmp_path, attributes, {"alphaMode": "MASK", "pbrMetallicRoughness": {"baseColorTexture": texture}})
+    assert read(tmp_path)[1] == [
+        "m.glb: not used: 1 faces across the edge of a clamped texture (it is stretched there)",
+        "m.glb: not used: 1 transparency of materials",
+    ]
+
+
 def test_a_factor_a_texture_and_colours_of_vertices_are_multiplied(tmp_path):
     glb = Glb()
     light = np.array([(1, 1, 1)] * 3 + [(0.5, 1, 1)] * 3, np.float32)

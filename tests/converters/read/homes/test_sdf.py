@@ -120,6 +120,12 @@ def test_what_moves_where_it_stands_and_what_it_weighs(source):
     assert any("2 x <light> in <world>: not read" in w for w in raw.warnings) and raw.licence == "MIT-0"
 
 
+def test_an_attribute_of_an_element_that_has_only_text_is_reported(tmp_path):
+    odd = LOOSE.replace("<size>", "<size unit='feet'>", 1)
+    raw = read_sdf(write_world(tmp_path / "home", [*ROOM, odd]))
+    assert odd != LOOSE and "home.world: 1 x unit= of <size>: not read" in raw.warnings
+
+
 def test_floor_and_walls_are_told_although_their_faces_are_large(source):
     raw = read_sdf(source)
     label = face_labels(raw.scan.labels, raw.scan.faces)

@@ -322,6 +322,18 @@ def test_levels_become_storeys_and_stairs_a_shaft(tmp_path):
     assert any("hidden" in w for w in raw.warnings)
 
 
+def test_attributes_and_keywords_that_are_not_read_are_reported_and_shelves_are_read(tmp_path):
+    texture = "<texture attribute='floorTexture' name='t' width='1' height='1' angle='0.7' image='no'/>"
+    shelf = piece("Regal", 200, 150, "60 30 180", "model='7' shelfElevations='0.1 0.5'", tag="shelfUnit")
+    elements = [*HOME[:4], HOME[4].replace("</room>", f"{texture}</room>"), shelf, "<carpet/>"]
+    raw = read_sh3d(write_home(tmp_path, elements, {"7": cuboid((0, 0, 0), (1, 1, 1)) + "curv 0 1 1 2\n"}))
+    assert [w for w in raw.warnings if "not read" in w or "not used" in w] == [
+        "the drawing: 1 x <carpet> in <home>: not read", "the drawing: 1 x angle= of <texture>: not read",
+        "7: not used: 1 curv",
+    ]  # fmt: skip
+    assert np.ptp(placed(raw, "Regal"), axis=0) == pytest.approx([0.6, 0.3, 1.8])
+
+
 def test_a_texture_is_repeated_by_its_size(tmp_path):
     picture = io.BytesIO()
     Image.fromarray(np.array([[(255, 0, 0), (0, 0, 255)]], np.uint8)).save(picture, "PNG")
