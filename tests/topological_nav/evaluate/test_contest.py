@@ -71,7 +71,7 @@ class Recorded:
 @pytest.fixture(scope="module")
 def watched(contest):
     """One episode of runs of 2 s played with everything recorded; nowhere is near enough to the goal to end it."""
-    config = replace(CONFIG, episodes=1, batch=1, run_s=2.0, success_m=0.01, glance=False)
+    config = replace(CONFIG, episodes=1, batch=1, limit_s=30.0, run_s=2.0, success_m=0.01, glance=False)
     (venue,) = contest_scenes(dataclasses.replace(contest, config=config))
     navigator = venue.navigator("dense")
     navigator.policy = Recorded(navigator.policy)
