@@ -1,4 +1,4 @@
-"""A raw folder in, a scene folder out: read, stages that are functions of arrays, write, rename."""
+"""Convert a raw folder to a scene folder: read it, run stages that are functions of arrays, write, rename."""
 
 import concurrent.futures
 import contextlib
@@ -13,10 +13,9 @@ import mujoco
 import numpy as np
 
 from converters.annotate.session import with_annotations
-from converters.bodies.alignment import Alignment
 from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig, Decomposition, cache_folder, decompose_all
 from converters.bodies.objects import PlacedObject, name_objects, place_object
-from converters.bodies.physical import Physical, physical_properties, with_source
+from converters.bodies.physical import physical_properties
 from converters.bodies.placement import align_objects
 from converters.check.gates import drawn_shares, evaluate
 from converters.check.settle import Settled, settle
@@ -33,7 +32,7 @@ from converters.records.errors import SceneRejected
 from converters.records.gate import Gate
 from converters.records.raw import ATTRIBUTION, CATEGORY_LABELS, RawScene, at_origin
 from converters.records.visual import TexturedMesh, VisualMesh, joined_clouds
-from converters.structure.cut import cut_furniture
+from converters.structure.cut import CutResult, cut_furniture
 from converters.structure.fill import fill_holes, wall_planes
 from converters.structure.floor import LIFT_M, level_floor
 from converters.structure.maps import FloorPlan, main_direction, make_floor_plan, resample
@@ -83,10 +82,15 @@ class ConvertConfig:
     library: Path | None = dataclasses.field(default=None, metadata=NOT_HASHED)
     """Folder with `cad/` for that; None: the source folder, or the packaged furniture where it has none."""
 
+    @property
+    def search(self) -> DecomposeConfig:
+        """The parameters of the decomposition."""
+        return DecomposeConfig(seed=self.seed, timeout_s=self.timeout_s)
+
 
 @dataclasses.dataclass(frozen=True)
 class Converted:
-    """What `convert` made."""
+    """The result of `convert`."""
 
     folder: Path
     manifest: SceneManifest
@@ -107,12 +111,12 @@ def _structure_visual(
     annotated: tuple[PlacedObject, ...],
     config: ConvertConfig,
 ) -> VisualMesh:
-    """The scan as it is, where it is small and whole; else levelled, filled, simplified and textured."""
+    """Return the scan as it is where it is small and whole; else levelled, filled, simplified and textured."""
     # As the levelled floor of a scan: above the plane that collides. A generated structure brings that with it.
     lift = np.array([0.0, 0.0, LIFT_M if raw.scan.furnished else 0.0])
-    own = TexturedMesh(vertices_w + lift, raw.scan.faces, raw.scan.corner_uv, raw.scan.texture)
+    scanned = TexturedMesh(vertices_w + lift, raw.scan.faces, raw.scan.corner_uv, raw.scan.texture)
     most = (config.structure_faces, config.structure_texture) if raw.scan.furnished else MODELLED
-    small = as_it_is(own, *most)
+    small = as_it_is(scanned, *most)
     if small is not None and keep.all() and not raw.picture:
         return small
     kept = np.flatnonzero(keep)
@@ -138,7 +142,7 @@ def _object_visuals(
     annotated: tuple[PlacedObject, ...],
     config: ConvertConfig,
 ) -> list[Drawn]:
-    """Every object's visual, model by model, side by side in processes."""
+    """Draw every object, model by model, side by side in processes."""
     models: dict[tuple[str, bytes], list[int]] = {}
     for k, placed in enumerate(annotated):
         models.setdefault((placed.cad_id, placed.vertices_b.tobytes()), []).append(k)
@@ -157,132 +161,170 @@ def _object_visuals(
         with concurrent.futures.ProcessPoolExecutor(min(config.jobs, len(groups)), mp_context=context) as pool:
             drawn = list(pool.map(draw, *zip(*groups, strict=True)))
     places = [k for of in models.values() for k in of]
-    made = dict(zip(places, [one for some in drawn for one in some], strict=True))
-    return [made[k] for k in range(len(annotated))]
+    by_place = dict(zip(places, [one for some in drawn for one in some], strict=True))
+    return [by_place[k] for k in range(len(annotated))]
 
 
-def _decompose_models(
-    raw: RawScene, search: DecomposeConfig, config: ConvertConfig, cache: Path, progress: Callable[[float], None]
-) -> Decomposition:
-    """Hulls of every model: its own convex pieces where it came with them, else coacd's."""
+@dataclasses.dataclass(frozen=True)
+class Placed:
+    """One floor with its furniture at rest: the results of the stages from `align` to `settle`."""
+
+    raw: RawScene
+    """With the models that were retrieved for it."""
+    floor_m: float
+    vertices_w: np.ndarray
+    """(n, 3) of the scan, m."""
+    rows: list[dict[str, Any]]
+    """How each annotation compares with its pose re-solved from keypoints."""
+    decomposed: Decomposition
+    annotated: tuple[PlacedObject, ...]
+    """At the annotated poses."""
+    cut: CutResult
+    plan: FloorPlan
+    maps: SceneMaps
+    settled: Settled
+
+    def held_built_in(self) -> RawScene:
+        """Return the source with what settling could not part from its surroundings as structure."""
+        called = {o.name: o.cad_id for o in self.annotated}
+        held = self.settled.held
+        return built_in(self.raw, {k: called.get(held[k], "a wall, or what is built in") for k in held})
+
+
+def _decompose(raw: RawScene, config: ConvertConfig, cache: Path, progress: Callable[[float], None]) -> Decomposition:
+    """Return the hulls of every model: the convex pieces that it came with, else coacd's."""
     bare = {k: c for k, c in sorted(raw.cads.items()) if c.pieces is None}
-    found = decompose_all(
+    decomposed = decompose_all(
         {k: (c.vertices, c.faces) for k, c in bare.items()},
-        search,
+        config.search,
         config.jobs,
         cache,
         progress,
         {k: DOOR_OVERRIDES for k, c in bare.items() if c.category == "door"},
         config.strict,
     )
-    own = {k: tuple(Hull(*p) for p in c.pieces) for k, c in raw.cads.items() if c.pieces is not None}
-    return dataclasses.replace(found, hulls=found.hulls | own)
+    given = {k: tuple(Hull(*p) for p in c.pieces) for k, c in raw.cads.items() if c.pieces is not None}
+    return dataclasses.replace(decomposed, hulls=decomposed.hulls | given)
 
 
-def _report_objects(
-    rows: list[dict[str, Any]], settled: Settled, drawn: list[Drawn], annotated: tuple[PlacedObject, ...]
-) -> None:
-    """Adds to each object's row how it settled, how much of it the scan showed and what is drawn of its surface."""
-    for row, moved, drop, own, placed in zip(
-        rows, settled.displacement_m, settled.drop_m, drawn, annotated, strict=True
-    ):
-        row |= {"settle_shift_m": moved, "settle_drop_m": drop, "texture_seen_share": round(own.seen_share, 3)}
-        row |= {"drawn_area_share": round(own.kept_share, 3), "drawn_off_m": round(own.off_m, 4)}
-        if placed.hinge is not None:
-            row["hinge_assumed"] = placed.hinge.assumed
-
-
-def _placed(
-    raw: RawScene, placements: list[Alignment], decomposed: Decomposition, floor_m: float, walls_yaw: float
-) -> tuple[tuple[PlacedObject, ...], tuple[Physical, ...]]:
-    """Every object where it was annotated, and its mass and friction."""
-    annotated = tuple(
-        place_object(name, a, raw.cads[a.cad_id], decomposed.hulls[a.cad_id], pose, floor_m, walls_yaw)
-        for name, a, pose in zip(name_objects(raw.annotations), raw.annotations, placements, strict=True)
-    )
-    cads = [raw.cads[o.cad_id] for o in annotated]
-    return annotated, tuple(
-        with_source(physical_properties(o.category, o.hulls_b), cad.mass_kg, cad.friction)
-        for o, cad in zip(annotated, cads, strict=True)
-    )
-
-
-def _beside(settled: Settled, annotated: tuple[PlacedObject, ...]) -> dict[int, str]:
-    """Number of an object that was held -> what its source calls what it overlaps."""
-    called = {o.name: o.cad_id for o in annotated}
-    return {k: called.get(other, "a wall, or what is built in") for k, other in settled.held.items()}
-
-
-def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock, cache: Path) -> Converted:
-    """Every stage after reading, of one floor; writes into `folder`, which exists and is empty."""
-    stages = StageCache(cache)
+def _place(raw: RawScene, config: ConvertConfig, clock: Clock, stages: StageCache, cache: Path) -> Placed:
+    """Run the stages from `align` to `settle`."""
     with clock.stage("align") as progress:
         raw = with_retrieved(raw, config.library, progress) if config.auto_align else raw
-        placements, rows = align_objects(raw)
-        floor_height = floor_of(raw)
-        vertices_w = raw.scan.vertices - [0.0, 0.0, floor_height]
-        walls_yaw = main_direction(vertices_w, raw.scan.faces, raw.scan.labels)
-    decompose_config = DecomposeConfig(seed=config.seed, timeout_s=config.timeout_s)
+        poses, rows = align_objects(raw)
+        floor_m = floor_of(raw)
+        vertices_w = raw.scan.vertices - [0.0, 0.0, floor_m]
+        yaw = main_direction(vertices_w, raw.scan.faces, raw.scan.labels)
     with clock.stage("decompose") as progress:
-        decomposed = _decompose_models(raw, decompose_config, config, cache, progress)
-        annotated, physical = _placed(raw, placements, decomposed, floor_height, walls_yaw)
+        decomposed = _decompose(raw, config, cache, progress)
+        annotated = tuple(
+            place_object(name, a, raw.cads[a.cad_id], decomposed.hulls[a.cad_id], pose, floor_m, yaw)
+            for name, a, pose in zip(name_objects(raw.annotations), raw.annotations, poses, strict=True)
+        )
+        cads = [raw.cads[o.cad_id] for o in annotated]
+        physical = tuple(
+            physical_properties(o.category, o.hulls_b, cad.mass_kg, cad.friction)
+            for o, cad in zip(annotated, cads, strict=True)
+        )
     with clock.stage("cut"):
         cut = stages.call(cut_furniture, vertices_w, raw.scan.faces, raw.scan.labels, annotated, raw.scan.furnished)
     with clock.stage("map"):
-        kept = raw.scan.faces[cut.keep]
-        seen = vertices_w, kept, raw.scan.labels, annotated, raw.given_map, walls_yaw
-        plan = stages.call(make_floor_plan, *seen, bool(raw.picture))
+        kept = vertices_w, raw.scan.faces[cut.keep], raw.scan.labels
+        plan = stages.call(make_floor_plan, *kept, annotated, raw.given_map, yaw, bool(raw.picture))
         walls = stages.call(wall_boxes, plan)
         traversable, origin = resample(plan.grid, plan.traversable, plan.grid.resolution_m)
         if not traversable.any():
             raise SceneRejected("scan: the traversable map is empty; the scan needs visible floor")
-        maps = SceneMaps(traversable, plan.grid.resolution_m, origin, floor_height)
+        maps = SceneMaps(traversable, plan.grid.resolution_m, origin, floor_m)
     with clock.stage("settle"):
         unsettled = SceneParts(raw.name, annotated, physical, walls)
         fitted = [k for k, a in enumerate(raw.annotations) if a.confidence is not None]
         settled = settle(unsettled, bool(raw.picture), fitted) if annotated else Settled(unsettled, (), ())
-    if settled.held:
-        found = dataclasses.replace(config, auto_align=False)
-        return convert_raw(built_in(raw, _beside(settled, annotated)), folder, found, clock, cache)
+    return Placed(raw, floor_m, vertices_w, rows, decomposed, annotated, cut, plan, maps, settled)
+
+
+def _write(placed: Placed, structure: VisualMesh, drawn: list[Drawn], folder: Path) -> SceneParts:
+    """Write the model and the maps of a floor; return what the model is made of."""
+    down = np.array([0.0, 0.0, placed.floor_m])
+    parts = dataclasses.replace(
+        placed.settled.parts,
+        structure_visual=structure,
+        object_visuals=tuple(one.mesh for one in drawn),
+        lamps=tuple(dataclasses.replace(p, at=p.at - down) for p in placed.raw.lamps),
+        windows=tuple(dataclasses.replace(w, middle=w.middle - down) for w in placed.raw.windows),
+    )
+    write_scene(parts, folder)
+    save_maps(placed.maps, folder)
+    return parts
+
+
+def _object_rows(placed: Placed, drawn: list[Drawn]) -> list[dict[str, Any]]:
+    """Return each object's row with how it settled, how much of it the scan showed and what is drawn of its surface."""
+    moves = zip(placed.settled.displacement_m, placed.settled.drop_m, strict=True)
+    rows = []
+    for row, (shift_m, drop_m), one, placed_object in zip(placed.rows, moves, drawn, placed.annotated, strict=True):
+        settled = {"settle_shift_m": shift_m, "settle_drop_m": drop_m, "texture_seen_share": round(one.seen_share, 3)}
+        shown = {"drawn_area_share": round(one.kept_share, 3), "drawn_off_m": round(one.off_m, 4)}
+        hinge = placed_object.hinge
+        rows.append(row | settled | shown | ({} if hinge is None else {"hinge_assumed": hinge.assumed}))
+    return rows
+
+
+def _judge(
+    placed: Placed, parts: SceneParts, drawn: list[Drawn], config: ConvertConfig, folder: Path
+) -> tuple[SceneManifest, tuple[Gate, ...]]:
+    """Run the gates on a floor that is written; write and return its manifest."""
+    structure, plan, faces = parts.structure_visual, placed.plan, placed.raw.scan.faces[placed.cut.owner < 0]
+    assert structure is not None
+    shares = {
+        "scan_kept": kept_share(placed.vertices_w, faces, (structure.vertices, structure.faces)),
+        "floor_open": plan.open_share,
+    }
+    rows = _object_rows(placed, drawn)
+    spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
+    gates = evaluate(spec, placed.maps, scene_objects(parts), drawn_shares(rows), shares)
+    area_m2, fallbacks = float(plan.traversable.sum()) * plan.grid.resolution_m**2, placed.decomposed.fallbacks
+    manifest = make_manifest(
+        placed.raw, config.split, parts, area_m2, rows, gates, config.search, fallbacks, placed.maps
+    )
+    rounded = {name: round(share, 4) for name, share in shares.items()}
+    manifest = dataclasses.replace(manifest, floor_unseen_m2=round(plan.unseen_m2, 3), **rounded)
+    save_manifest(manifest, folder)
+    return manifest, gates
+
+
+def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock, cache: Path) -> Converted:
+    """Run every stage after reading on one floor; write into `folder`, which exists and is empty."""
+    stages = StageCache(cache)
+    placed = _place(raw, config, clock, stages, cache)
+    while placed.settled.held:
+        # Structure that is new changes the map and the walls, and with them where everything else comes to rest.
+        config = dataclasses.replace(config, auto_align=False)
+        placed = _place(placed.held_built_in(), config, clock, stages, cache)
+    raw, vertices_w, cut = placed.raw, placed.vertices_w, placed.cut
     with clock.stage("texture") as progress:
-        structure = stages.call(_structure_visual, raw, vertices_w, cut.keep, plan, annotated, config)
+        structure = stages.call(_structure_visual, raw, vertices_w, cut.keep, placed.plan, placed.annotated, config)
         progress(0.5)
-        drawn = stages.call(_object_visuals, raw, vertices_w, cut.owner, annotated, config)
-    _report_objects(rows, settled, drawn, annotated)
+        drawn = stages.call(_object_visuals, raw, vertices_w, cut.owner, placed.annotated, config)
     with clock.stage("write"):
-        visuals = tuple(own.mesh for own in drawn)
-        lamps = tuple(dataclasses.replace(p, at=p.at - [0.0, 0.0, floor_height]) for p in raw.lamps)
-        windows = tuple(dataclasses.replace(w, middle=w.middle - [0.0, 0.0, floor_height]) for w in raw.windows)
-        seen = {"structure_visual": structure, "object_visuals": visuals, "lamps": lamps, "windows": windows}
-        parts = dataclasses.replace(settled.parts, **seen)
-        write_scene(parts, folder)
-        save_maps(maps, folder)
+        parts = _write(placed, structure, drawn, folder)
     with clock.stage("gates"):
-        spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
-        shares = {
-            "scan_kept": kept_share(vertices_w, raw.scan.faces[cut.owner < 0], (structure.vertices, structure.faces)),
-            "floor_open": plan.open_share,
-        }
-        gates = evaluate(spec, maps, scene_objects(parts), drawn_shares(rows), shares)
-        area_m2, found = float(plan.traversable.sum()) * plan.grid.resolution_m**2, decomposed.fallbacks
-        manifest = make_manifest(raw, config.split, parts, area_m2, rows, gates, decompose_config, found, maps)
-        rounded = {name: round(share, 4) for name, share in shares.items()}
-        manifest = dataclasses.replace(manifest, floor_unseen_m2=round(plan.unseen_m2, 3), **rounded)
-        save_manifest(manifest, folder)
-    return Converted(folder, manifest, gates, settled, len(walls), clock.seconds, decomposed.worker_mib)
+        manifest, gates = _judge(placed, parts, drawn, config, folder)
+    memory_mib = placed.decomposed.worker_mib
+    return Converted(folder, manifest, gates, placed.settled, len(parts.walls), clock.seconds, memory_mib)
 
 
 def _read(source: Path, name: str, config: ConvertConfig, annotations: Path | None) -> RawScene:
-    """The source under its scene's name, with a file's annotations if one is given."""
+    """Read the source under its scene's name, with a file's annotations if one is given."""
     about = config.up, config.unit, config.root, config.mirror
     raw = read_source(source, config.format, config.strict, *about)
     if annotations is not None:
         raw = with_annotations(raw, annotations, config.library)
     raw = at_origin(raw)
-    labelled = np.isin(raw.scan.labels, [label for own in CATEGORY_LABELS.values() for label in own]).any()
+    labelled = np.isin(raw.scan.labels, [label for labels in CATEGORY_LABELS.values() for label in labels]).any()
     unfit = ("--auto-align: no label of furniture in the scan, so no model is fitted",)
-    told = raw.warnings if labelled or not config.auto_align else raw.warnings + unfit
-    return dataclasses.replace(raw, name=name, warnings=told)
+    warnings = raw.warnings if labelled or not config.auto_align else raw.warnings + unfit
+    return dataclasses.replace(raw, name=name, warnings=warnings)
 
 
 def convert_building(
@@ -295,7 +337,7 @@ def convert_building(
     floors: int | None = None,
     annotations: Path | None = None,
 ) -> tuple[Converted, ...]:
-    """Converts one raw folder, floor by floor; the scene folders appear whole and together, or not at all.
+    """Convert one raw folder, floor by floor; the scene folders appear whole and together, or not at all.
 
     Args:
         source: folder in one of the layouts of `READERS`.
@@ -304,7 +346,7 @@ def convert_building(
         config: choices.
         report: progress callback.
         cache: folder of hulls and stage results by content; default `cache_folder()`.
-        warn: told what is wrong with the source as soon as it is read; all warnings stand in the result too.
+        warn: called with what is wrong with the source as soon as it is read; all warnings stand in the result too.
         floors: that it must have; None: any number.
         annotations: Scan2CAD's file, in place of the source's own; its models are those of `config.library`.
     """
@@ -313,7 +355,7 @@ def convert_building(
         config = dataclasses.replace(config, library=source)
     check_name(target.name, f"{target}: the scene's name")
     with contextlib.ExitStack() as stack:
-        # Before reading, which may take a while: an OUT that cannot be written is told at once.
+        # Before reading, which may take a while: an OUT that cannot be written is reported at once.
         first = stack.enter_context(part_folder(target, config.overwrite))
         with clock.stage("read"):
             raw = _read(source, target.name, config, annotations)
@@ -341,5 +383,5 @@ def convert_building(
 def convert(
     source: Path, target: Path, config: ConvertConfig, report: Report | None = None, cache: Path | None = None
 ) -> Converted:
-    """Converts a raw folder of one floor; arguments and errors of `convert_building`."""
+    """Convert a raw folder of one floor; arguments and errors of `convert_building`."""
     return convert_building(source, target, config, report, cache, floors=1)[0]

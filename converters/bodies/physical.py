@@ -42,22 +42,19 @@ def mass_moments(hulls: tuple[Hull, ...]) -> tuple[float, np.ndarray, np.ndarray
     return float(sum(volumes)), com, inertia
 
 
-def physical_properties(category: str, hulls: tuple[Hull, ...]) -> Physical:
-    """Mass = density x summed hull volume, clipped to the category's range; moments from them (body frame, m, kg)."""
+def physical_properties(
+    category: str, hulls: tuple[Hull, ...], mass_kg: float | None = None, friction: float | None = None
+) -> Physical:
+    """Return mass, moments (body frame, m, kg) and friction; moments scale with the mass.
+
+    The mass is density x summed hull volume, clipped to the category's range, unless the source gives one.
+    """
     material = MATERIALS[category]
     volume, com, inertia = mass_moments(hulls)
     wanted = material.density_kg_m3 * volume
-    mass = float(np.clip(wanted, *material.mass_range_kg))
-    return Physical(mass, com, inertia * mass / volume, material.friction, volume, mass != wanted)
-
-
-def with_source(physical: Physical, mass_kg: float | None, friction: float | None) -> Physical:
-    """The source's own mass and friction where it has them; moments scale with the mass."""
-    mass = physical.mass_kg if mass_kg is None else mass_kg
-    return dataclasses.replace(
-        physical,
-        mass_kg=mass,
-        inertia_b=physical.inertia_b * (mass / physical.mass_kg),
-        friction=physical.friction if friction is None else friction,
-        clipped=physical.clipped and mass_kg is None,
+    usual = float(np.clip(wanted, *material.mass_range_kg))
+    mass = usual if mass_kg is None else mass_kg
+    friction = material.friction if friction is None else friction
+    return Physical(
+        mass, com, inertia * usual / volume * (mass / usual), friction, volume, mass_kg is None and usual != wanted
     )
