@@ -16,9 +16,10 @@ from converters.check.surfaces import surface_values
 from converters.records.gate import Gate, Limit
 from interactive_nav_common.grids import clearance, largest_component
 from interactive_nav_common.records import read_packaged
+from scenes_mjcf.robot_facts import SMALLEST
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, SceneObject, load_manifest, load_maps
 
-ROBOT_RADIUS_M = 0.18
+ROBOT_RADIUS_M = SMALLEST.radius_m
 """Free space is judged for a TurtleBot-sized disc."""
 OFF_MAP_M = 1.0
 """An object with no free floor this near lies outside of what was mapped."""

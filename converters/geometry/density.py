@@ -1,52 +1,39 @@
-"""Rasters of floor in, numbers of how full a home is and how much of it is behind furniture out.
+"""Measure on rasters of floor how much of a home is behind furniture.
 
 Rasters are (rows, columns) bool, True where free, of square cells.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from interactive_nav_common.grids import clearance, label
+from scenes_mjcf import robot_facts
+
+ROBOTS = {name: robot_facts.ROBOTS[name] for name in ("turtlebot", "fetch")}
+"""Robots whose shares that must be pushed are measured."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Disc:
-    """What a robot needs of the floor."""
-
-    radius_m: float
-    height_m: float
-    """What is above is not in its way."""
-
-
-ROBOTS = {"turtlebot": Disc(0.18, 0.41), "fetch": Disc(0.31, 1.12)}
-"""Robots whose shares that must be pushed are told, as their specifications have them."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Ways:
+class Ways(NamedTuple):
     """Where a disc gets on a floor without movables."""
 
-    cell_m: float
     radius_m: float
     region: np.ndarray
     """(rows, columns) int: region that the disc's middle may be in, from 1; 0 where it does not fit."""
 
     @classmethod
     def of(cls, static_free: np.ndarray, cell_m: float, radius_m: float) -> Ways:
-        """Of a floor with nothing on it but what is fixed."""
-        return cls(cell_m, radius_m, label(clearance(static_free, cell_m) >= radius_m)[0])
+        """Return those of a floor with nothing on it but what is fixed."""
+        return cls(radius_m, label(clearance(static_free, cell_m) >= radius_m)[0])
 
     def must_push_share(self, room_m: np.ndarray) -> float:
-        """Share of the pairs of places between which the disc finds no way that avoids everything.
+        """Return the share of the pairs of places between which no path of the disc avoids everything.
 
-        Counted are all pairs of places where the disc touches nothing and that it gets between with the movables away.
-
-        Returns:
-            0 where nothing is in the way; 0 too where the disc fits nowhere.
+        Counted are all pairs of places where the disc touches nothing and that it gets between with the movables away;
+        0 where nothing is in the way, and where the disc fits nowhere.
         """
         now = label((room_m >= self.radius_m) & (self.region > 0))[0]
         here = now > 0
@@ -57,7 +44,7 @@ class Ways:
 
 
 def must_push_shares(static_free: np.ndarray, free: Mapping[str, np.ndarray], cell_m: float) -> dict[str, float]:
-    """Robot -> `Ways.must_push_share`, of a floor with and without its movables.
+    """Return `Ways.must_push_share` by robot, of a floor with and without its movables.
 
     Args:
         static_free: (rows, columns) bool, without movables.

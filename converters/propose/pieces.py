@@ -10,6 +10,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from converters.geometry.boxes import upright_box
+from interactive_nav_common.grids import nearest_cell
 from scenes_mjcf.categories import TABLE
 
 MIN_VOXELS = 60
@@ -133,9 +134,7 @@ def _basins(mask: np.ndarray) -> np.ndarray:
     # Cells along the outline were flooded from whichever side came first: they go with the nearest inner ones.
     core = (final > 0) & (distance >= CORE_CELLS)
     if core.any():
-        nearest = ndimage.distance_transform_edt(~core, return_distances=False, return_indices=True)
-        assert nearest is not None
-        final = np.where(final > 0, final[nearest[0], nearest[1]], 0)
+        final = np.where(final > 0, final[tuple(nearest_cell(core))], 0)
     return final[1:-1, 1:-1]
 
 

@@ -8,6 +8,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull
 
 from converters.propose.pieces import LABEL_CATEGORIES, MIN_VOXELS, PART_SHARE, SIZES_M, Piece, part_by_number
+from interactive_nav_common.grids import label, nearest_cell
 from interactive_nav_common.rotations import yaw_matrix
 from scenes_mjcf.categories import TABLE
 
@@ -72,9 +73,8 @@ def _plan(points: np.ndarray, cell_m: float) -> _Plan:
     # Cells without a sample, and holes: as high as what is nearest.
     padded = np.pad(known, 2)
     closed = ndimage.binary_fill_holes(ndimage.binary_closing(padded, np.ones((3, 3))))
-    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    assert closed is not None and nearest is not None
-    return _Plan(axes, low, cell_m, np.where(closed[2:-2, 2:-2], top[tuple(nearest)], np.nan))
+    assert closed is not None
+    return _Plan(axes, low, cell_m, np.where(closed[2:-2, 2:-2], top[tuple(nearest_cell(known))], np.nan))
 
 
 def _fill(mask: np.ndarray) -> float:
@@ -134,7 +134,7 @@ def _two_rectangles(plan: _Plan, shown_floor: np.ndarray | None, category: str) 
             score = float(shape.sum() / boxes.sum()) - 0.1 * odd
             # What the two leave free of the common rectangle, without stripes along them.
             free = np.asarray(ndimage.binary_opening(~boxes & (index[axis] != cut), np.ones((notch, notch))))
-            numbers, count = ndimage.label(free)  # pyright: ignore[reportGeneralTypeIssues]
+            numbers, count = label(free)
             corners = [numbers == k for k in range(1, count + 1)]
             hidden = shown_floor is not None and not any(shown_floor[c].mean() >= NOTCH_SHOWN for c in corners)
             if corners and not hidden and score > best_score:

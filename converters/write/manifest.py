@@ -8,7 +8,7 @@ from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig
 from converters.records.gate import Gate
 from converters.records.raw import RawScene
 from converters.write.emit import SceneParts
-from converters.write.measures import measure_parts
+from converters.write.measures import measure_scene
 from scenes_mjcf.schema import SceneManifest, SceneMaps, SceneObject
 
 PACKAGES = ("mujoco", "coacd", "trimesh", "fast-simplification", "xatlas", "numpy", "scipy", "pillow", "shapely")
@@ -59,7 +59,7 @@ def make_manifest(
         gates={g.name: g.as_dict() for g in gates},
         versions={name: version(name) for name in PACKAGES},
         alignment=tuple(alignment),
-        measures=measure_parts(parts, maps) if maps is not None else {},
+        measures=measure_scene(parts, maps) if maps is not None else {},
         warnings=(
             *raw.warnings,
             *(f"{why}; its convex hull stands for it" for _, why in sorted(fell.items())),

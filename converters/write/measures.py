@@ -1,4 +1,4 @@
-"""A finished scene's movables, maps and surfaces in; how full it is and how hard to get through, for scene.json, out.
+"""Measure how full a finished scene is and how hard it is to get through, for scene.json.
 
 Two of the measures are those by which Gibson describes its buildings (Xia et al., "Gibson Env: Real-World Perception
 for Embodied Agents", CVPR 2018): specific surface area, the mesh's area over the volume of its convex hull, and
@@ -20,7 +20,7 @@ from converters.geometry.density import ROBOTS, must_push_shares
 from converters.geometry.faces import face_areas
 from converters.structure.maps import Grid
 from converters.write.emit import SceneParts
-from interactive_nav_common.grids import clearance, label
+from interactive_nav_common.grids import clearance, largest_component
 from scenes_mjcf.schema import SceneMaps
 
 NAVIGATION_CELL_M = 0.1
@@ -31,7 +31,7 @@ LEAST_APART_M = 1.0
 
 
 def shadow(objects: Sequence[PlacedObject], maps: SceneMaps, height_m: float = math.inf) -> np.ndarray:
-    """[rows, columns] bool: cells of the map with their middle below a movable's hull that reaches below a height."""
+    """Return [rows, columns] bool: cells with their middle below a movable's hull that reaches below a height."""
     out = np.zeros_like(maps.traversable)
     grid = Grid(0.0, maps.origin_w, out.shape, maps.resolution_m)
     for placed in objects:
@@ -43,25 +43,22 @@ def shadow(objects: Sequence[PlacedObject], maps: SceneMaps, height_m: float = m
 
 
 def specific_surface_1_m(surfaces: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Area of meshes over the volume of the convex hull of all of them, 1/m."""
+    """Return the area of meshes over the volume of the convex hull of all of them, 1/m."""
     area_m2 = sum(float(face_areas(vertices, faces).sum()) for vertices, faces in surfaces)
     return area_m2 / float(ConvexHull(np.vstack([vertices for vertices, _ in surfaces])).volume)
 
 
 def navigation_complexity(free: np.ndarray, cell_m: float, radius_m: float) -> float:
-    """Largest ratio of the shortest way between two places to the straight line, of pairs a metre or more apart.
+    """Return the largest ratio of shortest path to straight line of two places a metre or more apart.
 
-    Ways lead through the middles of cells of `NAVIGATION_CELL_M`, along rows, columns and diagonals, in the largest
-    region that a disc's middle may be in.
-
-    Returns:
-        1 where there is no such pair.
+    Paths lead through the middles of cells of `NAVIGATION_CELL_M`, along rows, columns and diagonals, in the largest
+    region that a disc's middle may be in; 1 where there is no such pair. Diagonals may cut corners, so that
+    `grids.grid_graph`, whose paths go round them, gives larger values than those in the packaged scenes.
     """
     step = max(round(NAVIGATION_CELL_M / cell_m), 1)
-    region = label((clearance(free, cell_m) >= radius_m)[step // 2 :: step, step // 2 :: step])[0]
-    if not region.any():
+    mask = largest_component((clearance(free, cell_m) >= radius_m)[step // 2 :: step, step // 2 :: step])
+    if not mask.any():
         return 1.0
-    mask = region == 1 + np.bincount(region.ravel())[1:].argmax()
     height, width = mask.shape
     number = np.full((height, width), -1)
     number[mask] = np.arange(mask.sum())
@@ -83,18 +80,20 @@ def navigation_complexity(free: np.ndarray, cell_m: float, radius_m: float) -> f
     return float((way_m[far] / line_m[far]).max()) if far.any() else 1.0
 
 
-def measure_scene(
-    objects: Sequence[PlacedObject], maps: SceneMaps, surfaces: Sequence[tuple[np.ndarray, np.ndarray]]
-) -> dict[str, Any]:
-    """Measures a scene.
+def measure_scene(parts: SceneParts, maps: SceneMaps) -> dict[str, Any]:
+    """Measure a scene with its visuals.
 
     Returns:
         `movable_share`: share of the traversable floor below movables (built-in furniture is not part of that floor);
         `must_push_share`: robot -> `converters.geometry.density.Ways.must_push_share`; `specific_surface_1_m` and
         `navigation_complexity`, the latter for the smallest robot with the movables where they stand.
     """
+    structure, objects = parts.structure_visual, parts.objects
+    assert structure is not None
+    visuals = zip(objects, parts.object_visuals, strict=True)
+    surfaces = [(structure.vertices, structure.faces), *((to_world(o, v.vertices), v.faces) for o, v in visuals)]
     below = shadow(objects, maps)
-    free = {robot: maps.traversable & ~shadow(objects, maps, disc.height_m) for robot, disc in ROBOTS.items()}
+    free = {robot: maps.traversable & ~shadow(objects, maps, facts.height_m) for robot, facts in ROBOTS.items()}
     must_push = must_push_shares(maps.traversable, free, maps.resolution_m)
     smallest = min(ROBOTS, key=lambda robot: ROBOTS[robot].radius_m)
     complexity = navigation_complexity(free[smallest], maps.resolution_m, ROBOTS[smallest].radius_m)
@@ -104,11 +103,3 @@ def measure_scene(
         "specific_surface_1_m": round(specific_surface_1_m(surfaces), 4),
         "navigation_complexity": round(complexity, 3),
     }
-
-
-def measure_parts(parts: SceneParts, maps: SceneMaps) -> dict[str, Any]:
-    """`measure_scene` of a scene with its visuals."""
-    structure = parts.structure_visual
-    assert structure is not None
-    seen = [(to_world(o, v.vertices), v.faces) for o, v in zip(parts.objects, parts.object_visuals, strict=True)]
-    return measure_scene(parts.objects, maps, [(structure.vertices, structure.faces), *seen])

@@ -8,6 +8,7 @@ import shapely
 from scipy import ndimage
 
 from converters.structure.walls import cover_rectangles
+from interactive_nav_common.grids import clearance, label
 from interactive_nav_common.rotations import yaw_matrix
 from scenes_mjcf.schema import SceneMaps
 
@@ -121,19 +122,19 @@ def rooms_of(maps: SceneMaps, low: Any, high: Any, least_m2: float, slack_m: flo
     rows, columns = (np.arange(n) for n in maps.traversable.shape)
     x, y = np.meshgrid(x0 + (columns + 0.5) * res, y0 + (rows + 0.5) * res)
     floor = (maps.traversable | shapely.contains_xy(low, x, y)) & ~shapely.contains_xy(high, x, y)
-    wide = np.asarray(ndimage.distance_transform_edt(np.pad(floor, 1)))[1:-1, 1:-1] * res > DOORWAY_M / 2
-    label, count = ndimage.label(wide)  # pyright: ignore[reportGeneralTypeIssues]
-    small = 1 + np.flatnonzero(np.bincount(label.ravel(), minlength=count + 1)[1:] * res**2 < CORE_M2)
-    label[np.isin(label, small)] = 0
-    pieces, many = ndimage.label(floor)  # pyright: ignore[reportGeneralTypeIssues]
+    wide = clearance(floor, res) > (DOORWAY_M - res) / 2
+    room, count = label(wide)
+    small = 1 + np.flatnonzero(np.bincount(room.ravel(), minlength=count + 1)[1:] * res**2 < CORE_M2)
+    room[np.isin(room, small)] = 0
+    pieces, many = label(floor)
     for k in range(1, many + 1):  # a room that is narrow everywhere
-        if not label[pieces == k].any():
-            label[pieces == k] = label.max() + 1
-    while (grown := np.where(floor & (label == 0), ndimage.grey_dilation(label, size=3), label)).sum() > label.sum():
-        label = grown
+        if not room[pieces == k].any():
+            room[pieces == k] = room.max() + 1
+    while (grown := np.where(floor & (room == 0), ndimage.grey_dilation(room, size=3), room)).sum() > room.sum():
+        room = grown
     plans = []
-    for k in range(1, label.max() + 1):
-        r, c = np.nonzero(label == k)
+    for k in range(1, room.max() + 1):
+        r, c = np.nonzero(room == k)
         cells: Any = shapely.box(x0 + c * res, y0 + r * res, x0 + (c + 1) * res, y0 + (r + 1) * res)
         whole = shapely.union_all(cells).buffer(slack_m, join_style="mitre").difference(high)
         parts = shapely.get_parts(whole.buffer(-slack_m / 4).buffer(slack_m / 4, join_style="mitre"))

@@ -14,6 +14,7 @@ from converters.read.obj import texels
 from converters.records.limits import CLOUD
 from converters.records.raw import ScanMesh
 from converters.records.visual import ColourCloud, TexturedMesh, VisualMesh
+from interactive_nav_common.grids import nearest_cell
 
 SEEN_M = 0.08
 """A scan point this close to the model's surface shows it: alignments are off by several centimetres."""
@@ -114,9 +115,8 @@ def fill_image(texel: np.ndarray, colours: np.ndarray, size: int) -> np.ndarray:
     image = np.zeros((size * size, 3))
     covered = np.zeros(size * size, bool)
     image[texel], covered[texel] = colours, True
-    nearest = ndimage.distance_transform_edt(~covered.reshape(size, size), return_distances=False, return_indices=True)
-    assert nearest is not None
-    return np.clip(np.rint(image.reshape(size, size, 3)[nearest[0], nearest[1]]), 0, 255).astype(np.uint8)
+    nearest = tuple(nearest_cell(covered.reshape(size, size)))
+    return np.clip(np.rint(image.reshape(size, size, 3)[nearest]), 0, 255).astype(np.uint8)
 
 
 def as_png(image: np.ndarray) -> Image.Image:

@@ -27,6 +27,7 @@ from interactive_nav.robots import robot_names
 from interactive_nav.task.env import EPISODE_METRICS, REWARD_TERMS, InteractiveNav
 from interactive_nav.task.wrappers import reset_all, scene_of_slot
 from interactive_nav_common.errors import ConfigError, MissingPackage, missing
+from scenes_mjcf.robot_facts import title
 
 try:
     import gymnasium
@@ -44,7 +45,6 @@ STEP_INFO = (*REWARD_TERMS, NONFINITE_ACTIONS)
 """What `info` holds at every step."""
 VERSION = 0
 """Raised whenever reported numbers would move."""
-_SPELLING = {"turtlebot": "TurtleBot", "jackrabbot": "JackRabbot"}
 
 
 _PROCESS = os.getpid()
@@ -67,7 +67,7 @@ def _refuse_fork() -> None:
 
 def env_id(robot: str) -> str:
     """Gymnasium's id of a robot's environment: turtlebot -> InteractiveNav-TurtleBot-v0."""
-    name = _SPELLING.get(robot, "".join(part.capitalize() for part in robot.split("_")))
+    name = title(robot) or "".join(part.capitalize() for part in robot.split("_"))
     return f"InteractiveNav-{name}-v{VERSION}"
 
 

@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from interactive_nav_common.grids import clearance, largest_component
 from scenes_mjcf.agreement import differences
+from scenes_mjcf.robot_facts import SMALLEST
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps
 
 MASS_KG = (1e-3, 1e4)
@@ -20,8 +21,6 @@ BASE_M = (-0.5, 3.0)
 """Least and greatest height of an object's lowest point above the floor."""
 BESIDE_M = 1.0
 """Objects may stand, and free floor may reach, so far beyond the map and the walls."""
-RADIUS_M = 0.18
-"""Of the smallest wheeled robot, a TurtleBot."""
 
 
 def check_scene(
@@ -55,7 +54,7 @@ def check_scene(
 
 def objects_apart(maps: SceneMaps, movables: Sequence[Any]) -> list[str]:
     """Return the objects more than `BESIDE_M` away from the largest piece of floor that a small robot fits on."""
-    piece = largest_component(clearance(maps.traversable, maps.resolution_m) >= RADIUS_M)
+    piece = largest_component(clearance(maps.traversable, maps.resolution_m) >= SMALLEST.radius_m)
     away_m = np.asarray(ndimage.distance_transform_edt(~piece, sampling=maps.resolution_m))
     apart = []
     for movable in movables:

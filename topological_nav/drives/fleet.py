@@ -13,6 +13,7 @@ import interactive_nav
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.rows import Rows
+from scenes_mjcf.robot_facts import ROBOTS
 from topological_nav.config import DriveConfig
 from topological_nav.drives.expert import CONTROL_S, Terrain, command, scan_points
 from topological_nav.scenes.rendering import need_engine
@@ -20,8 +21,8 @@ from topological_nav.scenes.simulation import episode_starts
 
 SEGMENT = 25
 """Control steps a program; between two of them the host looks whether any drive still goes on."""
-LIDAR_B = {"ttbot": (0.17, 0.0, 0.36)}
-"""Scanners by robot, m in the base's frame, as `interactive_nav/robots/mjcf` has them."""
+LIDAR_B = {name: facts.lidar_b for name, facts in ROBOTS.items() if facts.lidar_b is not None}
+"""Scanners by robot, m in the base's frame."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,6 +13,7 @@ import numpy as np
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.records import read_packaged
 from interactive_nav_common.statistics import Estimate
+from scenes_mjcf.robot_facts import title
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -137,8 +138,8 @@ def name_of(algorithm: str) -> str:
 
 
 def robot_name(robot: str) -> str:
-    """As papers write it."""
-    return {"turtlebot": "TurtleBot", "fetch": "Fetch"}.get(robot, robot)
+    """Return it as papers write it."""
+    return title(robot) or robot
 
 
 def seeds_text(counts: set[int]) -> str:

@@ -6,6 +6,7 @@ import dataclasses
 
 from converters.generate.models.cad import LIBRARY, TRAIN_MODELS
 from interactive_nav_common.errors import UserError
+from scenes_mjcf.robot_facts import SMALLEST
 
 NAMES = ("models", "passage_chairs")
 """Settings that are names of CAD models, not ranges."""
@@ -79,7 +80,7 @@ class BuildingConfig:
     passage_chairs: tuple[str, ...] = ()
     """Names of the chair models that may narrow a doorway; empty: all chairs of `models`. Light ones can be pushed
     by a small robot."""
-    robot_radius_m: float = 0.18
+    robot_radius_m: float = SMALLEST.radius_m
     """A disc of this radius reaches every room with the furniture (but for blockers) where it stands."""
     scale_jitter: float = 0.08
     """Each instance is scaled per axis by up to this fraction."""

@@ -1,4 +1,4 @@
-"""A plan and furniture in, free space out: grids of free floor, and what a disc can reach on them.
+"""Draw grids of free floor from a plan and furniture, and find what a disc can reach on them.
 
 Grids are (n, n) bool, rows along +y and columns along +x, cells of `GRID_M`, the scan frame's origin in the
 middle.
@@ -10,13 +10,13 @@ import shapely
 from converters.generate.design.instance import Instance
 from converters.generate.design.maps import floor_maps
 from converters.generate.design.plan import Plan, Rect
-from interactive_nav_common.grids import clearance, label
+from interactive_nav_common.grids import clearance, label, largest_component
 
 GRID_M = 0.05
 
 
 def static_grid(plan: Plan) -> np.ndarray:
-    """(n, n) bool, True where the static map is free."""
+    """Return (n, n) bool, True where the static map is free."""
     trav = floor_maps(plan)[1] > 0
     step = round(GRID_M / 0.01)
     n = trav.shape[0] // (2 * step) * 2
@@ -26,13 +26,13 @@ def static_grid(plan: Plan) -> np.ndarray:
 
 
 def cell_centres(grid: np.ndarray) -> np.ndarray:
-    """(n,) coordinate in metres of the cells along either axis."""
+    """Return the (n,) coordinate in metres of the cells along either axis."""
     n = grid.shape[0]
     return (np.arange(n) - n / 2 + 0.5) * GRID_M
 
 
 def without(grid: np.ndarray, items: list[Instance]) -> np.ndarray:
-    """A copy of the grid with the footprints of the furniture blocked."""
+    """Return a copy of the grid with the footprints of the furniture blocked."""
     centres = cell_centres(grid)
     grid = grid.copy()
     for item in items:
@@ -46,27 +46,24 @@ def without(grid: np.ndarray, items: list[Instance]) -> np.ndarray:
 
 
 def free_grid(plan: Plan, items: list[Instance]) -> np.ndarray:
-    """Static map and furniture on a coarse grid: (n, n) bool, True where free."""
+    """Draw static map and furniture on a coarse grid: (n, n) bool, True where free."""
     return without(static_grid(plan), items)
 
 
 def room_mask(grid: np.ndarray, room: Rect) -> np.ndarray:
-    """(n, n) bool: the cells of a room."""
+    """Return (n, n) bool, the cells of a room."""
     c = cell_centres(grid)
     return ((c > room.y0) & (c < room.y1))[:, None] & ((c > room.x0) & (c < room.x1))[None]
 
 
 def rooms_joined(grid: np.ndarray, plan: Plan, radius_m: float, least_m2: float = 0.4) -> bool:
-    """True where a disc of `radius_m` reaches `least_m2` or more of every room from every other."""
-    region = label(clearance(grid, GRID_M) >= radius_m)[0]
-    if not region.any():
-        return False
-    main = region == 1 + np.argmax(np.bincount(region.ravel())[1:])
-    return all((main & room_mask(grid, r)).sum() * GRID_M**2 >= least_m2 for r in plan.rooms)
+    """Return whether a disc of `radius_m` reaches `least_m2` or more of every room from every other."""
+    main = largest_component(clearance(grid, GRID_M) >= radius_m)
+    return bool(main.any()) and all((main & room_mask(grid, r)).sum() * GRID_M**2 >= least_m2 for r in plan.rooms)
 
 
 def passes(room_m: np.ndarray, masks: list[np.ndarray], width_m: float) -> bool:
-    """True where a disc `width_m` wide gets from one mask to the other.
+    """Return whether a disc `width_m` wide gets from one mask to the other.
 
     Args:
         room_m: (n, n) clearance.

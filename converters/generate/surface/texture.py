@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from PIL import Image, ImageDraw
-from scipy import ndimage, sparse
+from scipy import sparse
 from scipy.spatial import cKDTree
 
 from converters.generate.models.cad import cad_model
@@ -20,6 +20,7 @@ from converters.generate.surface.scan import Scan, smooth_noise
 from converters.geometry.faces import face_vectors, unit_normals
 from converters.records.visual import TexturedMesh
 from converters.write.texture import textured_cloud
+from interactive_nav_common.grids import nearest_cell
 
 PAD = 2
 """Texels between charts."""
@@ -127,8 +128,7 @@ def face_image(uv: np.ndarray, face_uv: np.ndarray, side: int) -> np.ndarray:
     for k, polygon in enumerate(corners.tolist()):
         draw.polygon(polygon, fill=k + 1)
     ids = np.array(image)
-    nearest = ndimage.distance_transform_edt(ids == 0, return_distances=False, return_indices=True)
-    return ids[tuple(nearest)] - 1  # pyright: ignore[reportCallIssue, reportArgumentType]
+    return ids[tuple(nearest_cell(ids != 0))] - 1
 
 
 def texel_positions(uv: np.ndarray, face_uv: np.ndarray, scan: Scan, ids: np.ndarray, texels: np.ndarray) -> np.ndarray:

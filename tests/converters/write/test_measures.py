@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 
 from converters.bodies.objects import PlacedObject
 from converters.geometry.boxes import convex_hull
-from converters.geometry.density import ROBOTS, Disc, Ways, must_push_shares
+from converters.geometry.density import ROBOTS, Ways, must_push_shares
+from converters.records.visual import VisualMesh
+from converters.write.emit import SceneParts
 from converters.write.measures import measure_scene, navigation_complexity, shadow, specific_surface_1_m
-from interactive_nav.robots import get_robot
 from interactive_nav_common.grids import clearance
 from scenes_mjcf.schema import SceneMaps, load_manifest
 
@@ -51,11 +52,6 @@ def test_a_thing_beside_the_map_shadows_nothing(at):
 
 def for_all(free: np.ndarray) -> dict[str, np.ndarray]:
     return dict.fromkeys(ROBOTS, free)
-
-
-def test_discs_are_those_of_the_robots():
-    robots = [get_robot(name) for name in ROBOTS]
-    assert {r.name: Disc(r.footprint_radius_m, r.height_m) for r in robots} == ROBOTS
 
 
 def test_nothing_must_be_pushed_where_nothing_stands():
@@ -121,10 +117,13 @@ def test_complexity_is_one_in_an_empty_room_and_more_round_a_wall():
 def test_a_scene_is_measured():
     maps = SceneMaps(np.ones((80, 80), bool), CELL_M, (0.0, 0.0), 0.0)
     thing = box_at(2.0, 2.0, (1.0, 1.0, 1.0))
-    measured = measure_scene([thing], maps, [(thing.vertices_b, thing.faces)])
+    flat = np.zeros((1, 3), int)
+    surface = VisualMesh(thing.vertices_b, thing.faces, np.zeros((1, 2)), flat, np.zeros((1, 1, 3), np.uint8))
+    around = dataclasses.replace(surface, vertices=2.0 * surface.vertices + [2.0, 2.0, 0.0])
+    measured = measure_scene(SceneParts("it", (thing,), (), (), around, (surface,)), maps)
     assert measured["movable_share"] == pytest.approx(1 / 16)
     assert measured["must_push_share"] == {"turtlebot": 0.0, "fetch": 0.0}
-    assert measured["specific_surface_1_m"] == pytest.approx(6.0)
+    assert measured["specific_surface_1_m"] == pytest.approx((24.0 + 6.0) / 8.0)
     assert measured["navigation_complexity"] > 1.08
 
 

@@ -4,17 +4,20 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 import interactive_nav
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, make_physics
-from interactive_nav.robots import get_robot
+from interactive_nav.robots import get_robot, robot_names
+from interactive_nav.robots.build import FOLDER
 from interactive_nav.robots.spec import RobotState
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
 from interactive_nav_common.errors import UserError
+from scenes_mjcf.robot_facts import ROBOTS, SMALLEST
 from tests.toys import write_room
 
 
@@ -23,6 +26,17 @@ def test_turtlebot_commands_and_actions_are_inverse():
     np.testing.assert_allclose(robot.command([-1.0, 1.0]), [-12.5, 25.0])
     np.testing.assert_allclose(robot.command([0.0, 5.0]), [6.25, 25.0])
     np.testing.assert_allclose(robot.action([6.25, 40.0]), [0.0, 1.0])
+
+
+def test_the_table_of_facts_agrees_with_the_models():
+    for name, facts in ROBOTS.items():
+        robot = get_robot(name)
+        assert (robot.footprint_radius_m, robot.height_m) == (facts.radius_m, facts.height_m)
+        if facts.lidar_b is not None:
+            site = mujoco.MjSpec.from_file(str(FOLDER / f"{name}.xml")).site("lidar")
+            assert f"{name}_{site.parent.name}" == robot.base_body and tuple(site.pos) == facts.lidar_b
+    wheeled = [robot for robot in map(get_robot, robot_names()) if robot.kind == "wheeled"]
+    assert SMALLEST.radius_m == min(robot.footprint_radius_m for robot in wheeled)
 
 
 def test_symmetric_actions_drive_backwards_as_fast_as_forwards(tmp_path):
