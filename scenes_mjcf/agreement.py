@@ -1,4 +1,4 @@
-"""Compare what `scene.json` states about objects with a compiled `scene.xml`."""
+"""Compare what `scene.json` states with a compiled `scene.xml`, and read what only the latter says."""
 
 from collections.abc import Sequence
 
@@ -9,6 +9,16 @@ from scenes_mjcf.schema import SceneObject
 
 TOLERANCE = 1e-3
 """Largest relative difference of two numbers that mean the same."""
+LIT_AMBIENT = 0.25
+"""Ambient headlight of scenes whose structure is lit in its own image; others have MuJoCo's 0.1."""
+
+
+def is_lit(model: mujoco.MjModel) -> bool:
+    """Return whether the structure is lit in its own image, so that it needs no shading.
+
+    It is inferred from the headlight: scenes on disk have no field for it, and its absence could mean either.
+    """
+    return bool(model.vis.headlight.ambient[0] > 0.8 * LIT_AMBIENT)
 
 
 def sliding_friction(model: mujoco.MjModel, body: int) -> list[float]:

@@ -18,6 +18,7 @@ from converters.records.raw import Lamp, Window
 from converters.records.visual import VisualMesh
 from converters.write.texture import as_png, quantise, share_plain
 from interactive_nav_common.rotations import yaw_matrix
+from scenes_mjcf.agreement import LIT_AMBIENT
 
 TIMESTEP_S = 0.005
 DOOR_DAMPING = 2.0
@@ -262,7 +263,7 @@ def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[OrientedBox, ...], lit: 
     if lit or lamps:
         spec.visual.headlight.diffuse = [0.15] * 3
     if lit:
-        spec.visual.headlight.ambient = [0.25] * 3
+        spec.visual.headlight.ambient = [LIT_AMBIENT] * 3
 
 
 def _add_structure(spec: mujoco.MjSpec, parts: SceneParts, look: Look | None) -> None:

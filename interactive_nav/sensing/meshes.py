@@ -26,12 +26,11 @@ from interactive_nav.sensing.boxes import BoxTables, body_poses, boxes_of_slots,
 from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, SKY_COLOUR, geom_colour
 from interactive_nav.sensing.surfaces import lit_images
 from interactive_nav_common.rotations import matrix_from_quat
+from scenes_mjcf.agreement import is_lit
 from scenes_mjcf.categories import class_id
 
 NEAR, FAR = wp.constant(NEAR_M), wp.constant(FAR_M)
 SKY, FLOOR = wp.constant(wp.vec3(*SKY_COLOUR)), wp.constant(wp.vec3(*FLOOR_COLOUR))
-_BAKED_AMBIENT = 0.2
-"""Scenes whose structure is lit in its own image ask for more ambient light than this (`converters.write.emit`)."""
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 _SIDES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
                    [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])  # fmt: skip
@@ -52,7 +51,8 @@ class _Part:
     """[h, w, 3] u8."""
     colour: np.ndarray
     """(3,) in [0, 1] where there is no image."""
-    baked: bool = False
+    lit: bool = False
+    """In the image itself: it is drawn without shading."""
 
 
 def _box_part(slot: int, boxes: np.ndarray, colour: np.ndarray) -> _Part:
@@ -99,8 +99,8 @@ def _mesh_part(model: mujoco.MjModel, geom: int, slot: int, standing: bool) -> _
         uv = model.mesh_texcoord[model.mesh_texcoordadr[mesh] + model.mesh_facetexcoord[own]]
         shape = model.tex_height[texture], model.tex_width[texture], model.tex_nchannel[texture]
         image = model.tex_data[model.tex_adr[texture] :][: np.prod(shape)].reshape(shape)[..., :3]
-    baked = standing and model.vis.headlight.ambient[0] > _BAKED_AMBIENT
-    return _Part(slot, points, model.mesh_face[own], uv, image, geom_colour(model, geom), baked)
+    lit = standing and is_lit(model)
+    return _Part(slot, points, model.mesh_face[own], uv, image, geom_colour(model, geom), lit)
 
 
 def _parts(world: World, s: int, tables: BoxTables) -> tuple[list[_Part], list[int]]:
@@ -167,7 +167,7 @@ def build_meshes(world: World, tables: BoxTables) -> MeshTables:
             centre = (part.points.min(0) + part.points.max(0)) / 2
             radius = np.linalg.norm(part.points - centre, axis=1).max() + 1e-4
             surface[s, k], slot[s, k], sphere[s, k] = surfaces[key], part.slot, [*centre, radius]
-            look[s, k, 0], look[s, k, 4], colour[s, k] = ids[part.slot], part.baked, part.colour
+            look[s, k, 0], look[s, k, 4], colour[s, k] = ids[part.slot], part.lit, part.colour
             if part.image is not None:
                 pixels = (part.image.reshape(-1, 3).astype(np.uint32) << [0, 8, 16]).sum(-1, dtype=np.uint32)
                 name = pixels.tobytes()
