@@ -172,7 +172,7 @@ def simulation(
         "gpu_memory_mib": [m for m in (memory[0], memory[1], memory[-1]) if m is not None],
         "nv": tiers[-1].window.model.nv if tiers else physics.nv,
         "tiers": [(tier.window.model.nv, tier.contacts_per_env, tier.constraints_per_env) for tier in tiers],
-        "movables": int(env.world.occupied.sum(1).max()),
+        "movables": int(env.world.slots.occupied.sum(1).max()),
     }
 
 

@@ -25,8 +25,8 @@ from interactive_nav.pictures.replay import Replay, ReplayError, load
 from interactive_nav.pictures.views import COLOURS
 from interactive_nav.record import check_scene
 from interactive_nav.robots import get_robot
-from interactive_nav.scenes.objects import body_names
 from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav.scenes.slots import bodies_by_name
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.rotations import matrix_from_quat, yaw_from_quat
@@ -36,14 +36,6 @@ COLOUR_BY = ("time", "contact")
 TOUCH_COLOURS = {"nothing": "#0072b2", "an object": "#d55e00", "a wall": "#555555"}
 MOVED_M = 0.02
 """Objects whose outline moved less than this count as not moved."""
-
-
-def outlines(replay: Replay, scene: Scene) -> dict[str, tuple[str, np.ndarray]]:
-    """Boxes of everything movable: body name -> (category, [n, 10] centre, quaternion, half sizes, body frame)."""
-    found = {m.name: (m.category, m.boxes) for m in scene.movables}
-    for name, obj in zip(body_names(replay.small), replay.small, strict=True):
-        found[name] = (obj.category, obj.rows)
-    return found
 
 
 def shadow(boxes: np.ndarray, pos_w: np.ndarray, quat_w: np.ndarray) -> Any:
@@ -73,10 +65,10 @@ def draw(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "time") -> N
     axis.imshow(
         maps.traversable, origin="lower", extent=extent, cmap=ListedColormap(["0.75", "1.0"]), interpolation="nearest"
     )
-    for name, (category, boxes) in outlines(replay, scene).items():
+    for name, thing in bodies_by_name(scene, replay.small).items():
         if name in replay.bodies:
             b = replay.bodies.index(name)
-            _draw_object(axis, category, boxes, replay.body_pos_w[:, b], replay.body_quat_w[:, b], extent)
+            _draw_object(axis, thing.category, thing.rows, replay.body_pos_w[:, b], replay.body_quat_w[:, b], extent)
     _draw_path(axis, replay, colour_by)
     robot = get_robot(replay.robot)
     for step, style in ((0, "--"), (-1, "-")):

@@ -52,7 +52,9 @@ class BulletScene:
             shape = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=list(row[7:10]))
             bullet.createMultiBody(0, shape, basePosition=list(row[:3]), baseOrientation=_xyzw(row[3:7]))
         furniture = {m.name: m for m in scene.movables}
-        for k, (name, kind, at) in enumerate(zip(world.names[0], layout.slot_kind, layout.slot_qpos, strict=True)):
+        for k, (name, kind, at) in enumerate(
+            zip(world.slots.names[0], layout.slot_kind, layout.slot_qpos, strict=True)
+        ):
             if kind == "small":
                 obj = world.small_objects[k]
                 boxes = obj.rows
@@ -199,7 +201,7 @@ def main() -> None:
     }
     row = {
         "scene": args.scene,
-        "movables": int(world.occupied[0].sum()),
+        "movables": int(world.slots.occupied[0].sum()),
         "walls": len(scene.walls),
         "pybullet_env_steps_per_s": {k: round(float(np.median(v))) for k, v in peers.items()},
         "pybullet_travelled_m": round(travelled, 1),

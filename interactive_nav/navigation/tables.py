@@ -62,18 +62,14 @@ def furniture_map(scene: Scene, poses: dict[str, tuple[np.ndarray, np.ndarray]],
 def rest_poses(world: World, index: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Body name -> (position, quaternion) of a scene's furniture at rest, world frame."""
     qpos, layout = world.rest_qpos[index], world.layout
-    rest = {m.name: (m.pos_w, m.quat_w) for m in world.scenes[index].movables}
-    for name, kind, at in zip(world.names[index], layout.slot_kind, layout.slot_qpos, strict=True):
-        if kind == "free" and name:
-            rest[name] = (qpos[at : at + 3], qpos[at + 3 : at + 7])
-    return rest
+    slots = zip(world.slots.names[index], layout.slot_kind, layout.slot_qpos, strict=True)
+    free = {name: (qpos[at : at + 3], qpos[at + 3 : at + 7]) for name, kind, at in slots if name and kind == "free"}
+    return {m.name: (m.pos_w, m.quat_w) for m in world.scenes[index].movables} | free
 
 
 def friction_share(world: World, index: int) -> np.ndarray:
     """[M] mass times friction of what is in a scene's movable slots over the robot's mass; 0 where a slot is empty."""
-    model = world.models[index]
-    first = np.maximum(model.body_geomadr[world.layout.slot_body], 0)
-    return world.mass_kg[index] * model.geom_friction[first, 0] / world.robot_mass_kg
+    return world.slots.mass_kg[index] * world.slots.friction[index] / world.robot_mass_kg
 
 
 def round_tables(world: World, tables: SceneTables, rules: TaskRules, limit: float) -> SceneTables:
@@ -82,7 +78,7 @@ def round_tables(world: World, tables: SceneTables, rules: TaskRules, limit: flo
     fine, kinds = rules.nav_cell_m / FINE_CELLS, world.layout.slot_kind
 
     def graph(index: int) -> CornerGraph:
-        slots = zip(world.names[index], kinds, friction_share(world, index), strict=True)
+        slots = zip(world.slots.names[index], kinds, friction_share(world, index), strict=True)
         heavy = {name for name, kind, share in slots if kind != "hinge" and share > limit}
         poses = {name: pose for name, pose in rest_poses(world, index).items() if name in heavy}
         maps = world.scenes[index].maps
@@ -221,8 +217,7 @@ def build_tables(world: World, rules: TaskRules) -> SceneTables:
     """Solves navigation for every scene and stacks all constants on the device."""
     with ThreadPoolExecutor() as pool:  # NumPy works on large arrays here, without holding Python's lock
         places = list(pool.map(lambda i: _scene_places(world, i, rules), range(len(world.scenes))))
-    com = np.stack([m.body_ipos[world.layout.slot_body] for m in world.models])
-    mass = np.concatenate([np.full((len(world.scenes), 1), world.robot_mass_kg), world.mass_kg], 1)
+    mass = np.concatenate([np.full((len(world.scenes), 1), world.robot_mass_kg), world.slots.mass_kg], 1)
 
     def f32(value) -> jnp.ndarray:
         return jax.device_put(np.asarray(value, np.float32))
@@ -233,7 +228,7 @@ def build_tables(world: World, rules: TaskRules) -> SceneTables:
     tables = SceneTables(
         rest_qpos=f32(world.rest_qpos),
         mass_kg=f32(mass),
-        com_m=f32(com),
+        com_m=f32(world.slots.com_b_m),
         **navigation_tables([p[0] for p in places]),
         start_xy_w=f32(_pad([p[1] for p in places], 1)),
         num_starts=i32([len(p[1]) for p in places]),

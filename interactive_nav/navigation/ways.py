@@ -42,10 +42,7 @@ class Footprints:
         self._model, self._data = model, mujoco.MjData(model)
         self._bodies, self._height_m = bodies, height_m
         self._origin, self._shape = np.asarray(origin_w, float), shape
-        self._geoms = [
-            [g for g in range(model.ngeom) if model.geom_bodyid[g] == body and model.geom_rbound[g] > 5e-3]
-            for body in bodies
-        ]
+        self._geoms = [np.flatnonzero((model.geom_bodyid == b) & (model.geom_rbound > 5e-3)) for b in bodies]
         self._known: dict[Any, np.ndarray] = {}
         self._corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, -1).T
 
@@ -64,7 +61,7 @@ class Footprints:
             out.append(self._known[key])
         return out
 
-    def _covered(self, geoms: list[int]) -> np.ndarray:
+    def _covered(self, geoms: np.ndarray) -> np.ndarray:
         model, data = self._model, self._data
         found = []
         for g in geoms:
@@ -105,13 +102,12 @@ class _SceneGrid:
         self.room_m = sampled_clearance(maps.traversable, maps.resolution_m, CELL_M)
         self.shape = self.room_m.shape
         self.free = largest_component(self.room_m >= env.robot.footprint_radius_m)
-        self.occupied = np.flatnonzero(world.occupied[index])
+        self.occupied = np.flatnonzero(world.slots.occupied[index])
         bodies = world.layout.slot_body[self.occupied]
         model = world.models[index]
         self.footprints = Footprints(model, bodies, env.robot.height_m, self.origin_w, self.shape)
         self.price = friction_share(world, index)[self.occupied]
-        slides = np.array([world.layout.slot_kind[k] != "hinge" for k in self.occupied], bool)
-        self.stuck = slides & (self.price > 1.0)  # its friction exceeds the robot's weight
+        self.stuck = ~world.slots.hinged[self.occupied] & (self.price > 1.0)  # its friction exceeds the robot's weight
 
     def middles_w(self, cells: np.ndarray) -> np.ndarray:
         """[p, 2] m of cells [p, 2] (row, column)."""

@@ -85,7 +85,8 @@ class NativePhysics(Physics):
         self._contacts = sensor_addresses(world.models[0]) if config.rules.needs_contacts else None
         self._slots = world.layout.num_slots
         self._robot, self._layout = world.robot, world.layout
-        self._models = tuple(with_feet_apart(spec, [slot.name for slot in world.slots]) for spec in world.specs)
+        names = [world.models[0].body(body).name for body in world.layout.slot_body]
+        self._models = tuple(with_feet_apart(spec, names) for spec in world.specs)
         self._iterations = int(world.models[0].opt.iterations)
         for model in self._models:
             # A failed state must be seen, not silently replaced by the model's default.

@@ -11,11 +11,10 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from interactive_nav.physics.base import PhysicsState
-from interactive_nav.scenes.spec import FEET
+from interactive_nav.scenes.slots import SlotTables
 from interactive_nav.scenes.world import World
 from interactive_nav_common.rotations import Array, matrix_from_quat, namespace
 
@@ -72,24 +71,26 @@ class Nearness:
     """Where the world's movable slots and walls are, in a scene and a state."""
 
     def __init__(self, world: World):
-        self.world, layout = world, world.layout
-        self.hinge = np.asarray(layout.slot_kind) == "hinge"
+        self.world, layout, slots = world, world.layout, world.slots
+        self.hinge = slots.hinged
         self._qpos = layout.slot_qpos[:, None] + np.where(self.hinge[:, None], 0, np.arange(7))
         self._qvel = layout.slot_qvel[:, None] + np.where(self.hinge[:, None], 0, np.arange(6))
         self._robot = layout.robot_qpos + np.arange(2)
-        made = [_rest(world, s) for s in range(len(world.scenes))]
-        tables = (np.stack(t).astype(np.float32) for t in zip(*made, strict=True))
-        self._offset_m, self._half_m, self._frame, self._anchor_m, self._sense, *self._walls = tables
+        (offset, half), arm = _bounds(slots), slots.hinge_anchor_b_m
+        swung, arm, axis = ((slots.axes_w @ v[..., None])[..., 0] for v in (offset - arm, arm, slots.hinge_axis_b))
+        offset, anchor = np.where(self.hinge[:, None], swung, offset), slots.pos_w_m + arm
+        self._tables = tuple(t.astype(np.float32) for t in (offset, half, slots.axes_w, anchor, axis))
+        walls = slots.boxes_b[:, slots.box_slot == layout.num_slots]
+        axes = matrix_from_quat(walls[..., 3:7])[..., :2, :2]
+        self._walls = tuple(t.astype(np.float32) for t in (walls[..., :2], axes, walls[..., 7:9], walls[..., 7] > 0))
 
     def boxes(self, scene: Array, state: PhysicsState) -> Boxes:
         """Of all slots of one environment, or, in NumPy, of many of one scene."""
         xp = namespace(state.qpos)
-        sense, frame, anchor, offset, half = (
-            xp.asarray(t)[scene] for t in (self._sense, self._frame, self._anchor_m, self._offset_m, self._half_m)
-        )
+        offset, half, frame, anchor, axis = (xp.asarray(t)[scene] for t in self._tables)
         qpos = state.qpos[..., self._qpos]
-        angle = qpos[..., 0] * sense
-        turn = matrix_from_quat(xp.stack([xp.cos(angle / 2), 0 * angle, 0 * angle, xp.sin(angle / 2)], -1))
+        angle = qpos[..., :1]
+        turn = matrix_from_quat(xp.concatenate([xp.cos(angle / 2), xp.sin(angle / 2) * axis], -1))
         hung = anchor + xp.einsum("...mij,mj->...mi", turn, offset)
         quat = qpos[..., 3:]
         free = matrix_from_quat(quat / xp.maximum(xp.linalg.norm(quat, axis=-1, keepdims=True), 1e-6))
@@ -129,7 +130,7 @@ class Nearness:
             [M] m, negative where it can be met, `FAR_M` for empty slots; [M] whether it moves; [W] m to where each
             wall can be met, see `_walls_gap_m`.
         """
-        boxes, occupied = self.boxes(scene, state), jnp.asarray(self.world.occupied)[scene]
+        boxes, occupied = self.boxes(scene, state), jnp.asarray(self.world.slots.occupied)[scene]
         gap = boxes.gap_m(state.qpos[self._robot], jnp.eye(2, 3), jnp.zeros(3)) - reach_m
         speed = jnp.where(occupied, jnp.abs(state.qvel[self._qvel]).max(-1), 0.0)
         moving = speed > MOVING_M_S
@@ -162,7 +163,7 @@ class Nearness:
                 qpos[:, self._robot], qpos[:, self._qpos[small, :2]] = places[:, 0], places[:, 1:]
                 state = PhysicsState(qpos, np.zeros(0), np.zeros(0))
                 boxes = self.boxes(scene, state)
-                gap = np.where(world.occupied[scene], boxes.gap_m(places[:, 0], np.eye(2, 3), np.zeros(3)), FAR_M)
+                gap = np.where(world.slots.occupied[scene], boxes.gap_m(places[:, 0], np.eye(2, 3), np.zeros(3)), FAR_M)
                 walls = self._walls_gap_m(scene, state, reach_m, boxes, gap - reach_m + (REACH_M - _PUSH_M)) < 0
                 for kind, own in counts.items():
                     own.append((walls if kind == "walls" else (gap < reach_m)[:, kinds == kind]).sum(-1))
@@ -174,31 +175,12 @@ def widths_at(counts: Mapping[str, np.ndarray], share: float = _SHARE) -> dict[s
     return {k: max(1, int(np.quantile(c, share, method="higher"))) for k, c in counts.items()}
 
 
-def _rest(world: World, s: int) -> tuple[np.ndarray, ...]:
-    """Of each slot: the box's centre and half sizes in its body's frame; for hinges, from the joint's anchor in the
-    world at rest, with the body's matrix, the anchor, and the joint's sense about the world's z. Of each wall: planar
-    place, axes and half sizes, and whether it is one."""
-    model, layout = world.models[s], world.layout
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    count = layout.num_slots
-    offset, half, anchor = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3))
-    frame, sense = np.tile(np.eye(3), (count, 1, 1)), np.zeros(count)
-    for k, body in enumerate(layout.slot_body):
-        geoms = slice(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body] - FEET)
-        if geoms.stop > geoms.start:
-            turn = matrix_from_quat(model.geom_quat[geoms])
-            middle = model.geom_pos[geoms] + np.einsum("gij,gj->gi", turn, model.geom_aabb[geoms, :3])
-            extent = np.einsum("gij,gj->gi", np.abs(turn), model.geom_aabb[geoms, 3:])
-            low, high = (middle - extent).min(0), (middle + extent).max(0)
-            offset[k], half[k] = (low + high) / 2, (high - low) / 2
-        if layout.slot_kind[k] == "hinge":
-            joint = model.body_jntadr[body]
-            frame[k], anchor[k] = data.xmat[body].reshape(3, 3), data.xanchor[joint]
-            offset[k] = frame[k] @ offset[k] + data.xpos[body] - anchor[k]
-            sense[k] = np.sign(data.xaxis[joint, 2])
-    first = model.body_geomadr[layout.structure_body]
-    walls = slice(first, first + model.body_geomnum[layout.structure_body])
-    used = np.arange(walls.stop - walls.start) < len(world.scenes[s].walls)
-    xmat = data.geom_xmat[walls].reshape(-1, 3, 3)[:, :2, :2]
-    return offset, half, frame, anchor, sense, data.geom_xpos[walls, :2], xmat, model.geom_size[walls, :2], used
+def _bounds(slots: SlotTables) -> tuple[np.ndarray, np.ndarray]:
+    """Return centres and half sizes [S, M, 3], m, of the boxes around each slot's in its body's frame, 0 where none."""
+    bounds = np.zeros((2, *slots.occupied.shape, 3))
+    for s, m in np.argwhere(slots.occupied):
+        rows = slots.rows(s, m)
+        extent = np.einsum("gij,gj->gi", np.abs(matrix_from_quat(rows[:, 3:7])), rows[:, 7:])
+        low, high = (rows[:, :3] - extent).min(0), (rows[:, :3] + extent).max(0)
+        bounds[:, s, m] = (low + high) / 2, (high - low) / 2
+    return bounds[0], bounds[1]

@@ -49,6 +49,7 @@ _HIDDEN = {
     "geom_aabb": np.array([0, 0, 0, 1e-3, 1e-3, 1e-3]),
 }
 """Padding boxes: too small to be met, at the body's centre of mass."""
+_A_GEOM = mujoco.mjtObj.mjOBJ_GEOM
 _WALL = ("geom_size", "geom_pos", "geom_quat", "geom_rbound", "geom_aabb")
 
 
@@ -85,13 +86,9 @@ class Window:
         found = widths_at(self.needs_at_rest) if None in limits.values() else {}
         self.widths = {kind: found[kind] if limit is None else limit for kind, limit in limits.items()}
         """Kind of slot, and `walls` -> how many at a time; 0: all."""
-        model = world.models[0]
-        walls = {"walls": int(model.body_geomnum[layout.structure_body])}
-        there = {kind: len(own) for kind, own in self._slots.items()} | walls
-        self._boxes = {
-            kind: max((int(model.body_geomnum[b]) for b in layout.slot_body[own]), default=FEET) - FEET
-            for kind, own in self._slots.items()
-        }
+        there = {kind: len(own) for kind, own in self._slots.items()} | {"walls": len(layout.wall_geoms)}
+        counts = np.bincount(world.slots.box_slot, minlength=layout.num_slots)
+        self._boxes = {kind: int(counts[own].max(initial=0)) for kind, own in self._slots.items()}
         self._tables = {kind: self._group_tables(kind) for kind, own in self._slots.items() if len(own)}
         self._wall_tables = self._walls()
         self._fit({kind: min(width or there[kind], there[kind]) for kind, width in self.widths.items()}, config)
@@ -115,7 +112,7 @@ class Window:
             rows, _ = _rows(self.model, self.layout, np.arange(first, first + width), self._boxes[kind], kind)
             self.groups += (_Group(self._slots[kind], width, first, tables, rows, outer),)
             first += width
-        self._wall_rows = self.model.body_geomadr[self.layout.structure_body] + np.arange(self.n_walls)
+        self._wall_rows = self.layout.wall_geoms
         self._base = {name: np.asarray(getattr(self.model, name), np.float32) for name in FIELDS}
         xpos, xmat = _static_poses(self.model)
         self._xpos, self._xmat = jax.device_put((np.float32(xpos), np.float32(xmat)))
@@ -139,9 +136,7 @@ class Window:
         return jax.device_put({name: np.float32(np.stack(values)) for name, values in tables.items()}), outer
 
     def _walls(self) -> dict[str, jax.Array]:
-        world, body = self.world, self.world.layout.structure_body
-        start, count = world.models[0].body_geomadr[body], world.models[0].body_geomnum[body]
-        own = np.arange(start, start + count)
+        world, own = self.world, self.world.layout.wall_geoms
         tables = {name: np.stack([getattr(m, name)[own] for m in world.models]) for name in _WALL}
         poses = [_static_poses(m) for m in world.models]
         tables["xpos"] = np.stack([xpos[own] for xpos, _ in poses])
@@ -242,12 +237,13 @@ class Window:
 def _rows(
     model: mujoco.MjModel, layout: Layout, slots: np.ndarray, boxes: int, kind: str
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Field -> its rows [m, ...] of slots of one kind; of geoms `boxes` and the feet, and where these are padding."""
+    """Return field -> its rows [m, ...] of slots of one kind; of geoms `boxes` and the feet, and which are padding."""
     body = layout.slot_body[slots]
-    start, own = model.body_geomadr[body][:, None], model.body_geomnum[body][:, None] - FEET
-    k = np.arange(boxes + FEET)
-    padding = (k >= own) & (k < boxes)
-    geoms = start + np.where(k < own, k, np.where(padding, 0, k - boxes + own))
+    names = [*(f"box_{i}" for i in range(boxes)), *(f"foot_{i}" for i in range(FEET))]
+    ids = [[mujoco.mj_name2id(model, _A_GEOM, f"{model.body(b).name}_{name}") for name in names] for b in body]
+    geoms = np.array(ids, int).reshape(len(body), len(names))
+    padding = geoms < 0  # a body's first geom stands for it
+    geoms = np.where(padding, geoms[:, :1], geoms)
     n_q, n_v = (1, 1) if kind == "hinge" else (7, 6)
     rows: dict[str, np.ndarray] = {**dict.fromkeys(_BODY, body), **dict.fromkeys(_GEOM, geoms)}
     rows |= dict.fromkeys(_JOINT, model.body_jntadr[body])

@@ -13,6 +13,7 @@ import numpy as np
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import VISUAL_GROUP, SmallObject, add_boxes, body_names
 from interactive_nav.scenes.scene import Scene
+from interactive_nav.scenes.slots import bodies_by_name
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing.base import CameraPose, Lens
 from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, geom_colour
@@ -56,8 +57,7 @@ def picture_spec(
     scene: Scene,
     robot: RobotSpec | None = None,
     small: Sequence[SmallObject] = (),
-    class_of: dict[str, int] | None = None,
-    classes: MaskClasses = 4,
+    classes: MaskClasses | None = None,
 ) -> mujoco.MjSpec:
     """`furnished_spec` in the groups of pictures, lit by its own lamps or by one, with a camera named `view`.
 
@@ -65,12 +65,11 @@ def picture_spec(
         scene: its visual meshes are drawn; bodies that have none, as their boxes.
         robot: or None.
         small: the small objects.
-        class_of: body name -> class id, by which boxes are coloured; None: as they are stored.
-        classes: the setting `segmentation_classes` that the ids are of.
+        classes: the setting `segmentation_classes` by which boxes are coloured; None: as they are stored.
     """
     spec = furnished_spec(scene, robot, small, cut_walls=robot is not None)
     own = {b.name for b in spec.body(robot.base_body).find_all("body")} | {robot.base_body} if robot else set()
-    movable, little = {m.name for m in scene.movables}, set(body_names(small))
+    movable = bodies_by_name(scene, small)
     with_mesh = {g.parent.name for g in spec.geoms if g.group == VISUAL_GROUP}
     visible_robot = bool(own & with_mesh)
     for geom in list(spec.geoms):
@@ -84,12 +83,12 @@ def picture_spec(
         bare = box and name not in with_mesh
         if plane:
             geom.rgba = [*FLOOR_COLOUR, 1.0]
-        elif bare and class_of is not None:
-            geom.rgba = [*PALETTES[classes][class_of.get(name, 0)], 1.0]
+        elif bare and classes is not None:
+            geom.rgba = [*PALETTES[classes][movable[name].mask_id(classes) if name in movable else 0], 1.0]
         if not (plane or bare or geom.group == VISUAL_GROUP):
             geom.group = HIDDEN
         else:
-            geom.group = THINGS if plane or name in movable or name in little else BUILDING
+            geom.group = THINGS if plane or name in movable else BUILDING
     for camera in list(spec.cameras):  # MJX-Warp draws every camera that there is
         spec.delete(camera)
     spec.worldbody.add_camera(name="view", fovy=60.0)
@@ -114,9 +113,8 @@ class SceneModel:
             classes: the setting `segmentation_classes`.
         """
         self.robot = robot
-        known = {m.name: (class_id(m.category, classes), m.category) for m in scene.movables}
-        known |= {n: (o.mask_id(classes), o.category) for n, o in zip(body_names(small), small, strict=True)}
-        spec = picture_spec(scene, robot, small, {name: number for name, (number, _) in known.items()}, classes)
+        rows = {n: (body.mask_id(classes), body.category) for n, body in bodies_by_name(scene, small).items()}
+        spec = picture_spec(scene, robot, small, classes)
         spec.visual.global_.offwidth = spec.visual.global_.offheight = 2048
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
@@ -129,10 +127,10 @@ class SceneModel:
         mine, rest = ((class_id(kind, classes), kind) for kind in ("robot", "structure"))
         robots = np.isin(self.model.geom_group, (ROBOT, ROBOT_SOLIDS))
         names = [self.model.body(int(body)).name for body in self.model.geom_bodyid]
-        rows = [mine if own else known.get(name, rest) for own, name in zip(robots, names, strict=True)]
-        self.class_id = np.array([number for number, _ in rows], np.uint8)
+        of_geom = [mine if own else rows.get(name, rest) for own, name in zip(robots, names, strict=True)]
+        self.class_id = np.array([number for number, _ in of_geom], np.uint8)
         """[ngeom] segmentation ids."""
-        self.category = [category for _, category in rows]
+        self.category = [category for _, category in of_geom]
         """[ngeom]"""
 
     @functools.cached_property
@@ -263,11 +261,10 @@ def world_poses(world: World, scene: int, qpos: np.ndarray) -> tuple[tuple[str, 
     Returns:
         Names (B), how many of them are the robot's, positions [T, B, 3] and orientations [T, B, 4].
     """
-    layout, model = world.layout, world.models[scene]
+    layout, slots, model = world.layout, world.slots, world.models[scene]
     data = mujoco.MjData(model)
-    used = [slot for slot, name in enumerate(world.names[scene]) if name]
-    ids = np.concatenate([layout.robot_bodies, layout.slot_body[used]])
-    names = [model.body(int(b)).name for b in layout.robot_bodies] + [world.names[scene][slot] for slot in used]
+    ids = np.concatenate([layout.robot_bodies, layout.slot_body[slots.occupied[scene]]])
+    names = [*(model.body(int(b)).name for b in layout.robot_bodies), *filter(None, slots.names[scene])]
     pos, quat = np.zeros((len(qpos), len(ids), 3)), np.zeros((len(qpos), len(ids), 4))
     for t, row in enumerate(qpos):
         if np.isfinite(row).all():

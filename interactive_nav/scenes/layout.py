@@ -29,6 +29,8 @@ class Layout:
     robot_bodies: np.ndarray
     """Body ids of the robot's subtree."""
     structure_body: int
+    wall_geoms: np.ndarray
+    """[W] geom ids."""
     force_sensors: np.ndarray
     """[M + 1] addresses in sensordata of the net force (3) on each slot's body, then on the structure."""
 
@@ -62,5 +64,6 @@ def find_layout(model: mujoco.MjModel, robot: RobotSpec, slots: list[tuple[str, 
         slot_body=np.asarray([body(name) for name, _ in slots], np.int32),
         robot_bodies=np.asarray(subtree, np.int32),
         structure_body=body("structure"),
+        wall_geoms=np.flatnonzero(model.geom_bodyid == body("structure")),
         force_sensors=np.asarray([*sensors, model.sensor("force_structure").adr[0]], np.int32),
     )

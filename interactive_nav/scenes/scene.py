@@ -10,6 +10,7 @@ import numpy as np
 
 from interactive_nav.scenes.checks import check_scene
 from interactive_nav_common.rotations import rotate
+from scenes_mjcf.categories import MaskClasses, class_id
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
 from scenes_mjcf.sets import PACKAGED, installed, meant
 
@@ -56,6 +57,15 @@ class Movable:
     """Vertices [v, 3] of each convex hull."""
     hinge: Hinge | None
     """None: a free body."""
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Return `boxes`, under the name that `SmallObject` has for the same."""
+        return self.boxes
+
+    def mask_id(self, classes: MaskClasses) -> int:
+        """Return its class where the setting `segmentation_classes` is this."""
+        return class_id(self.category, classes)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,9 +133,8 @@ def hull_sources(xml: Path) -> dict[str, list]:
     return found
 
 
-def _boxes(model: mujoco.MjModel, geoms: list[int]) -> np.ndarray:
-    rows = [np.concatenate([model.geom_pos[g], model.geom_quat[g], model.geom_size[g]]) for g in geoms]
-    return np.asarray(rows).reshape(-1, 10)
+def _boxes(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
+    return np.concatenate([model.geom_pos[geoms], model.geom_quat[geoms], model.geom_size[geoms]], 1)
 
 
 def _hull(model: mujoco.MjModel, geom: int) -> np.ndarray:
@@ -136,8 +145,11 @@ def _hull(model: mujoco.MjModel, geom: int) -> np.ndarray:
     return model.mesh_vert[start : start + count] @ rotation.reshape(3, 3).T + model.geom_pos[geom]
 
 
-def _geoms(model: mujoco.MjModel, body: int) -> list[int]:
-    return [g for g in range(model.ngeom) if model.geom_bodyid[g] == body]
+def _geoms(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a body's boxes and what of it collides."""
+    own = model.geom_bodyid == body
+    solid = own & ((model.geom_contype != 0) | (model.geom_conaffinity != 0))
+    return np.flatnonzero(own & (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX)), np.flatnonzero(solid)
 
 
 def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, friction: float) -> Movable:
@@ -148,13 +160,8 @@ def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, fri
     if model.body_jntnum[body] != 1:
         raise SceneError(f"{xml}: body '{name}' has {model.body_jntnum[body]} joints, expected 1")
     joint = model.body_jntadr[body]
-    box = [g for g in _geoms(model, body) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_BOX]
-    hull = [
-        g
-        for g in _geoms(model, body)
-        if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH and (model.geom_contype[g] or model.geom_conaffinity[g])
-    ]
-    if not box:
+    box, solid = _geoms(model, body)
+    if not len(box):
         raise SceneError(f"{xml}: body '{name}' has no box geom to collide with; convert it again")
     hinge = None
     if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
@@ -180,7 +187,7 @@ def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, fri
         quat_w=model.body_quat[body].copy(),
         friction=friction,
         boxes=_boxes(model, box),
-        hulls=tuple(_hull(model, g) for g in hull),
+        hulls=tuple(_hull(model, g) for g in solid if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH),
         hinge=hinge,
     )
 
@@ -206,14 +213,11 @@ def load_scene(folder: str | Path) -> Scene:
     structure = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "structure")
     if structure < 0:
         raise SceneError(f"{xml}: no body named 'structure'; convert the scene again")
-    solid = [g for g in _geoms(model, structure) if model.geom_contype[g] or model.geom_conaffinity[g]]
-    wrong = [g for g in solid if model.geom_type[g] != mujoco.mjtGeom.mjGEOM_BOX]
-    if wrong:
-        raise SceneError(f"{xml}: geom '{model.geom(wrong[0]).name}' of 'structure' collides but is not a box")
+    box, solid = _geoms(model, structure)
+    if len(wrong := np.setdiff1d(solid, box)):
+        raise SceneError(f"{xml}: geom '{model.geom(int(wrong[0])).name}' of 'structure' collides but is not a box")
 
-    movables = []
-    for obj in manifest.objects:
-        movables.append(read_movable(model, xml, obj.name, obj.category, obj.friction))
+    movables = [read_movable(model, xml, obj.name, obj.category, obj.friction) for obj in manifest.objects]
     walls = _boxes(model, solid)
     for row in walls:
         row[:3] = model.body_pos[structure] + rotate(model.body_quat[structure], row[:3])

@@ -1,7 +1,6 @@
 """Robot, small objects, furniture and walls in, the `MjSpec` of one padded scene out."""
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -14,12 +13,10 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.contacts import add_contact_sensors, add_sensor
 from interactive_nav.scenes.layout import Layout, find_layout
 from interactive_nav.scenes.object_folders import ConvertedObject
-from interactive_nav.scenes.objects import SmallObject, add_boxes, body_names
+from interactive_nav.scenes.objects import SmallObject, add_boxes
 from interactive_nav.scenes.scene import Movable, Scene
+from interactive_nav.scenes.slots import Slot, parking_spot
 
-PARKING_W = (200.0, 200.0)
-"""World x, y of the first parking spot; far outside any building."""
-_PARKING_STEP_M = 3.0
 _EMPTY_BOX = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1e-3, 1e-3, 1e-3])
 _TILTED = np.array([0.8, 0.36, 0.48, 0.0])
 FEET = 12
@@ -31,11 +28,6 @@ CEILING_M = 1.2
 """Height of the ceiling that flying robots meet: just below the tops of walls, which are cut above ground robots."""
 FLOOR_FRICTION = 0.05
 """Below every object's: MuJoCo takes the larger of two friction coefficients, so the object's own holds."""
-
-
-def parking_spot(index: int) -> tuple[float, float]:
-    """World x, y of a parking spot."""
-    return PARKING_W[0] + _PARKING_STEP_M * (index % 16), PARKING_W[1] + _PARKING_STEP_M * (index // 16)
 
 
 def foot_points(boxes: np.ndarray, count: int = FEET) -> np.ndarray:
@@ -63,27 +55,6 @@ def foot_points(boxes: np.ndarray, count: int = FEET) -> np.ndarray:
         if len(kept) < count and all(np.linalg.norm(point - k) > 0.02 for k in kept):
             kept.append(point)
     return np.stack(kept)
-
-
-@dataclasses.dataclass(frozen=True)
-class Slot:
-    """A place that all scenes of a batch have for a movable body."""
-
-    name: str
-    kind: str
-    """small, free or hinge."""
-    bodies: tuple[Movable | SmallObject | None, ...]
-    """[S] what each scene has there; None: nothing."""
-
-
-def find_slots(scenes: Sequence[Scene], small: Sequence[SmallObject]) -> list[Slot]:
-    """The small objects, then each scene's free bodies and its hinged ones, most boxes first."""
-    slots = [Slot(name, "small", (obj,) * len(scenes)) for name, obj in zip(body_names(small), small, strict=True)]
-    for kind in ("free", "hinge"):
-        own = ([m for m in scene.movables if (m.hinge is None) == (kind == "free")] for scene in scenes)
-        columns = itertools.zip_longest(*(sorted(movables, key=lambda m: -len(m.boxes)) for movables in own))
-        slots += [Slot(f"{kind}_{i}", kind, column) for i, column in enumerate(columns)]
-    return slots
 
 
 def _solid(friction: float, group: int = 3) -> dict[str, Any]:

@@ -6,10 +6,7 @@ slot is a body without a place: it waits at its parking spot and never counts.
 """
 
 import dataclasses
-import functools
 import math
-from collections.abc import Callable
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -20,7 +17,8 @@ from interactive_nav.scenes.layout import Layout, find_layout
 from interactive_nav.scenes.object_folders import small_objects
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.scenes.scene import Scene
-from interactive_nav.scenes.spec import Slot, build_spec, find_slots, parking_spot
+from interactive_nav.scenes.slots import SlotTables, build_slot_tables, find_slots, parking_spot
+from interactive_nav.scenes.spec import build_spec
 from interactive_nav_common.errors import ConfigError
 from scenes_mjcf.schema import SceneError
 
@@ -42,32 +40,8 @@ class World:
     rest_qpos: np.ndarray
     """[S, nq]: furniture settled, robot and small objects parked."""
     robot_mass_kg: float
-    slots: tuple[Slot, ...]
-    """[M] what may move, by scene."""
-
-    @functools.cached_property
-    def names(self) -> tuple[tuple[str, ...], ...]:
-        """[S][M] body names, '' for an empty slot."""
-        return self._told(lambda slot, body: slot.name if slot.kind == "small" else body.name)
-
-    @functools.cached_property
-    def categories(self) -> tuple[tuple[str, ...], ...]:
-        """[S][M] categories of the same."""
-        return self._told(lambda slot, body: body.category)
-
-    def _told(self, of: Callable[[Slot, Any], str]) -> tuple[tuple[str, ...], ...]:
-        every = range(len(self.scenes))
-        return tuple(tuple(of(slot, slot.bodies[s]) if slot.bodies[s] else "" for slot in self.slots) for s in every)
-
-    @functools.cached_property
-    def occupied(self) -> np.ndarray:
-        """[S, M] bool: the slot holds a body of the scene (small objects always do)."""
-        return np.array([[name != "" for name in names] for names in self.names], bool)
-
-    @functools.cached_property
-    def mass_kg(self) -> np.ndarray:
-        """[S, M], 0 for an empty slot."""
-        return self.occupied * np.stack([model.body_mass[self.layout.slot_body] for model in self.models])
+    slots: SlotTables
+    """What may move, by scene."""
 
 
 def _settle(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> np.ndarray:
@@ -121,5 +95,5 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
         layout=layout,
         rest_qpos=np.asarray(rest),
         robot_mass_kg=float(models[0].body_mass[layout.robot_bodies].sum()),
-        slots=tuple(slots),
+        slots=build_slot_tables(slots, scenes, models, layout),
     )

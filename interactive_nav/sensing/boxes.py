@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from interactive_nav.scenes.objects import VISUAL_GROUP, SmallObject
+from interactive_nav.scenes.objects import VISUAL_GROUP
 from interactive_nav.scenes.world import World
-from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, body_colours, geom_colour
+from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, geom_colour, visual_geoms
 from interactive_nav_common.rotations import Array, matrix_from_quat
 from scenes_mjcf.categories import MaskClasses, class_id
 
@@ -88,14 +88,13 @@ def robot_geoms(world: World) -> list[list[int]]:
     bodies = world.layout.robot_bodies
     own = np.flatnonzero(np.isin(model.geom_bodyid, bodies))
     shown = own[model.geom_group[own] == VISUAL_GROUP]
-    found: list[list[int]] = [[] for _ in bodies]
+    geoms: list[list[int]] = [[] for _ in bodies]
     for geom in map(int, shown if len(shown) else own):
-        name = model.body(int(model.geom_bodyid[geom])).name
-        box = geom_box(model, geom)
+        body, box = int(model.geom_bodyid[geom]), geom_box(model, geom)
         inside = np.abs((np.asarray(camera.pos_m) - box[:3]) @ matrix_from_quat(box[3:7])) <= box[7:] + HOUSING_M
-        if name != camera.body or not inside.all():
-            found[list(bodies).index(model.geom_bodyid[geom])].append(geom)
-    return found
+        if model.body(body).name != camera.body or not inside.all():
+            geoms[list(bodies).index(body)].append(geom)
+    return geoms
 
 
 def geom_box(model: mujoco.MjModel, geom: int) -> np.ndarray:
@@ -109,12 +108,9 @@ class BoxTables:
     """Boxes of all scenes, padded alike; S scenes, B boxes, M bodies that move, then one that stands (the walls), then
     the robot's if it is seen."""
 
+    world: World = flax.struct.field(pytree_node=False)
     body: np.ndarray = flax.struct.field(pytree_node=False)
     """[B] index of each box's body; M for walls."""
-    slot_qpos: np.ndarray = flax.struct.field(pytree_node=False)
-    """[M] address in qpos."""
-    hinged: np.ndarray = flax.struct.field(pytree_node=False)
-    """[M] bool."""
     pos_b: jax.Array
     """[S, B, 3] f32 centre in the body's frame, m."""
     axes_b: jax.Array
@@ -125,14 +121,6 @@ class BoxTables:
     """[S, B] u8."""
     colour: jax.Array | None
     """[S, B + 1, 3] f32 in [0, 1], the floor's last; None: not asked for."""
-    hinge_pos_w: jax.Array
-    """[S, M, 3] f32 rest position of a hinged body's frame, m."""
-    hinge_axes_w: jax.Array
-    """[S, M, 3, 3] f32 rest orientation of it."""
-    hinge_axis_b: jax.Array
-    """[S, M, 3] f32."""
-    hinge_anchor_b: jax.Array
-    """[S, M, 3] f32, m."""
     classes: MaskClasses = flax.struct.field(pytree_node=False, default=4)
     """How `class_id` tells categories apart: the setting `segmentation_classes`."""
     robot: Links | None = flax.struct.field(pytree_node=False, default=None)
@@ -144,24 +132,13 @@ class BoxTables:
         return len(self.body)
 
 
-def boxes_of_slots(world: World, s: int, classes: MaskClasses) -> list[tuple[np.ndarray, int]]:
-    """Boxes [n, 10] and class id of what is in each slot of a scene, then of its walls."""
-    out = []
-    for body in (slot.bodies[s] for slot in world.slots):
-        if isinstance(body, SmallObject):
-            out.append((body.rows, body.mask_id(classes)))
-        else:
-            out.append((body.boxes, class_id(body.category, classes)) if body else (np.zeros((0, 10)), 0))
-    return [*out, (world.scenes[s].walls, 0)]
-
-
-def _colours_of_slots(world: World, s: int, ids: list[int], classes: MaskClasses) -> np.ndarray:
+def _colours_of_slots(world: World, s: int, ids: np.ndarray, classes: MaskClasses) -> np.ndarray:
     """[M + 2 or more, 3]: mean colour of the visual meshes in each slot, of the walls, of the robot's bodies, and the
     floor's; where a body has no mesh, that of its class."""
-    own, names = body_colours(world.scenes[s]), (*world.names[s], "structure")
-    rows = [own[name] if name in own else PALETTES[classes][number] for name, number in zip(names, ids, strict=False)]
-    model, geoms = world.models[0], robot_geoms(world)[: len(ids) - len(rows)]
-    rows += [np.mean([geom_colour(model, geom) for geom in own], 0) if own else np.zeros(3) for own in geoms]
+    (model, visual), names = visual_geoms(world.scenes[s]), (*world.slots.names[s], "structure")
+    shown = [(model, visual.get(name, []), PALETTES[classes][number]) for name, number in zip(names, ids, strict=False)]
+    shown += [(world.models[0], geoms, np.zeros(3)) for geoms in robot_geoms(world)[: len(ids) - len(shown)]]
+    rows = [np.mean([geom_colour(of, g) for g in geoms], 0) if geoms else other for of, geoms, other in shown]
     return np.stack([*rows, np.asarray(FLOOR_COLOUR)])
 
 
@@ -170,51 +147,27 @@ def build_boxes(world: World, classes: MaskClasses = 4, colours: bool = False, r
 
     `colours` reads the textures, for images in colour; with `robot` its bodies are seen, each geom as a box.
     """
-    layout, scenes = world.layout, world.scenes
-    slots = layout.num_slots
-    columns = [boxes_of_slots(world, s, classes) for s in range(len(scenes))]
+    slots, model = world.slots, world.models[0]
+    body, rows, ids = slots.box_slot, slots.boxes_b, slots.class_ids(classes)
     if robot:
-        model, number = world.models[0], class_id("robot", classes)
-        boxes = [np.reshape([geom_box(model, geom) for geom in own], (-1, 10)) for own in robot_geoms(world)]
-        columns = [[*column, *((rows, number) for rows in boxes)] for column in columns]
-    counts = [max(len(column[m][0]) for column in columns) for m in range(len(columns[0]))]
-    body = np.repeat(np.arange(len(counts)), counts)
-    first = np.concatenate([[0], np.cumsum(counts)])
-    shape = (len(scenes), len(body))
-    pos, half, ids = np.zeros((*shape, 3)), np.full((*shape, 3), -1.0), np.zeros(shape, np.uint8)
-    axes = np.broadcast_to(np.eye(3), (*shape, 3, 3)).copy()
-    is_hinge = np.asarray([kind == "hinge" for kind in layout.slot_kind], bool)
-    hinge_pos, hinge_axis, anchor = np.zeros((3, len(scenes), slots, 3))
-    hinge_axes = np.broadcast_to(np.eye(3), (len(scenes), slots, 3, 3)).copy()
-    for s, (column, model) in enumerate(zip(columns, world.models, strict=True)):
-        for m, (boxes, number) in enumerate(column):
-            at = slice(first[m], first[m] + len(boxes))
-            pos[s, at], half[s, at], ids[s, at] = boxes[:, :3], boxes[:, 7:10], number
-            axes[s, at] = matrix_from_quat(boxes[:, 3:7])
-        leaf = layout.slot_body[is_hinge]
-        joint = model.body_jntadr[leaf]
-        hinge_pos[s, is_hinge], hinge_axes[s, is_hinge] = model.body_pos[leaf], matrix_from_quat(model.body_quat[leaf])
-        hinge_axis[s, is_hinge], anchor[s, is_hinge] = model.jnt_axis[joint], model.jnt_pos[joint]
-    painted = [
-        _colours_of_slots(world, s, [number for _, number in column], classes)[[*body, -1]]
-        for s, column in enumerate(columns if colours else [])
-    ]
+        own, first = robot_geoms(world), ids.shape[1]
+        shown = np.array([geom_box(model, geom) for geoms in own for geom in geoms])
+        body = np.concatenate([body, np.repeat(first + np.arange(len(own)), [len(geoms) for geoms in own])])
+        rows = np.concatenate([rows, np.broadcast_to(shown, (len(rows), *shown.shape))], 1)
+        ids = np.pad(ids, [(0, 0), (0, len(own))], constant_values=class_id("robot", classes))
+    scenes = range(len(rows) if colours else 0)
+    painted = [_colours_of_slots(world, s, ids[s], classes)[[*body, -1]] for s in scenes]
     f32 = jnp.float32
     return BoxTables(
+        world=world,
         body=body,
-        slot_qpos=np.asarray(layout.slot_qpos),
-        hinged=is_hinge,
-        pos_b=jnp.asarray(pos, f32),
-        axes_b=jnp.asarray(axes, f32),
-        half_m=jnp.asarray(half, f32),
-        class_id=jnp.asarray(ids),
+        pos_b=jnp.asarray(rows[..., :3], f32),
+        axes_b=jnp.asarray(matrix_from_quat(rows[..., 3:7]), f32),
+        half_m=jnp.asarray(rows[..., 7:], f32),
+        class_id=jnp.asarray(ids[:, body]),
         colour=jnp.asarray(np.stack(painted), f32) if colours else None,
         classes=classes,
-        robot=make_links(world.models[0], world.layout.robot_bodies.tolist()) if robot else None,
-        hinge_pos_w=jnp.asarray(hinge_pos, f32),
-        hinge_axes_w=jnp.asarray(hinge_axes, f32),
-        hinge_axis_b=jnp.asarray(hinge_axis, f32),
-        hinge_anchor_b=jnp.asarray(anchor, f32),
+        robot=make_links(model, world.layout.robot_bodies.tolist()) if robot else None,
     )
 
 
@@ -245,19 +198,16 @@ def body_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[ja
         Positions [..., M + 1, 3], m, and axes as columns [..., M + 1, 3, 3]; the last is the standing body. If the
         robot is seen, its bodies follow.
     """
-    lead = qpos.shape[:-1]
-    free, hinged = np.flatnonzero(~tables.hinged), np.flatnonzero(tables.hinged)
-    pose = qpos[..., tables.slot_qpos[free][:, None] + np.arange(7)]
-    axis, anchor = tables.hinge_axis_b[scene][..., hinged, :], tables.hinge_anchor_b[scene][..., hinged, :]
-    arm, turned = swing(axis, anchor, qpos[..., tables.slot_qpos[hinged]])
-    rest = tables.hinge_axes_w[scene][..., hinged, :, :]
-    swung = tables.hinge_pos_w[scene][..., hinged, :] + rotate(rest, arm)
+    lead, slots, address = qpos.shape[:-1], tables.world.slots, tables.world.layout.slot_qpos
+    hinged = slots.hinged  # which `find_slots` puts last
+    pose = qpos[..., address[~hinged][:, None] + np.arange(7)]
+    at_rest = slots.pos_w_m, slots.axes_w, slots.hinge_axis_b, slots.hinge_anchor_b_m
+    pos, rest, axis, anchor = (jnp.asarray(table[:, hinged], jnp.float32)[scene] for table in at_rest)
+    arm, turned = swing(axis, anchor, qpos[..., address[hinged]])
+    swung = pos + rotate(rest, arm)
     standing = jnp.broadcast_to(jnp.eye(3, dtype=qpos.dtype), (*lead, 1, 3, 3))
     pos = jnp.concatenate([pose[..., :3], swung, jnp.zeros((*lead, 1, 3), qpos.dtype)], -2)
     axes = jnp.concatenate([matrix_from_quat(pose[..., 3:]), compose(rest, turned), standing], -3)
-    order = np.argsort(np.concatenate([free, hinged, [len(tables.slot_qpos)]]))
-    if (order != np.arange(len(order))).any():
-        pos, axes = pos[..., order, :], axes[..., order, :, :]
     if tables.robot is not None:
         own_pos, own_axes = zip(*tables.robot.frames(qpos), strict=True)
         pos = jnp.concatenate([pos, jnp.stack(own_pos, -2)], -2)

@@ -19,11 +19,10 @@ import warp as wp
 from scipy.spatial import ConvexHull
 
 from interactive_nav.physics.warp_callbacks import held, keep_collector_out
-from interactive_nav.scenes.objects import VISUAL_GROUP
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing.base import FAR_M, NEAR_M, Lens, Renderer
-from interactive_nav.sensing.boxes import BoxTables, body_poses, boxes_of_slots, geom_box, robot_geoms, rotate
-from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, SKY_COLOUR, geom_colour
+from interactive_nav.sensing.boxes import BoxTables, body_poses, geom_box, robot_geoms, rotate
+from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, SKY_COLOUR, geom_colour, visual_geoms
 from interactive_nav.sensing.surfaces import lit_images
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.agreement import is_lit
@@ -105,20 +104,17 @@ def _mesh_part(model: mujoco.MjModel, geom: int, slot: int, standing: bool) -> _
 
 def _parts(world: World, s: int, tables: BoxTables) -> tuple[list[_Part], list[int]]:
     """What there is to see of a scene, bodies without visual meshes as their boxes; and the class of each slot."""
-    model = mujoco.MjModel.from_xml_path(str(world.scenes[s].path / "scene.xml"))
-    column = boxes_of_slots(world, s, tables.classes)
-    visual: dict[str, list[int]] = {}
-    for geom in np.flatnonzero((model.geom_group == VISUAL_GROUP) & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)):
-        visual.setdefault(model.body(int(model.geom_bodyid[geom])).name, []).append(int(geom))
+    model, visual = visual_geoms(world.scenes[s])
+    slots, ids = world.slots, world.slots.class_ids(tables.classes)[s]
     parts = []
-    for slot, (name, (boxes, number)) in enumerate(zip((*world.names[s], "structure"), column, strict=True)):
-        if name in visual:
-            parts += [_mesh_part(model, geom, slot, name == "structure") for geom in visual[name]]
-        elif len(boxes):
-            parts.append(_box_part(slot, boxes, PALETTES[tables.classes][number]))
+    for slot, name in enumerate((*slots.names[s], "structure")):
+        if meshes := [g for g in visual.get(name, []) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH]:
+            parts += [_mesh_part(model, geom, slot, name == "structure") for geom in meshes]
+        elif len(boxes := slots.rows(s, slot)):
+            parts.append(_box_part(slot, boxes, PALETTES[tables.classes][ids[slot]]))
     own = robot_geoms(world) if tables.robot else []
-    parts += [_geom_part(world.models[0], g, len(column) + i) for i, geoms in enumerate(own) for g in geoms]
-    return parts, [number for _, number in column] + [class_id("robot", tables.classes)] * len(own)
+    parts += [_geom_part(world.models[0], g, len(ids) + i) for i, geoms in enumerate(own) for g in geoms]
+    return parts, [*ids, *[class_id("robot", tables.classes)] * len(own)]
 
 
 @dataclasses.dataclass(frozen=True)

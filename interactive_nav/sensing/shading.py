@@ -79,10 +79,9 @@ def geom_colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
     return pixels[used].mean(0) / 255.0 if used.any() else np.full(3, 0.5)
 
 
-def body_colours(scene: Scene) -> dict[str, np.ndarray]:
-    """Name of each body that has visual meshes -> (3,) mean colour of them, in [0, 1]."""
-    model = mujoco.MjModel.from_xml_path(str(scene.path / "scene.xml"))
-    found: dict[str, list[np.ndarray]] = {}
-    for geom in np.flatnonzero(model.geom_group == VISUAL_GROUP):
-        found.setdefault(model.body(int(model.geom_bodyid[geom])).name, []).append(geom_colour(model, int(geom)))
-    return {name: np.mean(colours, 0) for name, colours in found.items()}
+def visual_geoms(scene: Scene) -> tuple[mujoco.MjModel, dict[str, list[int]]]:
+    """Return a scene's model as stored, and the geoms for show by the name of each body that has any."""
+    model, geoms = mujoco.MjModel.from_xml_path(str(scene.path / "scene.xml")), {}
+    for geom in map(int, np.flatnonzero(model.geom_group == VISUAL_GROUP)):
+        geoms.setdefault(model.body(model.geom_bodyid[geom]).name, []).append(geom)
+    return model, geoms

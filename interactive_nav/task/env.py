@@ -26,7 +26,7 @@ from interactive_nav.physics.base import TOUCH_FORCE_N
 from interactive_nav.reward import interactive_navigation_reward
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.scene import Scene
-from interactive_nav.scenes.spec import parking_spot
+from interactive_nav.scenes.slots import parking_spot
 from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing.boxes import body_poses, rotate
 from interactive_nav.sensing.observation import advance_odometry, waypoints_in_body

@@ -34,7 +34,7 @@ def jumble(world):
             at = layout.slot_qpos[slot]
             if kind == "hinge":
                 qpos[i, at] = rng.uniform(-1.2, 1.2)
-            elif world.occupied[scene[i], slot]:
+            elif world.slots.occupied[scene[i], slot]:
                 tilt = np.append(1.0, rng.normal(0, 0.3, 3))
                 qpos[i, at : at + 7] = [*rng.uniform(-1.4, 1.4, 2), rng.uniform(0.0, 0.4), *tilt / np.linalg.norm(tilt)]
     eye = np.column_stack([rng.uniform(-1.8, -1.4, N), rng.uniform(-1, 1, N), rng.uniform(0.25, 0.6, N)])

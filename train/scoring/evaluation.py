@@ -142,7 +142,7 @@ def evaluate(
             constants["checkpoint_steps"] = meta.env_steps
         else:
             constants |= dict.fromkeys(OF_LEARNED)
-        table = episode_table(played[name], env.scenes, env.world.categories, constants)
+        table = episode_table(played[name], env.scenes, env.world.slots.categories, constants)
         if fixed:
             needed = [row.get("push_needed") for row in fixed.episodes]
             table = table.append_column("push_needed", pa.array(needed, pa.bool_()))
@@ -187,7 +187,7 @@ def write_paths(path: Path, played: dict[str, PlayedEpisodes], env: Any) -> None
         arrays[f"scene/{i}/furniture"] = env.furniture_map(i)
         arrays[f"scene/{i}/resolution_m"] = np.array(scene.maps.resolution_m)
         arrays[f"scene/{i}/origin_w"] = np.array(scene.maps.origin_w)
-        arrays[f"scene/{i}/object_names"] = np.array(env.world.names[i], dtype=str)
+        arrays[f"scene/{i}/object_names"] = np.array(env.world.slots.names[i], dtype=str)
     write_arrays(path, **arrays)
 
 

@@ -19,8 +19,9 @@ from interactive_nav.pictures.scene_model import ROBOT, SCENE
 from interactive_nav.pictures.views import SceneView
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav.scenes.slots import bodies_by_name
 from interactive_nav.sensing.base import CameraPose, Lens
-from interactive_nav.topdown import outlines, shadow
+from interactive_nav.topdown import shadow
 from train.figures import style
 
 LENS = Lens(480, 360, 20.0)
@@ -32,7 +33,7 @@ LABEL_BOX = {"facecolor": "0.1", "linewidth": 0, "boxstyle": "round,pad=0.2"}
 
 def shadows_of(replay: Replay, scene: Scene, step: int) -> dict[str, Any]:
     """What each movable thing covers of the floor, by its body's name."""
-    at = {name: (boxes, replay.bodies.index(name)) for name, (_, boxes) in outlines(replay, scene).items()}
+    at = {name: (thing.rows, replay.bodies.index(name)) for name, thing in bodies_by_name(scene, replay.small).items()}
     pos_w, quat_w = replay.body_pos_w[step], replay.body_quat_w[step]
     return {name: shadow(boxes, pos_w[b], quat_w[b]) for name, (boxes, b) in at.items()}
 

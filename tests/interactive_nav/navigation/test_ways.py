@@ -54,7 +54,7 @@ def env(tmp_path_factory):
 def test_footprints_cover_the_cube_below_the_robot_only(env):
     world = env.world
     model = world.models[1]
-    slot = int(np.flatnonzero(world.occupied[1])[0])
+    slot = int(np.flatnonzero(world.slots.occupied[1])[0])
     prints = Footprints(model, world.layout.slot_body[[slot]], 0.41, (-2.5, -2.0), (80, 100))
     qpos = world.rest_qpos[1].copy()
     (cells,) = prints.cells(qpos)

@@ -83,7 +83,7 @@ def test_boxes_hold_the_geoms_wherever_bodies_stand(world):
     place = jax.jit(lambda qpos: near.boxes(jnp.asarray(0), _state(world, qpos)))
     for _ in range(5):
         data.qpos[:] = world.rest_qpos[0]
-        for slot in np.flatnonzero(world.occupied[0]):
+        for slot in np.flatnonzero(world.slots.occupied[0]):
             at = layout.slot_qpos[slot]
             if near.hinge[slot]:
                 data.qpos[at] = rng.uniform(-1, 1)
@@ -92,7 +92,7 @@ def test_boxes_hold_the_geoms_wherever_bodies_stand(world):
                 data.qpos[at : at + 7] = [*rng.uniform(-2, 2, 3), *quat / np.linalg.norm(quat)]
         mujoco.mj_kinematics(model, data)
         boxes = place(data.qpos)
-        for slot in np.flatnonzero(world.occupied[0]):
+        for slot in np.flatnonzero(world.slots.occupied[0]):
             body = layout.slot_body[slot]
             first, last = model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body] - FEET
             shadow = _shadow(boxes.centre[slot], _whole(boxes.axes[slot]), boxes.half[slot])
@@ -119,7 +119,7 @@ def _state(world, qpos, qvel=None):
 
 def test_what_stands_behind_a_moving_thing_is_near_however_far_from_the_robot(world):
     """The chair stands 0.25 m behind the sofa, out of the robot's own reach."""
-    near, slot = Nearness(world), {n: i for i, n in enumerate(world.names[0]) if n}
+    near, slot = Nearness(world), {n: i for i, n in enumerate(world.slots.names[0]) if n}
     qpos = world.rest_qpos[0].copy()
     qpos[:7] = [0.0, 0.0, 0, 1, 0, 0, 0]
     measure = jax.jit(lambda state: near.measure(jnp.asarray(0), state, 0.78))
@@ -135,7 +135,7 @@ def test_what_stands_behind_a_moving_thing_is_near_however_far_from_the_robot(wo
     assert bool(moves[sofa]) and not bool(moves[chair])
     np.testing.assert_allclose(pushed[chair], min(float(rest[chair]), between - TOUCH_M), atol=1e-4)
     assert float(pushed[table]) > 1.0 and float(pushed[sofa]) == pytest.approx(float(rest[sofa]))
-    assert (np.asarray(rest)[~np.asarray(world.occupied[0])] == FAR_M).all()
+    assert (np.asarray(rest)[~np.asarray(world.slots.occupied[0])] == FAR_M).all()
 
 
 def test_a_window_is_as_wide_as_what_stands_near_somewhere(tmp_path):

@@ -211,7 +211,7 @@ def test_the_solvers_warm_start_crosses_tiers(world, engines):
     chosen = whole.select(measured)[0]
     after = whole.leave(state, whole.enter(state, chosen), chosen)
     inner = narrow.enter(after, narrow.select(measured)[0]).qacc_warmstart
-    layout, chair = world.layout, world.layout.slot_qvel[world.names[0].index("chair_0")]
+    layout, chair = world.layout, world.layout.slot_qvel[world.slots.names[0].index("chair_0")]
     robot = layout.robot_qvel + np.arange(layout.robot_nv)
     expected = 1.0 + np.concatenate([robot, chair + np.arange(6)])
     assert sorted(inner.tolist()) == sorted(expected.tolist())

@@ -86,7 +86,7 @@ def test_the_nearest_are_chosen_and_what_is_left_out_within_reach_is_told(world)
 
     def names(xy):
         chosen, _, missed = select(jnp.asarray(0), _state(world, 0, xy))
-        return {world.names[0][s] for s in group.slots[np.asarray(chosen[free])]}, int(missed)
+        return {world.slots.names[0][s] for s in group.slots[np.asarray(chosen[free])]}, int(missed)
 
     assert names((0.0, 0.0)) == ({"chair_0", "chair_1"}, 0)
     assert names((-2.0, 0.0))[0] >= {"table_1"}
@@ -106,12 +106,12 @@ def test_sizes_are_measured_where_none_are_set(world):
 def test_a_moving_object_outranks_one_at_rest(world):
     one = Window(world, NavConfig.of(num_objects=2, active_furniture=1))
     state = _state(world, 0)
-    slot = world.names[0].index("chair_1")
+    slot = world.slots.names[0].index("chair_1")
     moving = state.replace(qvel=state.qvel.at[world.layout.slot_qvel[slot]].set(0.5))
     free = next(i for i, g in enumerate(one.groups) if slot in g.slots)
     select = _select(one)
     picked = [int(one.groups[free].slots[int(select(jnp.asarray(0), s)[0][free][0])]) for s in (state, moving)]
-    assert [world.names[0][p] for p in picked] == ["chair_0", "chair_1"]
+    assert [world.slots.names[0][p] for p in picked] == ["chair_0", "chair_1"]
 
 
 def test_enter_and_leave_are_inverse(world):
@@ -152,11 +152,11 @@ def test_a_push_in_a_window_is_that_of_the_whole_building(furnished):
 
     whole, force = run("native")
     window, window_force = run("jax", active_furniture=2)
-    chair = world.layout.slot_qpos[world.names[0].index("chair_0")]
+    chair = world.layout.slot_qpos[world.slots.names[0].index("chair_0")]
     assert whole[chair] - world.rest_qpos[0][chair] > 0.05
     np.testing.assert_allclose(window[chair : chair + 3], whole[chair : chair + 3], atol=0.02)
     for name in ("table_0", "table_1"):
-        slot = world.names[0].index(name)
+        slot = world.slots.names[0].index(name)
         at = world.layout.slot_qpos[slot]
         np.testing.assert_allclose(window[at : at + 7], np.float32(world.rest_qpos[0][at : at + 7]), atol=1e-4)
         assert window_force[slot] == 0.0 == force[slot]
@@ -196,7 +196,7 @@ def test_a_pushed_sofa_does_not_enter_a_wall_in_a_window(narrow):
         mujoco.mj_step(model, data, nstep=5)
         new = (jnp.asarray(x, jnp.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart))
         part = window.leave(part, PhysicsState(*new), chosen)
-    sofa = world.layout.slot_qpos[world.names[0].index("sofa_0")]
+    sofa = world.layout.slot_qpos[world.slots.names[0].index("sofa_0")]
     moved = [float(s.qpos[sofa] - first.qpos[sofa]) for s in (whole, part)]
     assert moved == pytest.approx([0.05, 0.05], abs=2e-3), "0.05 m to the wall"
 

@@ -34,6 +34,7 @@ from interactive_nav.pictures.views import (
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav.scenes.slots import bodies_by_name
 from interactive_nav.sensing.base import Lens, look_along
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.rotations import yaw_from_quat
@@ -167,11 +168,11 @@ def test_pictures_show_the_episodes_own_models_and_goal(room, played, tmp_path, 
     told = replay.load(tmp_path / "a.npz")
     assert (told.small_objects, told.segmentation_classes, told.success_distance_m) == ("test", 5, 0.7)
     names = [f"{o.category}_small_{i}" for i, o in enumerate(pick(3, "test"))]
-    shown = {name: rows for name, (_, rows) in topdown.outlines(told, load_scene(room)).items()}
+    shown = bodies_by_name(load_scene(room), told.small)
     view = record.Compositor(told, load_scene(room), height=120)._view
     for name, obj in zip(names, pick(3, "test"), strict=True):
         halves = [box.half_m for box in obj.boxes]
-        np.testing.assert_allclose(shown[name][:, 7:], halves)
+        np.testing.assert_allclose(shown[name].rows[:, 7:], halves)
         body = view.model.body(name)
         np.testing.assert_allclose(view.model.geom_size[body.geomadr[0] : body.geomadr[0] + body.geomnum[0]], halves)
     painted = []

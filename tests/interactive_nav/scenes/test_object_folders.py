@@ -19,7 +19,7 @@ from interactive_nav.config import make_config
 from interactive_nav.pictures.replay import EpisodePlayer, load, save
 from interactive_nav.scenes.object_folders import load_object, small_objects
 from interactive_nav.scenes.objects import Box, pick
-from interactive_nav.topdown import outlines
+from interactive_nav.scenes.slots import bodies_by_name
 from interactive_nav_common.errors import UserError
 from scenes_mjcf.schema import SceneError
 
@@ -80,8 +80,8 @@ def test_they_rest_where_an_episode_puts_them(env):
     last = np.array(state.pipeline_state.qpos)
     for at in env.world.layout.slot_qpos[:3]:
         np.testing.assert_allclose(last[at : at + 7], first[at : at + 7], atol=3e-3)
-    np.testing.assert_allclose(env.world.mass_kg[0, :3], (2.0, 0.5, 2.0))
-    assert env.world.names[0][:3] == ("toy_small_0", "other_small_1", "toy_small_2")
+    np.testing.assert_allclose(env.world.slots.mass_kg[0, :3], (2.0, 0.5, 2.0))
+    assert env.world.slots.names[0][:3] == ("toy_small_0", "other_small_1", "toy_small_2")
     crate = env.world.models[0].body("toy_small_0")
     a, b, c = 0.3, 0.2, 0.1
     want = 2.0 / 12 * np.array([b * b + c * c, a * a + c * c, a * a + b * b])
@@ -126,9 +126,9 @@ def test_replays_draw_the_objects(env, tmp_path):
     save(replay, tmp_path / "r.npz")
     again = load(tmp_path / "r.npz")
     assert again.objects == replay.objects and again.small == env.world.small_objects
-    category, rows = outlines(again, env.scenes[0])["other_small_1"]
-    assert category == "other"
-    np.testing.assert_array_equal(rows, env.world.small_objects[1].rows)
+    thing = bodies_by_name(env.scenes[0], again.small)["other_small_1"]
+    assert thing.category == "other"
+    np.testing.assert_array_equal(thing.rows, env.world.small_objects[1].rows)
 
 
 def test_refusals(tmp_path, folders):

@@ -27,15 +27,15 @@ def world(room, two_rooms):
 def test_slots_masses_and_names(world):
     # Three small objects, two free slots, one hinge; the first scene leaves a free slot and the hinge empty.
     assert world.layout.slot_kind == ("small", "small", "small", "free", "free", "hinge")
-    np.testing.assert_array_equal(world.occupied, [[1, 1, 1, 1, 0, 0], [1, 1, 1, 1, 1, 1]])
-    assert world.names[0][3:] == ("chair_0", "", "") and world.names[1][3:] == (
+    np.testing.assert_array_equal(world.slots.occupied, [[1, 1, 1, 1, 0, 0], [1, 1, 1, 1, 1, 1]])
+    assert world.slots.names[0][3:] == ("chair_0", "", "") and world.slots.names[1][3:] == (
         "chair_0",
         "table_0",
         "door_0",
     )
     small = tuple(o.category for o in world.small_objects)
-    assert world.categories == ((*small, "chair", "", ""), (*small, "chair", "table", "door"))
-    np.testing.assert_allclose(world.mass_kg[1], [0.9, 0.38, 1.4, 5.0, 10.0, 8.0], rtol=1e-5)
+    assert world.slots.categories == ((*small, "chair", "", ""), (*small, "chair", "table", "door"))
+    np.testing.assert_allclose(world.slots.mass_kg[1], [0.9, 0.38, 1.4, 5.0, 10.0, 8.0], rtol=1e-5)
     assert world.robot_mass_kg == pytest.approx(2.673)
     for model, rest in zip(world.models, world.rest_qpos, strict=True):
         furniture = [
@@ -78,7 +78,7 @@ def test_a_chair_rests_on_its_feet_and_weighs_on_the_floor(world):
             up += force[0]
             kinds |= {int(model.geom_type[g]) for g in geoms if g != floor}
     assert kinds == {int(mujoco.mjtGeom.mjGEOM_SPHERE)}
-    assert up == pytest.approx(9.81 * world.mass_kg[1, 3], rel=0.02)
+    assert up == pytest.approx(9.81 * world.slots.mass_kg[1, 3], rel=0.02)
 
 
 def test_an_empty_slot_floats_in_place(world):

@@ -47,7 +47,7 @@ def c_mujoco(world, scene, qpos, pos, axes, lens, classes: MaskClasses = 4):
     mujoco.mj_multiRay(model, data, np.asarray(pos, float), unit, None, 1, -1, geom, distance, None, length.size, 400.0)
     categories = {m.name: m.category for m in world.scenes[scene].movables}
     ids = np.zeros(model.ngeom, np.uint8)
-    for slot, name in enumerate(world.names[scene]):
+    for slot, name in enumerate(world.slots.names[scene]):
         if name:
             small = layout.slot_kind[slot] == "small"
             own = world.small_objects[slot].mask_id(classes) if small else class_id(categories[name], classes)

@@ -4,7 +4,6 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
@@ -15,7 +14,7 @@ from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing.base import Lens, look_along
 from interactive_nav.sensing.boxes import build_boxes
 from interactive_nav.sensing.rays import RayRenderer
-from interactive_nav.sensing.shading import FLOOR_COLOUR, SKY_COLOUR, body_colours, geom_colour
+from interactive_nav.sensing.shading import FLOOR_COLOUR, SKY_COLOUR, geom_colour, visual_geoms
 from scenes_mjcf.categories import CATEGORIES
 
 SUN = np.array([0.35, 0.25, 0.9]) / np.linalg.norm([0.35, 0.25, 0.9])
@@ -67,16 +66,18 @@ def test_depth_and_masks_are_the_same_with_and_without_colours(world, boxes, jum
 
 def test_a_bodys_colour_is_the_mean_of_its_texture():
     scene = load_scene("scenes_mjcf/apartment_0")
-    model = mujoco.MjModel.from_xml_path(str(scene.path / "scene.xml"))
-    colours = body_colours(scene)
-    assert {m.name for m in scene.movables} | {"structure"} <= set(colours)
+    model, visual = visual_geoms(scene)
+    assert {m.name for m in scene.movables} | {"structure"} <= set(visual)
     name = scene.movables[0].name
     own = model.geom_bodyid == model.body(name).id
     (geom,) = np.flatnonzero(own & (model.geom_group == 2))
-    np.testing.assert_allclose(colours[name], geom_colour(model, int(geom)), atol=1e-6)
-    assert all(value.min() > 0 and value.max() <= 1 for value in colours.values())
+    assert visual[name] == [geom]
     world = build_world(get_robot("turtlebot"), (scene,), NavConfig.of(num_objects=1))
     tables = build_boxes(world, colours=True)
     assert tables.colour is not None and tables.colour.shape == (1, tables.num_boxes + 1, 3)
     walls = np.asarray(tables.colour)[0, :-1][tables.body == world.layout.num_slots]
-    np.testing.assert_allclose(walls, np.tile(colours["structure"], (len(walls), 1)), atol=1e-6)
+    mean = np.mean([geom_colour(model, g) for g in visual["structure"]], 0)
+    assert mean.min() > 0 and mean.max() <= 1
+    np.testing.assert_allclose(walls, np.tile(mean, (len(walls), 1)), atol=1e-6)
+    box = np.flatnonzero(tables.body == world.slots.names[0].index(name))[0]
+    np.testing.assert_allclose(np.asarray(tables.colour)[0, box], geom_colour(model, int(geom)), atol=1e-6)

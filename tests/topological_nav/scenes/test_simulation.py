@@ -36,7 +36,7 @@ def test_pushed_furniture_and_small_objects_are_seen_where_they_are(room):
     names, own, pos_w, _ = world_poses(env.world, 0, qpos)
     little = [names.index(name) for name in body_names(env.world.small_objects)]
     assert len(little) == 3 and np.abs(pos_w[0, little, :2]).max() < 2.5  # in the room
-    chair = env.world.layout.slot_qpos[next(i for i, n in enumerate(env.world.names[0]) if n == "chair_0")]
+    chair = env.world.layout.slot_qpos[next(i for i, n in enumerate(env.world.slots.names[0]) if n == "chair_0")]
     qpos[1, chair : chair + 2] += (0.3, -0.4)
     camera = scene_camera(SceneRenderer(scene, lens, small=env.world.small_objects), robot, env.world)
     rest, now, pushed = camera(xy[:1], yaw[:1])[0], *camera(xy, yaw, qpos)

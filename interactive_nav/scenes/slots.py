@@ -1,0 +1,136 @@
+"""Build the tables of what each scene of a world holds in each slot: all that physics, sensors and pictures read."""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from interactive_nav.scenes.layout import Layout
+from interactive_nav.scenes.objects import SmallObject, body_names
+from interactive_nav.scenes.scene import Movable, Scene
+from interactive_nav_common.rotations import matrix_from_quat
+from scenes_mjcf.categories import MaskClasses
+
+Body = Movable | SmallObject
+_NO_BOX = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0, -1.0, -1.0)
+_PARKING_W, _PARKING_STEP_M = (200.0, 200.0), 3.0
+"""The first parking spot, far outside any building, and how far apart they are."""
+
+
+def parking_spot(index: int) -> tuple[float, float]:
+    """Return world x, y of a slot's parking spot, or, with the number of slots for its index, of the robot's."""
+    return _PARKING_W[0] + _PARKING_STEP_M * (index % 16), _PARKING_W[1] + _PARKING_STEP_M * (index // 16)
+
+
+@dataclasses.dataclass(frozen=True)
+class Slot:
+    """A place that all scenes of a batch have for a movable body."""
+
+    name: str
+    kind: str
+    """small, free or hinge."""
+    bodies: tuple[Body | None, ...]
+    """[S] what each scene has there; None: nothing."""
+
+
+def find_slots(scenes: Sequence[Scene], small: Sequence[SmallObject]) -> list[Slot]:
+    """Return slots for the small objects, then for each scene's free bodies and its hinged ones, most boxes first."""
+    slots = [Slot(name, "small", (obj,) * len(scenes)) for name, obj in zip(body_names(small), small, strict=True)]
+    for kind in ("free", "hinge"):
+        own = ([m for m in scene.movables if (m.hinge is None) == (kind == "free")] for scene in scenes)
+        columns = itertools.zip_longest(*(sorted(movables, key=lambda m: -len(m.boxes)) for movables in own))
+        slots += [Slot(f"{kind}_{i}", kind, column) for i, column in enumerate(columns)]
+    return slots
+
+
+def bodies_by_name(scene: Scene, small: Sequence[SmallObject]) -> dict[str, Body]:
+    """Return a scene's movable bodies and the small objects, by the names of their bodies in models."""
+    return {m.name: m for m in scene.movables} | dict(zip(body_names(small), small, strict=True))
+
+
+@dataclasses.dataclass(frozen=True)
+class SlotTables:
+    """What is in the slots of a world: S scenes, M slots, B boxes; an empty slot has mass 0 and no boxes."""
+
+    bodies: tuple[tuple[Body | None, ...], ...]
+    """[S][M]"""
+    names: tuple[tuple[str, ...], ...]
+    """[S][M] names of the bodies, '' for an empty slot."""
+    categories: tuple[tuple[str, ...], ...]
+    """[S][M] categories of the same."""
+    occupied: np.ndarray
+    """[S, M] bool: the slot holds a body of the scene (small objects always do)."""
+    mass_kg: np.ndarray
+    """[S, M]"""
+    friction: np.ndarray
+    """[S, M] sliding friction."""
+    com_b_m: np.ndarray
+    """[S, M, 3] centres of mass."""
+    box_slot: np.ndarray
+    """[B] slot of each box; M: a wall."""
+    boxes_b: np.ndarray
+    """[S, B, 10] centre (3) in the body's frame, m, quaternion (4), half sizes (3), m, which are -1 for padding."""
+    hinged: np.ndarray
+    """[M] bool."""
+    pos_w_m: np.ndarray
+    """[S, M, 3] the bodies' frames at rest."""
+    axes_w: np.ndarray
+    """[S, M, 3, 3] axes of the same, as columns."""
+    hinge_axis_b: np.ndarray
+    """[S, M, 3] unit vector about which a hinged body turns."""
+    hinge_anchor_b_m: np.ndarray
+    """[S, M, 3] a point of that axis."""
+
+    def rows(self, scene: int, slot: int) -> np.ndarray:
+        """Return the boxes [n, 10] of a slot in a scene, or of the scene's walls where `slot` is M."""
+        rows = self.boxes_b[scene, self.box_slot == slot]
+        return rows[rows[:, 7] > 0]
+
+    def class_ids(self, classes: MaskClasses) -> np.ndarray:
+        """Return segmentation ids [S, M + 1] u8 of what the slots hold, 0 for an empty one and for the walls."""
+        ids = [[*(body.mask_id(classes) if body else 0 for body in row), 0] for row in self.bodies]
+        return np.array(ids, np.uint8)
+
+
+def build_slot_tables(
+    slots: Sequence[Slot], scenes: Sequence[Scene], models: Sequence[mujoco.MjModel], layout: Layout
+) -> SlotTables:
+    """Build the tables of a world out of its scenes and their compiled models."""
+    every = range(len(scenes))
+    bodies = tuple(tuple(slot.bodies[s] for slot in slots) for s in every)
+    boxes = [[*(b.rows if b else np.zeros((0, 10)) for b in bodies[s]), scenes[s].walls] for s in every]
+    counts = [max(len(boxes[s][m]) for s in every) for m in range(len(slots) + 1)]
+    box_slot = np.repeat(np.arange(len(counts)), counts)
+    boxes_b = np.tile(np.array(_NO_BOX), (len(scenes), len(box_slot), 1))
+    for s, m in itertools.product(every, range(len(counts))):
+        boxes_b[s, np.flatnonzero(box_slot == m)[: len(boxes[s][m])]] = boxes[s][m]
+
+    def values(of: str, empty: str | float) -> tuple:
+        return tuple(tuple(getattr(body, of) if body else empty for body in row) for row in bodies)
+
+    def field(name: str, rows: np.ndarray) -> np.ndarray:
+        return np.stack([getattr(model, name)[rows] for model in models])
+
+    def name(slot: Slot, s: int) -> str:
+        return slot.name if slot.kind == "small" else getattr(slot.bodies[s], "name", "")
+
+    occupied = np.array([[body is not None for body in row] for row in bodies], bool)
+    body, joint = layout.slot_body, models[0].body_jntadr[layout.slot_body]
+    return SlotTables(
+        bodies=bodies,
+        names=tuple(tuple(name(slot, s) for slot in slots) for s in every),
+        categories=values("category", ""),
+        occupied=occupied,
+        mass_kg=occupied * field("body_mass", body),
+        friction=np.array(values("friction", 0.0)),
+        com_b_m=field("body_ipos", body),
+        box_slot=box_slot,
+        boxes_b=boxes_b,
+        hinged=np.array([slot.kind == "hinge" for slot in slots], bool),
+        pos_w_m=field("body_pos", body),
+        axes_w=matrix_from_quat(field("body_quat", body)),
+        hinge_axis_b=field("jnt_axis", joint),
+        hinge_anchor_b_m=field("jnt_pos", joint),
+    )
