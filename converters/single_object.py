@@ -23,7 +23,6 @@ from converters.check.gates import collide_with, physical_values
 from converters.check.settle import settle
 from converters.geometry.boxes import Hull, convex_hull, fit_box
 from converters.geometry.faces import merge_vertices
-from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.geometry.simplify import simplify_to
 from converters.read.cad import clean_surface
 from converters.read.files import SourceFolder
@@ -37,7 +36,7 @@ from converters.write.emit import SceneParts, build_spec, write_scene
 from converters.write.manifest import PACKAGES
 from converters.write.texture import bake_object, textured_cloud
 from interactive_nav_common.files import whole_folder
-from interactive_nav_common.rotations import matrix_from_quat
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP, matrix_from_quat
 from scenes_mjcf.categories import TABLE
 from scenes_mjcf.schema import CATEGORIES
 

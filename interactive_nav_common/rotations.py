@@ -7,6 +7,8 @@ import numpy as np
 
 Array = Any
 """A NumPy or JAX array, or a number."""
+Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Turns a y-up vector into a z-up one: x stays, y becomes z, z becomes -y."""
 
 
 def namespace(*values: Array) -> Any:
@@ -52,6 +54,18 @@ def yaw_matrix(yaw_rad: float) -> np.ndarray:
     """[3, 3] rotation about z."""
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def transform(matrix: np.ndarray, position: Any = 0.0) -> np.ndarray:
+    """Return the [4, 4] of a [3, 3] matrix, after which points move by a position [3]."""
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = matrix, position
+    return result
+
+
+def transformed(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Return points [n, 3] after a [4, 4]."""
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def wrap_angle(angle_rad: Array, period_rad: float = 2 * math.pi) -> Array:

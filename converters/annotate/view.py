@@ -9,12 +9,11 @@ import trimesh
 from converters.annotate.session import Item
 from converters.bodies.alignment import Alignment, apply_alignment
 from converters.check.model_sheet import camera_axes, mesh_picture
-from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.propose.proposals import bounds
 from converters.read.meshes import textured_by_face
 from converters.read.obj import texels
 from converters.records.raw import CEILING, CadModel, RawScene, ScanMesh
-from interactive_nav_common.rotations import yaw_matrix
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP, yaw_matrix
 
 MARGIN_M = 0.3
 """So much of the scan is shown around an object."""

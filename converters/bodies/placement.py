@@ -16,7 +16,7 @@ from converters.bodies.alignment import (
 )
 from converters.bodies.objects import name_objects
 from converters.records.raw import Annotation, RawScene
-from interactive_nav_common.rotations import wrap_angle, yaw_matrix
+from interactive_nav_common.rotations import transformed, wrap_angle, yaw_matrix
 
 LYING_DEG = 15.0
 """Annotated tilt from which a scene's report says that the object was stood upright."""
@@ -62,7 +62,7 @@ def compare(
         degrees = math.degrees(tilt_rad)
         row["note"] = f"annotated {degrees:.0f} degrees off the vertical; placed upright, yaw is the only rotation"
     if len(annotation.keypoints_cad):
-        at = annotation.keypoints_cad @ annotation.pose[:3, :3].T + annotation.pose[:3, 3]
+        at = transformed(annotation.keypoints_cad, annotation.pose)
         distance2 = ((at - annotation.keypoints_scan) ** 2).sum(axis=1)
         row["annotated_rms_m"] = round(float(np.sqrt(distance2.mean())), 5)
     try:

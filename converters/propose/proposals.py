@@ -15,7 +15,6 @@ import numpy as np
 
 from converters.geometry.boxes import upright_box
 from converters.geometry.faces import face_labels, sample_faces
-from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.propose.pieces import (
     LABEL_CATEGORIES,
     MIN_VOXELS,
@@ -30,7 +29,7 @@ from converters.propose.pieces import (
 )
 from converters.propose.tops import split_tops
 from converters.records.raw import FLOOR, SYNSETS, UNLABELLED, WALL, ScanMesh
-from interactive_nav_common.rotations import yaw_matrix
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP, yaw_matrix
 
 VOXEL_M = 0.03
 """Chairs that touch at 0.05 m stay apart at 0.03 m in the sample scan."""

@@ -17,7 +17,6 @@ from scipy.spatial import KDTree
 
 from converters.bodies.alignment import Alignment, AlignmentError, apply_alignment, least_squares
 from converters.bodies.placement import PoseDifference, pose_difference, upright
-from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.library.store import read_index, read_shape
 from converters.propose.pieces import SIZES_M
 from converters.propose.proposals import Proposal, bounds, box_iou
@@ -27,7 +26,7 @@ from converters.read.obj import texels
 from converters.records.errors import SceneRejected
 from converters.records.raw import CATEGORY_LABELS, SYNSETS, Annotation, CadModel
 from converters.records.visual import TexturedMesh
-from interactive_nav_common.rotations import wrap_angle, yaw_matrix
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, transformed, wrap_angle, yaw_matrix
 
 N_YAWS = 24
 """Starting yaws, even steps over the circle from the box's own."""
@@ -263,12 +262,9 @@ def retrieve(
 
 
 def as_annotation(found: Retrieval) -> Annotation:
-    """The retrieved pose as an annotation without keypoints."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = yaw_matrix(found.pose.yaw) * found.pose.scale
-    matrix[:3, 3] = found.pose.translation
-    none = np.zeros((0, 3))
-    return Annotation(found.cad.category, found.cad.cad_id, matrix, "__SYM_NONE", none, none, None, found.confidence)
+    """Return the retrieved pose as an annotation without keypoints."""
+    pose = transform(yaw_matrix(found.pose.yaw) * found.pose.scale, found.pose.translation)
+    return Annotation(found.cad.category, found.cad.cad_id, pose, confidence=found.confidence)
 
 
 MIN_CONFIDENCE = 0.2
@@ -276,8 +272,8 @@ MIN_CONFIDENCE = 0.2
 
 
 def annotated_vertices(annotation: Annotation, cads: Mapping[str, CadModel]) -> np.ndarray:
-    """(n, 3) the annotated model's vertices in the scan frame, m."""
-    return cads[annotation.cad_id].vertices @ annotation.pose[:3, :3].T + annotation.pose[:3, 3]
+    """Return (n, 3), the annotated model's vertices in the scan frame, m."""
+    return transformed(cads[annotation.cad_id].vertices, annotation.pose)
 
 
 def without_annotation(

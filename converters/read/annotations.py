@@ -11,11 +11,11 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.read.files import SourceFolder
 from converters.records.errors import SceneRejected
 from converters.records.raw import SYNSETS, Annotation, CadModel, ScannedHinge
 from interactive_nav_common.files import check_name
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, transformed
 
 OUTSIDE_M = 0.5
 """An object this far from everything scanned stands outside the scan."""
@@ -25,16 +25,11 @@ TURNS = 20
 def trs_matrix(trs: dict[str, Any]) -> np.ndarray:
     """(4, 4) matrix that scales, then turns (quaternion w x y z), then moves."""
     w, x, y, z = (float(v) for v in trs["rotation"])
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix() * np.asarray(trs["scale"], float)
-    matrix[:3, 3] = np.asarray(trs["translation"], float)
+    turn = Rotation.from_quat([x, y, z, w]).as_matrix() * np.asarray(trs["scale"], float)
+    matrix = transform(turn, np.asarray(trs["translation"], float))
     if not np.isfinite(matrix).all() or np.abs(matrix).max() > 1e6:
         raise ValueError(f"the transform {trs} is not made of usable numbers")
     return matrix
-
-
-def _apply(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def _keypoints(model: dict[str, Any], key: str) -> np.ndarray:
@@ -81,8 +76,7 @@ def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Anno
     try:
         scan_to_world = trs_matrix(data[0]["trs"])
         world_to_scan = np.linalg.inv(scan_to_world)
-        cad_to_y_up = np.eye(4)
-        cad_to_y_up[:3, :3] = Y_UP_TO_Z_UP.T
+        cad_to_y_up = transform(Y_UP_TO_Z_UP.T)
         for i, model in enumerate(data[0]["aligned_models"]):
             where = f"{path}: aligned_models[{i}]"
             synset, cad_id = str(model["catid_cad"]), str(model["id_cad"])
@@ -94,8 +88,8 @@ def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Anno
             if abs(np.linalg.det(pose_y_up)) < 1e-9:
                 raise SceneRejected(f"{where}: the scale is {model['trs']['scale']}, expected three non-zero numbers")
             pose = world_to_scan @ pose_y_up @ cad_to_y_up
-            cad_points = _apply(np.linalg.inv(pose_y_up @ cad_to_y_up), _keypoints(model, "keypoints_cad"))
-            scan_points = _apply(world_to_scan, _keypoints(model, "keypoints_scan"))
+            cad_points = transformed(_keypoints(model, "keypoints_cad"), np.linalg.inv(pose_y_up @ cad_to_y_up))
+            scan_points = transformed(_keypoints(model, "keypoints_scan"), world_to_scan)
             count = min(len(cad_points), len(scan_points))
             records.append(
                 (
@@ -123,7 +117,7 @@ def gap_to_scan(annotation: Annotation, cad_vertices: np.ndarray, vertices: np.n
 
     The box and each triangle are convex: projecting from one to the other by turns leads to their nearest points.
     """
-    placed = _apply(annotation.pose, cad_vertices)
+    placed = transformed(cad_vertices, annotation.pose)
     low, high = placed.min(axis=0), placed.max(axis=0)
     gap = float(np.linalg.norm(vertices - vertices.clip(low, high), axis=1).min())
     if gap <= OUTSIDE_M:

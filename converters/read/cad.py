@@ -4,12 +4,12 @@ import numpy as np
 
 from converters.geometry.faces import merge_vertices
 from converters.geometry.pieces import convex_pieces
-from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.read.files import SourceFolder, read_obj
 from converters.read.obj import GREY, join_textures, read_painted_obj, texels
 from converters.records.errors import SceneRejected
 from converters.records.raw import SYNSETS, CadModel
 from converters.records.visual import TexturedMesh
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP
 
 COLLISION = "collision.obj"
 """Beside a model: its collision mesh, made of convex pieces that share no vertex."""

@@ -25,7 +25,7 @@ from converters.read.surfaces import check_extent, check_upright, with_own_corne
 from converters.read.urdf import read_urdf
 from converters.records.errors import SceneRejected
 from converters.records.raw import FLOOR, SYNSETS, Annotation, CadModel, GivenMap, RawScene, ScannedHinge
-from interactive_nav_common.rotations import yaw_matrix
+from interactive_nav_common.rotations import transform, transformed, yaw_matrix
 
 MESH = "mesh_z_up_cleaned.obj"
 PREFIX = "alignment_centered"
@@ -89,18 +89,14 @@ def _furniture(source: SourceFolder, path: Path) -> tuple[Annotation, CadModel]:
     vertices, faces, keep = merge_vertices(item.surface.vertices, item.surface.faces)
     colours = colours_of_faces(item.surface)[keep]
     vertices, faces, colours = clean_surface(source, path.name, vertices, faces, colours)
-    pose = np.eye(4)
-    pose[:3, 3] = position
-    pieces = item.pieces
+    turn, pieces = np.eye(3), item.pieces
     if category == "door":
         turn = leaf_turn(vertices)
-        pose[:3, :3] = turn
         vertices = vertices @ turn
         pieces = None if pieces is None else tuple((v @ turn, f) for v, f in pieces)
     name = path.stem.removeprefix(PREFIX).strip("_")
     cad = CadModel(category, name, vertices, faces, colours, pieces, item.mass_kg, item.friction)
-    none = np.zeros((0, 3))
-    return Annotation(category, name, pose, "__SYM_NONE", none, none), cad
+    return Annotation(category, name, transform(turn, position)), cad
 
 
 def leaf_turn(leaf: np.ndarray) -> np.ndarray:
@@ -167,7 +163,7 @@ def _without_doubles(
     """Drops objects of one class that stand in an earlier one: the release annotates some furniture twice."""
     kept: list[tuple[Annotation, np.ndarray, np.ndarray]] = []
     for annotation in annotations:
-        placed = cads[annotation.cad_id].vertices @ annotation.pose[:3, :3].T + annotation.pose[:3, 3]
+        placed = transformed(cads[annotation.cad_id].vertices, annotation.pose)
         low, high = placed.min(axis=0), placed.max(axis=0)
         double = None
         for other, o_low, o_high in kept:

@@ -19,7 +19,6 @@ from PIL import Image
 from trimesh.resolvers import Resolver
 from trimesh.visual import ColorVisuals
 
-from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.geometry.upright import AXES, UNITS_M, faces_away, find_unit, find_up, turn_upright
 from converters.read.files import SourceFolder, as_number, check_mesh, read_labels
 from converters.read.formats.gltf import read_gltf
@@ -38,6 +37,7 @@ from converters.read.surfaces import check_extent, floor_level, labelled, welded
 from converters.records.errors import SceneRejected
 from converters.records.raw import RawScene
 from interactive_nav_common.errors import readable
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP
 
 SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".dae", ".off")
 """Of files that may be a scan."""

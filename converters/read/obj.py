@@ -327,6 +327,12 @@ def join_textures(corner_uv: np.ndarray, number: np.ndarray, images: list[np.nda
     return result, joint
 
 
+def in_colour(mesh: TexturedMesh, rgb: np.ndarray) -> TexturedMesh:
+    """Return a mesh in one colour (3 or more,), 0 to 1."""
+    colour = np.clip(np.round(255 * rgb[:3]), 0, 255).astype(np.uint8)
+    return textured_by_face(mesh.vertices, mesh.faces, np.tile(colour, (len(mesh.faces), 1)))
+
+
 def textured_by_face(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> TexturedMesh:
     """A mesh with one colour a face, as an image with one 4 x 4 tile a colour."""
     palette, index = np.unique(np.asarray(colours, np.uint8), axis=0, return_inverse=True)

@@ -15,9 +15,10 @@ import trimesh
 
 from converters.geometry.pieces import convex_pieces
 from converters.read.files import SourceFolder, read_obj
-from converters.read.meshes import read_surface, textured_by_face
-from converters.read.obj import TexturedMesh, find_file, join_meshes
+from converters.read.meshes import read_surface
+from converters.read.obj import TexturedMesh, find_file, in_colour, join_meshes
 from converters.records.errors import SceneRejected
+from interactive_nav_common.rotations import transform, transformed
 
 READ = {
     "any": "| @name",
@@ -67,7 +68,7 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = Fal
         places = _link_places(path, root, links, hold)
         rgba = {m.get("name"): str(c.get("rgba")) for m in root.iter("material") for c in m.findall("color")}
         visual = [placed(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "visual", rgba)]
-        solid = [placed(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "collision", {})]
+        hard = [placed(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "collision", {})]
         masses = [_value(e, "inertial/mass") for e in links.values()]
         frictions = [_value(e, "contact/lateral_friction") for e in links.values()]
     except (ElementTree.ParseError, ValueError, KeyError, LookupError) as error:
@@ -77,12 +78,12 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = Fal
     unread: Counter[str] = Counter()
     count_unread(root, READ, unread)
     report_unread(source, relative, unread)
-    surface = joined(visual or solid)
+    surface = joined(visual or hard)
     if surface is None:
         raise SceneRejected(f"{path}: names no mesh to see or to collide with; expected a <visual> with geometry")
-    if not solid:
+    if not hard:
         source.note(f"{relative}: has no collision mesh; the visual one is decomposed")
-    body = joined(solid) or surface
+    body = joined(hard) or surface
     mass = sum(m for m in masses if m is not None)
     friction = [f for f in frictions if f is not None and f > 0]
     if mass <= 0:
@@ -90,7 +91,7 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = Fal
     return RigidObject(
         name=str(root.get("name") or path.stem),
         surface=surface,
-        pieces=convex_pieces(body.vertices, body.faces) if solid else None,
+        pieces=convex_pieces(body.vertices, body.faces) if hard else None,
         collision=(body.vertices, body.faces),
         mass_kg=mass if mass > 0 else None,
         friction=max(friction) if friction else None,
@@ -148,9 +149,8 @@ def _origin(element: ElementTree.Element) -> np.ndarray:
     origin = element.find("origin")
     if origin is None:
         return np.eye(4)
-    matrix = trimesh.transformations.euler_matrix(*numbers(origin.get("rpy"), (0.0, 0.0, 0.0)), axes="sxyz")
-    matrix[:3, 3] = numbers(origin.get("xyz"), (0.0, 0.0, 0.0))
-    return matrix
+    turn = trimesh.transformations.euler_matrix(*numbers(origin.get("rpy"), (0.0, 0.0, 0.0)), axes="sxyz")
+    return transform(turn[:3, :3], numbers(origin.get("xyz"), (0.0, 0.0, 0.0)))
 
 
 def _link_places(
@@ -208,8 +208,7 @@ def _geometries(
                 rgba.get(material.get("name"), "")
             ]
             if mesh.texture is None and own[0]:
-                colour = np.clip(np.round(255 * numbers(own[0], (0.0,) * 4)[:3]), 0, 255)
-                mesh = textured_by_face(mesh.vertices, mesh.faces, np.tile(colour, (len(mesh.faces), 1)))
+                mesh = in_colour(mesh, numbers(own[0], (0.0,) * 4))
         found.append(placed(mesh, _origin(element)))
     return found
 
@@ -241,14 +240,19 @@ def primitive(path: Path, kind: str, text: Callable[[str], str | None]) -> Textu
     """
     if kind not in SHAPES:
         raise SceneRejected(f"{path}: geometry <{kind}>, expected mesh, {', '.join(SHAPES)}")
-    count, build = SHAPES[kind]
+    count = SHAPES[kind][0]
     names = {"box": ("size",), "ellipsoid": ("radii",)}.get(kind, ("radius", "length")[:count])
     words = " ".join(text(name) or "" for name in names)
     size = numbers(words, (0.0,) * count)
     if size.min() < 0 or not size.any() or (kind != "box" and size.min() == 0):
         raise SceneRejected(f"{path}: a <{kind}> of {size.tolist()} m, expected positive numbers")
-    solid = build(size)
-    return TexturedMesh(np.asarray(solid.vertices, float), np.asarray(solid.faces, np.int64), None, None)
+    return solid(kind, size)
+
+
+def solid(kind: str, size: np.ndarray) -> TexturedMesh:
+    """Build an uncoloured shape of `SHAPES` from the numbers that are its size, m."""
+    mesh = SHAPES[kind][1](size)
+    return TexturedMesh(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64), None, None)
 
 
 def placed(mesh: TexturedMesh, matrix: np.ndarray) -> TexturedMesh:
@@ -257,9 +261,7 @@ def placed(mesh: TexturedMesh, matrix: np.ndarray) -> TexturedMesh:
     corner_uv = mesh.corner_uv
     if faces is not mesh.faces and corner_uv is not None:
         corner_uv = corner_uv[:, ::-1]
-    return dataclasses.replace(
-        mesh, vertices=mesh.vertices @ matrix[:3, :3].T + matrix[:3, 3], faces=faces, corner_uv=corner_uv
-    )
+    return dataclasses.replace(mesh, vertices=transformed(mesh.vertices, matrix), faces=faces, corner_uv=corner_uv)
 
 
 def joined(meshes: list[TexturedMesh]) -> TexturedMesh | None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from converters.records.cache import NOT_HASHED
 from converters.records.visual import TexturedMesh
+from interactive_nav_common.rotations import transform
 from scenes_mjcf.categories import TABLE
 
 ATTRIBUTION = "ATTRIBUTION.md"
@@ -92,11 +93,11 @@ class Annotation:
     cad_id: str
     pose: np.ndarray
     """(4, 4) CAD frame -> scan frame, with scale."""
-    symmetry: str
+    symmetry: str = "__SYM_NONE"
     """Scan2CAD's `sym` word."""
-    keypoints_cad: np.ndarray
+    keypoints_cad: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     """(k, 3) CAD frame."""
-    keypoints_scan: np.ndarray
+    keypoints_scan: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     """(k, 3) scan frame, m."""
     hinge: ScannedHinge | None = None
     confidence: float | None = None
@@ -194,8 +195,7 @@ def at_origin(raw: RawScene) -> RawScene:
     def moved_map(given: GivenMap | None) -> GivenMap | None:
         return given and dataclasses.replace(given, origin=(given.origin[0] - float(x), given.origin[1] - float(y)))
 
-    shift = np.eye(4)
-    shift[:3, 3] = -by
+    shift = transform(np.eye(3), -by)
     return dataclasses.replace(
         raw,
         scan=dataclasses.replace(raw.scan, vertices=raw.scan.vertices - by),

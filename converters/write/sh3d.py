@@ -18,7 +18,6 @@ import shapely
 from PIL import Image
 
 from converters.geometry.boxes import convex_hull
-from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.read.files import read_image, read_obj
 from converters.read.homes.sh3d import OURS
 from converters.read.homes.sh3d_models import GLASS, HULLS, PANE
@@ -29,7 +28,7 @@ from converters.write.sh3d_rooms import SIDE_M, Wall, gap_around, half_wall, mer
 from converters.write.texture import textured_cloud
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import whole_file
-from interactive_nav_common.rotations import matrix_from_quat, yaw_from_quat, yaw_matrix
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP, matrix_from_quat, yaw_from_quat, yaw_matrix
 from scenes_mjcf.schema import SceneMaps, load_manifest, load_maps
 
 WALL_M = 1.8

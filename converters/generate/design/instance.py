@@ -10,6 +10,7 @@ import numpy as np
 import shapely
 
 from converters.generate.models.cad import CadModel
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, transformed, yaw_matrix
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,17 +38,11 @@ class Instance:
     @property
     def matrix(self) -> np.ndarray:
         """(4, 4) CAD frame (y up) -> scan x, y and height above the floor (z up)."""
-        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        upright = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
-        out = np.eye(4)
-        out[:3, :3] = turn @ upright @ np.diag(self.scale)
-        out[:3, 3] = self.position
-        return out
+        return transform(yaw_matrix(self.yaw_rad) @ Y_UP_TO_Z_UP @ np.diag(self.scale), self.position)
 
     def to_floor(self, points_cad: np.ndarray) -> np.ndarray:
         """Moves (n, 3) points of the CAD frame into scan x, y and height above the floor."""
-        return points_cad @ self.matrix[:3, :3].T + self.matrix[:3, 3]
+        return transformed(points_cad, self.matrix)
 
     @property
     def footprint(self) -> shapely.Polygon:

@@ -24,6 +24,7 @@ from converters.records.errors import SceneRejected
 from converters.records.limits import NUMBERS, PIXELS, check_count
 from converters.records.visual import TexturedMesh
 from interactive_nav_common.records import Reader
+from interactive_nav_common.rotations import transformed
 
 READ = {
     "KHR_mesh_quantization", "KHR_texture_transform", "KHR_materials_pbrSpecularGlossiness", "KHR_materials_unlit",
@@ -235,7 +236,7 @@ class _File:
         if not len(faces):
             return []
         check_mesh(self.path, vertices, faces)
-        vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
+        vertices = transformed(vertices, pose)
         faces = faces[:, ::-1] if np.linalg.det(pose[:3, :3]) < 0 else faces
         check_mesh(self.path, vertices, faces)
         layers = self._layers(self.tree["materials"][part["material"]]) if "material" in part else None

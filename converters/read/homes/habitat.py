@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.read.files import SourceFolder, read_json
 from converters.read.homes.parts import Part, home
 from converters.read.meshes import SUFFIXES, read_surface
@@ -23,7 +22,7 @@ from converters.read.urdf import placed, read_urdf
 from converters.records.errors import SceneRejected
 from converters.records.limits import PARTS, check_count
 from converters.records.raw import RawScene
-from interactive_nav_common.rotations import matrix_from_quat
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP, matrix_from_quat, transform
 
 SCENE, STAGE, OBJECT, ARTICULATED = (
     f".{kind}.json" for kind in ("scene_instance", "stage_config", "object_config", "ao_config")
@@ -129,15 +128,12 @@ class _Reader:
         length = float(np.linalg.norm(quat))
         if length < 1e-6 or not (np.abs(scale) > 1e-6).all():
             raise SceneRejected(f"{path}: '{name}' has no usable rotation or scale ({quat.tolist()}, {scale.tolist()})")
-        pose = np.eye(4)
-        pose[:3, :3] = matrix_from_quat(quat / length)
-        pose[:3, 3] = _numbers(instance, "translation", (0.0, 0.0, 0.0), path)
+        pose = transform(matrix_from_quat(quat / length), _numbers(instance, "translation", (0.0, 0.0, 0.0), path))
         origin = _word(instance, "translation_origin", path)
         if kind == OBJECT and not (origin == "asset_local" or (local and origin != "com")):
             pose[:3, 3] -= pose[:3, :3] @ (asset.origin * scale)
-        turn, grow = np.eye(4), np.diag([*scale, 1.0])
-        turn[:3, :3] = Y_UP_TO_Z_UP
-        upright = turn @ grow  # The part's frame has z up as well.
+        turn = transform(Y_UP_TO_Z_UP)
+        upright = turn @ np.diag([*scale, 1.0])  # The part's frame has z up as well.
         motion = _word(instance, "motion_type", path) or ("static" if kind != OBJECT else "dynamic")
         return Part(
             asset.name,
@@ -214,8 +210,7 @@ class _Reader:
         mesh = read_surface(self.source, self.source.inside(target), "")
         frame = _frame(about, config)
         size = _numbers(about, "scale", (1.0, 1.0, 1.0), config) * _number(about, "units_to_meters", 1.0, config)
-        matrix = np.eye(4)
-        matrix[:3, :3] = frame @ np.diag(size)
+        matrix = transform(frame @ np.diag(size))
         if abs(np.linalg.det(matrix)) < 1e-12:
             raise SceneRejected(f"{config}: scale {size.tolist()} leaves nothing; expected positive numbers")
         return placed(mesh, matrix)

@@ -18,14 +18,13 @@ import numpy as np
 
 from converters.read.files import SourceFolder
 from converters.read.homes.parts import LEVEL, Part, category_of, home
-from converters.read.homes.solids import height_field
-from converters.read.meshes import textured_by_face
-from converters.read.obj import TexturedMesh
-from converters.read.urdf import SHAPES, joined, parse_xml, placed
+from converters.read.homes.solids import height_field, rectangle
+from converters.read.obj import TexturedMesh, in_colour
+from converters.read.urdf import SHAPES, joined, parse_xml, placed, solid
 from converters.records.errors import SceneRejected
 from converters.records.limits import FILES, GEOMS, PIXELS, check_count, check_image
 from converters.records.raw import RawScene
-from interactive_nav_common.rotations import matrix_from_quat
+from interactive_nav_common.rotations import matrix_from_quat, transform
 from scenes_mjcf.categories import CATEGORIES, Category
 
 NUMBER = re.compile(r"\+?\d+\.?\d*(e\+?\d+)?", re.IGNORECASE)
@@ -193,7 +192,7 @@ def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Part
         if top[body] != body:
             continue
         members = np.flatnonzero(top == body)
-        pose = _matrix(data.xpos[body], data.xquat[body])
+        pose = transform(matrix_from_quat(data.xquat[body]), data.xpos[body])
         back = np.linalg.inv(pose)
         seen, solid = [], []
         for geom in np.flatnonzero(np.isin(model.geom_bodyid, members) & ~np.isin(range(model.ngeom), list(planes))):
@@ -201,7 +200,7 @@ def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Part
             if mesh is None:
                 dropped[f"{_GEOM(model.geom_type[geom]).name[7:].lower()}: dropped"] += 1
                 continue
-            at = back @ _matrix(data.geom_xpos[geom], None, data.geom_xmat[geom])
+            at = back @ transform(data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom])
             collides = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
             if collides:
                 solid.append((placed(mesh, at), float(model.geom_friction[geom, 0])))
@@ -231,7 +230,7 @@ def _planes(model: mujoco.MjModel, data: mujoco.MjData) -> dict[int, Part]:
     """Return the level planes, which collide without an end whatever the size that they are drawn in, by their geom."""
     planes = {}
     for geom in np.flatnonzero(model.geom_type == int(_GEOM.mjGEOM_PLANE)):
-        at = _matrix(data.geom_xpos[geom], None, data.geom_xmat[geom])
+        at = transform(data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom])
         collides = model.geom_contype[geom] or model.geom_conaffinity[geom] or not model.geom_size[geom, :2].all()
         if at[2, 2] > LEVEL and collides:
             mesh = _mesh(model, int(geom), 1.0)
@@ -277,13 +276,6 @@ def _tops(model: mujoco.MjModel, categories: list[Category | None]) -> np.ndarra
     return top
 
 
-def _matrix(position: np.ndarray, quat: np.ndarray | None, turn: np.ndarray | None = None) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, 3] = position
-    matrix[:3, :3] = turn.reshape(3, 3) if turn is not None else matrix_from_quat(np.asarray(quat))
-    return matrix
-
-
 def _mesh(model: mujoco.MjModel, geom: int, span_m: float) -> TexturedMesh | None:
     """A geom's surface in its own frame; None for kinds without one. Planes without an end reach `span_m` far."""
     size, kind = model.geom_size[geom], _GEOM(model.geom_type[geom])  # a NumPy integer is `in` no tuple of kinds
@@ -294,28 +286,21 @@ def _mesh(model: mujoco.MjModel, geom: int, span_m: float) -> TexturedMesh | Non
         rows, columns, first = (int(v[data]) for v in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
         x, y, high, _ = model.hfield_size[data]
         height_m = high * model.hfield_data[first : first + rows * columns].reshape(rows, columns).astype(float)
-        return _plain(*height_field(height_m, (x, y)), rgba)
+        return in_colour(TexturedMesh(*height_field(height_m, (x, y)), None, None), rgba)
     if kind == _GEOM.mjGEOM_PLANE:
         x, y = (v if v > 0 else span_m for v in size[:2])
-        corners = np.array([(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)], float)
-        return _plain(corners, np.array([(0, 1, 2), (0, 2, 3)]), rgba)
+        return in_colour(rectangle(x, y), rgba)
     name = kind.name[7:].lower()
     if name not in SHAPES:
         return None
     sizes = {"box": 2 * size, "sphere": size[:1], "ellipsoid": size}.get(name, size[:2] * [1.0, 2.0])
-    solid = SHAPES[name][1](sizes)
-    return _plain(np.asarray(solid.vertices, float), np.asarray(solid.faces, np.int64), rgba)
+    return in_colour(solid(name, sizes), rgba)
 
 
 def _rgba(model: mujoco.MjModel, geom: int) -> np.ndarray:
     """Return a geom's colour: its own if it has one, or else its material's."""
     own, material = model.geom_rgba[geom], int(model.geom_matid[geom])
     return own if material < 0 or not np.allclose(own, DEFAULT_RGBA) else model.mat_rgba[material]
-
-
-def _plain(vertices: np.ndarray, faces: np.ndarray, rgba: np.ndarray) -> TexturedMesh:
-    colour = np.clip(np.round(255 * np.asarray(rgba)[:3]), 0, 255).astype(np.uint8)
-    return textured_by_face(vertices, faces, np.tile(colour, (len(faces), 1)))
 
 
 def _of_mesh(model: mujoco.MjModel, mesh: int, material: int, rgba: np.ndarray) -> TexturedMesh:
@@ -329,7 +314,7 @@ def _of_mesh(model: mujoco.MjModel, mesh: int, material: int, rgba: np.ndarray) 
         texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
     start = model.mesh_texcoordadr[mesh]
     if texture < 0 or start < 0 or model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D:
-        return _plain(vertices, faces, rgba)
+        return in_colour(TexturedMesh(vertices, faces, None, None), rgba)
     uv = np.array(model.mesh_texcoord[start + model.mesh_facetexcoord[face : face + faces_n]], float)
     height, width, channels = (int(v[texture]) for v in (model.tex_height, model.tex_width, model.tex_nchannel))
     at = model.tex_adr[texture]

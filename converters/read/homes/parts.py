@@ -31,6 +31,7 @@ from converters.records.errors import SceneRejected
 from converters.records.limits import MOVABLES, check_count
 from converters.records.raw import UNLABELLED, Annotation, CadModel, RawScene, ScannedHinge, Storey
 from interactive_nav_common.records import read_packaged
+from interactive_nav_common.rotations import transform, transformed
 from scenes_mjcf.categories import CATEGORIES, Category
 
 ALIASES = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, str])
@@ -194,7 +195,7 @@ def _tell(source: SourceFolder, parts: list[Part], moves: list[bool], carried: l
 
 
 def _bounds(part: Part) -> tuple[np.ndarray, np.ndarray]:
-    points = part.surface.vertices @ part.pose[:3, :3].T + part.pose[:3, 3]
+    points = transformed(part.surface.vertices, part.pose)
     return points.min(axis=0), points.max(axis=0)
 
 
@@ -256,8 +257,7 @@ def _on_floors(
     vertices, faces = flat(shapely.difference(shapely.box(*low, *high), shapely.union_all(covers)))
     if len(faces):
         colour = np.tile(colours_of_faces(plane.surface)[:1], (len(faces), 1))
-        place = np.eye(4)
-        place[2, 3] = ground_m
+        place = transform(np.eye(3), (0.0, 0.0, ground_m))
         rest = [*rest, dataclasses.replace(plane, pose=place, surface=textured_by_face(vertices, faces, colour))]
     return rest, (floor_m,)
 
@@ -356,8 +356,7 @@ def _furniture(
             hinge = ScannedHinge(part.swing[0] @ turn, 1.0, part.swing[1])
     cad_id = re.sub(r"[^A-Za-z0-9_-]", "_", "-".join(p.name for p in (part, *riders)))[:100]
     cad = CadModel(name, cad_id, vertices, faces, colours, pieces, _mass(source, part, name), part.friction, surface)
-    none = np.zeros((0, 3))
-    return Annotation(name, cad_id, pose, "__SYM_NONE", none, none, hinge), cad
+    return Annotation(name, cad_id, pose, hinge=hinge), cad
 
 
 def _pieces(part: Part, by: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], ...] | None:

@@ -21,9 +21,9 @@ from converters.geometry.faces import face_vectors
 from converters.read.files import SourceFolder, read_image
 from converters.read.homes.parts import LEVEL, Part, home
 from converters.read.homes.sdf_frames import Model
-from converters.read.homes.solids import height_field
-from converters.read.meshes import UP_AXES, read_surface, textured_by_face
-from converters.read.obj import GREY, TexturedMesh, find_file
+from converters.read.homes.solids import height_field, rectangle
+from converters.read.meshes import UP_AXES, read_surface
+from converters.read.obj import GREY, TexturedMesh, find_file, in_colour
 from converters.read.urdf import count_unread, joined, numbers, parse_xml, placed, primitive, report_unread
 from converters.records.errors import SceneRejected
 from converters.records.limits import PARTS, check_count
@@ -226,11 +226,10 @@ class _Reader:
             return TexturedMesh(vertices + at, faces, None, None)
         if shape.tag == "plane":
             x, y = np.maximum(numbers(size, (1.0, 1.0)), 1e-3) / 2
-            corners = np.array([(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)], float)
             a, b, c = numbers(shape.findtext("normal"), (0.0, 0.0, 1.0))
             axis, angle = (-b, a, 0.0) if a or b else (1.0, 0.0, 0.0), math.atan2(math.hypot(a, b), c)
             turn = trimesh.transformations.rotation_matrix(angle, axis)
-            return placed(TexturedMesh(corners, np.array([(0, 1, 2), (0, 2, 3)]), None, None), turn)
+            return placed(rectangle(x, y), turn)
         return primitive(path, shape.tag, shape.findtext)
 
     def _coloured(self, mesh: TexturedMesh, element: ElementTree.Element) -> TexturedMesh:
@@ -245,8 +244,7 @@ class _Reader:
             self.unread["<script> in <material>, but for Gazebo's plain ones"] += 1
         text = diffuse or TABLES["colours"].get(script) or element.findtext("material/ambient") or ""
         rgb = numbers(" ".join(text.split()[:3]), tuple(c / 255 for c in GREY))
-        colour = np.clip(np.round(255 * rgb), 0, 255).astype(np.uint8)
-        return textured_by_face(mesh.vertices, mesh.faces, np.tile(colour, (len(mesh.faces), 1)))
+        return in_colour(mesh, rgb)
 
     def _find(self, uri: str, path: Path) -> Path:
         """Return the file or folder within the source that a URI names."""

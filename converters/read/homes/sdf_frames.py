@@ -9,7 +9,7 @@ import trimesh
 
 from converters.read.urdf import numbers
 from converters.records.errors import SceneRejected
-from interactive_nav_common.rotations import matrix_from_quat
+from interactive_nav_common.rotations import matrix_from_quat, transform
 
 
 @dataclasses.dataclass
@@ -90,13 +90,9 @@ class Model:
             form = f"{pose.get('rotation_format')} {values[3:].tolist()}"
             raise SceneRejected(f"{self.path}: '{self.name}' is turned by {form}, expected euler_rpy or quat_xyzw")
         if quaternion:
-            matrix = np.eye(4)
-            matrix[:3, :3] = matrix_from_quat(values[[6, 3, 4, 5]] / length)
-        else:
-            turn = np.radians(values[3:]) if pose.get("degrees") in ("true", "1") else values[3:]
-            matrix = trimesh.transformations.euler_matrix(*turn, axes="sxyz")
-        matrix[:3, 3] = values[:3]
-        return matrix
+            return transform(matrix_from_quat(values[[6, 3, 4, 5]] / length), values[:3])
+        rpy = np.radians(values[3:]) if pose.get("degrees") in ("true", "1") else values[3:]
+        return transform(trimesh.transformations.euler_matrix(*rpy, axes="sxyz")[:3, :3], values[:3])
 
 
 def _frame(pose: ElementTree.Element | None) -> str:

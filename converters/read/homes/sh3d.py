@@ -45,6 +45,7 @@ from converters.records.errors import SceneRejected
 from converters.records.limits import DRAWN, UNPACKED, check_count
 from converters.records.raw import Lamp, RawScene
 from interactive_nav_common.records import read_packaged
+from interactive_nav_common.rotations import transformed
 
 ENDING = ".sh3d"
 PIECES = ("pieceOfFurniture", "doorOrWindow", "light", "shelfUnit")
@@ -198,7 +199,7 @@ class _Drawing:
         if not floors_m:
             raise SceneRejected("has no room and no closed walls, expected a floor; draw a room")
         storeys = _storeys(sorted(floors_m))
-        places = [p.surface.vertices @ p.pose[:3, :3].T + p.pose[:3, 3] for p in parts]
+        places = [transformed(p.surface.vertices, p.pose) for p in parts]
         check_extent(str(self.source.root), np.vstack(places))
         lamps = self._brightest(storeys)
         return dataclasses.replace(home(self.source, "sh3d", parts, storeys), lamps=lamps, windows=windows)

@@ -4,7 +4,6 @@ Models are y up, front along +z. A piece's own frame is z up, front along -y, th
 """
 
 import dataclasses
-import math
 import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -13,7 +12,6 @@ import numpy as np
 import trimesh
 
 from converters.geometry.faces import compacted
-from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.read.files import SourceFolder, read_image, read_obj
 from converters.read.homes.sh3d_archive import called, colour, metres, model_path, number
 from converters.read.homes.sh3d_sheet import WHITE, Look
@@ -23,6 +21,7 @@ from converters.read.urdf import placed
 from converters.records.errors import SceneRejected
 from converters.records.limits import EXTENT_M, GEOMS, check_count
 from interactive_nav_common.records import read_packaged
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, yaw_matrix
 
 BUILT_IN = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, str])
 """Colours of the materials that models name without a file: those of the first OBJ viewers, diffuse."""
@@ -249,8 +248,5 @@ def _numbers(element: ElementTree.Element, what: str, text: str) -> np.ndarray:
 
 
 def yaw_pose(at: np.ndarray, yaw: float) -> np.ndarray:
-    """(4, 4) of an upright piece at (3,) m, turned by `yaw` rad."""
-    pose = np.eye(4)
-    pose[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
-    pose[:3, 3] = at
-    return pose
+    """Return the (4, 4) of an upright piece at (3,) m, turned by `yaw` rad."""
+    return transform(yaw_matrix(yaw), at)

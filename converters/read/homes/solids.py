@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 import shapely
 
+from converters.records.visual import TexturedMesh
+
 
 def flat(region: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners (n, 3) at z = 0 and the faces (m, 3), which look up, of polygons in plan."""
@@ -27,3 +29,9 @@ def height_field(height_m: np.ndarray, half_m: tuple[float, float]) -> tuple[np.
     a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
     faces = np.vstack([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
     return np.column_stack([x.ravel(), y.ravel(), height_m.ravel()]), faces
+
+
+def rectangle(x_m: float, y_m: float) -> TexturedMesh:
+    """Return an uncoloured rectangle around the origin that looks up, from its half sides."""
+    corners = np.array([(-x_m, -y_m, 0), (x_m, -y_m, 0), (x_m, y_m, 0), (-x_m, y_m, 0)], float)
+    return TexturedMesh(corners, np.array([(0, 1, 2), (0, 2, 3)]), None, None)

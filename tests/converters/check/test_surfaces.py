@@ -12,8 +12,8 @@ import trimesh
 from converters.check.gates import LIMITS, check_folder, judge
 from converters.check.surfaces import body_shares
 from converters.geometry.faces import face_areas, simplify
-from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.library.store import read_shape
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP
 
 CUBE = trimesh.creation.box((1.0, 1.0, 1.0)).subdivide().subdivide()
 

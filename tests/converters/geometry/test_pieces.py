@@ -9,9 +9,9 @@ import trimesh
 from converters.generate.models.cad import cad_model
 from converters.generate.surface.write import write_cad
 from converters.geometry.pieces import convex_pieces, hull_volume, merge_pieces
-from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.read.cad import MOST_OWN, read_cad
 from converters.read.files import SourceFolder
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP
 
 CUBE = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
 

@@ -16,10 +16,10 @@ from converters.check.settle import settle
 from converters.generate.models.cad import cad_model
 from converters.generate.models.parts import hull
 from converters.geometry.boxes import Hull
-from converters.geometry.rotations import Y_UP_TO_Z_UP
 from converters.library.store import read_index
 from converters.records.raw import Annotation, CadModel
 from converters.write.emit import SceneParts, build_spec
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP
 from scenes_mjcf.categories import CATEGORIES
 
 MOVABLE = sorted(n for n, m in read_index().items() if CATEGORIES[m.category].is_object)
