@@ -39,13 +39,7 @@ MOVED_M = 0.02
 
 
 def shadow(boxes: np.ndarray, pos_w: np.ndarray, quat_w: np.ndarray) -> Any:
-    """What boxes of a body cover of the floor: a shapely geometry, m, world.
-
-    Args:
-        boxes: [n, 10] centre, quaternion w x y z, half sizes, in the body's frame.
-        pos_w: (3,) of the body, m.
-        quat_w: (4,) of the body.
-    """
+    """Return what the boxes [n, 10] of a body at (3,) with quaternion (4,) cover of the floor, in world m."""
     corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
     body = matrix_from_quat(quat_w)
     hulls = []
@@ -145,7 +139,7 @@ def _draw_object(axis: Axes, category: str, boxes: np.ndarray, pos: np.ndarray, 
     before, after = (shadow(boxes, pos[i], quat[i]) for i in (0, -1))
     centre = np.array(before.centroid.coords[0])
     if not (extent[0] <= centre[0] <= extent[1] and extent[2] <= centre[1] <= extent[3]):
-        return  # an object that found no place waits outside
+        return  # an object without a place waits outside
     colour = COLOURS[category]
     axis.add_patch(_patch(after, facecolor=(*colour, 0.75), edgecolor=(*(0.6 * np.array(colour)), 1.0), linewidth=0.6))
     if before.hausdorff_distance(after) <= MOVED_M:
@@ -196,8 +190,8 @@ def _files(sources: Sequence[str]) -> list[Path]:
 @reports_errors("interactive_nav.topdown")
 def main(argv: Sequence[str] | None = None) -> int:
     """Draws; 0 when done, 2 on a user's error."""
-    made = program(Path(__file__).with_name("words.yaml"), "topdown", colour_by=COLOUR_BY)
-    arguments = made.parse_args(argv)
+    parser = program(Path(__file__).with_name("words.yaml"), "topdown", colour_by=COLOUR_BY)
+    arguments = parser.parse_args(argv)
     if arguments.columns < 1:
         raise ReplayError(f"--columns is {arguments.columns}, expected at least 1")
     replays = [load(path) for path in _files(arguments.replays)]

@@ -1,4 +1,4 @@
-"""A `World` and its settings in, `SceneTables` on the device out: all that `reset` and `step` look up."""
+"""Build `SceneTables`, all that `reset` and `step` look up, from a `World` and its settings."""
 
 import functools
 import math
@@ -30,11 +30,7 @@ robot wide, so nothing is stepped over; a corner clipped between two samples is 
 
 
 def furniture_map(scene: Scene, poses: dict[str, tuple[np.ndarray, np.ndarray]], height_m: float) -> np.ndarray:
-    """Cells of the scene's map over which furniture stands below a height.
-
-    Returns:
-        [rows, columns] bool.
-    """
+    """Return [rows, columns] bool: cells of the scene's map over which furniture stands below a height."""
     maps = scene.maps
     rows, columns = maps.traversable.shape
     x = maps.origin_w[0] + (np.arange(columns) + 0.5) * maps.resolution_m
@@ -60,7 +56,7 @@ def furniture_map(scene: Scene, poses: dict[str, tuple[np.ndarray, np.ndarray]],
 
 
 def rest_poses(world: World, index: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Body name -> (position, quaternion) of a scene's furniture at rest, world frame."""
+    """Return body name -> (position, quaternion) of a scene's furniture at rest, world frame."""
     qpos, layout = world.rest_qpos[index], world.layout
     slots = zip(world.slots.names[index], layout.slot_kind, layout.slot_qpos, strict=True)
     free = {name: (qpos[at : at + 3], qpos[at + 3 : at + 7]) for name, kind, at in slots if name and kind == "free"}
@@ -68,13 +64,13 @@ def rest_poses(world: World, index: int) -> dict[str, tuple[np.ndarray, np.ndarr
 
 
 def friction_share(world: World, index: int) -> np.ndarray:
-    """[M] mass times friction of what is in a scene's movable slots over the robot's mass; 0 where a slot is empty."""
+    """Return [M] mass times friction of what is in a scene's slots over the robot's mass; 0 for an empty slot."""
     return world.slots.mass_kg[index] * world.slots.friction[index] / world.robot_mass_kg
 
 
 def round_tables(world: World, tables: SceneTables, rules: TaskRules, limit: float) -> SceneTables:
-    """The tables with shortest paths that also go round furniture at rest of more than this `friction_share`; doors,
-    which turn, are no obstacle."""
+    """Return the tables with shortest paths that also go round furniture at rest of more than this `friction_share`;
+    doors, which turn, are no obstacle."""
     fine, kinds = rules.nav_cell_m / FINE_CELLS, world.layout.slot_kind
 
     def graph(index: int) -> CornerGraph:
@@ -94,7 +90,7 @@ def round_tables(world: World, tables: SceneTables, rules: TaskRules, limit: flo
 
 
 def _scene_places(world: World, index: int, rules: TaskRules) -> tuple[CornerGraph, np.ndarray, np.ndarray, np.ndarray]:
-    """Shortest paths, start cells [p, 2], goal cells [g, 2] and clutter cells [q, 2] of one scene."""
+    """Return shortest paths, start cells [p, 2], goal cells [g, 2] and clutter cells [q, 2] of one scene."""
     scene, robot = world.scenes[index], world.robot
     maps, fine = scene.maps, rules.nav_cell_m / FINE_CELLS
     free = navigation_grid(maps.traversable, maps.resolution_m, robot.footprint_radius_m, fine)
@@ -106,7 +102,7 @@ def _scene_places(world: World, index: int, rules: TaskRules) -> tuple[CornerGra
     graph = corner_graph(free, fine, rules.nav_cell_m, maps.origin_w)
 
     def room(blocked: np.ndarray | bool) -> np.ndarray:
-        """Clearance in metres that every point of a fine cell has."""
+        """Return the clearance in metres that every point of a fine cell has."""
         open_ = maps.traversable & ~np.asarray(blocked)
         return sampled_clearance(open_, maps.resolution_m, fine) - math.sqrt(0.5) * fine
 
@@ -123,7 +119,7 @@ def _scene_places(world: World, index: int, rules: TaskRules) -> tuple[CornerGra
 
 
 def _known_pairs(world: World, tables: SceneTables, rules: TaskRules) -> np.ndarray:
-    """[S, PAIRS_KEPT, 2, 2] f32 starts and goals at middles of cells, as far apart as asked: some of each scene's."""
+    """Return some starts and goals of each scene [S, PAIRS_KEPT, 2, 2] f32, at middles of cells, at valid distances."""
     least_m, largest_m = rules.min_goal_distance_m, rules.max_goal_distance_m
 
     @jax.jit
@@ -131,7 +127,7 @@ def _known_pairs(world: World, tables: SceneTables, rules: TaskRules) -> np.ndar
         field = goal_field(tables, scene, goal)  # type: ignore[arg-type]
         return jax.vmap(lambda start: geodesic_at(tables, scene, field, start))(tables.start_xy_w[scene])  # type: ignore[arg-type]
 
-    known, rng = [], np.random.default_rng(0)
+    pairs_kept, rng = [], np.random.default_rng(0)
     all_starts, all_goals = np.asarray(tables.start_xy_w), np.asarray(tables.goal_xy_w)
     for i, scene in enumerate(world.scenes):
         starts = all_starts[i, : tables.num_starts[i]]
@@ -159,12 +155,12 @@ def _known_pairs(world: World, tables: SceneTables, rules: TaskRules) -> np.ndar
                 "max_goal_distance_m or lower min_goal_distance_m"
             )
         pairs = np.concatenate(fits)
-        known.append(pairs[np.linspace(0, len(pairs) - 1, PAIRS_KEPT).astype(int)])
-    return np.stack(known)
+        pairs_kept.append(pairs[np.linspace(0, len(pairs) - 1, PAIRS_KEPT).astype(int)])
+    return np.stack(pairs_kept)
 
 
 def _farthest(starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
-    """[g] m: how far the farthest of the starts [p, 2] is from each goal [g, 2], to within 0.2 %."""
+    """Return [g] m: how far the farthest of the starts [p, 2] is from each goal [g, 2], to within 0.2 %."""
     if not len(starts):
         return np.zeros(0)
     angle = np.arange(64) * np.pi / 32
@@ -173,7 +169,7 @@ def _farthest(starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
 
 
 def _pad(arrays: list[np.ndarray], axes: int, fill: float = 0) -> np.ndarray:
-    """Stacks arrays padded at the end of their first `axes` axes to common sizes."""
+    """Stack arrays padded at the end of their first `axes` axes to common sizes."""
     sizes = [max(a.shape[i] for a in arrays) for i in range(axes)]
     padded = [
         np.pad(a, [(0, s - n) for s, n in zip(sizes, a.shape, strict=False)] + [(0, 0)] * (a.ndim - axes),
@@ -184,7 +180,7 @@ def _pad(arrays: list[np.ndarray], axes: int, fill: float = 0) -> np.ndarray:
 
 
 def navigation_tables(graphs: list[CornerGraph]) -> dict[str, Any]:
-    """The shortest paths of all scenes, padded; in each the last corner is none."""
+    """Return the shortest paths of all scenes, padded; in each the last corner is none."""
     count = max(len(g.corner_xy_w) for g in graphs)
     # The tables are large: the smallest type that numbers every corner.
     index = np.uint16 if count < 2**16 else np.int32
@@ -214,7 +210,7 @@ def navigation_tables(graphs: list[CornerGraph]) -> dict[str, Any]:
 
 
 def build_tables(world: World, rules: TaskRules) -> SceneTables:
-    """Solves navigation for every scene and stacks all constants on the device."""
+    """Solve navigation for every scene and stack all constants on the device."""
     with ThreadPoolExecutor() as pool:  # NumPy works on large arrays here, without holding Python's lock
         places = list(pool.map(lambda i: _scene_places(world, i, rules), range(len(world.scenes))))
     mass = np.concatenate([np.full((len(world.scenes), 1), world.robot_mass_kg), world.slots.mass_kg], 1)

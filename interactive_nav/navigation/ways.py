@@ -1,6 +1,6 @@
-"""A scene's state and a start and goal in, the way that a planner would take out; on the host.
+"""Plan paths between starts and goals in a scene's state, on the host.
 
-Ways are found by Dijkstra on a grid, round everything that can be moved or, at a price, through it (navigation among
+The planner is Dijkstra on a grid, round everything that can be moved or, at a price, through it (navigation among
 movable obstacles; Stilman and Kuffner 2005, Interactive Gibson section II-D).
 """
 
@@ -47,7 +47,7 @@ class Footprints:
         self._corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, -1).T
 
     def cells(self, qpos: np.ndarray) -> list[np.ndarray]:
-        """Per body, the flat indices of the cells that it covers."""
+        """Return, per body, the flat indices of the cells that it covers."""
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self._data)
         out = []
@@ -63,7 +63,7 @@ class Footprints:
 
     def _covered(self, geoms: np.ndarray) -> np.ndarray:
         model, data = self._model, self._data
-        found = []
+        cells = []
         for g in geoms:
             if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH:
                 mesh = model.geom_dataid[g]
@@ -74,11 +74,11 @@ class Footprints:
             points = data.geom_xpos[g] + local @ data.geom_xmat[g].reshape(3, 3).T
             if points[:, 2].min() > self._height_m:
                 continue
-            found.append(self._polygon(points[:, :2]))
-        return np.unique(np.concatenate(found)) if found else np.zeros(0, np.int64)
+            cells.append(self._polygon(points[:, :2]))
+        return np.unique(np.concatenate(cells)) if cells else np.zeros(0, np.int64)
 
     def _polygon(self, points: np.ndarray) -> np.ndarray:
-        """Cells whose middle lies in the convex hull of points [p, 2], or within half a cell of it."""
+        """Return the cells whose middle lies in the convex hull of points [p, 2], or within half a cell of it."""
         rows, columns = self._shape
         at = (points - self._origin) / CELL_M
         low = np.maximum(np.floor(at.min(0) - 1), 0).astype(int)
@@ -110,21 +110,19 @@ class _SceneGrid:
         self.stuck = ~world.slots.hinged[self.occupied] & (self.price > 1.0)  # its friction exceeds the robot's weight
 
     def middles_w(self, cells: np.ndarray) -> np.ndarray:
-        """[p, 2] m of cells [p, 2] (row, column)."""
+        """Return [p, 2] m of cells [p, 2] (row, column)."""
         return self.origin_w + (cells[:, ::-1] + 0.5) * CELL_M
 
     def cell(self, xy_w: np.ndarray) -> tuple[int, int]:
-        """(row, column) of a place; beyond the map, the nearest."""
+        """Return (row, column) of a place; beyond the map, the nearest."""
         c, r = np.floor((xy_w - self.origin_w) / CELL_M).astype(int)
         return int(np.clip(r, 0, self.shape[0] - 1)), int(np.clip(c, 0, self.shape[1] - 1))
 
 
 class PathGrid:
-    """Ways over one grid by Dijkstra over 16 moves; the graph is made once.
+    """Paths over one grid by Dijkstra over 16 moves; the graph is built once.
 
-    Args:
-        free: [rows, columns] bool.
-        cost: [rows, columns] at least 1, per metre.
+    `free` is [rows, columns] bool, and `cost`, at least 1 per metre, alike.
     """
 
     def __init__(self, free: np.ndarray, cost: np.ndarray):
@@ -137,13 +135,9 @@ class PathGrid:
         self._graph = grid_graph(free, cost, CELL_M, MOVES_16, corners=False)
 
     def path(self, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray:
-        """The cheapest one between two cells.
+        """Return the cheapest path between two cells (row, column), for which the nearest free ones stand.
 
-        Args:
-            start: (row, column), the nearest free cell stands for it.
-
-        Returns:
-            [p, 2] (row, column), both ends included; [0, 2] where there is none.
+        It is [p, 2] (row, column), both ends included; [0, 2] where there is none.
         """
         if not self._any:
             return np.zeros((0, 2), np.int64)
@@ -170,12 +164,9 @@ class Ways:
         self._grids = [_SceneGrid(env, i) for i in range(len(env.scenes))]
 
     def way(self, scene: int, qpos: np.ndarray, start_xy_w: np.ndarray, goal_xy_w: np.ndarray) -> np.ndarray:
-        """[p, 2] m, the world's frame, ending at the goal unless nothing may be touched; [0, 2] where there is none.
+        """Return a path [p, 2], m, in the world's frame, for `qpos` [nq] and places (2,), m; [0, 2] where none exists.
 
-        Args:
-            qpos: [nq] of the scene's model.
-            start_xy_w: (2,) m.
-            goal_xy_w: (2,) m.
+        It ends at the goal unless nothing may be touched.
         """
         grid = self._grids[scene]
         free, cost = self._costs(grid, qpos)
@@ -186,7 +177,7 @@ class Ways:
         return path if self._weight is None else np.concatenate([path, goal_xy_w[None]])
 
     def exists(self, scene: int, qpos: np.ndarray, start_xy_w: np.ndarray, goal_xy_w: np.ndarray) -> bool:
-        """Whether `way` finds one, sooner told."""
+        """Return whether `way` has a path, in less time."""
         grid = self._grids[scene]
         free, _ = self._costs(grid, qpos)
         if not free.any():
@@ -199,12 +190,12 @@ class Ways:
         return bool(one and self._near(grid.middles_w(ends), start_xy_w, goal_xy_w))
 
     def _near(self, ends_w: np.ndarray, start_xy_w: np.ndarray, goal_xy_w: np.ndarray) -> bool:
-        """The nearest free cells stand for start and goal: a way between others than those is none."""
+        """Return whether a path's ends, free cells, are near enough to stand for the start and the goal."""
         off = np.linalg.norm(ends_w - np.stack([start_xy_w, goal_xy_w]), axis=-1)
         return bool(off[0] <= START_OFF_M and off[1] <= self._env.success_distance_m)
 
     def _costs(self, grid: _SceneGrid, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """[rows, columns] where the robot's middle may be, and what a metre costs there."""
+        """Return [rows, columns] where the robot's middle may be, and what a metre costs there."""
         radius, cost, free = self._env.robot.footprint_radius_m, np.ones(grid.shape), grid.free
         near = np.clip(1.0 - (grid.room_m - radius) / NEAR_M, 0.0, 1.0)
         if self._weight == 0.0:

@@ -32,10 +32,10 @@ _OVERFLOWS = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNS
 
 
 def with_feet_apart(spec: mujoco.MjSpec, names: Sequence[str]) -> mujoco.MjModel:
-    """A scene's model that steps as its spec's does, to the bit, and faster.
+    """Return a scene's model that steps as its spec's does, to the bit, and faster.
 
     MuJoCo's broadphase measures each geom of each body that can collide, asleep or not, and most geoms are feet. Here
-    the feet of `names` are on bodies of their own that can collide with nothing; pairs name the floor for them.
+    the feet of `names` are on separate bodies that can collide with nothing; pairs name the floor for them.
     """
     spec = spec.copy()
     floor = spec.geom("floor")
@@ -73,7 +73,7 @@ class _Pool:
 
 
 class NativePhysics(Physics):
-    """Steps each environment with its own scene's model, in parallel threads."""
+    """Steps each environment with its scene's model, in parallel threads."""
 
     name = "native"
 
@@ -89,7 +89,7 @@ class NativePhysics(Physics):
         self._models = tuple(with_feet_apart(spec, names) for spec in world.specs)
         self._iterations = int(world.models[0].opt.iterations)
         for model in self._models:
-            # A failed state must be seen, not silently replaced by the model's default.
+            # A failed state must show, not be silently replaced by the model's default.
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
             if self._physics.sleep:
                 model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
@@ -99,13 +99,13 @@ class NativePhysics(Physics):
     def step_batch(self, scene, state, command, time_s):
         n = scene.shape[0]
 
-        def told(name: str) -> jax.ShapeDtypeStruct:
+        def shape_of(name: str) -> jax.ShapeDtypeStruct:
             shape = (n, self._slots) if name == "slot_force_n" else (n,)
             return jax.ShapeDtypeStruct(shape, jnp.float32 if name.endswith("force_n") else jnp.int32)
 
         shapes = (
             PhysicsState(*(jax.ShapeDtypeStruct((n, size), jnp.float32) for size in (self.nq, self.nv, self.nv))),
-            StepSignals(**{field.name: told(field.name) for field in dataclasses.fields(StepSignals)}),
+            StepSignals(**{field.name: shape_of(field.name) for field in dataclasses.fields(StepSignals)}),
         )
         # One array: JAX takes 30 us to hand over each argument of a callback.
         columns = (state.qpos, state.qvel, state.qacc_warmstart, command, time_s[:, None], scene[:, None])
@@ -125,14 +125,14 @@ class NativePhysics(Physics):
                 self._pools[size].append(pool)
 
     def _take_pool(self, qpos: np.ndarray) -> _Pool:
-        """A pool that nobody else is using (each JAX device calls from its own thread), if possible the one that
+        """Return a pool that nobody else is using (each JAX device calls from another thread), if possible the one that
         returned this state."""
         size = len(qpos)
         with self._lock:
             free = self._pools.setdefault(size, [])
             if free:
-                known = [np.equal(p.qpos, qpos).all(1).sum() for p in free]
-                return free.pop(int(np.argmax(known)))
+                equal = [np.equal(p.qpos, qpos).all(1).sum() for p in free]
+                return free.pop(int(np.argmax(equal)))
         return _Pool(self._models, size, self._physics.threads, self._physics.sleep)
 
     def _step_pool(self, pool: _Pool, size: int, scene, state: PhysicsState, qpos, qvel, command, time_s):
@@ -142,8 +142,8 @@ class NativePhysics(Physics):
             pool.qpos[np.flatnonzero(pool.scene - scene)] = np.nan
             pool.scene = scene.copy()
         finite = np.asarray(np.isfinite(qpos).all(1) & np.isfinite(qvel).all(1))
-        known = np.equal(qpos, pool.qpos).all(1) & np.equal(qvel, pool.qvel).all(1)
-        fresh = np.flatnonzero(~known)
+        resumed = np.equal(qpos, pool.qpos).all(1) & np.equal(qvel, pool.qvel).all(1)
+        fresh = np.flatnonzero(~resumed)
         if len(fresh):
             batch.reset(fresh, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
             good = fresh[finite[fresh]]
@@ -173,7 +173,7 @@ class NativePhysics(Physics):
         )
 
     def _advance(self, pool: _Pool, command: np.ndarray, time_s: np.ndarray) -> tuple[Any, Any]:
-        """Runs the substeps; sensor readings [N, substeps, ...] and the most solver iterations [N]."""
+        """Run the substeps and return sensor readings [N, substeps, ...] and the most solver iterations [N]."""
         rounds = self._physics.substeps if self._robot.control_every_substep else 1
         sensed, layout = [], self._layout
         iterations = np.zeros(len(command), np.int64)

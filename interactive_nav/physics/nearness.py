@@ -1,6 +1,6 @@
-"""The world's state in, how near each movable slot and wall is to the robot and to what moves out.
+"""Measure how near each movable slot and wall is to the robot and to moving objects, from the world's state.
 
-A slot's body is the box that bounds it in its own frame, so a bed or a sofa is near where its side is near, at
+A slot's body is the box that bounds it in the body's frame, so a bed or a sofa is near where its side is near, at
 whatever turn. Gaps are planar and never larger than the true ones: the largest of the gaps across the edges of
 the boxes' shadows and between their centres (separating axes).
 """
@@ -43,7 +43,7 @@ Measured = tuple[Any, Any, Any]
 
 @flax.struct.dataclass
 class Boxes:
-    """Bounding boxes in the world, seen from above; leading axes may stand before these."""
+    """Bounding boxes in the world, from above; leading axes may stand before these."""
 
     centre: Array
     """[M, 2] m"""
@@ -53,7 +53,7 @@ class Boxes:
     """[M, 3] half sizes, m"""
 
     def gap_m(self, centre: Array, axes: Array, half: Array) -> Array:
-        """[..., M] m from each box to one other, whose `half` is 0 for a point; at most 0 where they overlap."""
+        """Return [..., M] m from each box to one other, whose `half` is 0 for a point; at most 0 where they overlap."""
         xp = namespace(self.centre, centre)
         between = self.centre - centre[..., None, :]
         mine, others = xp.broadcast_arrays(self.axes, axes[..., None, :, :])
@@ -62,9 +62,9 @@ class Boxes:
         ways = xp.concatenate([between[..., None], across], -1)
         ways = ways / xp.maximum(xp.linalg.norm(ways, axis=-2, keepdims=True), 1e-6)
         apart = xp.abs(xp.einsum("...pw,...p->...w", ways, between))
-        own = xp.einsum("...wa,...a->...w", xp.abs(xp.einsum("...pw,...pa->...wa", ways, mine)), self.half)
+        ours = xp.einsum("...wa,...a->...w", xp.abs(xp.einsum("...pw,...pa->...wa", ways, mine)), self.half)
         theirs = (xp.abs(xp.einsum("...pw,...pa->...wa", ways, others)) * half[..., None, None, :]).sum(-1)
-        return (apart - own - theirs).max(-1)
+        return (apart - ours - theirs).max(-1)
 
 
 class Nearness:
@@ -85,7 +85,7 @@ class Nearness:
         self._walls = tuple(t.astype(np.float32) for t in (walls[..., :2], axes, walls[..., 7:9], walls[..., 7] > 0))
 
     def boxes(self, scene: Array, state: PhysicsState) -> Boxes:
-        """Of all slots of one environment, or, in NumPy, of many of one scene."""
+        """Return those of all slots of one environment, or, in NumPy, of many of one scene."""
         xp = namespace(state.qpos)
         offset, half, frame, anchor, axis = (xp.asarray(t)[scene] for t in self._tables)
         qpos = state.qpos[..., self._qpos]
@@ -101,7 +101,7 @@ class Nearness:
         return Boxes(centre[..., :2], axes[..., :2, :], half)
 
     def walls_m(self, scene: Array, state: PhysicsState) -> Array:
-        """[..., W] planar distance from the robot to each wall box; `FAR_M` for empty ones."""
+        """Return [..., W] planar distance from the robot to each wall box; `FAR_M` for empty ones."""
         xp = namespace(state.qpos)
         xpos, xmat, half, used = (xp.asarray(t)[scene] for t in self._walls)
         offset = xp.einsum("...wi,wij->...wj", state.qpos[..., None, self._robot] - xpos, xmat)
@@ -109,7 +109,7 @@ class Nearness:
         return xp.where(used > 0, xp.linalg.norm(outside, axis=-1), FAR_M)
 
     def _walls_gap_m(self, scene: Array, state: PhysicsState, reach_m: float, boxes: Boxes, push_m: Array) -> Array:
-        """[..., W] m to where each wall can be met: within `reach_m` of the robot, or `TOUCH_M` of what it may push."""
+        """Return [..., W] m to where walls are met: within `reach_m` of the robot, or `TOUCH_M` of what it may push."""
         xp, gap = namespace(state.qpos), self.walls_m(scene, state) - reach_m
         xpos, xmat, half, used = (xp.asarray(t)[scene] for t in self._walls)
         walls = Boxes(xpos, xp.pad(xmat, ((0, 0), (0, 0), (0, 1))), xp.pad(half, ((0, 0), (0, 1))))
@@ -124,11 +124,10 @@ class Nearness:
         return gap
 
     def measure(self, scene: Array, state: PhysicsState, reach_m: float) -> Measured:
-        """How far each slot is from where it can be met: within `reach_m` of the robot, or `TOUCH_M` of what moves.
+        """Return how far each slot is from where it can be met: within `reach_m` of the robot or `TOUCH_M` of movers.
 
-        Returns:
-            [M] m, negative where it can be met, `FAR_M` for empty slots; [M] whether it moves; [W] m to where each
-            wall can be met, see `_walls_gap_m`.
+        This is [M] m, negative where it can be met, `FAR_M` for empty slots; then come [M] whether it moves, and [W] m
+        to where each wall can be met, see `_walls_gap_m`.
         """
         boxes, occupied = self.boxes(scene, state), jnp.asarray(self.world.slots.occupied)[scene]
         gap = boxes.gap_m(state.qpos[self._robot], jnp.eye(2, 3), jnp.zeros(3)) - reach_m
@@ -146,10 +145,8 @@ class Nearness:
         return jnp.where(occupied, gap, FAR_M), moving, walls
 
     def counts(self, reach_m: float) -> dict[str, np.ndarray]:
-        """[P] how many of each kind of slot, and of walls, are near at rest, the robot anywhere on free floor.
-
-        Small objects lie anywhere, too.
-        """
+        """Return [P] how many of each kind of slot, and of walls, are near at rest, the robot and the small objects
+        anywhere on free floor."""
         world, rng, kinds = self.world, np.random.default_rng(0), np.asarray(self.world.layout.slot_kind)
         small, most = np.flatnonzero(kinds == "small"), max(200, _PLACES // len(self.world.scenes))
         counts: dict[str, list[np.ndarray]] = {kind: [] for kind in ("small", "free", "hinge", "walls")}
@@ -165,13 +162,13 @@ class Nearness:
                 boxes = self.boxes(scene, state)
                 gap = np.where(world.slots.occupied[scene], boxes.gap_m(places[:, 0], np.eye(2, 3), np.zeros(3)), FAR_M)
                 walls = self._walls_gap_m(scene, state, reach_m, boxes, gap - reach_m + (REACH_M - _PUSH_M)) < 0
-                for kind, own in counts.items():
-                    own.append((walls if kind == "walls" else (gap < reach_m)[:, kinds == kind]).sum(-1))
+                for kind, values in counts.items():
+                    values.append((walls if kind == "walls" else (gap < reach_m)[:, kinds == kind]).sum(-1))
         return {kind: np.concatenate(values) for kind, values in counts.items()}
 
 
 def widths_at(counts: Mapping[str, np.ndarray], share: float = _SHARE) -> dict[str, int]:
-    """Of each kind, what suffices in this share of the counts; at least one, since 0 stands for all."""
+    """Return, of each kind, what suffices in this share of the counts; at least one, since 0 stands for all."""
     return {k: max(1, int(np.quantile(c, share, method="higher"))) for k, c in counts.items()}
 
 

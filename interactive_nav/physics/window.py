@@ -1,4 +1,4 @@
-"""A `World` in, the part of it that can move near a robot out: what MJX steps instead of the whole building.
+"""Select the part of a `World` that can move near a robot: what MJX steps instead of the whole building.
 
 Objects at rest far from the robot stay where they are, so only the nearest ones need to be simulated. C
 MuJoCo leaves the others out by letting them sleep; MJX steps every body of its model, and its cost grows
@@ -83,22 +83,22 @@ class Window:
         self._nearness = Nearness(world)
         self._reach_m = world.robot.footprint_radius_m + REACH_M
         limits["walls"] = physics.active_walls
-        found = widths_at(self.needs_at_rest) if None in limits.values() else {}
-        self.widths = {kind: found[kind] if limit is None else limit for kind, limit in limits.items()}
+        measured = widths_at(self.needs_at_rest) if None in limits.values() else {}
+        self.widths = {kind: measured[kind] if limit is None else limit for kind, limit in limits.items()}
         """Kind of slot, and `walls` -> how many at a time; 0: all."""
-        there = {kind: len(own) for kind, own in self._slots.items()} | {"walls": len(layout.wall_geoms)}
+        there = {kind: len(slots) for kind, slots in self._slots.items()} | {"walls": len(layout.wall_geoms)}
         counts = np.bincount(world.slots.box_slot, minlength=layout.num_slots)
-        self._boxes = {kind: int(counts[own].max(initial=0)) for kind, own in self._slots.items()}
-        self._tables = {kind: self._group_tables(kind) for kind, own in self._slots.items() if len(own)}
+        self._boxes = {kind: int(counts[slots].max(initial=0)) for kind, slots in self._slots.items()}
+        self._tables = {kind: self._group_tables(kind) for kind, slots in self._slots.items() if len(slots)}
         self._wall_tables = self._walls()
         self._fit({kind: min(width or there[kind], there[kind]) for kind, width in self.widths.items()}, config)
 
     def narrower(self, widths: Mapping[str, int], config: NavConfig) -> Window:
-        """One with the same tables and at most these numbers of slots and walls, literally; one wall at least."""
-        made = copy.copy(self)
+        """Return one with the same tables and at most these numbers of slots and walls, but one wall at least."""
+        other = copy.copy(self)
         least = {**widths, "walls": max(1, widths["walls"])}
-        made._fit({kind: min(least[kind], room) for kind, room in self.room.items()}, config)
-        return made
+        other._fit({kind: min(least[kind], room) for kind, room in self.room.items()}, config)
+        return other
 
     def _fit(self, room: dict[str, int], config: NavConfig) -> None:
         self.room = room
@@ -119,7 +119,7 @@ class Window:
 
     @functools.cached_property
     def needs_at_rest(self) -> dict[str, np.ndarray]:
-        """[P] of each kind of slot, and of walls: needed with the robot at random places, everything at rest."""
+        """Return [P] of each kind of slot, and of walls: needed with the robot at random places, everything at rest."""
         return self._nearness.counts(self._reach_m)
 
     def _group_tables(self, kind: str) -> tuple[dict[str, jax.Array], dict[str, np.ndarray]]:
@@ -136,23 +136,22 @@ class Window:
         return jax.device_put({name: np.float32(np.stack(values)) for name, values in tables.items()}), outer
 
     def _walls(self) -> dict[str, jax.Array]:
-        world, own = self.world, self.world.layout.wall_geoms
-        tables = {name: np.stack([getattr(m, name)[own] for m in world.models]) for name in _WALL}
+        world, geoms = self.world, self.world.layout.wall_geoms
+        tables = {name: np.stack([getattr(m, name)[geoms] for m in world.models]) for name in _WALL}
         poses = [_static_poses(m) for m in world.models]
-        tables["xpos"] = np.stack([xpos[own] for xpos, _ in poses])
-        tables["xmat"] = np.stack([xmat[own] for _, xmat in poses])
+        tables["xpos"] = np.stack([xpos[geoms] for xpos, _ in poses])
+        tables["xmat"] = np.stack([xmat[geoms] for _, xmat in poses])
         return jax.device_put({k: np.float32(v) for k, v in tables.items()})
 
     def measure(self, scene: jax.Array, state: PhysicsState) -> Measured:
-        """See `Nearness.measure`: of one environment's scene, [] i32, and state of the whole world."""
+        """Return `Nearness.measure` of one environment's scene, [] i32, and state of the whole world."""
         return self._nearness.measure(scene, state, self._reach_m)
 
     def select(self, measured: Measured) -> tuple[tuple[jax.Array, ...], jax.Array, jax.Array]:
-        """What goes into the window of one environment.
+        """Return what goes into the window of one environment.
 
-        Returns:
-            Per group [width] indices into its slots; [walls] indices of walls; [] i32, 1 if something
-            within reach had to be left out.
+        This is, per group, [width] indices into its slots; [walls] indices of walls; [] i32, 1 if something within
+        reach had to be left out.
         """
         near, moving, walls = measured
         chosen, missed = [], jnp.zeros((), bool)
@@ -172,14 +171,14 @@ class Window:
         return tuple(chosen), index, missed.astype(jnp.int32)
 
     def needs(self, measured: Measured) -> dict[str, jax.Array]:
-        """How many of each kind can be met, or move, in one environment: [] i32 by kind of slot, and of walls."""
+        """Return how many of each kind can be met, or move, in one environment: [] i32 by kind of slot, and walls."""
         near, moving, walls = measured
         needed = (near < 0) | moving
         counts = {kind: needed[jnp.asarray(slots)].sum() for kind, slots in self._slots.items()}
         return {**counts, "walls": (walls < 0).sum()}
 
     def fields(self, scene: jax.Array, chosen: tuple[jax.Array, ...], walls: jax.Array) -> dict[str, jax.Array]:
-        """Values of all `FIELDS` of the window's model, in MuJoCo's shapes."""
+        """Return values of all `FIELDS` of the window's model, in MuJoCo's shapes."""
         out = {name: jnp.asarray(value) for name, value in self._base.items()}
         for group, index in zip(self.groups, chosen, strict=True):
             for name, rows in group.rows.items():
@@ -189,24 +188,24 @@ class Window:
         return out
 
     def static_poses(self, scene: jax.Array, walls: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """World positions [ngeom, 3] and matrices [ngeom, 3, 3] of the geoms; right for those that never move."""
+        """Return world positions [ngeom, 3] and matrices [ngeom, 3, 3] of the geoms, right where these never move."""
         xpos = self._xpos.at[self._wall_rows].set(self._wall_tables["xpos"][scene, walls])
         return xpos, self._xmat.at[self._wall_rows].set(self._wall_tables["xmat"][scene, walls])
 
     def _addresses(self, chosen: tuple[jax.Array, ...]) -> list[tuple[Any, Any, Any, Any]]:
-        """(window's qpos, world's qpos, window's qvel, world's qvel) addresses of the robot and each group."""
+        """Return (window's qpos, world's qpos, window's qvel, world's qvel) addresses of the robot and each group."""
         inner, outer = self.layout, self.world.layout
         q, v = np.arange(inner.robot_nq), np.arange(inner.robot_nv)
-        found: list[tuple[Any, Any, Any, Any]] = [
+        addresses: list[tuple[Any, Any, Any, Any]] = [
             (inner.robot_qpos + q, outer.robot_qpos + q, inner.robot_qvel + v, outer.robot_qvel + v)
         ]
         for group, index in zip(self.groups, chosen, strict=True):
             (q_in, q_out), (v_in, v_out) = ((group.rows[name], group.outer[name]) for name in ("qpos0", "dof_damping"))
-            found.append((q_in, jnp.asarray(q_out)[index], v_in, jnp.asarray(v_out)[index]))
-        return found
+            addresses.append((q_in, jnp.asarray(q_out)[index], v_in, jnp.asarray(v_out)[index]))
+        return addresses
 
     def enter(self, state: PhysicsState, chosen: tuple[jax.Array, ...]) -> PhysicsState:
-        """The window's state out of the world's."""
+        """Return the window's state out of the world's."""
         qpos = jnp.zeros(self.model.nq, jnp.float32)
         qvel = warm = jnp.zeros(self.model.nv, jnp.float32)
         for q_in, q_out, v_in, v_out in self._addresses(chosen):
@@ -216,7 +215,7 @@ class Window:
         return PhysicsState(qpos, qvel, warm)
 
     def leave(self, state: PhysicsState, inner: PhysicsState, chosen: tuple[jax.Array, ...]) -> PhysicsState:
-        """The world's new state: what is outside of the window stays, at rest."""
+        """Return the world's new state: what is outside of the window stays, at rest."""
         qpos, qvel, warm = state.qpos, jnp.zeros_like(state.qvel), jnp.zeros_like(state.qacc_warmstart)
         for q_in, q_out, v_in, v_out in self._addresses(chosen):
             qpos = qpos.at[q_out].set(inner.qpos[q_in])
@@ -225,7 +224,7 @@ class Window:
         return PhysicsState(qpos, qvel, warm)
 
     def spread_forces(self, forces: jax.Array, chosen: tuple[jax.Array, ...]) -> jax.Array:
-        """[..., window slots + 1, 3] forces to [..., world slots + 1, 3], the structure last; 0 outside the window."""
+        """Spread [..., window slots + 1, 3] forces to [..., world slots + 1, 3], the structure last; 0 elsewhere."""
         slots = self.world.layout.num_slots
         out = jnp.zeros((*forces.shape[:-2], slots + 1, 3), forces.dtype)
         for group, index in zip(self.groups, chosen, strict=True):

@@ -1,4 +1,4 @@
-"""A scene as people see it: a scene, a robot and small objects in, a MuJoCo model of what is looked at out.
+"""Build MuJoCo models for pictures of a scene with a robot and small objects.
 
 Every picture and viewer starts from `furnished_spec`. `SceneModel` is what pictures are taken of: its bodies are put
 where a caller wants them, and rays are cast into it.
@@ -23,9 +23,9 @@ from scenes_mjcf.categories import MaskClasses, class_id
 
 THINGS, BUILDING, CUT_WALLS, ROBOT, ROBOT_SOLIDS, HIDDEN = range(6)
 """Geom groups: the floor and what stands on it; walls at full height; walls cut low; the robot; the collision shapes
-of a robot that has others to be seen; what is never drawn."""
+of a robot that has others to show; what is never drawn."""
 SCENE = (THINGS, BUILDING)
-"""What is seen from inside, without the robot."""
+"""Groups that show from inside, without the robot."""
 CUT_M = 0.55
 """Height of the walls in views from outside."""
 
@@ -33,13 +33,9 @@ CUT_M = 0.55
 def furnished_spec(
     scene: Scene, robot: RobotSpec | None, small: Sequence[SmallObject], cut_walls: bool = False
 ) -> mujoco.MjSpec:
-    """The scene as stored, with a robot and small objects added, which are boxes and stand at the origin.
+    """Return the scene of `scene.xml` with a robot and small objects added, which are boxes and stand at the origin.
 
-    Args:
-        scene: its `scene.xml` is read.
-        robot: or None.
-        small: the small objects.
-        cut_walls: adds the walls once more, cut low.
+    With `cut_walls` the walls are there once more, cut low.
     """
     spec = mujoco.MjSpec.from_file(str(scene.path / "scene.xml"))
     if cut_walls:
@@ -59,13 +55,10 @@ def picture_spec(
     small: Sequence[SmallObject] = (),
     classes: MaskClasses | None = None,
 ) -> mujoco.MjSpec:
-    """`furnished_spec` in the groups of pictures, lit by its own lamps or by one, with a camera named `view`.
+    """Return `furnished_spec` in the groups of pictures, lit by its own lamps or one, with a camera named `view`.
 
-    Args:
-        scene: its visual meshes are drawn; bodies that have none, as their boxes.
-        robot: or None.
-        small: the small objects.
-        classes: the setting `segmentation_classes` by which boxes are coloured; None: as they are stored.
+    Visual meshes are drawn, and the boxes of bodies that have none. `classes` is the setting `segmentation_classes` by
+    which boxes are coloured; None leaves their colours as they are stored.
     """
     spec = furnished_spec(scene, robot, small, cut_walls=robot is not None)
     own = {b.name for b in spec.body(robot.base_body).find_all("body")} | {robot.base_body} if robot else set()
@@ -104,14 +97,7 @@ class SceneModel:
     """One scene with a robot and small objects, whose bodies are put where a caller wants them."""
 
     def __init__(self, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject], classes: MaskClasses = 4):
-        """Compiles the model to look at.
-
-        Args:
-            robot: its collision shapes are drawn, or its visual ones where it has any.
-            scene: its visual meshes are drawn.
-            small: the small objects.
-            classes: the setting `segmentation_classes`.
-        """
+        """Compile the model to look at; the robot's collision shapes are drawn, or its visual ones if it has any."""
         self.robot = robot
         rows = {n: (body.mask_id(classes), body.category) for n, body in bodies_by_name(scene, small).items()}
         spec = picture_spec(scene, robot, small, classes)
@@ -135,31 +121,16 @@ class SceneModel:
 
     @functools.cached_property
     def colour(self) -> np.ndarray:
-        """[ngeom, 3] in [0, 1]: of the geom, or its texture's mean."""
+        """Return [ngeom, 3] in [0, 1]: each geom's colour, or its texture's mean."""
         return np.array([geom_colour(self.model, g) for g in range(self.model.ngeom)], np.float32)
 
     def pose(self, world: World, scene: int, qpos: np.ndarray) -> None:
-        """Puts all bodies where an environment's `qpos` [nq] has them.
-
-        Args:
-            world: the environment's.
-            scene: index of the scene that this is the model of.
-            qpos: [nq].
-        """
+        """Put all bodies where an environment's `qpos` [nq] has them; `scene` is the index of this model's scene."""
         names, _, pos, quat = world_poses(world, scene, np.asarray(qpos)[None])
         self.place(names, pos[0], quat[0])
 
     def place(self, bodies: tuple[str, ...], pos_w: np.ndarray, quat_w: np.ndarray) -> None:
-        """Puts bodies where they are to be drawn; those that are not named stay at rest.
-
-        Args:
-            bodies: B names.
-            pos_w: [B, 3] m.
-            quat_w: [B, 4] w x y z.
-
-        Raises:
-            ConfigError: the scene has no body of a name.
-        """
+        """Put B named bodies at [B, 3] m with orientations [B, 4] w x y z; the others stay at rest."""
         model, data = self.model, self.data
         rotation = np.zeros(9)
         for name, pos, quat in zip(bodies, pos_w, quat_w, strict=True):
@@ -179,16 +150,9 @@ class SceneModel:
 def carried_geoms(
     model: mujoco.MjModel, body: int, pos_w: np.ndarray, axes_w: np.ndarray
 ) -> tuple[slice, np.ndarray, np.ndarray]:
-    """Where a body's geoms are.
+    """Return the ids of a body's geoms (g), their positions [N, g, 3] and axes [N, g, 3, 3] in N moments.
 
-    Args:
-        model: any.
-        body: its id.
-        pos_w: [N, 3] m, of the body in N moments.
-        axes_w: [N, 3, 3], its axes in columns.
-
-    Returns:
-        Ids of its geoms (g), positions [N, g, 3] and axes [N, g, 3, 3].
+    The body is at `pos_w` [N, 3], m, with `axes_w` [N, 3, 3] as columns.
     """
     own = slice(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
     axes_w = axes_w[:, None]
@@ -199,17 +163,9 @@ def carried_geoms(
 def cast(
     model: mujoco.MjModel, data: mujoco.MjData, origin_w: np.ndarray, unit_w: np.ndarray, groups: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What rays meet first.
+    """Return what rays from (3,), m, with unit directions [n, 3] meet first of some geom groups.
 
-    Args:
-        model: what is there.
-        data: where it is.
-        origin_w: (3,) m.
-        unit_w: [n, 3] directions of length 1.
-        groups: geom groups that can be met.
-
-    Returns:
-        [n] geoms, -1 where nothing is met; [n] distances, m; [n, 3] normals.
+    These are [n] geoms, -1 for nothing; [n] distances, m; [n, 3] normals.
     """
     count = len(unit_w)
     geom, distance, normal = np.zeros(count, np.int32), np.zeros(count), np.zeros(3 * count)
@@ -223,11 +179,10 @@ def cast(
 def trace(
     model: mujoco.MjModel, data: mujoco.MjData, pose: CameraPose, lens: Lens, groups: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What the pixels of a camera show of some geom groups.
+    """Return what the pixels of a camera show of some geom groups.
 
-    Returns:
-        [H, W, 3] rays, see `Lens.rays`; [H, W] geoms, -1 where nothing is met; [H, W] depths along the optical axis,
-        m; [H, W, 3] normals.
+    These are [H, W, 3] rays, see `Lens.rays`; [H, W] geoms, -1 for nothing; [H, W] depths along the optical axis, m;
+    [H, W, 3] normals.
     """
     ray = lens.rays(pose)
     length = np.linalg.norm(ray, axis=-1, keepdims=True)
@@ -251,15 +206,10 @@ def _add_cut_walls(spec: mujoco.MjSpec, walls: np.ndarray) -> None:
 
 
 def world_poses(world: World, scene: int, qpos: np.ndarray) -> tuple[tuple[str, ...], int, np.ndarray, np.ndarray]:
-    """World poses of the robot's bodies and of a scene's movable objects.
+    """Return world poses of the robot's bodies and of a scene's movable objects, for `qpos` [T, nq].
 
-    Args:
-        world: for its models.
-        scene: index.
-        qpos: [T, nq]; a row that is not finite repeats the one before it.
-
-    Returns:
-        Names (B), how many of them are the robot's, positions [T, B, 3] and orientations [T, B, 4].
+    These are names (B), how many of them are the robot's, positions [T, B, 3] and orientations [T, B, 4]. A row of
+    `qpos` that is not finite repeats the one before it.
     """
     layout, slots, model = world.layout, world.slots, world.models[scene]
     data = mujoco.MjData(model)

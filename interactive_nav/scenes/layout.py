@@ -1,4 +1,4 @@
-"""Where things are in the models' state vectors: compiled models of equal layout in, addresses out."""
+"""Find where bodies are in the state vectors of compiled models of equal layout."""
 
 import dataclasses
 
@@ -36,7 +36,7 @@ class Layout:
 
     @property
     def num_slots(self) -> int:
-        """M."""
+        """Return M."""
         return len(self.slot_kind)
 
 
@@ -50,9 +50,9 @@ def find_layout(model: mujoco.MjModel, robot: RobotSpec, slots: list[tuple[str, 
     subtree = [b for b in range(model.nbody) if b == base or model.body_rootid[b] == base]
     sensors = [model.sensor(f"force_{i}").adr[0] for i in range(len(slots))]
     width = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
-    own = [j for j in range(model.njnt) if model.jnt_bodyid[j] in subtree]
-    assert own == list(range(joint, joint + len(own))), "a robot's joints must follow its free joint"
-    sizes = [width.get(mujoco.mjtJoint(int(model.jnt_type[j])), (1, 1)) for j in own]
+    joint_ids = [j for j in range(model.njnt) if model.jnt_bodyid[j] in subtree]
+    assert joint_ids == list(range(joint, joint + len(joint_ids))), "a robot's joints must follow its free joint"
+    sizes = [width.get(mujoco.mjtJoint(int(model.jnt_type[j])), (1, 1)) for j in joint_ids]
     return Layout(
         robot_qpos=int(model.jnt_qposadr[joint]),
         robot_qvel=int(model.jnt_dofadr[joint]),

@@ -1,4 +1,4 @@
-"""A scene folder in, a `Scene` of plain arrays out: the one reader of `scene.xml`."""
+"""Read scene folders into a `Scene` of plain arrays: the one reader of `scene.xml`."""
 
 import dataclasses
 import functools
@@ -15,7 +15,7 @@ from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manife
 from scenes_mjcf.sets import PACKAGED, installed, meant
 
 TASK_DIGEST = "task-1:"
-"""Begins a digest of what decides a task, and says how it was made; what does not begin so is `Scene.digest`."""
+"""Begins a digest of what decides a task, and names the method; what does not begin so is `Scene.digest`."""
 _DECIMALS = 9
 """Numbers are rounded before they are hashed: what MuJoCo computes differs between machines in its last bits."""
 
@@ -85,8 +85,8 @@ class Scene:
 
     @functools.cached_property
     def task_digest(self) -> str:
-        """`TASK_DIGEST` and SHA-256 of what decides the task: map, walls, and the movables' places, shapes, masses,
-        friction and categories. Names, textures, colours and other looks are not in it."""
+        """Return `TASK_DIGEST` and SHA-256 of what decides the task: map, walls, and the movables' places, shapes,
+        masses, friction and categories. Names, textures, colours and other looks are not in it."""
         maps = self.maps
         parts = [maps.traversable.shape, np.packbits(maps.traversable).tobytes().hex()]
         parts += [_rounded([maps.resolution_m, *maps.origin_w]), _rounded(_six_digits(self.walls))]
@@ -110,7 +110,7 @@ def _six_digits(rows: np.ndarray) -> np.ndarray:
 
 
 def task_parts(movable: Movable, hulls: list) -> list:
-    """What of a body decides a task, to be hashed: all but its name; its hulls as `hull_sources` has them."""
+    """Return what of a body decides a task, to be hashed: all but its name; its hulls as `hull_sources` has them."""
     numbers = {f.name: getattr(movable, f.name) for f in dataclasses.fields(Movable)}
     for name in ("name", "hulls", "hinge", "category"):
         del numbers[name]
@@ -120,17 +120,17 @@ def task_parts(movable: Movable, hulls: list) -> list:
 
 
 def hull_sources(xml: Path) -> dict[str, list]:
-    """Body name -> what its colliding meshes are made from: MuJoCo turns and centres the vertices themselves."""
+    """Return body name -> what its colliding meshes come from: MuJoCo turns and centres the vertices themselves."""
     spec = mujoco.MjSpec.from_file(str(xml))
-    found: dict[str, list] = {}
+    sources: dict[str, list] = {}
     for geom in spec.geoms:
         if geom.type == mujoco.mjtGeom.mjGEOM_MESH and (geom.contype or geom.conaffinity):
             mesh = spec.mesh(geom.meshname)
             path = xml.parent / spec.meshdir / mesh.file
             content = path.read_bytes() if mesh.file else np.asarray(mesh.uservert).tobytes()
             numbers = [_rounded(v) for v in (geom.pos, geom.quat, mesh.scale, mesh.refpos, mesh.refquat)]
-            found.setdefault(geom.parent.name, []).append([hashlib.sha256(content).hexdigest(), numbers])
-    return found
+            sources.setdefault(geom.parent.name, []).append([hashlib.sha256(content).hexdigest(), numbers])
+    return sources
 
 
 def _boxes(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
@@ -147,13 +147,13 @@ def _hull(model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 def _geoms(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a body's boxes and what of it collides."""
-    own = model.geom_bodyid == body
-    solid = own & ((model.geom_contype != 0) | (model.geom_conaffinity != 0))
-    return np.flatnonzero(own & (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX)), np.flatnonzero(solid)
+    mine = model.geom_bodyid == body
+    solid = mine & ((model.geom_contype != 0) | (model.geom_conaffinity != 0))
+    return np.flatnonzero(mine & (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX)), np.flatnonzero(solid)
 
 
 def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, friction: float) -> Movable:
-    """One movable body of a compiled scene or single object; `xml` is named in errors, `friction` is sliding."""
+    """Return a movable body of a compiled scene or single object; `xml` is named in errors, `friction` is sliding."""
     body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
     if body < 0:
         raise SceneError(f"{xml}: no body named '{name}', which its JSON file lists; convert it again")
@@ -193,7 +193,7 @@ def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, fri
 
 
 def load_scene(folder: str | Path) -> Scene:
-    """Reads and checks a scene folder: scene.xml, scene.json, maps.npz; one that is `installed`, too."""
+    """Read and check a scene folder: scene.xml, scene.json, maps.npz; one that is `installed`, too."""
     folder, word = installed(folder), str(folder)
     if not folder.exists():
         raise SceneError(

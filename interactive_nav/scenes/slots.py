@@ -39,8 +39,8 @@ def find_slots(scenes: Sequence[Scene], small: Sequence[SmallObject]) -> list[Sl
     """Return slots for the small objects, then for each scene's free bodies and its hinged ones, most boxes first."""
     slots = [Slot(name, "small", (obj,) * len(scenes)) for name, obj in zip(body_names(small), small, strict=True)]
     for kind in ("free", "hinge"):
-        own = ([m for m in scene.movables if (m.hinge is None) == (kind == "free")] for scene in scenes)
-        columns = itertools.zip_longest(*(sorted(movables, key=lambda m: -len(m.boxes)) for movables in own))
+        movables = ([m for m in scene.movables if (m.hinge is None) == (kind == "free")] for scene in scenes)
+        columns = itertools.zip_longest(*(sorted(bodies, key=lambda m: -len(m.boxes)) for bodies in movables))
         slots += [Slot(f"{kind}_{i}", kind, column) for i, column in enumerate(columns)]
     return slots
 

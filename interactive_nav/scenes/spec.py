@@ -1,4 +1,4 @@
-"""Robot, small objects, furniture and walls in, the `MjSpec` of one padded scene out."""
+"""Build the `MjSpec` of a padded scene from a robot, small objects, furniture and walls."""
 
 import dataclasses
 import math
@@ -27,17 +27,15 @@ _SOLID, _FLOOR, _CEILING = 1, 2, 4
 CEILING_M = 1.2
 """Height of the ceiling that flying robots meet: just below the tops of walls, which are cut above ground robots."""
 FLOOR_FRICTION = 0.05
-"""Below every object's: MuJoCo takes the larger of two friction coefficients, so the object's own holds."""
+"""Below every object's: MuJoCo takes the larger of two friction coefficients, so the object's holds."""
 
 
 def foot_points(boxes: np.ndarray, count: int = FEET) -> np.ndarray:
-    """Points at which a body of boxes can rest on a plane: the outermost corners of its bottom, then of its top.
+    """Return [at most count, 3] points, m, at which a body of boxes can rest on a plane, its outermost corners.
 
     A rigid body touches a plane at vertices of its convex hull only. Boxes against the floor would make four
-    contacts each (a chair of twelve boxes has 16 where 4 carry it), and the solver's cost grows with them.
-
-    Returns:
-        [at most count, 3] m, body frame.
+    contacts each (a chair of twelve boxes has 16 where 4 carry it), and the solver's cost grows with them. Those of the
+    bottom come first, then those of the top.
     """
     corners = []
     for row in boxes:
@@ -58,7 +56,7 @@ def foot_points(boxes: np.ndarray, count: int = FEET) -> np.ndarray:
 
 
 def _solid(friction: float, group: int = 3) -> dict[str, Any]:
-    """What geoms that collide and weigh nothing are alike in."""
+    """Return what geoms that collide and weigh nothing are alike in."""
     return {"mass": 0.0, "friction": [friction, 0.005, 0.0001], "group": group}
 
 
@@ -68,7 +66,7 @@ def _add_box(body: mujoco.MjsBody, row: np.ndarray, name: str, friction: float) 
 
 
 def _add_feet(body: mujoco.MjsBody, name: str, boxes: np.ndarray, hidden_m: np.ndarray, friction: float) -> None:
-    """`FEET` small spheres that alone touch the floor; those not needed hide inside the body."""
+    """Add `FEET` small spheres that alone touch the floor; those not needed hide inside the body."""
     points = foot_points(boxes) if len(boxes) else np.zeros((0, 3))
     if len(points):
         centre = 0.5 * (points.min(0) + points.max(0))
@@ -157,7 +155,7 @@ def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject, park: int, coll
 
 
 def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
-    """Physics options, the floor and the robot."""
+    """Return a spec of physics options, the floor and the robot."""
     spec = mujoco.MjSpec()
     spec.modelname = "interactive_nav"
     spec.compiler.degree = False
@@ -206,7 +204,7 @@ def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
 def build_empty_spec(
     robot: RobotSpec, slots: tuple[tuple[str, int], ...], n_walls: int, config: NavConfig
 ) -> tuple[mujoco.MjSpec, mujoco.MjModel, Layout]:
-    """A model whose movable slots and walls are all empty: its numbers are filled in per environment.
+    """Return a model whose movable slots and walls are all empty: its numbers are filled in per environment.
 
     `slots` are (kind, number of boxes) each. Returns spec, compiled model and layout, with sensors as `build_world`'s.
     """
@@ -224,7 +222,7 @@ def build_empty_spec(
 def build_spec(
     robot: RobotSpec, scene_index: int, scenes: tuple[Scene, ...], slots: Sequence[Slot], config: NavConfig
 ) -> mujoco.MjSpec:
-    """The padded spec of one scene."""
+    """Return the padded spec of one scene."""
     spec, collision = _empty_spec(robot, config), config.physics.collision
     for i, slot in enumerate(slots):
         body = slot.bodies[scene_index]

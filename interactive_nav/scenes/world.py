@@ -1,4 +1,4 @@
-"""Robot, small objects and scenes in, one `World` out: MuJoCo models of equal layout, one per scene.
+"""Build a `World` from a robot, small objects and scenes: MuJoCo models of equal layout, one per scene.
 
 All scenes are padded to common slots (movable bodies, boxes per body, walls), so that one compiled
 program steps any mix of them: what differs between the models is numbers, never structure. An empty
@@ -45,7 +45,7 @@ class World:
 
 
 def _settle(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> np.ndarray:
-    """Rest configuration [nq]: furniture falls and slides to rest, with the robot parked."""
+    """Return the rest configuration [nq]: furniture falls and slides to rest, with the robot parked."""
     data = mujoco.MjData(model)
     x, y = parking_spot(layout.num_slots)
     adr = layout.robot_qpos
@@ -63,13 +63,13 @@ def _settle(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> np.ndarr
             data.qvel *= 0.8
     model.opt.iterations = iterations
     qpos = data.qpos.copy()
-    own = slice(adr, adr + layout.robot_nq)
-    qpos[own] = start[own]
+    robots = slice(adr, adr + layout.robot_nq)
+    qpos[robots] = start[robots]
     return qpos
 
 
 def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) -> World:
-    """Compiles one padded model per scene and settles its furniture under the environment's own physics."""
+    """Compile one padded model per scene and settle its furniture under the environment's physics."""
     if not scenes:
         raise ConfigError("scenes is empty, expected at least one scene folder")
     if config.physics.collision == "hulls" and len(scenes) > 1:

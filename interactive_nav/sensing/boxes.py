@@ -1,7 +1,7 @@
-"""What cameras and scanners see: a `World` in, its collision boxes with class ids as arrays, and their world poses out.
+"""Build the tables of collision boxes with class ids that cameras and scanners see, and compute their world poses.
 
-Every backend draws the same boxes and the floor, the plane z = 0. The robot is among them where that is asked for; else
-it is invisible to itself.
+Every backend draws the same boxes and the floor, the plane z = 0. Where the settings include the robot, it is among
+them; else it is invisible to itself.
 """
 
 import dataclasses
@@ -45,15 +45,15 @@ class Links:
     """All but the base."""
 
     def frames(self, qpos: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
-        """Of `qpos` [..., nq], world frames of the base and the rest: [..., 3], m, and axes as columns [..., 3, 3]."""
+        """Return world frames of the base and the rest, [..., 3], m, and [..., 3, 3], for `qpos` [..., nq]."""
         at = self.base_qpos
 
         def constant(value: np.ndarray) -> jax.Array:
             return jnp.broadcast_to(jnp.asarray(value, qpos.dtype), (*qpos.shape[:-1], *value.shape))
 
-        found = [(qpos[..., at : at + 3], matrix_from_quat(qpos[..., at + 3 : at + 7]))]
+        frames = [(qpos[..., at : at + 3], matrix_from_quat(qpos[..., at + 3 : at + 7]))]
         for link in self.rest:
-            pos, axes = found[link.parent]
+            pos, axes = frames[link.parent]
             pos, axes = pos + rotate(axes, constant(link.pos)), compose(axes, constant(link.axes))
             for slides, address, zero, axis, anchor in link.joints:
                 value, axis = qpos[..., address] - zero, constant(axis)
@@ -63,12 +63,12 @@ class Links:
                 arm, turn = swing(axis, constant(anchor), value)
                 pos = pos + rotate(axes, arm)
                 axes = compose(axes, turn)
-            found.append((pos, axes))
-        return found
+            frames.append((pos, axes))
+        return frames
 
 
 def make_links(model: mujoco.MjModel, bodies: Sequence[int]) -> Links:
-    """The links of a model's bodies: the one with the free joint first, parents before children."""
+    """Return the links of a model's bodies: the one with the free joint first, parents before children."""
     rest = []
     for body in bodies[1:]:
         joints = []
@@ -82,14 +82,14 @@ def make_links(model: mujoco.MjModel, bodies: Sequence[int]) -> Links:
 
 
 def robot_geoms(world: World) -> list[list[int]]:
-    """What is seen of each of the robot's bodies: geoms for show, or those that collide where it has none, but for the
-    housing of its camera."""
+    """Return the geoms that show each of the robot's bodies, or those that collide where it has none for show, but for
+    the housing of its camera."""
     model, camera = world.models[0], world.robot.camera
     bodies = world.layout.robot_bodies
-    own = np.flatnonzero(np.isin(model.geom_bodyid, bodies))
-    shown = own[model.geom_group[own] == VISUAL_GROUP]
+    every = np.flatnonzero(np.isin(model.geom_bodyid, bodies))
+    shown = every[model.geom_group[every] == VISUAL_GROUP]
     geoms: list[list[int]] = [[] for _ in bodies]
-    for geom in map(int, shown if len(shown) else own):
+    for geom in map(int, shown if len(shown) else every):
         body, box = int(model.geom_bodyid[geom]), geom_box(model, geom)
         inside = np.abs((np.asarray(camera.pos_m) - box[:3]) @ matrix_from_quat(box[3:7])) <= box[7:] + HOUSING_M
         if model.body(body).name != camera.body or not inside.all():
@@ -98,7 +98,7 @@ def robot_geoms(world: World) -> list[list[int]]:
 
 
 def geom_box(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """(10,) box around a geom in its body's frame: centre, orientation, half sizes."""
+    """Return the (10,) box around a geom in its body's frame: centre, orientation, half sizes."""
     around, turn = model.geom_aabb[geom], model.geom_quat[geom]
     return np.concatenate([model.geom_pos[geom] + matrix_from_quat(turn) @ around[:3], turn, around[3:]])
 
@@ -106,7 +106,7 @@ def geom_box(model: mujoco.MjModel, geom: int) -> np.ndarray:
 @flax.struct.dataclass
 class BoxTables:
     """Boxes of all scenes, padded alike; S scenes, B boxes, M bodies that move, then one that stands (the walls), then
-    the robot's if it is seen."""
+    the robot's if it is visible."""
 
     world: World = flax.struct.field(pytree_node=False)
     body: np.ndarray = flax.struct.field(pytree_node=False)
@@ -120,21 +120,21 @@ class BoxTables:
     class_id: jax.Array
     """[S, B] u8."""
     colour: jax.Array | None
-    """[S, B + 1, 3] f32 in [0, 1], the floor's last; None: not asked for."""
+    """[S, B + 1, 3] f32 in [0, 1], the floor's last; None: no images in colour."""
     classes: MaskClasses = flax.struct.field(pytree_node=False, default=4)
     """How `class_id` tells categories apart: the setting `segmentation_classes`."""
     robot: Links | None = flax.struct.field(pytree_node=False, default=None)
-    """None: it is not seen."""
+    """None: it is invisible."""
 
     @property
     def num_boxes(self) -> int:
-        """B."""
+        """Return B."""
         return len(self.body)
 
 
 def _colours_of_slots(world: World, s: int, ids: np.ndarray, classes: MaskClasses) -> np.ndarray:
-    """[M + 2 or more, 3]: mean colour of the visual meshes in each slot, of the walls, of the robot's bodies, and the
-    floor's; where a body has no mesh, that of its class."""
+    """Return [M + 2 or more, 3]: mean colour of the visual meshes in each slot, of the walls, of the robot's bodies,
+    and the floor's; where a body has no mesh, that of its class."""
     (model, visual), names = visual_geoms(world.scenes[s]), (*world.slots.names[s], "structure")
     shown = [(model, visual.get(name, []), PALETTES[classes][number]) for name, number in zip(names, ids, strict=False)]
     shown += [(world.models[0], geoms, np.zeros(3)) for geoms in robot_geoms(world)[: len(ids) - len(shown)]]
@@ -143,18 +143,18 @@ def _colours_of_slots(world: World, s: int, ids: np.ndarray, classes: MaskClasse
 
 
 def build_boxes(world: World, classes: MaskClasses = 4, colours: bool = False, robot: bool = False) -> BoxTables:
-    """Collects the boxes of every scene into common slots.
+    """Collect the boxes of every scene into common slots.
 
-    `colours` reads the textures, for images in colour; with `robot` its bodies are seen, each geom as a box.
+    `colours` reads the textures, for images in colour; with `robot` its bodies are visible, each geom as a box.
     """
     slots, model = world.slots, world.models[0]
     body, rows, ids = slots.box_slot, slots.boxes_b, slots.class_ids(classes)
     if robot:
-        own, first = robot_geoms(world), ids.shape[1]
-        shown = np.array([geom_box(model, geom) for geoms in own for geom in geoms])
-        body = np.concatenate([body, np.repeat(first + np.arange(len(own)), [len(geoms) for geoms in own])])
+        links, first = robot_geoms(world), ids.shape[1]
+        shown = np.array([geom_box(model, geom) for geoms in links for geom in geoms])
+        body = np.concatenate([body, np.repeat(first + np.arange(len(links)), [len(geoms) for geoms in links])])
         rows = np.concatenate([rows, np.broadcast_to(shown, (len(rows), *shown.shape))], 1)
-        ids = np.pad(ids, [(0, 0), (0, len(own))], constant_values=class_id("robot", classes))
+        ids = np.pad(ids, [(0, 0), (0, len(links))], constant_values=class_id("robot", classes))
     scenes = range(len(rows) if colours else 0)
     painted = [_colours_of_slots(world, s, ids[s], classes)[[*body, -1]] for s in scenes]
     f32 = jnp.float32
@@ -172,17 +172,17 @@ def build_boxes(world: World, classes: MaskClasses = 4, colours: bool = False, r
 
 
 def rotate(axes: jax.Array, vector: jax.Array) -> jax.Array:
-    """[..., 3, 3] times [..., 3]; a sum of products, because GPUs may round a matmul's factors to TF32."""
+    """Return [..., 3, 3] times [..., 3]; a sum of products, because GPUs may round a matmul's factors to TF32."""
     return (axes * vector[..., None, :]).sum(-1)
 
 
 def compose(first: jax.Array, second: jax.Array) -> jax.Array:
-    """[..., 3, 3] times [..., 3, 3], in full float32."""
+    """Return [..., 3, 3] times [..., 3, 3], in full float32."""
     return (first[..., :, :, None] * second[..., None, :, :]).sum(-2)
 
 
 def swing(axis: Array, anchor_m: Array, angle_rad: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """A hinged body's frame in its frame at rest: place [..., 3], m, and axes as columns [..., 3, 3].
+    """Return a hinged body's frame in its frame at rest: place [..., 3], m, and axes as columns [..., 3, 3].
 
     `axis`, [..., 3] of length 1, and `anchor_m`, [..., 3], are in the body's frame; `angle_rad` is [...].
     """
@@ -192,11 +192,10 @@ def swing(axis: Array, anchor_m: Array, angle_rad: jax.Array) -> tuple[jax.Array
 
 
 def body_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """World frames of the bodies, for scenes [...] i32 and qpos [..., nq]; leading batch axes as the caller has them.
+    """Return world frames of the bodies, for scenes [...] i32 and qpos [..., nq].
 
-    Returns:
-        Positions [..., M + 1, 3], m, and axes as columns [..., M + 1, 3, 3]; the last is the standing body. If the
-        robot is seen, its bodies follow.
+    These are positions [..., M + 1, 3], m, and axes as columns [..., M + 1, 3, 3]; the last is the standing body. The
+    robot's bodies follow, if it is visible.
     """
     lead, slots, address = qpos.shape[:-1], tables.world.slots, tables.world.layout.slot_qpos
     hinged = slots.hinged  # which `find_slots` puts last
@@ -216,18 +215,16 @@ def body_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[ja
 
 
 def box_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """World frames of the boxes: centres [..., B, 3], m, and axes as columns [..., B, 3, 3]."""
+    """Return world frames of the boxes: centres [..., B, 3], m, and axes as columns [..., B, 3, 3]."""
     pos, axes = body_poses(tables, scene, qpos)
     pos, axes = pos[..., tables.body, :], axes[..., tables.body, :, :]
     return pos + rotate(axes, tables.pos_b[scene]), compose(axes, tables.axes_b[scene])
 
 
 def slab(eye: jax.Array, half: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Where rays enter and leave the space between two opposite faces of a box, in units of the direction's length.
+    """Return where rays enter and leave the space between two opposite faces of a box, in units of their directions.
 
-    Args:
-        eye: the rays' origin along the faces' normal, from the box's centre, m.
-        half: from the centre to a face, m.
+    `eye` is the rays' origin along the faces' normal, from the box's centre, and `half` is from there to a face, m.
     """
     # A ray in a face's plane would divide by 0.
     inverse = 1.0 / (direction + _TINY)

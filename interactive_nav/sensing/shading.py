@@ -1,4 +1,4 @@
-"""Colours of classes and of bodies, and how pictures and observations are lit."""
+"""Colour classes and bodies, and light pictures and observations."""
 
 from typing import Any
 
@@ -36,10 +36,9 @@ class Look:
 
 
 def draw_look(key: jax.Array, colours: float, light: float, classes: MaskClasses) -> Look:
-    """An episode's look.
+    """Draw an episode's look with standard deviations `colours` and `light`.
 
-    Args:
-        light: that of brightness in stops, and of each component of the vector to the sun before it has length 1.
+    `light` is in stops of brightness, and of each component of the vector to the sun before it has length 1.
     """
     tint, sun, bright = jax.random.split(key, 3)
     sun_w = _LIGHT_W + light * jax.random.normal(sun, (3,))
@@ -53,7 +52,7 @@ def draw_look(key: jax.Array, colours: float, light: float, classes: MaskClasses
 
 
 def lit(base: Any, normal_w: Any, forward_w: Any, met: Any, xp: Any, sun_w: Any = _LIGHT_W) -> Any:
-    """Colours [..., 3] in [0, 1] under a sun and a lamp at the camera; what is not `met` keeps its colour."""
+    """Return colours [..., 3] in [0, 1] under a sun and a lamp at the camera; what is not `met` keeps its colour."""
     light_w = xp.broadcast_to(xp.asarray(sun_w), normal_w.shape)
     sun = xp.maximum((normal_w * light_w).sum(-1), 0.0)
     lamp = xp.maximum(-(normal_w * forward_w).sum(-1), 0.0)
@@ -61,12 +60,12 @@ def lit(base: Any, normal_w: Any, forward_w: Any, met: Any, xp: Any, sun_w: Any 
 
 
 def lambert(base: Any, normal_w: Any, forward_w: Any, met: Any, xp: Any) -> Any:
-    """`lit` as u8."""
+    """Return `lit` as u8."""
     return xp.round(255.0 * lit(base, normal_w, forward_w, met, xp)).astype(xp.uint8)
 
 
 def geom_colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """(3,) in [0, 1]: of the geom, or its texture's mean."""
+    """Return (3,) in [0, 1]: of the geom, or its texture's mean."""
     material = model.geom_matid[geom]
     texture = model.mat_texid[material][mujoco.mjtTextureRole.mjTEXROLE_RGB] if material >= 0 else -1
     if texture < 0:
