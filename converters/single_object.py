@@ -136,11 +136,8 @@ def convert_object(
     The URDF's mass, friction and collision mesh are used; its inertia is not (released ones are placeholders): it
     follows from the hulls at that mass.
 
-    Args:
-        config: choices; they win over the URDF's values.
-
-    Returns:
-        The content of `object.json`.
+    `config`: choices; they win over the URDF's values.
+    Returns the content of `object.json`.
     """
     if not path.is_file():
         raise SceneRejected(f"{path}: no such file; give a mesh (OBJ, PLY, STL, GLB, ...) or a URDF")

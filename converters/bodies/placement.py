@@ -25,12 +25,9 @@ LYING_DEG = 15.0
 def upright(pose: np.ndarray, pivot_cad: np.ndarray) -> tuple[Alignment, float]:
     """Takes the small roll and pitch out of an annotated pose, turning about the object's own middle.
 
-    Args:
-        pose: (4, 4) CAD frame -> scan frame, with scale.
-        pivot_cad: (3,) point of the CAD frame that keeps its place (the middle of the bounding box).
-
-    Returns:
-        The upright pose (`rms_m` is nan: nothing was fitted) and the tilt that was removed, rad.
+    `pose`: (4, 4) CAD frame -> scan frame, with scale.
+    `pivot_cad`: (3,) point of the CAD frame that keeps its place (the middle of the bounding box).
+    Returns the upright pose (`rms_m` is nan: nothing was fitted) and the tilt that was removed, rad.
     """
     scale = np.linalg.norm(pose[:3, :3], axis=0)
     turn = pose[:3, :3] / scale
@@ -46,8 +43,7 @@ def compare(
 ) -> dict[str, Any]:
     """One row of the alignment report: residual of the annotated pose, and the re-solved pose beside it.
 
-    Args:
-        pivot_cad: (3,) where the two poses' translations are compared.
+    `pivot_cad`: (3,) where the two poses' translations are compared.
     """
     row: dict[str, Any] = {
         "name": name,
@@ -95,9 +91,8 @@ class PoseDifference:
 def pose_difference(one: Alignment, other: Alignment, pivot_cad: np.ndarray, symmetry: str) -> PoseDifference:
     """Compares two poses of the same model at the pivot; turns that the symmetry allows do not count.
 
-    Args:
-        pivot_cad: (3,) point of the CAD frame where translations are compared.
-        symmetry: Scan2CAD's word; unknown words count as none.
+    `pivot_cad`: (3,) point of the CAD frame where translations are compared.
+    `symmetry`: Scan2CAD's word; unknown words count as none.
     """
     period = SYMMETRY_PERIOD_RAD.get(symmetry, 2 * math.pi)
     at = [apply_alignment(a, pivot_cad[None])[0] for a in (one, other)]

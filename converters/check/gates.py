@@ -180,8 +180,7 @@ def evaluate(
 ) -> tuple[Gate, ...]:
     """Return every gate in the table's order.
 
-    Args:
-        kept: object -> share of its model's area that is drawn; older scenes do not say it.
+    `kept`: object -> share of its model's area that is drawn; older scenes do not say it.
     """
     object_names = [o.name for o in objects]
     try:

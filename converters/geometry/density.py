@@ -46,8 +46,7 @@ class Ways(NamedTuple):
 def must_push_shares(static_free: np.ndarray, free: Mapping[str, np.ndarray], cell_m: float) -> dict[str, float]:
     """Return `Ways.must_push_share` by robot, of a floor with and without its movables.
 
-    Args:
-        static_free: (rows, columns) bool, without movables.
+    `static_free`: (rows, columns) bool, without movables.
     """
     return {
         robot: Ways.of(static_free, cell_m, disc.radius_m).must_push_share(clearance(free[robot] & static_free, cell_m))

@@ -102,8 +102,7 @@ def _basins(mask: np.ndarray) -> np.ndarray:
 
     A basin that meets a higher one where the distance is at least `NECK_SHARE` of its own greatest joins it.
 
-    Returns:
-        (rows, columns) number of the basin from 1 on, 0 outside.
+    Returns (rows, columns) number of the basin from 1 on, 0 outside.
     """
     distance = np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1)))
     distance = np.where(np.pad(mask, 1), ndimage.gaussian_filter(distance, 0.7), 0.0)

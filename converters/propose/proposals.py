@@ -77,8 +77,7 @@ def _confidence(category: str, extent: np.ndarray, purity: float, n_voxels: int,
 def propose_instances(scan: ScanMesh, voxel_m: float = VOXEL_M) -> tuple[Proposal, ...]:
     """Instances of every furniture class, the most certain first.
 
-    Args:
-        scan: with NYU40 labels.
+    `scan`: with NYU40 labels.
     """
     points, face = sample_faces(scan.vertices, scan.faces, voxel_m / 2)
     label = face_labels(scan.labels, scan.faces)[face]
@@ -134,11 +133,10 @@ def scan2cad_model(
 ) -> dict[str, Any]:
     """One model of Scan2CAD's list, whose world is y up; arguments are z up.
 
-    Args:
-        pose: scale (3,), yaw (rad) and translation (3,) m of the upright model.
-        vertices: (n, 3) of the model, CAD frame.
-        symmetry: Scan2CAD's word.
-        pairs: (k, 3) points of the model under its pose and of the scan, m, that were clicked.
+    `pose`: scale (3,), yaw (rad) and translation (3,) m of the upright model.
+    `vertices`: (n, 3) of the model, CAD frame.
+    `symmetry`: Scan2CAD's word.
+    `pairs`: (k, 3) points of the model under its pose and of the scan, m, that were clicked.
     """
     (scale, yaw, translation), (low, high) = pose, bounds(vertices @ Y_UP_TO_Z_UP)
     return {
@@ -165,8 +163,7 @@ def as_scan2cad(scan_id: str, proposals: tuple[Proposal, ...], chosen: dict[int,
     A proposal without a model is a unit cube with `id_cad` "" and the box as its pose; keypoints are empty. Each
     has one key more, `proposal`, with what was measured.
 
-    Args:
-        chosen: proposal's index -> `Retrieval` (model and pose), where one was found.
+    `chosen`: proposal's index -> `Retrieval` (model and pose), where one was found.
     """
     models = []
     for k, proposal in enumerate(proposals):

@@ -86,8 +86,7 @@ def _packaged() -> dict[str, CadModel]:
 def read_library(root: Path | None) -> dict[str, CadModel]:
     """Every model under `root/cad/<synset>/<id>/models/model_normalized.obj` of a class that is looked for, by id.
 
-    Args:
-        root: folder that holds `cad/`; None: the packaged furniture.
+    `root`: folder that holds `cad/`; None: the packaged furniture.
     """
     if root is None:
         return _packaged()

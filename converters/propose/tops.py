@@ -165,8 +165,7 @@ def _too_large(plan: _Plan, category: str) -> np.ndarray | None:
 def split_tops(piece: Piece, floor_xy: np.ndarray, origin: np.ndarray, voxel_m: float) -> list[Piece]:
     """The tables, or desks, that a piece consists of.
 
-    Args:
-        floor_xy: (n, 2) places of floor that the scan shows, m.
+    `floor_xy`: (n, 2) places of floor that the scan shows, m.
     """
     category = LABEL_CATEGORIES[piece.label]
     if category not in TOPS_M:

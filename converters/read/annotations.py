@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from converters.read.files import SourceFolder
 from converters.records.errors import SceneRejected
-from converters.records.raw import SYNSETS, Annotation, CadModel, ScannedHinge
+from converters.records.raw import Annotation, CadModel, ScannedHinge, category_of_id
 from interactive_nav_common.files import check_name
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, transformed
 
@@ -65,8 +65,7 @@ def _confidence(model: dict[str, Any]) -> float | None:
 def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Annotation], ...]]:
     """Turns the decoded list of one scan into records.
 
-    Returns:
-        The scan id, and for each object its synset id and annotation.
+    Returns the scan id, and for each object its synset id and annotation.
     """
     if not isinstance(data, list) or len(data) != 1:
         got = f"a list of {len(data)}" if isinstance(data, list) else type(data).__name__
@@ -80,9 +79,7 @@ def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Anno
         for i, model in enumerate(data[0]["aligned_models"]):
             where = f"{path}: aligned_models[{i}]"
             synset, cad_id = str(model["catid_cad"]), str(model["id_cad"])
-            if synset not in SYNSETS:
-                known = ", ".join(f"{k} ({v})" for k, v in sorted(SYNSETS.items()))
-                raise SceneRejected(f"{where}: category id is {synset}, expected one of {known}")
+            category = category_of_id(synset, f"{where}: category id is")
             check_name(cad_id, f"{where}: id_cad", SceneRejected)
             pose_y_up = trs_matrix(model["trs"])
             if abs(np.linalg.det(pose_y_up)) < 1e-9:
@@ -95,7 +92,7 @@ def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Anno
                 (
                     synset,
                     Annotation(
-                        category=SYNSETS[synset],
+                        category=category,
                         cad_id=cad_id,
                         pose=pose,
                         symmetry=str(model.get("sym", "__SYM_NONE")),

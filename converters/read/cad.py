@@ -7,7 +7,7 @@ from converters.geometry.pieces import convex_pieces
 from converters.read.files import SourceFolder, read_obj
 from converters.read.obj import GREY, join_textures, read_painted_obj, texels
 from converters.records.errors import SceneRejected
-from converters.records.raw import SYNSETS, CadModel
+from converters.records.raw import CadModel, category_of_id
 from converters.records.visual import TexturedMesh
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP
 
@@ -24,14 +24,12 @@ def read_cad(source: SourceFolder, synset: str, cad_id: str) -> CadModel:
 
     A `collision.obj` beside it, of convex pieces, saves the decomposition.
     """
-    if synset not in SYNSETS:
-        known = ", ".join(f"{k} ({v})" for k, v in sorted(SYNSETS.items()))
-        raise SceneRejected(f"{source.root}: CAD model {cad_id} has category id {synset}, expected one of {known}")
+    category = category_of_id(synset, f"{source.root}: CAD model {cad_id} has category id")
     relative = f"cad/{synset}/{cad_id}/models/model_normalized.obj"
     mesh, image, images = read_painted_obj(
         source,
         relative,
-        f"an annotation names CAD model {cad_id} of category {synset} ({SYNSETS[synset]}); "
+        f"an annotation names CAD model {cad_id} of category {synset} ({category}); "
         "put the model there or remove the annotation",
     )
     colours = np.full((len(mesh.faces), 3), GREY, np.uint8)
@@ -50,7 +48,7 @@ def read_cad(source: SourceFolder, synset: str, cad_id: str) -> CadModel:
         uv = np.zeros((len(mesh.faces), 3, 2)) if mesh.corner_uv is None else mesh.corner_uv
         surface = TexturedMesh(mesh.vertices @ Y_UP_TO_Z_UP.T, mesh.faces, *join_textures(uv, image, images))
     turned = vertices @ Y_UP_TO_Z_UP.T
-    return CadModel(SYNSETS[synset], cad_id, turned, faces, colours, pieces, surface=surface)
+    return CadModel(category, cad_id, turned, faces, colours, pieces, surface=surface)
 
 
 def _own_pieces(source: SourceFolder, relative: str) -> tuple[tuple[np.ndarray, np.ndarray], ...] | None:
@@ -72,10 +70,9 @@ def clean_surface(
     Decomposition rebuilds such surfaces as closed ones (coacd's manifold preprocessing), so that they need no repair
     here; their hulls are a voxel thicker.
 
-    Args:
-        vertices: (n, 3), equal positions joined.
-        faces: (m, 3).
-        colours: (m, 3) of the faces.
+    `vertices`: (n, 3), equal positions joined.
+    `faces`: (m, 3).
+    `colours`: (m, 3) of the faces.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     extent = np.ptp(vertices, axis=0)

@@ -8,6 +8,7 @@ import hashlib
 import math
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +90,11 @@ class SourceFolder:
         if message not in self.warnings:
             self.warnings.append(message)
 
+    def note_counts(self, where: str, counts: Mapping[str, int], times: str = " x ") -> None:
+        """Record how often there is each thing that is not read or not used."""
+        for what, count in sorted(counts.items()):
+            self.note(f"{where} {count}{times}{what}")
+
     def repaired(self, message: str) -> None:
         """Records a defect that was mended."""
         if self.strict:
@@ -102,6 +108,17 @@ def _resolve(path: Path) -> Path:
     with contextlib.suppress(FileNotFoundError, NotADirectoryError, PermissionError):
         end.lstat()  # raises OSError for names that no file system takes
     return end
+
+
+def only_file(
+    root: Path, files: list[Path], what: str, expected: str = "one; give the file of one", ending: str = ""
+) -> Path:
+    """Return the only one of the files that may be meant."""
+    if len(files) != 1:
+        names = ", ".join(p.name.removesuffix(ending) for p in files[:5]) or "none"
+        more = f" and {len(files) - 5} more" if len(files) > 5 else ""
+        raise SceneRejected(f"{root}: {what} are {names}{more}, expected {expected}")
+    return files[0]
 
 
 def read_json(path: Path) -> Any:

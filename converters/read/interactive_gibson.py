@@ -24,7 +24,16 @@ from converters.read.storeys import label_storeys
 from converters.read.surfaces import check_extent, check_upright, with_own_corners
 from converters.read.urdf import read_urdf
 from converters.records.errors import SceneRejected
-from converters.records.raw import FLOOR, SYNSETS, Annotation, CadModel, GivenMap, RawScene, ScannedHinge
+from converters.records.raw import (
+    FLOOR,
+    SYNSETS,
+    Annotation,
+    CadModel,
+    GivenMap,
+    RawScene,
+    ScannedHinge,
+    category_of_id,
+)
 from interactive_nav_common.rotations import transform, transformed, yaw_matrix
 
 MESH = "mesh_z_up_cleaned.obj"
@@ -79,11 +88,7 @@ def read_interactive_gibson(root: Path, strict: bool = False) -> RawScene:
 
 def _furniture(source: SourceFolder, path: Path) -> tuple[Annotation, CadModel]:
     """One piece of furniture and its model."""
-    synset = path.stem.rsplit("_", 1)[-1]
-    if synset not in CLASSES:
-        known = ", ".join(f"{k} ({v})" for k, v in sorted(CLASSES.items()))
-        raise SceneRejected(f"{path}: category id is {synset}, expected one of {known}")
-    category = CLASSES[synset]
+    category = category_of_id(path.stem.rsplit("_", 1)[-1], f"{path}: category id is", CLASSES)
     position = _position(source, path.name)
     item = read_urdf(source, path.name, "")
     vertices, faces, keep = merge_vertices(item.surface.vertices, item.surface.faces)
@@ -113,10 +118,9 @@ def assume_hinge(leaf: np.ndarray, pose: np.ndarray, structure: np.ndarray) -> S
     stands until structure lies in it, by 120 degrees at most. What lies in the leaf as it stands is taken for the
     scanned leaf itself.
 
-    Args:
-        leaf: (n, 3) vertices, CAD frame, the leaf along x.
-        pose: (4, 4) CAD frame -> scan frame, upright and unscaled.
-        structure: (m, 3) points of the scan, m.
+    `leaf`: (n, 3) vertices, CAD frame, the leaf along x.
+    `pose`: (4, 4) CAD frame -> scan frame, upright and unscaled.
+    `structure`: (m, 3) points of the scan, m.
     """
     low, high = leaf.min(axis=0), leaf.max(axis=0)
     local = (structure - pose[:3, 3]) @ pose[:3, :3]
@@ -216,8 +220,7 @@ def plane_patch(
 ) -> TexturedMesh | None:
     """Squares of 0.1 m of a floor plane, where its cells are unseen, inside the mesh and on the map.
 
-    Returns:
-        The squares with the plane's texture, or None where none is needed.
+    Returns the squares with the plane's texture, or None where none is needed.
     """
     check_extent("a floor plane", plane.vertices)
     points, face = sample_faces(plane.vertices, plane.faces, PLANE_CELL_M / 2)

@@ -135,8 +135,7 @@ def _read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedM
         raise resolver.refusal from None
     if resolver.refusal is not None:
         raise resolver.refusal
-    for what, count in sorted(_unused(path).items()):
-        source.note(f"{relative}: not used: {count} {what}")
+    source.note_counts(f"{relative}: not used:", _unused(path), " ")
     return _joined(path, [_painted(path, part, turn) for part in parts])
 
 
@@ -180,12 +179,11 @@ def read_single_mesh(
 ) -> RawScene:
     """Read a scan that is one mesh file; without labels beside it, structure is recognised by its shape.
 
-    Args:
-        path: of the file; what it names must lie in its folder.
-        strict: refuse what would be repaired with a warning.
-        up: word of `AXES`, or `auto` to detect it.
-        unit: word of `UNITS_M`, or `auto` to infer it from the height.
-        mirror: take -x for x.
+    `path`: of the file; what it names must lie in its folder.
+    `strict`: refuse what would be repaired with a warning.
+    `up`: word of `AXES`, or `auto` to detect it.
+    `unit`: word of `UNITS_M`, or `auto` to infer it from the height.
+    `mirror`: take -x for x.
     """
     source = SourceFolder(path.parent, strict)
     mesh = read_surface(source, source.inside(path), "give a mesh file")

@@ -109,8 +109,7 @@ def read_materials(
                     (base, gain), placings[name] = placing[3], placing
                     image = np.clip(np.round(255 * base + gain * image.astype(float)), 0, 255).astype(np.uint8)
                 result[name] = result[name] if image is None else image
-        for word, count in sorted((+unused).items()):
-            source.note(f"{source.relative(path)}: not used: {count} {word}")
+        source.note_counts(f"{source.relative(path)}: not used:", +unused, " ")
     return result, placings
 
 
@@ -186,14 +185,11 @@ def wrapped(
 ) -> tuple[np.ndarray, list[np.ndarray], bool]:
     """Return texture coordinates and images that show by repeating what other ways of wrapping show.
 
-    Args:
-        uv: (m, 3, 2) of faces, origin at the lower left.
-        images: (h, w, 3) of one size.
-        modes: along u and v: `repeat`, `mirror` or `clamp`.
-
-    Returns:
-        The coordinates, the images, and whether a face lies across an edge at which its texture is clamped: it shows
-        the texture up to there, stretched.
+    `uv`: (m, 3, 2) of faces, origin at the lower left.
+    `images`: (h, w, 3) of one size.
+    `modes`: along u and v: `repeat`, `mirror` or `clamp`.
+    Returns the coordinates, the images, and whether a face lies across an edge at which its texture is clamped: it
+    shows the texture up to there, stretched.
     """
     across = False
     for k, mode in enumerate(modes):
@@ -216,16 +212,12 @@ def read_painted_obj(
 ) -> tuple[ObjMesh, np.ndarray, list[np.ndarray]]:
     """Read an OBJ with all its materials.
 
-    Args:
-        builtin: return the image of a material that is in no file; the default warns, and takes grey.
-
-    Returns:
-        The mesh, (m,) image of each face, the images (h, w, 3) uint8: none where the file has no colour at all.
+    `builtin`: return the image of a material that is in no file; the default warns, and takes grey.
+    Returns the mesh, (m,) image of each face, the images (h, w, 3) uint8: none where the file has no colour at all.
     """
     path = source.use(relative, remedy)
     mesh = read_obj(path)
-    for word, count in sorted(mesh.unused.items()):
-        source.note(f"{relative}: not used: {count} {word}")
+    source.note_counts(f"{relative}: not used:", mesh.unused, " ")
     if builtin is None and mesh.corner_uv is None and not mesh.libraries and mesh.colours is None:
         source.note(f"{relative}: has no texture; it stays grey")
         return mesh, np.zeros(len(mesh.faces), np.int64), []
@@ -289,13 +281,10 @@ def texels(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
 def join_textures(corner_uv: np.ndarray, number: np.ndarray, images: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Puts several images above one another and moves texture coordinates along.
 
-    Args:
-        corner_uv: (m, 3, 2), origin at the lower left of each face's own image; may leave [0, 1] (repeats).
-        number: (m,) image of each face.
-        images: (h, w, 3) uint8 each.
-
-    Returns:
-        corner_uv (m, 3, 2) in the joint image, the joint image.
+    `corner_uv`: (m, 3, 2), origin at the lower left of each face's own image; may leave [0, 1] (repeats).
+    `number`: (m,) image of each face.
+    `images`: (h, w, 3) uint8 each.
+    Returns corner_uv (m, 3, 2) in the joint image, the joint image.
     """
     if len(images) == 1 and images[0].size > 3:
         return corner_uv, images[0]

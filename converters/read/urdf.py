@@ -58,8 +58,7 @@ class RigidObject:
 def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = False) -> RigidObject:
     """Reads a URDF whose links, if several, hang together by fixed joints.
 
-    Args:
-        hold: take joints that move as fixed where they are at 0.
+    `hold`: take joints that move as fixed where they are at 0.
     """
     path = source.use(relative, remedy)
     try:
@@ -235,8 +234,7 @@ SHAPES = {
 def primitive(path: Path, kind: str, text: Callable[[str], str | None]) -> TexturedMesh:
     """Build an uncoloured shape of `SHAPES`.
 
-    Args:
-        text: a dimension's name -> its text, m.
+    `text`: a dimension's name -> its text, m.
     """
     if kind not in SHAPES:
         raise SceneRejected(f"{path}: geometry <{kind}>, expected mesh, {', '.join(SHAPES)}")

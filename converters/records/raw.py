@@ -6,10 +6,12 @@ object's own.
 """
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 
 from converters.records.cache import NOT_HASHED
+from converters.records.errors import SceneRejected
 from converters.records.visual import TexturedMesh
 from interactive_nav_common.rotations import transform
 from scenes_mjcf.categories import TABLE
@@ -18,6 +20,15 @@ ATTRIBUTION = "ATTRIBUTION.md"
 """Whose models a source, and the scene made of it, has."""
 SYNSETS = {category.synset: category.name for category in TABLE if category.synset}
 """ShapeNet synset -> category."""
+
+
+def category_of_id(synset: str, where: str, classes: Mapping[str, str] = SYNSETS) -> str:
+    """Return the category of a synset; `where` begins the error about an unknown one."""
+    if synset not in classes:
+        known = ", ".join(f"{k} ({v})" for k, v in sorted(classes.items()))
+        raise SceneRejected(f"{where} {synset}, expected one of {known}")
+    return classes[synset]
+
 
 # NYU40 ids used by the stages (Gupta et al. 2013, the 40-class mapping that ScanNet labels with).
 UNLABELLED, WALL, FLOOR, CEILING, WINDOW, DOOR = 0, 1, 2, 22, 9, 8

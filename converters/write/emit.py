@@ -206,8 +206,7 @@ def share_assets(parts: SceneParts) -> Assets:
 def build_spec(parts: SceneParts, assets: Assets | None = None) -> mujoco.MjSpec:
     """The scene as an `MjSpec`.
 
-    Args:
-        assets: names of files in `assets/`; None keeps hulls inside the spec and leaves visuals out (settling).
+    `assets`: names of files in `assets/`; None keeps hulls inside the spec and leaves visuals out (settling).
     """
     spec = _empty_spec(parts.name)
     lit = parts.structure_visual is not None and parts.structure_visual.exact
@@ -293,9 +292,8 @@ def paired(faces: np.ndarray, corners: np.ndarray) -> list[list[int]]:
     Readers of OBJ cut a quad from its first corner to its third or along its shorter diagonal. The shared edge is both,
     or the quad is a parallelogram, which is the same however it is cut.
 
-    Args:
-        faces: (m, 3) triangles of one orientation.
-        corners: (k, 5) position and texture coordinates of each corner, in units of their last digit.
+    `faces`: (m, 3) triangles of one orientation.
+    `corners`: (k, 5) position and texture coordinates of each corner, in units of their last digit.
     """
     made: list[list[int]] = []
     free: dict[tuple[int, int], int] = {}

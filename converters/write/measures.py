@@ -83,10 +83,9 @@ def navigation_complexity(free: np.ndarray, cell_m: float, radius_m: float) -> f
 def measure_scene(parts: SceneParts, maps: SceneMaps) -> dict[str, Any]:
     """Measure a scene with its visuals.
 
-    Returns:
-        `movable_share`: share of the traversable floor below movables (built-in furniture is not part of that floor);
-        `must_push_share`: robot -> `converters.geometry.density.Ways.must_push_share`; `specific_surface_1_m` and
-        `navigation_complexity`, the latter for the smallest robot with the movables where they stand.
+    Returns `movable_share`: share of the traversable floor (built-in furniture is no part of it) below movables;
+    `must_push_share`: robot -> `converters.geometry.density.Ways.must_push_share`; `specific_surface_1_m` and
+    `navigation_complexity`, the latter for the smallest robot with the movables where they stand.
     """
     structure, objects = parts.structure_visual, parts.objects
     assert structure is not None

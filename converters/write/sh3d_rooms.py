@@ -115,8 +115,7 @@ def wall_between(stands: Any, ends: np.ndarray, height: float) -> Wall:
 def rooms_of(maps: SceneMaps, low: Any, high: Any, least_m2: float, slack_m: float) -> list[Any]:
     """(k) outlines of rooms, the largest first.
 
-    Args:
-        slack_m: how far walls that lie across the map's axes leave free between its cells and themselves.
+    `slack_m`: how far walls that lie across the map's axes leave free between its cells and themselves.
     """
     res, (x0, y0) = maps.resolution_m, maps.origin_w
     rows, columns = (np.arange(n) for n in maps.traversable.shape)

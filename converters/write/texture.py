@@ -33,10 +33,9 @@ def colour_cloud(
 ) -> ColourCloud:  # fmt: skip
     """Coloured points of some faces of the scan: their vertices, or a sampling of the texture.
 
-    Args:
-        vertices_w: (n, 3) the scan's vertices in the world, m.
-        faces: (m, 3) the scan's faces.
-        face_index: (k,) which of them to take.
+    `vertices_w`: (n, 3) the scan's vertices in the world, m.
+    `faces`: (m, 3) the scan's faces.
+    `face_index`: (k,) which of them to take.
     """
     chosen = faces[face_index]
     if scan.texture is None or scan.corner_uv is None:
@@ -63,8 +62,7 @@ def textured_cloud(mesh: TexturedMesh, spacing_m: float) -> ColourCloud:
 def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Texture atlas of a mesh.
 
-    Returns:
-        uv (k, 2) in [0, 1], uv_faces (m, 3).
+    Returns uv (k, 2) in [0, 1], uv_faces (m, 3).
     """
     atlas = xatlas.Atlas()
     atlas.add_mesh(vertices.astype(np.float32), faces.astype(np.uint32))
@@ -80,8 +78,7 @@ def texel_surface(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where each covered texel lies on the surface.
 
-    Returns:
-        texel (k,) flat index into the (size, size) image, point (k, 3) m, face (k,).
+    Returns texel (k,) flat index into the (size, size) image, point (k, 3) m, face (k,).
     """
     corners = uv[uv_faces] * size
     corners[..., 1] = size - corners[..., 1]  # image rows run downwards
@@ -138,8 +135,7 @@ def quantise(image: np.ndarray, colours: int) -> Image.Image:
 def share_plain(visual: VisualMesh) -> VisualMesh:
     """The same picture in fewer bytes: faces of one colour look up one place, and what nobody looks up is blank.
 
-    Returns:
-        Vertices and faces as they were, with another `uv` and `uv_faces`, and an image of the same size.
+    Returns vertices and faces as they were, with another `uv` and `uv_faces`, and an image of the same size.
     """
     side, faces = len(visual.image), np.arange(len(visual.faces))
     if visual.image.shape[1] != side or not len(faces):
@@ -179,12 +175,11 @@ def bake_structure(
 ) -> VisualMesh:
     """The simplified scan with a texture interpolated from coloured points (three nearest, by inverse distance).
 
-    Args:
-        vertices: (n, 3) of the simplified scan with its patches, m.
-        faces: (m, 3).
-        size: of the texture, pixels.
-        turned_m: how much farther a point counts for each unit between its normal and the surface's: both sides of a
-            thin wall keep their colours.
+    `vertices`: (n, 3) of the simplified scan with its patches, m.
+    `faces`: (m, 3).
+    `size`: of the texture, pixels.
+    `turned_m`: how much farther a point counts for each unit between its normal and the surface's: both sides of a
+    thin wall keep their colours.
     """
     uv, uv_faces = unwrap(vertices, faces, size)
     texel, point, face = texel_surface(vertices, faces, uv, uv_faces, size)
@@ -213,14 +208,11 @@ def bake_object(
     in-painted from the nearest shown texels of the same CAD material, else of any; an object that the scan
     does not show at all keeps its CAD colours.
 
-    Args:
-        vertices: (n, 3) CAD surface in the world, m.
-        faces: (m, 3).
-        face_colours: (m, 3) uint8 of the CAD materials.
-        size: of the texture, pixels.
-
-    Returns:
-        The mesh (world frame, as given) and the share of texels that the scan showed.
+    `vertices`: (n, 3) CAD surface in the world, m.
+    `faces`: (m, 3).
+    `face_colours`: (m, 3) uint8 of the CAD materials.
+    `size`: of the texture, pixels.
+    Returns the mesh (world frame, as given) and the share of texels that the scan showed.
     """
     low_vertices, low_faces = low
     uv, uv_faces = unwrap(low_vertices, low_faces, size)

@@ -65,10 +65,9 @@ def rooms_joined(grid: np.ndarray, plan: Plan, radius_m: float, least_m2: float 
 def passes(room_m: np.ndarray, masks: list[np.ndarray], width_m: float) -> bool:
     """Return whether a disc `width_m` wide gets from one mask to the other.
 
-    Args:
-        room_m: (n, n) clearance.
-        masks: two of (n, n) bool.
-        width_m: the disc's diameter.
+    `room_m`: (n, n) clearance.
+    `masks`: two of (n, n) bool.
+    `width_m`: the disc's diameter.
     """
     region = label(room_m >= width_m / 2)[0]
     return bool(set(np.unique(region[masks[0]])) & set(np.unique(region[masks[1]])) - {0})

@@ -50,8 +50,7 @@ def face_axes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def charts_of(faces: np.ndarray, axes: np.ndarray) -> tuple[int, np.ndarray]:
     """Connected patches of faces with the same axis.
 
-    Returns:
-        number of charts, and (m,) the chart of each face.
+    Returns number of charts, and (m,) the chart of each face.
     """
     m = len(faces)
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
@@ -68,11 +67,8 @@ def charts_of(faces: np.ndarray, axes: np.ndarray) -> tuple[int, np.ndarray]:
 def pack_rows(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
     """Packs rectangles into rows, tallest first.
 
-    Args:
-        sizes: (n, 2) int width and height, texels.
-
-    Returns:
-        (n, 2) lower corner of each, and the height used.
+    `sizes`: (n, 2) int width and height, texels.
+    Returns (n, 2) lower corner of each, and the height used.
     """
     corner = np.zeros_like(sizes)
     x = y = row = 0
@@ -88,9 +84,8 @@ def pack_rows(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
 def unwrap(vertices: np.ndarray, faces: np.ndarray, texels_per_m: float) -> tuple[np.ndarray, np.ndarray, int]:
     """Lays the faces out on a square sheet.
 
-    Returns:
-        uv (k, 2) in texels, face_uv (m, 3), and the sheet's side (a power of two, so resolution may come out
-        lower).
+    Returns uv (k, 2) in texels, face_uv (m, 3), and the sheet's side (a power of two, so resolution may come out
+    lower).
     """
     axes = face_axes(vertices, faces)
     n, chart = charts_of(faces, axes)
@@ -181,15 +176,12 @@ def paint(scan: Scan, rooms: list[Room], uses: Sequence[str], points: np.ndarray
           normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:  # fmt: skip
     """Colours of points on the scan.
 
-    Args:
-        scan: the mesh; the nearest solid's material decides.
-        rooms: x0, y0, x1, y1 of each; each has its own walls and floor.
-        points: (n, 3).
-        ids: (n,) face of each point.
-        normals: (m, 3) of faces.
-
-    Returns:
-        (n, 3) float in 0..1.
+    `scan`: the mesh; the nearest solid's material decides.
+    `rooms`: x0, y0, x1, y1 of each; each has its own walls and floor.
+    `points`: (n, 3).
+    `ids`: (n,) face of each point.
+    `normals`: (m, 3) of faces.
+    Returns (n, 3) float in 0..1.
     """
     corner = scan.solid[scan.faces[ids]]
     # Two of three corners decide, so that a border follows edges rather than zigzags.
@@ -229,8 +221,7 @@ def make_atlas(scan: Scan, rooms: list[Room], uses: Sequence[str], texels_per_m:
                rng: np.random.Generator) -> Atlas:  # fmt: skip
     """Unwraps and paints a scan; rooms are x0, y0, x1, y1 (m), their `uses` as `finishes` takes them.
 
-    Returns:
-        The atlas.
+    Returns the atlas.
     """
     uv, face_uv, side = unwrap(scan.vertices, scan.faces, texels_per_m)
     faces_at = face_image(uv, face_uv, side).ravel()

@@ -65,8 +65,7 @@ def read_gltf(source: SourceFolder, path: Path) -> list[TexturedMesh]:
     """Return the meshes of the default scene in its own frame."""
     file = _File(source, path)
     meshes = file.meshes()
-    for what, count in sorted((+file.unused).items()):
-        source.note(f"{file.where}: not used: {count} {what}")
+    source.note_counts(f"{file.where}: not used:", +file.unused, " ")
     return meshes
 
 

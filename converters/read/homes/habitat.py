@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.read.files import SourceFolder, read_json
+from converters.read.files import SourceFolder, only_file, read_json
 from converters.read.homes.parts import Part, home
 from converters.read.meshes import SUFFIXES, read_surface
 from converters.read.obj import TexturedMesh
@@ -57,15 +57,10 @@ def root_of(scene: Path) -> Path:
 def read_habitat(root: Path, strict: bool = False, chosen: Path | None = None) -> RawScene:
     """Reads the only scene of a folder, or the chosen one."""
     source = SourceFolder(root, strict)
-    scenes = [chosen] if chosen else scenes_of(root)
-    if len(scenes) != 1:
-        names = ", ".join(p.name.removesuffix(SCENE) for p in scenes[:5]) or "none"
-        more = f" and {len(scenes) - 5} more" if len(scenes) > 5 else ""
-        raise SceneRejected(f"{root}: scenes are {names}{more}, expected one; give the file of one")
+    scene = chosen or only_file(root, scenes_of(root), "scenes", ending=SCENE)
     reader = _Reader(source)
-    parts = list(reader.parts(scenes[0]))
-    for kind, count in sorted(reader.dropped.items()):
-        source.note(f"{scenes[0].name}: {count} x {kind}")
+    parts = list(reader.parts(scene))
+    source.note_counts(f"{scene.name}:", reader.dropped)
     return home(source, "habitat", parts)
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from converters.read.files import SourceFolder
+from converters.read.files import SourceFolder, only_file
 from converters.read.homes.parts import LEVEL, Part, category_of, home
 from converters.read.homes.solids import height_field, rectangle
 from converters.read.obj import TexturedMesh, in_colour
@@ -57,16 +57,13 @@ def _tag(path: Path) -> str:
 def read_mjcf(root: Path, strict: bool = False, chosen: Path | None = None, within: Path | None = None) -> RawScene:
     """Reads a folder's only MJCF file, its `scene.xml`, or the chosen one."""
     source = SourceFolder(within or root, strict, REMEDY)
-    mains = [chosen] if chosen else mains_of(root)
-    if len(mains) != 1:
-        names = ", ".join(p.name for p in mains) or "none"
-        raise SceneRejected(f"{root}: MJCF files are {names}, expected one or scene.xml; give the file of one")
+    main = chosen or only_file(root, mains_of(root), "MJCF files", "one or scene.xml; give the file of one")
     files = _Files(source)
     try:
-        model = mujoco.MjSpec.from_string(files.whole(mains[0]), include=files.models).compile()
+        model = mujoco.MjSpec.from_string(files.whole(main), include=files.models).compile()
     except (ValueError, RuntimeError) as error:  # RecursionError among them
-        raise SceneRejected(f"{mains[0]}: MuJoCo refuses it ({' '.join(str(error).split())})") from error
-    return home(source, "mjcf", _parts(model, source, mains[0]))
+        raise SceneRejected(f"{main}: MuJoCo refuses it ({' '.join(str(error).split())})") from error
+    return home(source, "mjcf", _parts(model, source, main))
 
 
 @dataclasses.dataclass
@@ -221,8 +218,7 @@ def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Part
         name, mass = model.body(body).name or f"body_{body}", float(model.body_mass[members].sum()) or None
         friction = friction if 0 < friction <= 2 else None
         parts.append(Part(name, pose, surface, joined([m for m, _ in solid]), not free, mass, friction, held))
-    for kind, count in sorted((+dropped).items()):
-        source.note(f"{path.name}: {count} x {kind}")
+    source.note_counts(f"{path.name}:", +dropped)
     return parts
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import trimesh
 
 from converters.geometry.faces import face_vectors
-from converters.read.files import SourceFolder, read_image
+from converters.read.files import SourceFolder, only_file, read_image
 from converters.read.homes.parts import LEVEL, Part, home
 from converters.read.homes.sdf_frames import Model
 from converters.read.homes.solids import height_field, rectangle
@@ -63,19 +63,16 @@ def root_of(world: Path) -> Path:
 def read_sdf(root: Path, strict: bool = False, chosen: Path | None = None, within: Path | None = None) -> RawScene:
     """Reads the only world of a folder, or the chosen one."""
     source = SourceFolder(within or root, strict)
-    worlds = [chosen] if chosen else worlds_of(root)
-    if len(worlds) != 1:
-        names = ", ".join(p.name for p in worlds) or "none"
-        raise SceneRejected(f"{root}: worlds are {names}, expected one; give the file of one")
+    file = chosen or only_file(root, worlds_of(root), "worlds")
     reader = _Reader(source, root)
-    world = parse_xml(source.use(source.inside(worlds[0]), "expected SDF"), "SDF").find("world")
+    world = parse_xml(source.use(source.inside(file), "expected SDF"), "SDF").find("world")
     if world is None:
-        raise SceneRejected(f"{worlds[0]}: has no <world>; give a world, not a model")
+        raise SceneRejected(f"{file}: has no <world>; give a world, not a model")
     count_unread(world, TABLES["read"], reader.unread)
     saved = world.find("state")
-    tree = reader.tree(Model("world", world, worlds[0]))
+    tree = reader.tree(Model("world", world, file))
     parts = list(reader.parts(tree, np.eye(4), UNMOVED if saved is None else saved))
-    report_unread(source, worlds[0].name, reader.unread)
+    report_unread(source, file.name, reader.unread)
     return home(source, "sdf", parts)
 
 

@@ -193,9 +193,8 @@ class _Drawing:
             parts += made
             if made and any(r.floor is not None for r in here):
                 floors_m.add(base)
-        for what, count in sorted(self.dropped.items()):
-            if count:
-                self.source.note(f"{count} {what}: dropped")
+        for what, count in sorted((+self.dropped).items()):
+            self.source.note(f"{count} {what}: dropped")
         if not floors_m:
             raise SceneRejected("has no room and no closed walls, expected a floor; draw a room")
         storeys = _storeys(sorted(floors_m))

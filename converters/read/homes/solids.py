@@ -20,8 +20,7 @@ def flat(region: Any) -> tuple[np.ndarray, np.ndarray]:
 def height_field(height_m: np.ndarray, half_m: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     """Return the vertices and faces of a surface over the plane around the origin.
 
-    Args:
-        height_m: [rows along y, columns along x].
+    `height_m`: [rows along y, columns along x].
     """
     rows, columns = height_m.shape
     x, y = np.meshgrid(np.linspace(-half_m[0], half_m[0], columns), np.linspace(-half_m[1], half_m[1], rows))
