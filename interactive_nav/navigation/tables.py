@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from interactive_nav.config import TaskRules
@@ -57,10 +58,11 @@ def furniture_map(scene: Scene, poses: dict[str, tuple[np.ndarray, np.ndarray]],
 
 def rest_poses(world: World, index: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return body name -> (position, quaternion) of a scene's furniture at rest, world frame."""
-    qpos, layout = world.rest_qpos[index], world.layout
-    slots = zip(world.slots.names[index], layout.slot_kind, layout.slot_qpos, strict=True)
-    free = {name: (qpos[at : at + 3], qpos[at + 3 : at + 7]) for name, kind, at in slots if name and kind == "free"}
-    return {m.name: (m.pos_w, m.quat_w) for m in world.scenes[index].movables} | free
+    data, layout = mujoco.MjData(world.models[index]), world.layout
+    data.qpos[:] = world.rest_qpos[index]
+    mujoco.mj_kinematics(world.models[index], data)
+    slots = zip(world.slots.names[index], layout.slot_kind, layout.slot_body, strict=True)
+    return {n: (data.xpos[body].copy(), data.xquat[body].copy()) for n, kind, body in slots if n and kind != "small"}
 
 
 def friction_share(world: World, index: int) -> np.ndarray:

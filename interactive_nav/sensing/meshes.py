@@ -1,7 +1,7 @@
-"""Textured visual meshes of all scenes, drawn for a batch that mixes them: one Warp kernel of our own, on GPU and CPU.
+"""Draw textured visual meshes for a batch that mixes scenes, with one Warp kernel, on GPU and CPU.
 
 MJX has one set of meshes for a whole batch, so its renderer cannot mix scenes. Here all meshes of all scenes lie in one
-`wp.Mesh`, each a group with a tree of its own that is built once; what an environment shows is a list of instances
+`wp.Mesh`, each a group with a separate tree that is built once; what an environment shows is a list of instances
 (which mesh, which body), and a ray is taken into each body's frame that it may meet. Nothing is refitted.
 """
 
@@ -63,7 +63,7 @@ def _box_part(slot: int, boxes: np.ndarray, colour: np.ndarray) -> _Part:
 
 
 def _geom_part(model: mujoco.MjModel, geom: int, slot: int) -> _Part:
-    """A geom of the robot's: a mesh, a box, or what is round as its hull."""
+    """Return the surface of a geom of the robot's: a mesh, a box, or what is round as its hull."""
     kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
         return _mesh_part(model, geom, slot, False)
@@ -87,23 +87,23 @@ def _geom_part(model: mujoco.MjModel, geom: int, slot: int) -> _Part:
 def _mesh_part(model: mujoco.MjModel, geom: int, slot: int, standing: bool) -> _Part:
     mesh, texture = model.geom_dataid[geom], -1
     vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
-    own = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
+    rows = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
     points = vertices @ matrix_from_quat(model.geom_quat[geom]).T + model.geom_pos[geom]
     if standing:
         points = points + model.body_pos[model.geom_bodyid[geom]]
-    uv, image = np.zeros((own.stop - own.start, 3, 2)), None
+    uv, image = np.zeros((rows.stop - rows.start, 3, 2)), None
     if model.geom_matid[geom] >= 0:
         texture = model.mat_texid[model.geom_matid[geom]][mujoco.mjtTextureRole.mjTEXROLE_RGB]
     if texture >= 0 and model.mesh_texcoordadr[mesh] >= 0:
-        uv = model.mesh_texcoord[model.mesh_texcoordadr[mesh] + model.mesh_facetexcoord[own]]
+        uv = model.mesh_texcoord[model.mesh_texcoordadr[mesh] + model.mesh_facetexcoord[rows]]
         shape = model.tex_height[texture], model.tex_width[texture], model.tex_nchannel[texture]
         image = model.tex_data[model.tex_adr[texture] :][: np.prod(shape)].reshape(shape)[..., :3]
     lit = standing and is_lit(model)
-    return _Part(slot, points, model.mesh_face[own], uv, image, geom_colour(model, geom), lit)
+    return _Part(slot, points, model.mesh_face[rows], uv, image, geom_colour(model, geom), lit)
 
 
 def _parts(world: World, s: int, tables: BoxTables) -> tuple[list[_Part], list[int]]:
-    """What there is to see of a scene, bodies without visual meshes as their boxes; and the class of each slot."""
+    """Return the surfaces of a scene, boxes where a body has no visual mesh, and the class of each slot."""
     model, visual = visual_geoms(world.scenes[s])
     slots, ids = world.slots, world.slots.class_ids(tables.classes)[s]
     parts = []
@@ -112,9 +112,9 @@ def _parts(world: World, s: int, tables: BoxTables) -> tuple[list[_Part], list[i
             parts += [_mesh_part(model, geom, slot, name == "structure") for geom in meshes]
         elif len(boxes := slots.rows(s, slot)):
             parts.append(_box_part(slot, boxes, PALETTES[tables.classes][ids[slot]]))
-    own = robot_geoms(world) if tables.robot else []
-    parts += [_geom_part(world.models[0], g, len(ids) + i) for i, geoms in enumerate(own) for g in geoms]
-    return parts, [*ids, *[class_id("robot", tables.classes)] * len(own)]
+    links = robot_geoms(world) if tables.robot else []
+    parts += [_geom_part(world.models[0], g, len(ids) + i) for i, geoms in enumerate(links) for g in geoms]
+    return parts, [*ids, *[class_id("robot", tables.classes)] * len(links)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,7 +144,7 @@ class MeshTables:
 
 
 def build_meshes(world: World, tables: BoxTables) -> MeshTables:
-    """Reads the visual meshes of every scene; bodies without any are drawn as their boxes."""
+    """Read the visual meshes of every scene; bodies without any are drawn as their boxes."""
     scenes = [_parts(world, s, tables) for s in range(len(world.scenes))]
     shape = len(scenes), max(len(parts) for parts, _ in scenes)
     surface, slot = np.full(shape, -1, np.int32), np.zeros(shape, np.int32)
@@ -214,7 +214,7 @@ def _meet(
     sphere_w: wp.array2d[wp.vec4],
     root: wp.array2d[int],
 ):
-    """The nearest of an environment's surfaces: distance, surface (-1: none), face, its first two weights, normal."""
+    """Return the nearest of an environment's surfaces: distance, surface (-1: none), face, two weights, normal."""
     square = wp.dot(ray, ray)
     # Warp takes plain numbers for constants.
     nearest = wp.float32(FAR)
@@ -267,7 +267,7 @@ def _draw(
     normal_w: wp.array3d[wp.vec3],
     base: wp.array3d[wp.vec3],
 ):
-    """One pixel: depth, class, 0 nothing, 1 lit or 2 shining by itself, normal, and colour before light."""
+    """Draw one pixel: depth, class, 0 nothing, 1 lit or 2 shining by itself, normal, and colour before light."""
     n, tile_y, tile_x, lane = wp.tid()
     # A warp's 32 rays go the same way.
     y = tile_y * 8 + lane / 4
@@ -298,7 +298,7 @@ def _draw(
     depth[n, y, x] = nearest
     ids[n, y, x] = wp.uint8(look[s, hit, 0])
     kind[n, y, x] = wp.uint8(1 + look[s, hit, 4])
-    # It may be seen from behind.
+    # Its back may show.
     normal_w[n, y, x] = -wp.sign(wp.dot(normal, ray)) * normal
     if look[s, hit, 2] == 0:
         base[n, y, x] = colour[s, hit]
@@ -313,25 +313,25 @@ class MeshRenderer(Renderer):
     name = "warp (meshes)"
 
     def __init__(self, tables: BoxTables, lens: Lens, world: World):
-        """Puts the meshes of all scenes on the device and builds their trees, once."""
+        """Put the meshes of all scenes on the device and build their trees, once."""
         keep_collector_out()
         self.lens, self.tables = lens, tables
-        made = build_meshes(world, tables)
+        built = build_meshes(world, tables)
         device = "cpu" if jax.default_backend() == "cpu" else "cuda"
         self._mesh = wp.Mesh(
-            wp.array(made.points, dtype=wp.vec3, device=device),
-            wp.array(made.faces.ravel(), dtype=int, device=device),
+            wp.array(built.points, dtype=wp.vec3, device=device),
+            wp.array(built.faces.ravel(), dtype=int, device=device),
             # Built slowly and with care, once: rays take a third less time.
             bvh_constructor="sah",
             bvh_leaf_size=1,
-            groups=wp.array(made.group, dtype=int, device=device),
+            groups=wp.array(built.group, dtype=int, device=device),
         )
-        root = wp.zeros(int(made.group[-1]) + 1, dtype=int, device=device)
+        root = wp.zeros(int(built.group[-1]) + 1, dtype=int, device=device)
         wp.launch(_roots, len(root), [self._mesh.id], [root], device=device)
-        self._slot, self._sphere_b = made.slot, jnp.asarray(made.sphere_b)
+        self._slot, self._sphere_b = built.slot, jnp.asarray(built.sphere_b)
         self._handle = jnp.asarray([self._mesh.id & 0xFFFFFFFF, self._mesh.id >> 32], jnp.uint32)
         self._constants = tuple(
-            map(jnp.asarray, (root.numpy()[made.surface], made.look, made.colour, made.uv, made.texels))
+            map(jnp.asarray, (root.numpy()[built.surface], built.look, built.colour, built.uv, built.texels))
         )
         self._draw = wp.jax_kernel(_draw, num_outputs=5)
 

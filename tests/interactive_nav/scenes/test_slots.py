@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from interactive_nav.config import NavConfig
-from interactive_nav.navigation.tables import friction_share
+from interactive_nav.navigation.tables import friction_share, rest_poses
 from interactive_nav.physics import PhysicsState
 from interactive_nav.physics.nearness import Nearness
 from interactive_nav.physics.window import Window
@@ -127,3 +127,14 @@ def test_hinged_bodies_are_where_c_mujoco_has_them_whatever_their_axis(hatch):
         np.testing.assert_allclose(boxes.axes[slot], data.xmat[body].reshape(3, 3)[:2], atol=1e-5)
         np.testing.assert_allclose(boxes.centre[slot], data.geom_xpos[geom][:2], atol=1e-5)
         np.testing.assert_allclose(boxes.half[slot], model.geom_size[geom], atol=1e-6)
+
+
+def test_a_hatch_that_fell_is_furniture_where_it_came_to_rest(hatch):
+    slot, data = hatch.slots.names[0].index("door_0"), mujoco.MjData(hatch.models[0])
+    data.qpos[:] = hatch.rest_qpos[0]
+    mujoco.mj_kinematics(hatch.models[0], data)
+    upright = abs((hatch.slots.axes_w[0, slot] @ hatch.slots.hinge_axis_b[0, slot])[2]) == 1.0
+    assert upright == (abs(hatch.rest_qpos[0, hatch.layout.slot_qpos[slot]]) < 1e-3)
+    pos, quat = rest_poses(hatch, 0)["door_0"]
+    np.testing.assert_array_equal(pos, data.body(hatch.layout.slot_body[slot]).xpos)
+    np.testing.assert_array_equal(quat, data.body(hatch.layout.slot_body[slot]).xquat)
