@@ -1,5 +1,6 @@
 """What can go wrong for a user of `topological_nav`: each error is one clear line (what, got, expected, remedy)."""
 
+import dataclasses
 from collections.abc import Callable
 
 from interactive_nav_common.errors import UserError
@@ -27,10 +28,16 @@ class Stopped(Exception):
 
 Progress = Callable[[str, int, int], None]
 """Told what is done, how much of it, and of how much; may raise to stop."""
-Asked = Callable[[], int]
-"""Asked at places where work can stop: the number of the signal that wants it to; 0: go on."""
 
 
-def go_on() -> int:
-    """An `Asked` that never stops."""
-    return 0
+@dataclasses.dataclass(frozen=True)
+class Host:
+    """Whoever started long work: shows its lines, and stops it between two steps."""
+
+    tell: Callable[[str], None] = lambda _: None
+    signal: Callable[[], int] = lambda: 0
+    """Return the number of the signal that wants the work to stop; 0: go on."""
+
+
+ALONE = Host()
+"""Shows nothing and never stops."""

@@ -8,7 +8,6 @@ source's extractor stays as it is. No label and no position of a target image is
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +22,14 @@ from interactive_nav_common.config import to_dict
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.data.dataset import RoomImages, load_rooms, read_header
 from topological_nav.data.domains import as_seen, preset
-from topological_nav.errors import Asked, RunError, go_on
-from topological_nav.learn.learning import compiled_epoch, initial, shuffled
+from topological_nav.errors import ALONE, Host, RunError
+from topological_nav.learn.learning import compiled_epoch, initial, keyed_batches, over
 from topological_nav.learn.networks import Network, joined, normalised
 from topological_nav.learn.runs import claimed, run_epochs, write_results
 from topological_nav.learn.training import Trained, load_trained, localisation, rows_by_scene, save_trained
 
 ROOMS_STREAM, PASSAGES_STREAM = 1, 2
 """Of chance in target images."""
-Tell = Callable[[str], None]
 
 
 class Critic(nn.Module):
@@ -89,11 +87,6 @@ def adversarial_epoch(network: Network, critic: Critic, config: AdaptConfig):
     """
     tx, critic_tx = _optimisers(config)
 
-    def steps(images, key):
-        key_order, key_source = jax.random.split(key)
-        order = shuffled(key_order, len(images), config.batch)
-        return order, jax.random.split(key_source, len(order))
-
     def critic_loss(weights, source, target):
         logits: Any = [critic.apply({"params": weights}, x) for x in (source, target)]
         # log(1 + e^-x) for the source, log(1 + e^x) for the target.
@@ -119,7 +112,7 @@ def adversarial_epoch(network: Network, critic: Critic, config: AdaptConfig):
         new = Adapting(optax.apply_updates(state.params, change), stats, opt, weights, critic_opt)
         return new, {"loss": loss, "critic_loss": told, "critic_accuracy": right}
 
-    return compiled_epoch(steps, update)
+    return compiled_epoch(keyed_batches(config.batch), update)
 
 
 def target_statistics(trained: Trained, images: np.ndarray, batch: int, passes: int = 3) -> Trained:
@@ -137,15 +130,9 @@ def target_statistics(trained: Trained, images: np.ndarray, batch: int, passes: 
 
 
 def adapt_features(
-    run: Path,
-    source: Path,
-    target: Path,
-    out: Path,
-    config: AdaptConfig,
-    tell: Tell = lambda _: None,
-    should_stop: Asked = go_on,
+    run: Path, source: Path, target: Path, out: Path, config: AdaptConfig, host: Host = ALONE
 ) -> dict[str, Any]:
-    """Adapts a run's embedding to another domain, or goes on with it.
+    """Adapt a run's embedding to another domain, or continue the adaptation at `out`.
 
     Returns:
         The content of results.json: localisation before, with the target's statistics alone, and after.
@@ -158,12 +145,9 @@ def adapt_features(
         learned, unlabelled = (x.images[~x.test].reshape(-1, *x.images.shape[3:]) for x in (near, far))
         embedded = trained.embed(learned)
         state, critic = make_adapting(trained.network, trained.variables, embedded.shape[1], config)
-        epoch: Any = adversarial_epoch(trained.network, critic, config)
-        on_device = jnp.asarray(unlabelled), jnp.asarray(embedded)
-        state = run_epochs(
-            out, "features", state, lambda learner, _, key: epoch(learner, *on_device, key), config.epochs,
-            epoch_keys(config), tell, should_stop, "checkpoint-features.msgpack",
-        )  # fmt: skip
+        epoch: Any = over(adversarial_epoch(trained.network, critic, config), unlabelled, embedded)
+        keys, kept = epoch_keys(config), "checkpoint-features.msgpack"
+        state = run_epochs(out, "features", state, epoch, config.epochs, keys, host, kept)
         variables = {"params": state.params, "batch_stats": state.batch_stats}
         adapted = save_trained(out, Trained(trained.network, variables, adapted_about(trained, config)))
         fitted = target_statistics(trained, unlabelled, config.batch)

@@ -21,7 +21,6 @@ from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.config import to_dict
 from topological_nav.adapt.adaptation import (
     PASSAGES_STREAM,
-    Tell,
     adapted_about,
     digest_of,
     epoch_keys,
@@ -32,8 +31,8 @@ from topological_nav.config import PITCHES, DataConfig
 from topological_nav.data.dataset import PassageImages, load_passages, read_header
 from topological_nav.data.domains import as_seen, preset
 from topological_nav.data.passages import balanced
-from topological_nav.errors import Asked, DatasetError, MapError, go_on
-from topological_nav.learn.learning import Learner, labelled_epoch, make_learner
+from topological_nav.errors import ALONE, DatasetError, Host, MapError
+from topological_nav.learn.learning import Learner, labelled_epoch, make_learner, over
 from topological_nav.learn.localise import in_words, localisation_scores, nearest_turn
 from topological_nav.learn.pairs import need_task
 from topological_nav.learn.runs import claimed, run_epochs, write_results
@@ -47,14 +46,9 @@ CONFIGURATIONS = {"A": (False, False), "B": (False, True), "C": (True, False), "
 
 
 def passage_configurations(
-    run: Path,
-    target: Path,
-    out: Path,
-    config: AdaptConfig,
-    tell: Tell = lambda _: None,
-    should_stop: Asked = go_on,
+    run: Path, target: Path, out: Path, config: AdaptConfig, host: Host = ALONE
 ) -> dict[str, Any]:
-    """Scores a passage detector in another domain, learned from the source or not, fine-tuned or not.
+    """Score a passage detector in another domain, learned from the source or not, fine-tuned or not.
 
     Returns:
         The content of results.json.
@@ -69,18 +63,15 @@ def passage_configurations(
         shape = (trained.about["data"]["height"], trained.about["data"]["width"])
         fresh = make_learner(network, shape, tx, config.seed)
         epoch = labelled_epoch(network, tx, config.fine_tune_batch, 0.0, True, learned.scored)
-        images, labels = jnp.asarray(learned.images), jnp.asarray(learned.free, jnp.int32)
+        one, keys = over(epoch, learned.images, learned.free.astype(np.int32)), epoch_keys(config)
         results: dict[str, Any] = {"fine_tuned_on": len(learned.images), "tested_on": len(tested.images)}
         for name, (from_source, tunes) in CONFIGURATIONS.items():
             # A copy: an epoch gives its argument's memory away.
             learner = jax.tree.map(jnp.array, _of(trained, tx) if from_source else fresh)
             if tunes:
-                learner = run_epochs(
-                    out, name, learner, lambda state, _, key: epoch(state, images, labels, key),
-                    config.fine_tune_epochs, epoch_keys(config), tell, should_stop, f"checkpoint-{name}.msgpack",
-                )  # fmt: skip
-            variables = {"params": learner.params, "batch_stats": learner.batch_stats}
-            tuned = Trained(network, variables, trained.about)
+                kept = f"checkpoint-{name}.msgpack"
+                learner = run_epochs(out, name, learner, one, config.fine_tune_epochs, keys, host, kept)
+            tuned = Trained(network, learner.variables, trained.about)
             results[name] = _scores(tuned, tested)
             if name == "D":
                 save_trained(out, dataclasses.replace(tuned, about=adapted_about(trained, config)))

@@ -6,16 +6,15 @@ from pathlib import Path
 from interactive_nav_common.config import field_docs, overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.records import read_metrics
-from interactive_nav_common.signals import stop_signals
 from topological_nav.adapt.adaptation import adapt_features, target_rooms
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.adapt.transfer import CONFIGURATIONS, collected_map, passage_configurations
 from topological_nav.commands.maps import keep_map
-from topological_nav.commands.progress import asked_by, say, tell_line
+from topological_nav.commands.progress import say, terminal
 from topological_nav.config import ADAPTED, DATASET, PITCHES
 from topological_nav.data.dataset import load_passages, load_rooms
 from topological_nav.data.domains import as_seen, preset
-from topological_nav.errors import Asked
+from topological_nav.errors import Host
 from topological_nav.figures.maps import save
 from topological_nav.figures.transfer_figures import features_figure, passages_figure
 from topological_nav.learn.localise import in_words
@@ -35,8 +34,8 @@ def run(arguments: argparse.Namespace) -> None:
     arguments.localiser, arguments.detector = chosen.localiser, chosen.detector
     if chosen.said:
         say(chosen.said)
-    with stop_signals() as stops:
-        WHAT[arguments.what](arguments, config, asked_by(stops))
+    with terminal() as host:
+        WHAT[arguments.what](arguments, config, host)
 
 
 def _refuse_unused(arguments: argparse.Namespace) -> None:
@@ -56,9 +55,9 @@ def _refuse_unused(arguments: argparse.Namespace) -> None:
         refuse_unused(arguments, "--data", f"{why} with --target")
 
 
-def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> None:
+def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, host: Host) -> None:
     out = arguments.out or ADAPTED / "features"
-    results = adapt_features(arguments.localiser, arguments.data, arguments.target, out, config, tell_line, should_stop)
+    results = adapt_features(arguments.localiser, arguments.data, arguments.target, out, config, host)
     rendered, seen = load_rooms(arguments.target).images, target_rooms(arguments.target, config).images
     level = PITCHES.index("level")
     figure = features_figure(rendered[:, level, 0], seen[:, level, 0], read_metrics(out / "metrics.jsonl"), results)
@@ -68,9 +67,9 @@ def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, should_s
     print(f"{out}: {results['target_images']:,} target images, {results['before']['queries']} queries")
 
 
-def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> None:
+def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, host: Host) -> None:
     out = arguments.out or ADAPTED / "passages"
-    results = passage_configurations(arguments.detector, arguments.target, out, config, tell_line, should_stop)
+    results = passage_configurations(arguments.detector, arguments.target, out, config, host)
     images = load_passages(arguments.target).images
     seen = as_seen(images, preset(config.domain))
     save(passages_figure(images, seen, read_metrics(out / "metrics.jsonl"), results), out / "configurations.png")
@@ -81,8 +80,8 @@ def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, should_s
     print(f"{out}: fine-tuned on {results['fine_tuned_on']} images, tested on {results['tested_on']}")
 
 
-def _adapt_map(arguments: argparse.Namespace, config: AdaptConfig, should_stop: Asked) -> None:
-    del should_stop
+def _adapt_map(arguments: argparse.Namespace, config: AdaptConfig, host: Host) -> None:
+    del host
     scene = Path(arguments.scene)
     out = arguments.out or ADAPTED / f"{scene.resolve().name}.npz"
     keep_map(collected_map(scene, arguments.target, arguments.localiser, arguments.detector, config), out)

@@ -11,10 +11,9 @@ from interactive_nav_common.config import overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import write_text
 from interactive_nav_common.jobs.progress import SafeConsole
-from interactive_nav_common.signals import stop_signals
 from scenes_mjcf.sets import scene_folders
 from topological_nav.commands.maps import build
-from topological_nav.commands.progress import bar, say, stopping
+from topological_nav.commands.progress import bar, say
 from topological_nav.config import PASSAGE_POLICY, RUNS, EvaluationConfig, MapConfig, NavigatorConfig
 from topological_nav.evaluate.contest import Contest, contest_scenes
 from topological_nav.evaluate.rows import play_contest, tracks_of
@@ -91,14 +90,13 @@ def navigate(arguments: argparse.Namespace) -> None:
     contest = _contest(arguments, [arguments.scene], ["sparse" if arguments.sparse else "dense"], RUNS)
     name = Path(arguments.scene).resolve().name
     out = arguments.out or RUNS / "navigate" / f"{name}-{arguments.episode}.png"
-    with stop_signals() as stops, bar() as tell:
-        told = stopping(tell, stops)
+    with bar() as tell:
         limit_s = int(contest.config.navigator.limit_s)
         driven = drive_episode(
             contest,
             arguments.episode,
             bool(arguments.video),
-            lambda time_s: told(f"{name}, simulated s", int(time_s), limit_s),
+            lambda time_s: tell(f"{name}, simulated s", int(time_s), limit_s),
         )
     for line in driven.told:
         print(line)
@@ -115,9 +113,9 @@ def evaluate(arguments: argparse.Namespace) -> None:
     if "ppo" not in names:
         refuse_unused(arguments, "--ppo", f"without contender ppo (--contenders {arguments.contenders})")
     contest = _contest(arguments, arguments.scenes, names, arguments.out)
-    with stop_signals() as stops, bar() as tell:
+    with bar() as tell:
         venues = contest_scenes(contest)
-        rows = play_contest(contest, venues, stopping(tell, stops))
+        rows = play_contest(contest, venues, tell)
     for venue in venues:
         panels = {}
         for name in contest.contenders:

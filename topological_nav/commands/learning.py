@@ -7,7 +7,7 @@ from interactive_nav_common.config import overridden, refuse_unused
 from interactive_nav_common.records import read_metrics
 from interactive_nav_common.signals import stop_signals
 from scenes_mjcf.sets import scene_folders
-from topological_nav.commands.progress import asked_by, bar, stopping, tell_line
+from topological_nav.commands.progress import bar, terminal
 from topological_nav.config import (
     DATASET,
     DRIVES,
@@ -37,8 +37,8 @@ def data(arguments: argparse.Namespace) -> None:
         return _drives(arguments)
     config = overridden(DataConfig(), arguments.settings)
     out = arguments.out or DATASET
-    with stop_signals() as stops, bar() as tell:
-        header = make_dataset([Path(s) for s in scene_folders(arguments.scenes)], out, config, stopping(tell, stops))
+    with bar() as tell:
+        header = make_dataset([Path(s) for s in scene_folders(arguments.scenes)], out, config, tell)
     save(dataset_figure(out), out / "preview.png")
     images = sum(s["positions"] * 3 * config.headings + s["passages"] for s in header["scenes"])
     for s in header["scenes"]:
@@ -55,10 +55,10 @@ def _drives(arguments: argparse.Namespace) -> None:
     config = overridden(DriveConfig(), arguments.settings)
     out, scenes = arguments.out or DRIVES, [Path(s) for s in scene_folders(arguments.scenes)]
     with stop_signals() as stops:
-        with bar() as tell:
-            drives = simulate_drives(scenes, out, config, stopping(tell, stops))
-        with bar() as tell:
-            draw_drives(scenes, out, stopping(tell, stops))
+        with bar(stops) as tell:
+            drives = simulate_drives(scenes, out, config, tell)
+        with bar(stops) as tell:
+            draw_drives(scenes, out, tell)
     save(drives_figure(scenes, out), out / "preview.png")
     row = summary(drives)
     print(
@@ -82,9 +82,8 @@ def train(arguments: argparse.Namespace) -> None:
     if config.init != "selfsup":
         refuse_unused(arguments, "selfsup_epochs selfsup_batch selfsup_learning_rate", f"with init={config.init}")
     out = arguments.out or RUNS / arguments.task
-    with stop_signals() as stops:
-        data = arguments.data or DATASET
-        results = train_network(arguments.task, data, out, config, tell_line, asked_by(stops))
+    with terminal() as host:
+        results = train_network(arguments.task, arguments.data or DATASET, out, config, host)
     save(curves_figure(read_metrics(out / "metrics.jsonl")), out / "curves.png")
     for name, row in results.get("groups", {}).items():
         print(f"{name:<8}{row['images']:>7} images  accuracy {row['accuracy']:.3f}  macro F1 {row['macro_f1']:.3f}")
@@ -100,11 +99,11 @@ def _policy(arguments: argparse.Namespace) -> None:
     if arguments.grid:
         refuse_unused(arguments, "alpha lam", "with --grid, which takes every pair of the report's")
     out = arguments.out or RUNS / ("policy-grid" if arguments.grid else "policy")
-    with stop_signals() as stops:
+    with terminal() as host:
         runs = arguments.localiser or RUNS / "rooms", arguments.detector or RUNS / "passages"
-        frames = embed_drives(arguments.data or DRIVES, *runs, config.mirror, tell_line, asked_by(stops))
+        frames = embed_drives(arguments.data or DRIVES, *runs, config.mirror, host)
         learn = train_grid if arguments.grid else train_policy
-        results = learn(frames, out, config, tell_line, asked_by(stops))
+        results = learn(frames, out, config, host)
     if isinstance(results, list):
         for row in results:
             folder = out / f"alpha-{row['alpha']:g}-lambda-{row['lambda']:g}"

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from interactive_nav_common.config import overridden
-from interactive_nav_common.signals import stop_signals
-from topological_nav.commands.progress import bar, say, stopping
+from topological_nav.commands.progress import bar, say
 from topological_nav.config import PASSAGE_POLICY, ExportConfig, MapConfig
 from topological_nav.figures.maps import map_figure, save
 from topological_nav.figures.transfer_figures import export_figure
@@ -31,8 +30,8 @@ def build(
 ) -> None:
     """Makes a map, draws it and tells of it."""
     parts = out.with_name(f"{out.name}.parts")
-    with stop_signals() as stops, bar() as tell:
-        built = build_map(scene, localiser, detector, config, stopping(tell, stops), parts)
+    with bar() as tell:
+        built = build_map(scene, localiser, detector, config, tell, parts)
     keep_map(built, out, ends)
     forget(parts)
 
@@ -57,9 +56,9 @@ def keep_map(built: Built, out: Path, ends: Sequence[int] | None = None) -> None
 def export_runs(arguments: argparse.Namespace) -> None:
     """Writes finished runs as a small folder."""
     config = overridden(ExportConfig(), arguments.settings)
-    with stop_signals() as stops, bar() as tell:
+    with bar() as tell:
         runs = (arguments.localiser, arguments.detector, arguments.policy, arguments.maps)
-        made = export(*runs, arguments.images, arguments.out, config, stopping(tell, stops))
+        made = export(*runs, arguments.images, arguments.out, config, tell)
     picture = arguments.picture or arguments.out.with_name(f"{arguments.out.name}.png")
     save(export_figure(made, config.limit_mib), picture)
     for name, value in made.compared.scores.items():

@@ -2,43 +2,36 @@
 
 import sys
 import time
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 
 from interactive_nav_common.jobs.progress import SafeConsole, progress_bar
-from topological_nav.errors import Asked, Progress, Stopped
-
-
-def stopping(tell: Progress, stops: list[int]) -> Progress:
-    """The same, which raises `Stopped` before the end once `stops` has a signal (see `signals.stop_signals`)."""
-
-    def told(what: str, done: int, total: int) -> None:
-        tell(what, done, total)
-        if stops and done < total:
-            raise Stopped(stops[0])
-
-    return told
-
-
-def asked_by(stops: list[int]) -> Asked:
-    """Asks a list of signals that came (see `signals.stop_signals`)."""
-    return lambda: stops[0] if stops else 0
-
-
-def say(line: str) -> None:
-    """A line to stderr, at once."""
-    print(line, file=sys.stderr, flush=True)
-
-
-def tell_line(line: str) -> None:
-    """A line to stdout, at once."""
-    print(line, flush=True)
+from interactive_nav_common.signals import stop_signals
+from topological_nav.errors import Host, Progress, Stopped
 
 
 @contextmanager
-def bar():
-    """A bar with the time left on a terminal, a line every tenth elsewhere."""
+def terminal() -> Iterator[Host]:
+    """Show lines on stdout, at once, and stop at a signal."""
+    with stop_signals() as stops:
+        yield Host(lambda line: print(line, flush=True), lambda: stops[0] if stops else 0)
+
+
+def say(line: str) -> None:
+    """Print a line to stderr, at once."""
+    print(line, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def bar(signals: list[int] | None = None) -> Iterator[Progress]:
+    """Show a bar with the time left on a terminal, a line every tenth elsewhere; raise `Stopped` before the end.
+
+    Args:
+        signals: of a `stop_signals` around it; None: it collects its own.
+    """
     console = SafeConsole(stderr=True)
-    with progress_bar(console, "starting") as update:
+    collected = stop_signals() if signals is None else nullcontext(signals)
+    with collected as stops, progress_bar(console, "starting") as update:
         tenths = 0
         # Neither compiling before the first step nor what an earlier run has done says how fast it goes.
         first: tuple[float, int] | None = None
@@ -52,5 +45,7 @@ def bar():
                 if done > before:
                     left = f", {(time.perf_counter() - began) / (done - before) * (total - done):.0f} s left"
                 console.print(f"{what}: {done:,} of {total:,}{left}", highlight=False, soft_wrap=True)
+            if stops and done < total:
+                raise Stopped(stops[0])
 
         yield tell

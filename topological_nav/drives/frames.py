@@ -12,7 +12,7 @@ import numpy as np
 
 from topological_nav.config import DriveConfig
 from topological_nav.drives.dataset import Drives, drive_images, load_drives, read_drives_header
-from topological_nav.errors import Asked, RunError, Stopped, go_on
+from topological_nav.errors import ALONE, Host, RunError, Stopped
 from topological_nav.learn.learning import in_batches
 from topological_nav.learn.pairs import SAME, load_pair, seen_by
 from topological_nav.learn.training import Trained
@@ -40,15 +40,8 @@ class Frames:
         return len(self.features) > len(self.drives.command)
 
 
-def embed_drives(
-    folder: Path,
-    localiser_run: Path,
-    detector_run: Path,
-    mirror: bool,
-    tell: Callable[[str], None] = lambda _: None,
-    should_stop: Asked = go_on,
-) -> Frames:
-    """Embeds the images of all kept drives."""
+def embed_drives(folder: Path, localiser_run: Path, detector_run: Path, mirror: bool, host: Host = ALONE) -> Frames:
+    """Embed the images of all kept drives."""
     header, config = read_drives_header(folder)
     drives, networks = load_drives(folder), load_pair(localiser_run, detector_run)
     mine, theirs = {**header["settings"], "fov_deg": header["fov_deg"]}, seen_by(networks[0])
@@ -69,8 +62,8 @@ def embed_drives(
             features[at + side * count] = part[:, side]
         done += len(images)
         if i % _TOLD_EVERY == 0 or done == total:
-            tell(f"embedded {done:,} of {total:,} images")
-        if stop := should_stop():
+            host.tell(f"embedded {done:,} of {total:,} images")
+        if stop := host.signal():
             raise Stopped(stop)
     if features is None:
         raise RunError(f"{folder}: none of {len(drives)} drives was kept; drive more, or in other scenes")

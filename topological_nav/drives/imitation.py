@@ -36,8 +36,8 @@ from topological_nav.drives.sequences import (
     thinned,
     turning_share,
 )
-from topological_nav.errors import Asked, RunError, go_on
-from topological_nav.learn.learning import Epoch, Learner, compiled_epoch, initial, shuffled
+from topological_nav.errors import ALONE, Host, RunError
+from topological_nav.learn.learning import Epoch, Learner, descent_epoch, initial, shuffled
 from topological_nav.learn.runs import claimed, run_epochs, write_network, write_results
 from topological_nav.learn.training import class_scores
 
@@ -47,14 +47,8 @@ LEAST_SPREAD = 0.3
 """Features are scaled by their standard deviation, at least this share of the mean one."""
 
 
-def train_policy(
-    frames: Frames,
-    out: Path,
-    config: PolicyConfig,
-    tell: Callable[[str], None] = lambda _: None,
-    should_stop: Asked = go_on,
-) -> dict[str, Any]:
-    """Trains a policy, or goes on with it.
+def train_policy(frames: Frames, out: Path, config: PolicyConfig, host: Host = ALONE) -> dict[str, Any]:
+    """Train a policy, or continue the run at `out`.
 
     Returns:
         The content of results.json.
@@ -79,7 +73,7 @@ def train_policy(
             return epoch(learner, shown, {**truth, **weights, "jointly": jnp.float32(number >= alone)}, key)
 
         key = jax.random.PRNGKey(config.seed)
-        learner = run_epochs(out, "policy", learner, one, config.epochs, key, tell, should_stop)
+        learner = run_epochs(out, "policy", learner, one, config.epochs, key, host)
         return _finish(frames, out, config, values, learner, policy, forward, split)
 
 
@@ -149,9 +143,12 @@ def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: 
     Labels: the fields of `Sequences`, and numbers `alpha`, `lam` and `jointly` as `policy_loss` has them: one program
     serves a whole grid.
     """
-    tx = optax.adam(learning_rate)
 
-    def loss_of(params, scale, u, batch, weights):
+    def loss_of(params, scale, features, labels, step):
+        (which,) = step
+        batch = {name: labels[name][which] for name in ("rows", "valid", "followed", "linear", "angular")}
+        weights = {name: labels[name] for name in ("alpha", "lam", "jointly")}
+        u = features[batch["rows"]].astype(jnp.float32)
         truth = (batch["linear"], batch["angular"])
         logits, next_after = _applied(policy, forward, params, scale, u)
         guesses = next_after(_one_hot(policy, *truth)), next_after([nn.softmax(value) for value in logits])
@@ -160,23 +157,13 @@ def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: 
             f"{name}_accuracy": ((one.argmax(-1) == t) & batch["valid"]).sum() / batch["valid"].sum()
             for name, one, t in zip(("linear", "angular"), logits, truth, strict=True)
         }
-        return loss, {"loss": loss, **parts, **right}
+        return loss, (scale, {**parts, **right})
 
     def steps(features, key):
         del features
         return (shuffled(key, count, batch),)
 
-    def update(learner, features, labels, step):
-        (which,) = step
-        batch = {name: labels[name][which] for name in ("rows", "valid", "followed", "linear", "angular")}
-        u = features[batch["rows"]].astype(jnp.float32)
-        grad = jax.value_and_grad(loss_of, has_aux=True)
-        weights = {name: labels[name] for name in ("alpha", "lam", "jointly")}
-        (_, told), slope = grad(learner.params, learner.batch_stats, u, batch, weights)
-        change, opt_state = tx.update(slope, learner.opt_state, learner.params)
-        return Learner(optax.apply_updates(learner.params, change), learner.batch_stats, opt_state), told
-
-    return compiled_epoch(steps, update)
+    return descent_epoch(steps, loss_of, optax.adam(learning_rate))
 
 
 def _finish(
@@ -267,14 +254,8 @@ def _scores(
     return out
 
 
-def train_grid(
-    frames: Frames,
-    out: Path,
-    config: PolicyConfig,
-    tell: Callable[[str], None] = lambda _: None,
-    should_stop: Asked = go_on,
-) -> list[dict[str, Any]]:
-    """A policy for every alpha and lambda of the report, each in a folder of its own under `out`.
+def train_grid(frames: Frames, out: Path, config: PolicyConfig, host: Host = ALONE) -> list[dict[str, Any]]:
+    """Train a policy for every alpha and lambda of the report, each in a folder of its own under `out`.
 
     Returns:
         The results, also written to grid.json and, as a table, to grid.md.
@@ -282,8 +263,8 @@ def train_grid(
     rows = []
     for alpha, lam in GRID:
         one = dataclasses.replace(config, alpha=alpha, lam=lam)
-        tell(f"alpha {alpha:g}, lambda {lam:g}: {len(rows) + 1} of {len(GRID)}")
-        rows.append(train_policy(frames, out / f"alpha-{alpha:g}-lambda-{lam:g}", one, tell, should_stop))
+        host.tell(f"alpha {alpha:g}, lambda {lam:g}: {len(rows) + 1} of {len(GRID)}")
+        rows.append(train_policy(frames, out / f"alpha-{alpha:g}-lambda-{lam:g}", one, host))
     write_text(out / "grid.json", json.dumps(rows, indent=1) + "\n")
     write_text(out / "grid.md", grid_table(rows))
     return rows

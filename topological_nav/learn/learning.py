@@ -32,6 +32,11 @@ class Learner:
     batch_stats: Any
     opt_state: Any
 
+    @property
+    def variables(self) -> dict[str, Any]:
+        """Return what `flax.linen.Module.apply` takes."""
+        return {"params": self.params, "batch_stats": self.batch_stats}
+
 
 Epoch = Callable[[Learner, jax.Array, Any, jax.Array], tuple[Learner, dict[str, jax.Array]]]
 """(learner, images, labels, key) -> learner and means over the epoch; compiled. Labels may be a tree of arrays."""
@@ -91,9 +96,12 @@ def labelled_epoch(
     The last, incomplete batch is left out: order changes every epoch, so every image has its turn.
     """
 
-    def loss_of(params, stats, x, y, key):
-        variables = {"params": params, "batch_stats": stats}
-        logits, new = network.apply(variables, x, train=True, mutable=["batch_stats"], rngs={"dropout": key})
+    def loss_of(params, stats, images, labels, step):
+        rows, key = step
+        key_image, key_drop = jax.random.split(key)
+        x, y, variables = images[rows], labels[rows], {"params": params, "batch_stats": stats}
+        x = augmented(key_image, x, network.task == "passages") if augment else x
+        logits, new = network.apply(variables, x, train=True, mutable=["batch_stats"], rngs={"dropout": key_drop})
         if network.task == "passages":
             loss = optax.sigmoid_binary_cross_entropy(logits, y.astype(jnp.float32)).mean()
             right = (logits[:, scored] > 0) == y[:, scored]
@@ -101,25 +109,9 @@ def labelled_epoch(
             target = optax.smooth_labels(jax.nn.one_hot(y, network.outputs), smoothing)
             loss = optax.softmax_cross_entropy(logits, target).mean()
             right = logits.argmax(1) == y
-        return loss, (new.get("batch_stats", stats), right.mean())
+        return loss, (new.get("batch_stats", stats), {"accuracy": right.mean()})
 
-    def steps(images, key):
-        key_order, key_steps = jax.random.split(key)
-        order = shuffled(key_order, len(images), batch)
-        return order, jax.random.split(key_steps, len(order))
-
-    def update(learner, images, labels, step):
-        rows, key = step
-        key_image, key_drop = jax.random.split(key)
-        x = images[rows]
-        x = augmented(key_image, x, network.task == "passages") if augment else x
-        grad = jax.value_and_grad(loss_of, has_aux=True)
-        (loss, (stats, right)), slope = grad(learner.params, learner.batch_stats, x, labels[rows], key_drop)
-        change, opt_state = tx.update(slope, learner.opt_state, learner.params)
-        new = Learner(optax.apply_updates(learner.params, change), stats, opt_state)
-        return new, {"loss": loss, "accuracy": right}
-
-    return compiled_epoch(steps, update)
+    return descent_epoch(keyed_batches(batch), loss_of, tx)
 
 
 def paired_epoch(module: Contrast, tx: optax.GradientTransformation, batch: int) -> Epoch:
@@ -129,11 +121,14 @@ def paired_epoch(module: Contrast, tx: optax.GradientTransformation, batch: int)
     not looked at.
     """
 
-    def loss_of(params, stats, x):
-        variables = {"params": params, "batch_stats": stats}
-        z, new = module.apply(variables, x, train=True, mutable=["batch_stats"])
+    def loss_of(params, stats, images, labels, step):
+        del labels
+        first, second, key = step
+        flat = images.reshape(-1, *images.shape[2:])
+        x = augmented(key, flat[jnp.concatenate([first, second])], False)
+        z, new = module.apply({"params": params, "batch_stats": stats}, x, train=True, mutable=["batch_stats"])
         a, b = jnp.split(z, 2)
-        return vicreg_loss(a, b), new.get("batch_stats", stats)
+        return vicreg_loss(a, b), (new.get("batch_stats", stats), {})
 
     def steps(images, key):
         places, around = images.shape[:2]
@@ -143,22 +138,46 @@ def paired_epoch(module: Contrast, tx: optax.GradientTransformation, batch: int)
         other = order // around * around + (order % around + turn) % around
         return order, other, jax.random.split(key_steps, len(order))
 
-    def update(learner, images, labels, step):
-        del labels
-        first, second, key = step
-        flat = images.reshape(-1, *images.shape[2:])
-        x = augmented(key, flat[jnp.concatenate([first, second])], False)
-        (loss, stats), slope = jax.value_and_grad(loss_of, has_aux=True)(learner.params, learner.batch_stats, x)
-        change, opt_state = tx.update(slope, learner.opt_state, learner.params)
-        return Learner(optax.apply_updates(learner.params, change), stats, opt_state), {"loss": loss}
-
-    return compiled_epoch(steps, update)
+    return descent_epoch(steps, loss_of, tx)
 
 
 def shuffled(key: jax.Array, count: int, batch: int) -> jax.Array:
     """[U, batch] rows of an epoch's updates: all in random order, but for a last, incomplete batch."""
     size = min(batch, count)
     return jax.random.permutation(key, count)[: count // size * size].reshape(-1, size)
+
+
+def over(epoch: Epoch, images: Any, labels: Any) -> Callable[[Learner, int, jax.Array], Any]:
+    """Return an epoch over these images and labels, from now on kept on the device, as `runs.run_epochs` takes it."""
+    x, y = jnp.asarray(images), jnp.asarray(labels)
+    return lambda learner, _, key: epoch(learner, x, y, key)
+
+
+def keyed_batches(batch: int) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+    """Return the steps of an epoch over images in random order: rows of a batch, and a key."""
+
+    def steps(images, key):
+        key_order, key_steps = jax.random.split(key)
+        order = shuffled(key_order, len(images), batch)
+        return order, jax.random.split(key_steps, len(order))
+
+    return steps
+
+
+def descent_epoch(steps: Callable[..., Any], loss_of: Callable[..., Any], tx: optax.GradientTransformation) -> Epoch:
+    """Build an epoch of gradient descent; see `compiled_epoch`.
+
+    Args:
+        loss_of: params, batch_stats, images, labels and a step to the loss, new batch_stats and other means.
+    """
+
+    def update(learner, images, labels, step):
+        grad = jax.value_and_grad(loss_of, has_aux=True)
+        (loss, (stats, means)), slope = grad(learner.params, learner.batch_stats, images, labels, step)
+        change, opt_state = tx.update(slope, learner.opt_state, learner.params)
+        return Learner(optax.apply_updates(learner.params, change), stats, opt_state), {"loss": loss, **means}
+
+    return compiled_epoch(steps, update)
 
 
 def compiled_epoch(steps: Callable[..., Any], update: Callable[..., Any]) -> Epoch:

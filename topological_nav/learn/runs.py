@@ -22,7 +22,7 @@ from interactive_nav_common.locks import alone_in
 from interactive_nav_common.records import Reader, read_metrics
 from interactive_nav_common.untrusted.reading import Loader, unpack
 from interactive_nav_common.versions import versions
-from topological_nav.errors import Asked, RunError, Stopped
+from topological_nav.errors import Host, RunError, Stopped
 
 CONFIG, METRICS, CHECKPOINT = "config.yaml", "metrics.jsonl", "checkpoint.msgpack"
 WEIGHTS, DESCRIPTION, RESULTS = "weights.msgpack", "network.json", "results.json"
@@ -66,8 +66,7 @@ def run_epochs(
     epoch: Callable[[State, int, jax.Array], tuple[State, dict[str, jax.Array]]],
     epochs: int,
     key: jax.Array,
-    tell: Callable[[str], None],
-    should_stop: Asked,
+    host: Host,
     checkpoint: str = CHECKPOINT,
 ) -> State:
     """Epochs of one phase of a run; those that the checkpoint holds are not run again.
@@ -93,8 +92,8 @@ def run_epochs(
         append_text(out / METRICS, json.dumps({**line, "seconds": round(now - started, 3)}) + "\n")
         left = (now - began) / (number + 1 - first) * (epochs - number - 1)
         scores = "  ".join(f"{k} {line[k]:.3f}" for k in means)
-        tell(f"{phase}: epoch {number + 1} of {epochs}  {scores}  {now - started:.1f} s  {left:.0f} s left")
-        stop = should_stop()
+        host.tell(f"{phase}: epoch {number + 1} of {epochs}  {scores}  {now - started:.1f} s  {left:.0f} s left")
+        stop = host.signal()
         if number + 1 == epochs or stop or now - saved_at > SAVE_EVERY_S:
             state = {"phase": phase, "epoch": number + 1, "learner": flax.serialization.to_state_dict(learner)}
             with whole_file(out / checkpoint) as partial:

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 from sklearn.metrics import confusion_matrix, f1_score
@@ -26,12 +25,13 @@ from interactive_nav_common.errors import readable
 from topological_nav.config import PITCHES, NetworkTrainConfig
 from topological_nav.data.dataset import PassageImages, RoomImages, load_passages, load_rooms, read_header
 from topological_nav.data.passages import logits_at
-from topological_nav.errors import Asked, RunError, go_on
+from topological_nav.errors import ALONE, Host, RunError
 from topological_nav.learn.learning import (
     Learner,
     in_batches,
     labelled_epoch,
     make_learner,
+    over,
     paired_epoch,
     variable_shapes,
     with_backbone,
@@ -121,15 +121,8 @@ class _Work:
     """Which of them is scored, of passages."""
 
 
-def train(
-    task: str,
-    dataset: Path,
-    out: Path,
-    config: NetworkTrainConfig,
-    tell: Callable[[str], None] = lambda _: None,
-    should_stop: Asked = go_on,
-) -> dict[str, Any]:
-    """Trains a network for rooms or passages, or goes on with it; tells a line, and asks whether to stop, each epoch.
+def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host: Host = ALONE) -> dict[str, Any]:
+    """Train a network for rooms or passages, or continue the run at `out`.
 
     Returns:
         The content of results.json.
@@ -142,17 +135,13 @@ def train(
         tx = optax.adam(config.learning_rate)
         learner = make_learner(network, shape, tx, config.seed)
         if config.init == "selfsup":
-            learner = _learned_without_labels(learner, work.places, out, config, tell, should_stop)
+            learner = _learned_without_labels(learner, work.places, out, config, host)
         elif config.init != "scratch":
             learner = _started_from(learner, Path(config.init))
         epoch = labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment, work.scored)
-        shown, truth, key = jnp.asarray(work.images), jnp.asarray(work.labels), _key(config, 2)
-        learner = run_epochs(
-            out, "labels", learner, lambda state, _, key: epoch(state, shown, truth, key), config.epochs, key, tell,
-            should_stop,
-        )  # fmt: skip
-        variables = {"params": learner.params, "batch_stats": learner.batch_stats}
-        trained = save_trained(out, Trained(network, variables, _about(header, work, config, learner)))
+        one = over(epoch, work.images, work.labels)
+        learner = run_epochs(out, "labels", learner, one, config.epochs, _key(config, 2), host)
+        trained = save_trained(out, Trained(network, learner.variables, _about(header, work, config, learner)))
         return write_results(out, _scores(trained, work))
 
 
@@ -161,25 +150,17 @@ def _key(config: NetworkTrainConfig, phase: int) -> jax.Array:
 
 
 def _learned_without_labels(
-    learner: Learner,
-    places: np.ndarray,
-    out: Path,
-    config: NetworkTrainConfig,
-    tell: Callable[[str], None],
-    should_stop: Asked,
+    learner: Learner, places: np.ndarray, out: Path, config: NetworkTrainConfig, host: Host
 ) -> Learner:
-    """The learner with a backbone that learned from pairs of images."""
+    """Return the learner with a backbone that learned from pairs of images."""
     saved = read_checkpoint(out / CHECKPOINT)
     if saved and saved["phase"] != "pairs":
         return learner  # a checkpoint of the later phase holds this one's outcome
     contrast, tx = Contrast(config.network, config.width), optax.adam(config.selfsup_learning_rate)
-    epoch = paired_epoch(contrast, tx, config.selfsup_batch)
-    shown, none = jnp.asarray(places), jnp.zeros(0, jnp.int32)
-    paired = run_epochs(
-        out, "pairs", make_learner(contrast, places.shape[2:4], tx, config.seed),
-        lambda state, _, key: epoch(state, shown, none, key), config.selfsup_epochs, _key(config, 1), tell, should_stop,
-    )  # fmt: skip
-    return with_backbone(learner, {"params": paired.params, "batch_stats": paired.batch_stats})
+    epoch = over(paired_epoch(contrast, tx, config.selfsup_batch), places, np.zeros(0, np.int32))
+    paired = make_learner(contrast, places.shape[2:4], tx, config.seed)
+    paired = run_epochs(out, "pairs", paired, epoch, config.selfsup_epochs, _key(config, 1), host)
+    return with_backbone(learner, paired.variables)
 
 
 def _about(header: dict[str, Any], work: _Work, config: NetworkTrainConfig, learner: Learner) -> dict[str, Any]:

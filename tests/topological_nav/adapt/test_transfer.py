@@ -17,7 +17,7 @@ from topological_nav.__main__ import main
 from topological_nav.adapt import adaptation, transfer
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.data.dataset import load_passages, load_rooms
-from topological_nav.errors import DatasetError, RunError, Stopped
+from topological_nav.errors import DatasetError, Host, RunError, Stopped
 from topological_nav.learn.runs import run_epochs
 from topological_nav.learn.training import load_trained, localisation
 from topological_nav.maps.graph import load_map
@@ -140,7 +140,7 @@ def counting(out, epochs, stop_after=None):
     start = {"n": np.array(1)}
     stop = lambda: 15 * (len(told) == stop_after)  # noqa: E731
     try:
-        learner = run_epochs(out, "count", start, epoch, epochs, jax.random.PRNGKey(0), told.append, stop)
+        learner = run_epochs(out, "count", start, epoch, epochs, jax.random.PRNGKey(0), Host(told.append, stop))
     except Stopped as stopped:
         return f"stopped by signal {stopped.args[0]}", len(told)
     return int(learner["n"]), len(told)
@@ -204,10 +204,10 @@ def test_a_stopped_fine_tuning_goes_on_to_the_same_weights(made, configurations,
     places = made.passages, made.data, out, SHORT
     asked = []
     with pytest.raises(Stopped):
-        transfer.passage_configurations(*places, should_stop=lambda: asked.append(1) is None)
+        transfer.passage_configurations(*places, Host(signal=lambda: asked.append(1) is None))
     seen = iter([0, 0, 15])
     with pytest.raises(Stopped):
-        transfer.passage_configurations(*places, should_stop=lambda: next(seen))
+        transfer.passage_configurations(*places, Host(signal=lambda: next(seen)))
     results = transfer.passage_configurations(*places)
     assert results == configurations[1]
     assert same(weights(out), weights(configurations[0]))
