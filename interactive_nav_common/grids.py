@@ -12,8 +12,10 @@ import numpy as np
 import scipy.sparse
 from scipy import ndimage
 
+MOVES_4 = ((0, 1), (1, 0))
+"""(row, column) moves between cells that share a side; the opposite ones are the same edges."""
 MOVES_16 = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
-"""(row, column) moves of a graph with 16 directions; the opposite ones are the same edges."""
+"""The same with 16 directions."""
 MOVES_32 = (
     *((0, 1), (1, -3), (1, -2), (1, -1), (1, 0), (1, 1), (1, 2), (1, 3)),
     *((2, -3), (2, -1), (2, 1), (2, 3), (3, -2), (3, -1), (3, 1), (3, 2)),

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.ndimage
 from scipy.sparse.csgraph import dijkstra
 
-from interactive_nav_common.grids import MOVES_32, grid_graph, nearest_cell
+from interactive_nav_common.grids import MOVES_32, cell_centres, grid_graph, nearest_cell
 from interactive_nav_common.rotations import wrap_angle
 from topological_nav.config import ExpertConfig
 from topological_nav.scenes.space import FreeSpace
@@ -61,9 +61,8 @@ def way_field(space: FreeSpace, goals_w: np.ndarray, config: ExpertConfig, limit
     rows, columns = free.shape
     goals_w = np.asarray(goals_w, float)
     if not free.any():
-        c, r = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
-        xy = np.asarray(space.origin_w) + np.stack([c, r], -1) * space.resolution_m
-        return np.linalg.norm(xy - goals_w[:, None, None], axis=-1).astype(np.float32)
+        xy = cell_centres(~free, space.resolution_m, space.origin_w)
+        return np.linalg.norm(xy - goals_w[:, None], axis=-1).astype(np.float32).reshape(-1, rows, columns)
     cost = 1.0 + config.near_cost * np.clip(1.0 - room / config.near_m, 0.0, 1.0)
     graph, nearest = grid_graph(free, cost, space.resolution_m, MOVES_32), nearest_cell(free)
     column, row = space.inner_cells(goals_w).T

@@ -3,10 +3,10 @@
 import dataclasses
 
 import numpy as np
-from scipy.ndimage import label as components
 
 from interactive_nav.navigation.ways import PathGrid
 from interactive_nav.scenes.scene import Scene
+from interactive_nav_common.grids import label
 from interactive_nav_common.rows import Rows
 from topological_nav.config import EvaluationConfig
 from topological_nav.errors import SpaceError
@@ -48,7 +48,7 @@ def draw_episodes(digest: str, space: FreeSpace, rooms: Rooms, count: int, confi
 
     Start and goal are uniform over free places, in different rooms, farther apart than `min_goal_m`, joined by a way.
     """
-    parts, _ = components(space.clearance_m >= CONNECTED_M)  # type: ignore[misc]
+    parts, _ = label(space.clearance_m >= CONNECTED_M)
     places = space.centres(config.clearance_m)
     if len(places) < 2:
         raise SpaceError(f"{len(places)} places are {config.clearance_m} m from obstacles; ask for less clearance_m")

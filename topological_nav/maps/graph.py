@@ -21,6 +21,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from interactive_nav_common.files import write_arrays
+from interactive_nav_common.grids import follow
 from interactive_nav_common.untrusted.reading import read_npz
 from topological_nav.errors import MapError
 
@@ -76,10 +77,7 @@ class TopologicalMap:
         cost, before = dijkstra(self._matrix(self.weight), indices=start, return_predecessors=True)
         if not np.isfinite(cost[goal]):
             raise MapError(f"no way from node {start} to {goal} in the map of '{self.scene}'; make it denser")
-        nodes = [goal]
-        while nodes[-1] != start:
-            nodes.append(int(before[nodes[-1]]))
-        return Route(tuple(reversed(nodes)), float(cost[goal]))
+        return Route(tuple(reversed(follow(before, goal, start))), float(cost[goal]))
 
     @functools.cached_property
     def weight(self) -> np.ndarray:

@@ -1,10 +1,10 @@
 """A scene's free space and rooms in, the places of a map's nodes out."""
 
 import numpy as np
-from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.distance import cdist
 
+from interactive_nav_common.grids import MOVES_4, cell_centres, follow, grid_graph
 from topological_nav.config import MapConfig
 from topological_nav.maps.graph import near_pairs, parts_of
 from topological_nav.scenes.rooms import Rooms
@@ -78,28 +78,30 @@ def _covering(places: np.ndarray, radius_m: float, step_m: float) -> np.ndarray:
 
 
 def _joined(space: FreeSpace, xy: np.ndarray, edge_m: float, margin_m: float, points: int) -> tuple[np.ndarray, int]:
-    """Nodes added until free edges join all that a free way joins; and the number of parts left."""
-    cells = space.centres(margin_m)
-    index = {key: i for i, key in enumerate(map(tuple, space.cells(cells)))}
-    room_m = space.at(cells)
-    lattice = _lattice(index, space.resolution_m * (1.0 + TIGHT_COST * np.clip(1.0 - room_m / ROOMY_M, 0.0, 1.0)))
+    """Add nodes until free edges join all that a free way joins; return them all, and the number of parts left."""
+    free = space.free(margin_m)
+    # Cells that share a side: the straight way between their centres is as free as they are.
+    cost = 1.0 + TIGHT_COST * np.clip(1.0 - space.clearance_m / ROOMY_M, 0.0, 1.0)
+    lattice, centres = (
+        grid_graph(free, cost, space.resolution_m, MOVES_4),
+        cell_centres(np.ones_like(free), space.resolution_m, space.origin_w),
+    )
     while True:
         parts = parts_of(free_edges(space, xy, edge_m, margin_m, points), len(xy))
-        at = np.array([index.get(tuple(c), -1) for c in space.cells(xy)])
+        column, row = space.inner_cells(xy).T
+        at = np.where(free[row, column], np.ravel_multi_index((row, column), free.shape), -1)
         for part in parts[1:]:
             mine = np.array(part)
             others = np.setdiff1d(np.arange(len(xy)), mine)
             mine, others = mine[at[mine] >= 0], others[at[others] >= 0]
             if not len(mine) or not len(others):
                 continue
-            far, before, _ = dijkstra(lattice, indices=at[mine], min_only=True, return_predecessors=True)
+            how = {"directed": False, "min_only": True, "return_predecessors": True}
+            far, before, _ = dijkstra(lattice, indices=at[mine], **how)
             end = int(others[far[at[others]].argmin()])
             if not np.isfinite(far[at[end]]):
                 continue
-            way = [int(at[end])]
-            while before[way[-1]] >= 0:
-                way.append(int(before[way[-1]]))
-            added = _stations(space, cells[way], edge_m, margin_m, points)
+            added = _stations(space, centres[follow(before, at[end])], edge_m, margin_m, points)
             if len(added):
                 xy = np.concatenate([xy, added])
                 break
@@ -125,12 +127,3 @@ def _stations(space: FreeSpace, way: np.ndarray, edge_m: float, margin_m: float,
         at = last
         chosen.append(way[at])
     return np.array(chosen[:-1]).reshape(-1, 2)
-
-
-def _lattice(index: dict[tuple[int, int], int], cost: np.ndarray) -> csr_array:
-    """Cells that share a side, so that the straight way between their centres is as free as they are."""
-    pairs = [(i, index.get(side, -1)) for (x, y), i in index.items() for side in ((x + 1, y), (x, y + 1))]
-    first, second = np.array([pair for pair in pairs if pair[1] >= 0], int).reshape(-1, 2).T
-    between = 0.5 * (cost[first] + cost[second])
-    entries = (np.r_[between, between], (np.r_[first, second], np.r_[second, first]))
-    return csr_array(entries, shape=(len(index), len(index)))

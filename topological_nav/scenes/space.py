@@ -27,9 +27,13 @@ class FreeSpace:
     origin_w: tuple[float, float]
     """World x, y of the outer corner of cell [0, 0]."""
 
+    def free(self, least_m: float) -> np.ndarray:
+        """Return which cells have at least this clearance, [rows, columns] bool."""
+        return self.clearance_m >= max(least_m, _FREE_M)
+
     def centres(self, least_m: float) -> np.ndarray:
-        """[n, 2] m, world: centres of the cells with at least this clearance, row by row."""
-        return cell_centres(self.clearance_m >= max(least_m, _FREE_M), self.resolution_m, self.origin_w)
+        """Return the centres of the cells with at least this clearance, row by row: [n, 2] m, world."""
+        return cell_centres(self.free(least_m), self.resolution_m, self.origin_w)
 
     def cells(self, xy_w: np.ndarray) -> np.ndarray:
         """[..., 2] int, column and row of the cells that hold points [..., 2], inside the map or not."""
@@ -75,19 +79,16 @@ class FreeSpace:
 
 
 def free_space(scene: Scene, height_m: float) -> FreeSpace:
-    """The free space of a scene."""
+    """Return the free space of a scene."""
     maps = scene.maps
-    rows, columns = maps.traversable.shape
-    x = maps.origin_w[0] + (np.arange(columns) + 0.5) * maps.resolution_m
-    y = maps.origin_w[1] + (np.arange(rows) + 0.5) * maps.resolution_m
-    grid_x, grid_y = np.meshgrid(x, y)
     free = maps.traversable.copy()
+    x, y = cell_centres(np.ones_like(free), maps.resolution_m, maps.origin_w).T
     for body in scene.movables:
         # A box's lowest point is at least its centre less its half diagonal.
         low = body.pos_w[2] + body.boxes[:, 2] - np.linalg.norm(body.boxes[:, 7:10], axis=1)
         boxes = body.boxes[low < height_m]
         if len(boxes):
-            free &= ~shapely.contains_xy(shadow(boxes, body.pos_w, body.quat_w), grid_x, grid_y)
+            free &= ~shapely.contains_xy(shadow(boxes, body.pos_w, body.quat_w), x, y).reshape(free.shape)
     return FreeSpace(clearance(free, maps.resolution_m), maps.resolution_m, maps.origin_w)
 
 

@@ -122,7 +122,7 @@ def test_a_stopped_adaptation_goes_on_to_the_same_weights(made, alexnet, adapted
     places = alexnet, made.data, made.data, out, SHORT
     told = []
     with pytest.raises(Stopped):
-        adaptation.adapt_features(*places, told.append, lambda: 2)
+        adaptation.adapt_features(*places, Host(told.append, lambda: 2))
     assert len(told) == 1 and "epoch 1 of 2" in told[0] and not (out / "network.json").exists()
     assert adaptation.adapt_features(*places) is not None
     assert same(weights(out), weights(adapted[0]))

@@ -19,7 +19,7 @@ from topological_nav.drives.dataset import drive_images
 from topological_nav.drives.driving import load_policy
 from topological_nav.drives.frames import embed_drives
 from topological_nav.drives.policy import Forward, Policy
-from topological_nav.errors import RunError, Stopped
+from topological_nav.errors import Host, RunError, Stopped
 from topological_nav.learn.learning import Learner
 
 WORDS = (
@@ -38,7 +38,7 @@ def frames(made, driven):
 def run(frames, tmp_path_factory):
     out = tmp_path_factory.mktemp("policy") / "run"
     told = []
-    assert imitation.train_policy(frames, out, CONFIG, told.append) is not None
+    assert imitation.train_policy(frames, out, CONFIG, Host(told.append)) is not None
     assert len(told) == 10
     return out
 
@@ -92,10 +92,10 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(frames, run, tmp_pat
     told = []
     out = tmp_path / "run"
     with pytest.raises(Stopped):
-        imitation.train_policy(frames, out, CONFIG, told.append, lambda: len(told) >= 4)
+        imitation.train_policy(frames, out, CONFIG, Host(told.append, lambda: len(told) >= 4))
     with pytest.raises(RunError, match="holds no trained policy; finish it"):
         load_policy(out)
-    assert imitation.train_policy(frames, out, CONFIG, told.append) is not None
+    assert imitation.train_policy(frames, out, CONFIG, Host(told.append)) is not None
     assert len(told) == 10
     assert (out / "weights.msgpack").read_bytes() == (run / "weights.msgpack").read_bytes()
     lines = [read_metrics(path / "metrics.jsonl") for path in (out, run)]

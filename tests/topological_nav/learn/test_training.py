@@ -11,7 +11,7 @@ from interactive_nav_common.config import overridden
 from interactive_nav_common.records import read_metrics
 from topological_nav.config import NetworkTrainConfig
 from topological_nav.data.dataset import load_passages, load_rooms
-from topological_nav.errors import RunError, Stopped
+from topological_nav.errors import Host, RunError, Stopped
 from topological_nav.learn import training
 from topological_nav.learn.learning import compiled_epoch, in_batches, padded_size
 
@@ -105,11 +105,11 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(made, whole, tmp_pat
     told = []
     for stop_after in (1, 3):
         with pytest.raises(Stopped):
-            training.train("rooms", made.data, out, config, told.append, lambda n=stop_after: len(told) >= n)
+            training.train("rooms", made.data, out, config, Host(told.append, lambda n=stop_after: len(told) >= n))
         assert len(told) == stop_after
     with pytest.raises(RunError, match="holds no trained network; finish it"):
         training.load_trained(out)
-    assert training.train("rooms", made.data, out, config, told.append) is not None
+    assert training.train("rooms", made.data, out, config, Host(told.append)) is not None
     assert len(told) == 4
     assert same(weights(out), weights(whole[0]))
     lines = [read_metrics(run / "metrics.jsonl") for run in (out, whole[0])]
@@ -120,7 +120,7 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(made, whole, tmp_pat
 def test_a_finished_run_is_left_as_it_is(made, whole):
     before = (whole[0] / "weights.msgpack").read_bytes()
     told = []
-    assert training.train("rooms", made.data, whole[0], whole[1], told.append) is not None
+    assert training.train("rooms", made.data, whole[0], whole[1], Host(told.append)) is not None
     assert told == [] and (whole[0] / "weights.msgpack").read_bytes() == before
 
 
