@@ -111,6 +111,17 @@ def read_rows(paths: Sequence[Path], check: Callable[[pa.Table, Path], None] | N
     return rows.take(np.sort(last))
 
 
+def column(first: Any, kind: type = float) -> Any:
+    """Declare a field of a dataclass: an array with a row for each of many, and the value that `fresh` gives it."""
+    return dataclasses.field(metadata={"first": first, "kind": kind})
+
+
+def fresh(record: type, count: int) -> dict[str, np.ndarray]:
+    """Return the first values of a dataclass's columns, of `count` rows."""
+    fields = [field for field in dataclasses.fields(record) if "first" in field.metadata]
+    return {field.name: np.full(count, field.metadata["first"], field.metadata["kind"]) for field in fields}
+
+
 class Rows:
     """A dataclass all of whose fields are arrays of as many rows."""
 

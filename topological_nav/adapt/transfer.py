@@ -27,18 +27,18 @@ from topological_nav.adapt.adaptation import (
     target_rooms,
 )
 from topological_nav.adapt.config import AdaptConfig
-from topological_nav.config import PITCHES, DataConfig
+from topological_nav.config import PITCHES
 from topological_nav.data.dataset import PassageImages, load_passages, read_header
 from topological_nav.data.domains import as_seen, preset
 from topological_nav.data.passages import balanced
 from topological_nav.errors import ALONE, DatasetError, Host, MapError
 from topological_nav.learn.learning import Learner, labelled_epoch, make_learner, over
-from topological_nav.learn.localise import in_words, localisation_scores, nearest_turn
-from topological_nav.learn.pairs import need_task
+from topological_nav.learn.localise import in_words, localisation_scores
+from topological_nav.learn.pairs import Networks, need_task
 from topological_nav.learn.runs import claimed, run_epochs, write_results
 from topological_nav.learn.training import Trained, class_scores, length_scores, load_trained, save_trained
-from topological_nav.maps.build import Built, edge_scores
-from topological_nav.maps.graph import assemble, lengths, near_pairs
+from topological_nav.maps.build import judged_map
+from topological_nav.maps.graph import near_pairs
 from topological_nav.scenes.space import free_space
 
 CONFIGURATIONS = {"A": (False, False), "B": (False, True), "C": (True, False), "D": (True, True)}
@@ -96,37 +96,17 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
     level = rooms.images[:, PITCHES.index("level")]
     shown, xy, label = level[nodes], rooms.xy_w[nodes], rooms.label[nodes]
     room = label - rooms.label[mine].min()
-
-    def probability(edges: np.ndarray, angle: np.ndarray) -> np.ndarray:
-        if not len(edges):
-            return np.zeros(0)
-        turn = nearest_turn(angle, data.headings)
-        return detector.passage(shown[edges[:, 0], turn], lengths(xy, edges))
-
     if not len(near_pairs(xy, config.edge_m)):
         raise MapError(f"no two positions of '{scene.name}' in {target} are within {config.edge_m} m; collect more")
-    embedded = localiser.embed(shown)
-    judged = DataConfig(**{k: detector.about["data"][k] for k in ("passage_margin_m", "passage_points")})
-    about = {
-        "settings": to_dict(config),
-        "data": header["settings"],
-        "localiser": localiser.about["digest"],
-        "detector": detector.about["digest"],
-        "margin_m": judged.passage_margin_m,
-        "points": judged.passage_points,
-        "domain": to_dict(preset(config.domain)),
-    }
-    made = assemble(scene.name, scene.digest, xy, room, embedded, config.edge_m, probability, about)
-    space = free_space(scene, get_robot(data.robot).height_m)
-    free = space.segment_free(
-        xy[made.edges[:, 0]], xy[made.edges[:, 1]], judged.passage_points, judged.passage_margin_m
-    )
-    scores = edge_scores(made, free, config.passable)
+    about = {"settings": to_dict(config), "data": header["settings"], "domain": to_dict(preset(config.domain))}
+    space, networks = free_space(scene, get_robot(data.robot).height_m), Networks(localiser, detector, data)
+    built = judged_map(scene, space, xy, room, shown, networks, config.edge_m, config.passable, about)
+    made = built.map
     if held.any():
         asked = localiser.embed(level[held][:, ::3])
         found = localisation_scores(asked, rooms.xy_w[held], rooms.label[held], made.embeddings, made.xy_w, label)
-        scores["held-out images localised"] = in_words(found)
-    return Built(made, space, free, scores)
+        built.scores["held-out images localised"] = in_words(found)
+    return built
 
 
 def _index_of(scene: Scene, header: dict[str, Any], target: Path) -> int:

@@ -11,7 +11,6 @@ import functools
 import json
 import math
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +73,20 @@ def train_policy(frames: Frames, out: Path, config: PolicyConfig, host: Host = A
 
         key = jax.random.PRNGKey(config.seed)
         learner = run_epochs(out, "policy", learner, one, config.epochs, key, host)
-        return _finish(frames, out, config, values, learner, policy, forward, split)
+        about = _about(frames, out, config, values, learner)
+        write_network(out, {"params": learner.params["policy"], "scale": learner.batch_stats}, about)
+        results: dict[str, Any] = {
+            "task": "policy",
+            "alpha": config.alpha,
+            "lambda": config.lam,
+            "parameters": about["parameters"],
+            "sequences": len(split.learned),
+            "nearly_straight": float((turning_share(split.every, config) < config.straight_share).mean()),
+            "classes": {"linear": about["linear_m_s"], "angular": about["angular_rad_s"]},
+        }
+        if len(split.held_out):
+            results["test"] = _scores(frames.features, learner, policy, forward, split.held_out, config)
+        return write_results(out, results)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,19 +178,11 @@ def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: 
     return descent_epoch(steps, loss_of, optax.adam(learning_rate))
 
 
-def _finish(
-    frames: Frames,
-    out: Path,
-    config: PolicyConfig,
-    values: tuple[np.ndarray, np.ndarray],
-    learner: Learner,
-    policy: Policy,
-    forward: Forward,
-    split: _Split,
+def _about(
+    frames: Frames, out: Path, config: PolicyConfig, values: tuple[np.ndarray, np.ndarray], learner: Learner
 ) -> dict[str, Any]:
-    """Writes weights, description and scores."""
-    kept = {"params": learner.params["policy"], "scale": learner.batch_stats}
-    about = {
+    """Return the content of network.json, but for the digest."""
+    return {
         "task": "policy",
         "hidden": config.hidden,
         "projection": config.projection,
@@ -191,51 +195,27 @@ def _finish(
         ],
         "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params["policy"]))),
     }
-    write_network(out, kept, about)
-    results: dict[str, Any] = {
-        "task": "policy",
-        "alpha": config.alpha,
-        "lambda": config.lam,
-        "parameters": about["parameters"],
-        "sequences": len(split.learned),
-        "nearly_straight": float((turning_share(split.every, config) < config.straight_share).mean()),
-        "classes": {"linear": about["linear_m_s"], "angular": about["angular_rad_s"]},
-    }
-    if len(split.held_out):
-        results["test"] = _scores(frames.features, learner, policy, forward, split.held_out, config)
-    return write_results(out, results)
 
 
-@functools.cache
-def _judge(policy: Policy, forward: Forward) -> Callable[..., tuple[jax.Array, ...]]:
-    """Compiled: the policy's classes, and squared errors of the forward model and of no change."""
-
-    @jax.jit
-    def judged(params, scale, u, linear, angular):
-        logits, next_after = _applied(policy, forward, params, scale, u)
-        guesses = next_after(_one_hot(policy, linear, angular)), u[:, :-1]
-        errors = [jnp.square(u[:, 1:] - guess).sum(-1) for guess in guesses]
-        return *(value.argmax(-1) for value in logits), *errors
-
-    return judged
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _judged(policy: Policy, forward: Forward, params: Any, scale: Any, u: jax.Array, linear: Any, angular: Any):
+    """Return the policy's classes, and squared errors of the forward model and of no change."""
+    logits, next_after = _applied(policy, forward, params, scale, u)
+    guesses = next_after(_one_hot(policy, linear, angular)), u[:, :-1]
+    errors = [jnp.square(u[:, 1:] - guess).sum(-1) for guess in guesses]
+    return *(value.argmax(-1) for value in logits), *errors
 
 
 def _scores(
-    features: np.ndarray,
-    learner: Learner,
-    policy: Policy,
-    forward: Forward,
-    held_out: Sequences,
-    config: PolicyConfig,
+    features: np.ndarray, learner: Learner, policy: Policy, forward: Forward, held_out: Sequences, config: PolicyConfig
 ) -> dict[str, Any]:
     """How the policy's commands on held-out drives compare with the expert's, and the forward model with no change."""
-    judged = _judge(policy, forward)  # type: ignore[arg-type]  (flax modules are hashable)
     columns = []
     for first in range(0, len(held_out), config.batch):
         rows = np.minimum(np.arange(first, first + config.batch), len(held_out) - 1)
         part = held_out.take(rows)
         u = jnp.asarray(features[part.rows], jnp.float32)
-        told = judged(learner.params, learner.batch_stats, u, part.linear, part.angular)
+        told = _judged(policy, forward, learner.params, learner.batch_stats, u, part.linear, part.angular)
         columns.append([np.asarray(c)[: len(held_out) - first] for c in told])
     linear, angular, predicted, still = (np.concatenate(c) for c in zip(*columns, strict=True))
     out: dict[str, Any] = {"steps": int(held_out.valid.sum())}

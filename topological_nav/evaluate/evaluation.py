@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from interactive_nav.metrics import path_efficiency
+from interactive_nav_common.rows import column, fresh
 from topological_nav.config import EvaluationConfig
 from topological_nav.evaluate.contenders import Contender
 from topological_nav.evaluate.episodes import DrivenEpisodes
@@ -25,33 +26,33 @@ SHRINK = 4
 """On the CPU, once only one episode in so many still runs, those go on in a batch of their own."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Played:
     """What came of n episodes."""
 
-    success: np.ndarray
+    success: np.ndarray = column(False, bool)
     """[n] bool."""
-    arrived: np.ndarray
+    arrived: np.ndarray = column(False, bool)
     """[n] bool: ended because the navigator found itself at the goal's node."""
-    goal_m: np.ndarray
+    goal_m: np.ndarray = column(0.0)
     """[n] distance to the goal at the end."""
-    path_m: np.ndarray
+    path_m: np.ndarray = column(0.0)
     """[n]."""
-    duration_s: np.ndarray
+    duration_s: np.ndarray = column(0.0)
     """[n]."""
-    runs: np.ndarray
+    runs: np.ndarray = column(0, int)
     """[n] i32 runs driven."""
-    contact_runs: np.ndarray
+    contact_runs: np.ndarray = column(0, int)
     """[n] i32 of them with a contact."""
-    contact_s: np.ndarray
+    contact_s: np.ndarray = column(0.0)
     """[n] seconds of control steps with a contact, turning included."""
-    wall_s: np.ndarray
+    wall_s: np.ndarray = column(0.0)
     """[n] of them with a wall."""
-    localisations: np.ndarray
-    blocked: np.ndarray
-    lost: np.ndarray
+    localisations: np.ndarray = column(0, int)
+    blocked: np.ndarray = column(0, int)
+    lost: np.ndarray = column(0, int)
     """[n] i32 such events of the navigator; 0 for others."""
-    broken: np.ndarray
+    broken: np.ndarray = column(False, bool)
     """[n] bool: the physics gave up, which ends an episode as failed."""
     track_w: list[np.ndarray]
     """n paths [t, 2], m, a point every `TRACK_S`."""
@@ -96,10 +97,7 @@ class _Tally:
     def __init__(self, episodes: DrivenEpisodes, config: EvaluationConfig, dt_s: float):
         n = len(episodes)
         self._episodes, self._config, self._dt_s = episodes, config, dt_s
-        kinds = dict.fromkeys(("success", "arrived", "broken"), bool)
-        kinds |= dict.fromkeys(("goal_m", "path_m", "duration_s", "contact_s", "wall_s"), float)
-        kinds |= dict.fromkeys(("runs", "contact_runs", "localisations", "blocked", "lost"), int)
-        self._numbers = {name: np.zeros(n, kind) for name, kind in kinds.items()}
+        self._numbers = fresh(Played, n)
         self._tracks: list[list[np.ndarray]] = [[] for _ in range(n)]
         self._at = np.arange(n)
         """Episode of each row of the batch."""

@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,9 @@ from topological_nav.data.dataset import headings
 from topological_nav.data.folders import lens_of
 from topological_nav.errors import Progress, SpaceError
 from topological_nav.learn.localise import nearest_turn
-from topological_nav.learn.pairs import load_networks
+from topological_nav.learn.pairs import Networks, load_networks
+from topological_nav.learn.runs import DESCRIPTION
+from topological_nav.learn.training import Trained
 from topological_nav.maps.graph import TopologicalMap, assemble, lengths
 from topological_nav.maps.nodes import place_nodes
 from topological_nav.maps.sight import NetworkSight, Sight
@@ -67,42 +69,72 @@ def build_map(
         parts: folder that drawn images are kept in, so that a map that was stopped goes on; None: they are not.
     """
     networks = load_networks(localiser_run, detector_run)
-    localiser, detector = networks.localiser, networks.detector
+    localiser = networks.localiser
     data = drawn_for(networks.camera, config.supersample)
     scene, robot = load_scene(scene_folder), get_robot(data.robot)
     space = free_space(scene, robot.height_m)
     rooms = scene_rooms(scene, space, data)
-    judged = overlay(DataConfig(), detector.about["data"], str(detector_run))
-    margin_m, points = judged.passage_margin_m, judged.passage_points
-    xy, lacking = place_nodes(space, rooms, config, margin_m, points)
+    xy, lacking = place_nodes(space, rooms, config, *judged_by(networks.detector))
     if not len(xy):
         raise SpaceError(f"{scene.path}: no place is {config.clearance_m} m from obstacles; lower clearance_m")
     around = headings(data)
     pictures = Pictures(scene, data, robot, progress, parts)
     images = pictures.draw_around(xy, around, "nodes")
-    embeddings = localiser.embed(images)
 
-    def probability(edges: np.ndarray, angle: np.ndarray) -> np.ndarray:
-        if config.edge_image == "nearest":
-            looked = images[edges[:, 0], nearest_turn(angle, len(around))]
-        else:
-            pictures.total += len(edges)
-            looked = pictures.draw(xy[edges[:, 0]], angle, "edges")
-        return detector.passage(looked, lengths(xy, edges))
+    def along(edges: np.ndarray, angle: np.ndarray) -> np.ndarray:
+        pictures.total += len(edges)
+        return pictures.draw(xy[edges[:, 0]], angle, "edges")
 
-    judging = {**networks.digests, "margin_m": margin_m, "points": points}
-    about = {"settings": to_dict(config), "data": to_dict(data), **judging}
-    made = assemble(scene.name, scene.digest, xy, rooms.of(xy), embeddings, config.edge_m, probability, about)
-    free = space.segment_free(xy[made.edges[:, 0]], xy[made.edges[:, 1]], points, margin_m)
-    scores = {"nodes a room": " ".join(map(str, np.bincount(made.room))), **edge_scores(made, free, config.passable)}
+    about = {"settings": to_dict(config), "data": to_dict(data)}
+    look = along if config.edge_image == "exact" else None
+    built = judged_map(scene, space, xy, rooms.of(xy), images, networks, config.edge_m, config.passable, about, look)
+    made = built.map
+    scores = {"nodes a room": " ".join(map(str, np.bincount(made.room))), **built.scores}
     scores |= {"lacking": "; ".join(lacking)} if lacking else {}
     if config.check:
         places = space.sample(np.random.default_rng([data.seed, 13]), config.check, config.clearance_m)
         looked = pictures.draw_around(places, around, "check")
         for match in ("aligned", "nearest"):
-            sight = NetworkSight(made, localiser, detector, match)
+            sight = NetworkSight(made, localiser, networks.detector, match)
             scores |= localisation_check(sight, made, looked, around, places)
-    return Built(made, space, free, scores)
+    return dataclasses.replace(built, scores=scores)
+
+
+def judged_by(detector: Trained) -> tuple[float, int]:
+    """Return the margin (m) and the number of points of the labels that a passage detector learned from."""
+    config = overlay(DataConfig(), detector.about["data"], DESCRIPTION)
+    return config.passage_margin_m, config.passage_points
+
+
+def judged_map(
+    scene: Scene,
+    space: FreeSpace,
+    xy_w: np.ndarray,
+    room: np.ndarray,
+    images: np.ndarray,
+    networks: Networks,
+    edge_m: float,
+    passable: float,
+    about: dict[str, Any],
+    look: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+) -> Built:
+    """Build the map of given nodes, and compare its edges with the plan.
+
+    Args:
+        images: [N, K, H, W, 3] u8 around each node.
+        look: edges [E, 2] and headings [E] to the images that edges are judged by; None: the node's nearest.
+    """
+    margin_m, points = judged_by(networks.detector)
+
+    def probability(edges: np.ndarray, angle: np.ndarray) -> np.ndarray:
+        ahead = look(edges, angle) if look else images[edges[:, 0], nearest_turn(angle, images.shape[1])]
+        return networks.detector.passage(ahead, lengths(xy_w, edges))
+
+    about = {**about, **networks.digests, "margin_m": margin_m, "points": points}
+    embeddings = networks.localiser.embed(images)
+    made = assemble(scene.name, scene.digest, xy_w, room, embeddings, edge_m, probability, about)
+    free = space.segment_free(xy_w[made.edges[:, 0]], xy_w[made.edges[:, 1]], points, margin_m)
+    return Built(made, space, free, edge_scores(made, free, passable))
 
 
 def localisation_check(

@@ -22,6 +22,7 @@ import numpy as np
 
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import wrap_angle
+from interactive_nav_common.rows import fresh
 from topological_nav.config import NavigatorConfig
 from topological_nav.drives.driving import LocalPolicy
 from topological_nav.learn.learning import padded_size
@@ -87,34 +88,12 @@ class Navigator:
         Args:
             goal: [B] nodes, of `goal_nodes`.
         """
-        batch, zero = len(goal), np.zeros(len(goal))
-        count = np.zeros(batch, np.int32)
+        batch = len(goal)
         return State(
-            phase=np.full(batch, LOCALISE, np.int8),
+            **fresh(State, batch),
             goal=np.asarray(goal, np.int32),
-            node=count - 1,
-            edge=count - 1,
-            began_s=zero + np.nan,
-            looks=count,
             evidence=self._no_evidence(batch),
-            base_rad=zero,
-            target_rad=zero + np.nan,
-            swing=count,
-            best_p=zero - 1.0,
-            best_rad=zero,
             penalty=np.zeros((batch, len(self.map.edges))),
-            driven=count - 1,
-            lost=count,
-            integral=zero,
-            error_rad=zero + np.nan,
-            clock_s=zero + np.nan,
-            run=count,
-            run_end_s=zero,
-            watch_s=zero,
-            least=zero + np.inf,
-            acts=count,
-            linear=zero,
-            angular=zero,
             hidden=jax.tree.map(np.asarray, self.policy.start(batch)),
         )
 
@@ -152,8 +131,8 @@ class Navigator:
         heading = np.asarray(heading_rad, float)
         time = np.broadcast_to(np.asarray(time_s, float), (batch,))
         s = Work(state, batch)
-        fresh = np.isnan(s.began_s)
-        s.began_s[fresh] = time[fresh]
+        unset = np.isnan(s.began_s)
+        s.began_s[unset] = time[unset]
         late = ~state.over & (time - s.began_s >= self.config.limit_s - SLACK_S)
         s.phase[late], s.timed_out[late] = TIMED_OUT, True
 
@@ -167,8 +146,8 @@ class Navigator:
         still = s.phase >= ARRIVED
         s.linear[still] = s.angular[still] = 0.0
         s.clock_s[:] = time
-        new = s.state()
-        return new, new.linear.copy(), new.angular.copy(), s.events()
+        new, events = s.end()
+        return new, new.linear.copy(), new.angular.copy(), events
 
     def _first_heading(self, heading: np.ndarray) -> np.ndarray:
         """The nearest heading along which nodes have images."""
@@ -226,8 +205,8 @@ class Navigator:
             if edge >= 0:
                 s.base_rad[i] = self.map.angle_rad[edge]
             else:
-                s.lost[i] += 1
-                s.lost_now[i] = True
+                s.times_lost[i] += 1
+                s.lost[i] = True
                 s.base_rad[i] = wrap_angle(heading[i] + GOLDEN_RAD)
         s.phase[rows] = FACE
         s.target_rad[rows] = s.base_rad[rows]

@@ -3,67 +3,70 @@
 from __future__ import annotations
 
 import dataclasses
+import types
 from typing import Any
 
 import jax
 import numpy as np
+
+from interactive_nav_common.rows import column
 
 LOCALISE, FACE, SWING, LEAN, DRIVE, ARRIVED, STOPPED, TIMED_OUT = range(8)
 PHASES = ("localise", "face", "swing", "lean", "drive", "arrived", "stopped", "timed out")
 TURNING, OVER = (LOCALISE, FACE, SWING, LEAN), (ARRIVED, STOPPED, TIMED_OUT)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class State:
     """What a batch of B navigators remembers; N nodes, E edges. Every leaf has B rows."""
 
-    phase: np.ndarray
+    phase: np.ndarray = column(LOCALISE, np.int8)
     """i8, one of `PHASES`."""
     goal: np.ndarray
     """i32 node."""
-    node: np.ndarray
+    node: np.ndarray = column(-1, np.int32)
     """i32 node of the last localisation, -1 before the first."""
-    edge: np.ndarray
+    edge: np.ndarray = column(-1, np.int32)
     """i32 edge that is followed; -1 where the map has no way, or none is planned yet."""
-    began_s: np.ndarray
+    began_s: np.ndarray = column(np.nan)
     """When the episode began; NaN before its first step."""
-    looks: np.ndarray
+    looks: np.ndarray = column(0, np.int32)
     """i32 images taken in this localisation."""
     evidence: np.ndarray
     """[B, N] what they say: sums, or least, of distances."""
-    base_rad: np.ndarray
+    base_rad: np.ndarray = column(0.0)
     """The edge's angle; in a localisation, the first heading."""
-    target_rad: np.ndarray
+    target_rad: np.ndarray = column(np.nan)
     """Heading to reach."""
-    swing: np.ndarray
+    swing: np.ndarray = column(0, np.int32)
     """i32 headings asked since the edge was planned."""
-    best_p: np.ndarray
-    best_rad: np.ndarray
+    best_p: np.ndarray = column(-1.0)
+    best_rad: np.ndarray = column(0.0)
     """The most open of them, for `NavigatorConfig.clear_m`."""
     penalty: np.ndarray
     """[B, E] added to the edges' weights."""
-    driven: np.ndarray
+    driven: np.ndarray = column(-1, np.int32)
     """i32 edge that was driven since the robot was last found, -1: none."""
-    lost: np.ndarray
+    times_lost: np.ndarray = column(0, np.int32)
     """i32 times that the map had no way."""
-    integral: np.ndarray
+    integral: np.ndarray = column(0.0)
     """PID: integral term, rad/s."""
-    error_rad: np.ndarray
+    error_rad: np.ndarray = column(np.nan)
     """PID: error of the step before; NaN where it starts."""
-    clock_s: np.ndarray
+    clock_s: np.ndarray = column(np.nan)
     """Time of the step before."""
-    run: np.ndarray
+    run: np.ndarray = column(0, np.int32)
     """i32 runs done since the robot last looked about."""
-    run_end_s: np.ndarray
-    watch_s: np.ndarray
+    run_end_s: np.ndarray = column(0.0)
+    watch_s: np.ndarray = column(0.0)
     """Next time to look, within a run, whether the edge's head is passed."""
-    least: np.ndarray
+    least: np.ndarray = column(np.inf)
     """Least distance to the head in this run, as `Sight.distances` tells it."""
-    acts: np.ndarray
+    acts: np.ndarray = column(0, np.int32)
     """i32 control steps of this run."""
-    linear: np.ndarray
+    linear: np.ndarray = column(0.0)
     """m/s, the last command."""
-    angular: np.ndarray
+    angular: np.ndarray = column(0.0)
     """rad/s."""
     hidden: Any
     """The local policy's."""
@@ -99,25 +102,20 @@ class Events:
     timed_out: np.ndarray
 
 
-class Work:
+class Work(types.SimpleNamespace):
     """A copy of a state that a step writes into, and its events."""
 
     def __init__(self, state: State, batch: int):
-        """Copies the state of a batch."""
-        self._names = [f.name for f in dataclasses.fields(State)]
-        for name in self._names:
-            value = getattr(state, name)
-            setattr(self, name, value if name == "hidden" else value.copy())
-        self._events = {"lost": "lost_now"}
-        for field in dataclasses.fields(Events):
-            setattr(self, self._events.get(field.name, field.name), np.zeros(batch, bool))
+        """Copy the state of a batch."""
+        copied = {name: value if name == "hidden" else value.copy() for name, value in vars(state).items()}
+        super().__init__(**copied, **{field.name: np.zeros(batch, bool) for field in dataclasses.fields(Events)})
 
     def restart_pid(self, rows: np.ndarray) -> None:
-        """A new target: errors of before say nothing."""
+        """Start turning to a new target: errors of before say nothing."""
         self.integral[rows], self.error_rad[rows] = 0.0, np.nan
 
     def put_hidden(self, rows: np.ndarray, new: Any) -> None:
-        """Rows of the local policy's state."""
+        """Set rows of the local policy's state."""
 
         def put(old: Any, value: Any) -> np.ndarray:
             out = np.array(old)
@@ -126,11 +124,7 @@ class Work:
 
         self.hidden = jax.tree.map(put, self.hidden, new)
 
-    def state(self) -> State:
-        """What it has become."""
-        return State(**{name: getattr(self, name) for name in self._names})
-
-    def events(self) -> Events:
-        """What happened."""
-        names = [f.name for f in dataclasses.fields(Events)]
-        return Events(**{name: getattr(self, self._events.get(name, name)) for name in names})
+    def end(self) -> tuple[State, Events]:
+        """Return what it has become, and what happened."""
+        state, events = ({f.name: getattr(self, f.name) for f in dataclasses.fields(kind)} for kind in (State, Events))
+        return State(**state), Events(**events)

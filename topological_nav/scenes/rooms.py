@@ -1,10 +1,12 @@
 """Free positions in, rooms by three kinds of clustering out.
 
-Positions are clustered by their coordinates alone. Where a scene's plan is recorded (`plans.py`: the generated
-scenes), the rooms found are compared with it by the adjusted Rand index.
+Positions are clustered by their coordinates alone. Where a scene's plan is recorded (plans.json: the generated scenes,
+drawn by `converters.generate.design_building`), rooms are compared with it by the adjusted Rand index.
 """
 
 import dataclasses
+import json
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -17,7 +19,6 @@ from interactive_nav.scenes.scene import Scene
 from interactive_nav_common.errors import ConfigError
 from topological_nav.config import DataConfig
 from topological_nav.errors import SpaceError
-from topological_nav.scenes.plans import RECORDED
 from topological_nav.scenes.space import FreeSpace
 
 METHODS = ("kmeans", "gmm", "spectral")
@@ -25,6 +26,11 @@ MAX_ROOMS = 15
 """Most rooms that a choice by BIC or silhouette considers."""
 CLUSTERED = 1000
 """Free positions that are clustered: enough that a doorway holds several."""
+_PLANS = json.loads(Path(__file__).with_name("plans.json").read_text(encoding="utf-8"))
+RECORDED: dict[str, tuple[tuple[float, ...], ...]] = {
+    plan["digest"]: tuple(map(tuple, plan["rooms"])) for plan in _PLANS.values()
+}
+"""Digest of a scene -> x0, y0, x1, y1 (m, world) of the clear inside of each room that its building was drawn with."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,8 +29,7 @@ from topological_nav.evaluate.episodes import DrivenEpisodes, count_of, draw_epi
 from topological_nav.evaluate.evaluation import play
 from topological_nav.evaluate.rows import _stem, play_contest
 from topological_nav.navigate.state import Events
-from topological_nav.scenes.plans import RECORDED
-from topological_nav.scenes.rooms import find_rooms
+from topological_nav.scenes.rooms import RECORDED, find_rooms
 from topological_nav.scenes.simulation import Seen, Simulator
 from topological_nav.weights import packaged
 from train.config import EnvConfig, TrainConfig

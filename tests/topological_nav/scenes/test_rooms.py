@@ -11,7 +11,7 @@ from converters.recipes import load_recipes
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.errors import UserError
 from topological_nav.scenes import rooms
-from topological_nav.scenes.plans import RECORDED
+from topological_nav.scenes.rooms import RECORDED
 from topological_nav.scenes.space import free_space
 
 SCENE = Path(__file__).parents[3] / "scenes_mjcf" / "apartment_0"
