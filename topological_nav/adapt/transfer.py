@@ -33,7 +33,7 @@ from topological_nav.data.domains import as_seen, preset
 from topological_nav.data.passages import balanced
 from topological_nav.errors import ALONE, DatasetError, Host, MapError
 from topological_nav.learn.learning import Learner, labelled_epoch, make_learner, over
-from topological_nav.learn.localise import in_words, localisation_scores
+from topological_nav.learn.localise import Places, in_words, localisation_scores
 from topological_nav.learn.pairs import Networks, need_task
 from topological_nav.learn.runs import claimed, run_epochs, write_results
 from topological_nav.learn.training import Trained, class_scores, length_scores, load_trained, save_trained
@@ -67,7 +67,7 @@ def passage_configurations(
         results: dict[str, Any] = {"fine_tuned_on": len(learned.images), "tested_on": len(tested.images)}
         for name, (from_source, tunes) in CONFIGURATIONS.items():
             # A copy: an epoch gives its argument's memory away.
-            learner = jax.tree.map(jnp.array, _of(trained, tx) if from_source else fresh)
+            learner = jax.tree.map(jnp.array, Learner.start(trained.variables, tx) if from_source else fresh)
             if tunes:
                 kept = f"checkpoint-{name}.msgpack"
                 learner = run_epochs(out, name, learner, one, config.fine_tune_epochs, keys, host, kept)
@@ -101,11 +101,10 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
     about = {"settings": to_dict(config), "data": header["settings"], "domain": to_dict(preset(config.domain))}
     space, networks = free_space(scene, get_robot(data.robot).height_m), Networks(localiser, detector, data)
     built = judged_map(scene, space, xy, room, shown, networks, config.edge_m, config.passable, about)
-    made = built.map
     if held.any():
-        asked = localiser.embed(level[held][:, ::3])
-        found = localisation_scores(asked, rooms.xy_w[held], rooms.label[held], made.embeddings, made.xy_w, label)
-        built.scores["held-out images localised"] = in_words(found)
+        queries = Places(localiser.embed(level[held][:, ::3]), rooms.xy_w[held], rooms.label[held])
+        nodes = Places(built.map.embeddings, built.map.xy_w, label)
+        built.scores["held-out images localised"] = in_words(localisation_scores(queries, nodes))
     return built
 
 
@@ -140,11 +139,6 @@ def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> 
         chosen = {name: getattr(passages, name)[rows] for name in ("free", "scene", "test")}
         parts.append(dataclasses.replace(passages, images=images[rows], **chosen))
     return parts[0], parts[1]
-
-
-def _of(trained: Trained, tx: optax.GradientTransformation) -> Learner:
-    params = trained.variables["params"]
-    return Learner(params, trained.variables["batch_stats"], tx.init(params))
 
 
 def _scores(trained: Trained, tested: PassageImages) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from topological_nav.config import (
     DATASET,
     DRIVES,
     RUNS,
+    CameraConfig,
     DataConfig,
     DriveConfig,
     PolicyConfig,
@@ -47,8 +48,11 @@ def data(arguments: argparse.Namespace) -> None:
             f"{s['name']}: {s['rooms']} rooms ({s['rooms_chosen_by']}{rand}), {s['positions']} positions "
             f"({s['test_positions']} for testing), {s['passages']} passages ({s['test_passages']})"
         )
-    size = folder_bytes(out)
-    print(f"{out}: {images:,} images of {config.width} x {config.height}, {size / 2**20:.1f} MiB")
+    print(_size_line(out, images, config))
+
+
+def _size_line(out: Path, images: int, config: CameraConfig) -> str:
+    return f"{out}: {images:,} images of {config.width} x {config.height}, {folder_bytes(out) / 2**20:.1f} MiB"
 
 
 def _drives(arguments: argparse.Namespace) -> None:
@@ -66,9 +70,7 @@ def _drives(arguments: argparse.Namespace) -> None:
         f"({row['contact_s']:.2f} s a drive), kept {int(drives.kept.sum()):,}; {row['seconds']:.1f} s long, "
         f"{row['m_s']:.2f} m/s, turning in {row['turning']:.2f} of the steps"
     )
-    images = int(drives.steps[drives.kept].sum())
-    size = folder_bytes(out)
-    print(f"{out}: {images:,} images of {config.width} x {config.height}, {size / 2**20:.1f} MiB")
+    print(_size_line(out, int(drives.steps[drives.kept].sum()), config))
 
 
 def train(arguments: argparse.Namespace) -> None:
@@ -111,14 +113,12 @@ def _policy(arguments: argparse.Namespace) -> None:
         print(grid_table(results), end="")
         return
     save(policy_figure(read_metrics(out / "metrics.jsonl"), results), out / "curves.png")
-    for name in ("linear", "angular") if "test" in results else ():
-        row = results["test"][name]
-        print(
-            f"{name:<8} {results['test']['steps']:,} held-out steps  accuracy {row['accuracy']:.3f} "
-            f"(the commonest class {row['commonest']:.3f})  macro F1 {row['macro_f1']:.3f}"
-        )
-    if "test" in results:
-        test = results["test"]
+    if test := results.get("test"):
+        for name in ("linear", "angular"):
+            print(
+                f"{name:<8} {test['steps']:,} held-out steps  accuracy {test[name]['accuracy']:.3f} "
+                f"(the commonest class {test[name]['commonest']:.3f})  macro F1 {test[name]['macro_f1']:.3f}"
+            )
         print(f"forward model: error {test['forward']:.4f}, of no change {test['no_change']:.4f}")
     print(
         f"{out}: {results['sequences']:,} sequences ({results['nearly_straight']:.2f} of all are nearly straight), "

@@ -24,7 +24,7 @@ from interactive_nav_common.files import write_arrays
 from topological_nav.config import DataConfig
 from topological_nav.data.folders import Folder, draw_missing, load_scenes
 from topological_nav.data.passages import Passages, draw_passages, held_out
-from topological_nav.data.shards import read_arrays, read_shards
+from topological_nav.data.shards import numbered, read_arrays, read_shards
 from topological_nav.errors import DatasetError, Progress, SpaceError
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.rooms import Rooms, agreement, recorded_rooms, scene_rooms
@@ -155,8 +155,7 @@ def _shards(folder: Path, plan: ScenePlan, robot: RobotSpec, config: DataConfig)
         "passages": [camera_pose(robot, passages.xy_w[r], passages.heading_rad[r], level[: len(r)]) for r in rows],
     }
     for kind, poses in sheets.items():
-        for i, first in enumerate(range(0, len(poses), config.shard)):
-            yield folder / f"{kind}-{i:03d}.npz", poses[first : first + config.shard]
+        yield from numbered(folder, kind, poses, config.shard)
 
 
 def load_rooms(folder: Path) -> RoomImages:
@@ -226,9 +225,8 @@ def _about(scene: Scene, plan: ScenePlan) -> dict[str, Any]:
 
 
 def _read_all(folder: Path, kind: str, count: int, config: DataConfig) -> np.ndarray:
-    sheets = math.ceil(count / (3 * config.headings))
-    files = [folder / f"{kind}-{i:03d}.npz" for i in range(math.ceil(sheets / config.shard))]
-    images = list(read_shards(files))
+    sheets = range(math.ceil(count / (3 * config.headings)))
+    images = list(read_shards([path for path, _ in numbered(folder, kind, sheets, config.shard)]))
     shape = (config.height, config.width, 3)
     joined = np.concatenate(images) if images else np.zeros((0, *shape), np.uint8)
     if joined.shape != (count, *shape):

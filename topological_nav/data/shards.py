@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from PIL import Image
@@ -106,6 +106,12 @@ def in_order(tasks: Iterable[Callable[[], Result]], ahead: int) -> Generator[Res
 
 
 def read_shards(paths: Sequence[Path], command: str = "data") -> Iterator[np.ndarray]:
-    """`read_shard` of each file that a command wrote, in order, some files ahead in threads."""
+    """Return `read_shard` of each file that a command wrote, in order, some files ahead in threads."""
     need_files(paths, command)
     return in_order((functools.partial(read_shard, path) for path in paths), THREADS)
+
+
+def numbered(folder: Path, kind: str, items: Sequence[Any] | np.ndarray, each: int) -> list[tuple[Path, Any]]:
+    """Return the files that hold so many items each, and the items of each file."""
+    firsts = range(0, len(items), each)
+    return [(folder / f"{kind}-{i:03d}.npz", items[first : first + each]) for i, first in enumerate(firsts)]

@@ -14,6 +14,7 @@ import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +26,7 @@ from interactive_nav_common.files import write_arrays
 from interactive_nav_common.locks import alone_in
 from topological_nav.config import DataConfig, DriveConfig, MapConfig
 from topological_nav.data.folders import Folder, draw_missing, load_scenes
-from topological_nav.data.shards import read_arrays, read_shards
+from topological_nav.data.shards import numbered, read_arrays, read_shards
 from topological_nav.drives.expert import CONTROL_S, Terrain, way_field
 from topological_nav.drives.fleet import Fleet, Tasks, make_env
 from topological_nav.drives.routes import draw_routes, drivable
@@ -149,15 +150,14 @@ def simulate_drives(
     header = DRIVES.describe(config, [{"name": s.name, "digest": s.digest, "split": s.split} for s in scenes])
     with DRIVES.claimed(out, header):
         total = len(scenes) * config.drives
-        files = _batch_files(out, total, config)
-        if all(path.is_file() for path in (*files, out / "plan.npz")):
+        files = numbered(out, "batch", np.arange(total), config.batch)
+        if all(path.is_file() for path in (*dict(files), out / "plan.npz")):
             progress("drives", total, total)
             return load_drives(out)
         tasks, test, terrain = plan_drives(scenes, config)
         write_arrays(out / "plan.npz", scene=tasks.scene, test=test, goal_w=tasks.goals_w[:, -1])
         fleet: Fleet | None = None
-        for i, path in enumerate(files):
-            mine = np.arange(i * config.batch, min((i + 1) * config.batch, total))
+        for path, mine in files:
             if not path.is_file():
                 fleet = fleet or Fleet(make_env(scene_folders, config), terrain, config)
 
@@ -165,7 +165,7 @@ def simulate_drives(
                     progress("drives", int(mine[0]) + min(ended, len(mine) - 1), total)  # the padding's are no news
 
                 # Padded by its last drive: one size, one program.
-                rows = np.minimum(np.arange(i * config.batch, (i + 1) * config.batch), total - 1)
+                rows = np.minimum(mine[0] + np.arange(config.batch), total - 1)
                 _write_batch(path, fleet.drive(tasks.take(rows), told), len(mine))
             progress("drives", int(mine[-1]) + 1, total)
         return load_drives(out)
@@ -196,15 +196,9 @@ def draw_drives(scene_folders: Sequence[Path], out: Path, progress: Progress = l
         draw_missing(drawn, int(drives.steps[drives.kept].sum()), config, progress)
 
 
-def _batch_files(out: Path, total: int, config: DriveConfig) -> list[Path]:
-    return [out / f"batch-{i:03d}.npz" for i in range(-(-total // config.batch))]
-
-
-def _image_files(out: Path, name: str, index: int, drives: Drives, config: DriveConfig):
-    """Yields each file of a scene's images and the drives [k] in it."""
-    mine = np.flatnonzero(drives.kept & (drives.scene == index))
-    for i, first in enumerate(range(0, len(mine), config.shard)):
-        yield out / name / f"images-{i:03d}.npz", mine[first : first + config.shard]
+def _image_files(out: Path, name: str, index: int, drives: Drives, config: DriveConfig) -> list[tuple[Path, Any]]:
+    """Return each file of a scene's images and the drives [k] in it."""
+    return numbered(out / name, "images", np.flatnonzero(drives.kept & (drives.scene == index)), config.shard)
 
 
 def drive_images(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -227,8 +221,8 @@ def load_drives(folder: Path) -> Drives:
     """All drives of a folder, kept or not."""
     folder = Path(folder)
     header, config = read_drives_header(folder)
-    total = len(header["scenes"]) * config.drives
-    parts = [read_arrays(path, AGAIN) for path in _batch_files(folder, total, config)]
+    batches = numbered(folder, "batch", range(len(header["scenes"]) * config.drives), config.batch)
+    parts = [read_arrays(path, AGAIN) for path, _ in batches]
     plan = read_arrays(folder / "plan.npz", AGAIN)
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     first = np.concatenate([[0], np.cumsum(joined.pop("steps"))])

@@ -11,7 +11,7 @@ adds files; the same one finds its own and plays what is missing.
 import hashlib
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +23,16 @@ from interactive_nav_common.files import write_arrays
 from interactive_nav_common.rows import Columns, read_rows, write_parquet
 from interactive_nav_common.untrusted.reading import read_npz
 from interactive_nav_common.versions import versions
-from topological_nav.errors import RunError
+from topological_nav.errors import Progress, RunError
 from topological_nav.evaluate.contest import Contest, ContestScene
 from topological_nav.evaluate.episodes import DrivenEpisodes
 from topological_nav.evaluate.evaluation import Played, columns, play
 
 CPU_BATCH = 8
 """Episodes played at a time on a CPU unless asked otherwise."""
-Tell = Callable[[str, int, int], None]
 
 
-def play_contest(contest: Contest, scenes: Sequence[ContestScene], tell: Tell = lambda *_: None) -> pa.Table:
+def play_contest(contest: Contest, scenes: Sequence[ContestScene], tell: Progress = lambda *_: None) -> pa.Table:
     """Plays what is missing, and returns all rows."""
     # Everything that can be refused is refused before the first episode.
     plan = [(scene, name, _stem(scene, name)) for scene in scenes for name in contest.contenders]

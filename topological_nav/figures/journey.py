@@ -124,7 +124,7 @@ def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callabl
     seen_at: list[tuple[float, np.ndarray, float, int]] = []
     views: dict[int, np.ndarray] = {}
     told: list[str] = []
-    every = max(1, round(FILM_EVERY_S / venue.simulator.dt_s))
+    every = _film_every(venue)
 
     def watch(time_s: float, seen: Seen, state: State, events: Events) -> None:
         if filmed and not contest.truth and len(seen_at) % every == 0:
@@ -162,15 +162,16 @@ def _said(made: TopologicalMap, state: State, events: Events) -> Iterator[str]:
         yield "out of time"
 
 
+def _film_every(venue: ContestScene) -> int:
+    """Return the control steps from one frame to the next."""
+    return max(1, round(FILM_EVERY_S / venue.simulator.dt_s))
+
+
 def film(driven: Driven, path: Path) -> int:
     """Writes a film, the plan beside the camera's images; returns the number of frames."""
     plan, pixels = plan_picture(
         driven.venue.space, driven.map, driven.venue.contest.config.navigator.passable, FILM_HEIGHT
     )
-    every = (
-        max(1, round(FILM_EVERY_S / max(driven.time_s[1] - driven.time_s[0], 1e-3))) if len(driven.time_s) > 1 else 1
-    )
-
-    steps = range(0, len(driven.time_s), every)
+    steps = range(0, len(driven.time_s), _film_every(driven.venue))
     with whole_file(path) as partial:
         return write_mp4((driven.frame(step, plan, pixels) for step in steps), partial, FILM_RATE)

@@ -6,7 +6,7 @@ run that goes on from a checkpoint ends where an uninterrupted one does.
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import flax.linen as nn
 import flax.struct
@@ -32,6 +32,11 @@ class Learner:
     batch_stats: Any
     opt_state: Any
 
+    @classmethod
+    def start(cls, variables: dict[str, Any], tx: optax.GradientTransformation) -> Self:
+        """Return these weights before the first update."""
+        return cls(variables["params"], variables["batch_stats"], tx.init(variables["params"]))  # type: ignore[call-arg]
+
     @property
     def variables(self) -> dict[str, Any]:
         """Return what `flax.linen.Module.apply` takes."""
@@ -45,9 +50,8 @@ Epoch = Callable[[Learner, jax.Array, Any, jax.Array], tuple[Learner, dict[str, 
 def make_learner(
     module: nn.Module, image_shape: tuple[int, int], tx: optax.GradientTransformation, seed: int
 ) -> Learner:
-    """Fresh weights."""
-    made = initial(variable_shapes(module, image_shape), seed)
-    return Learner(made["params"], made["batch_stats"], tx.init(made["params"]))
+    """Draw fresh weights."""
+    return Learner.start(initial(variable_shapes(module, image_shape), seed), tx)
 
 
 def variable_shapes(module: nn.Module, image_shape: tuple[int, int]) -> dict[str, Any]:

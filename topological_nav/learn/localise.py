@@ -1,6 +1,7 @@
 """Embeddings in, places out: which node of a map an image was taken nearest to."""
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,10 +18,14 @@ def nearest_node(queries: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np
     """
     # In double precision: images of neighbouring nodes differ by less than single precision loses here.
     queries, flat = queries.astype(float), nodes.reshape(-1, nodes.shape[-1]).astype(float)
-    squares = (queries**2).sum(-1)[:, None] + (flat**2).sum(-1) - 2.0 * queries @ flat.T
-    best = squares.argmin(1)
+    best = squares_between(queries, flat).argmin(1)
     gap = np.linalg.norm(queries - flat[best], axis=-1)
     return (best // nodes.shape[1]).astype(np.int32), gap.astype(np.float32)
+
+
+def squares_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the squared distances [n, m] of rows [n, D] and [m, D]."""
+    return (a**2).sum(-1)[:, None] + (b**2).sum(-1) - 2.0 * a @ b.T
 
 
 def in_words(scores: Mapping[str, float]) -> str:
@@ -36,35 +41,28 @@ def nearest_turn(angle_rad: np.ndarray, count: int) -> np.ndarray:
     return np.rint(angle_rad / (2 * np.pi) * count).astype(int) % count
 
 
-def localisation_scores(
-    queries: np.ndarray,
-    query_xy_w: np.ndarray,
-    query_room: np.ndarray,
-    nodes: np.ndarray,
-    node_xy_w: np.ndarray,
-    node_room: np.ndarray,
-) -> dict[str, float]:
-    """How well `nearest_node` does in one scene.
+class Places(NamedTuple):
+    """Embeddings [N, K, D] of K images at each of N places, their positions [N, 2] (m) and rooms [N]."""
 
-    Args:
-        queries: [Q, K, D] of K images at each of Q places.
-        query_xy_w: [Q, 2] m, where they were taken.
-        query_room: [Q].
-        nodes: [N, K, D].
-        node_xy_w: [N, 2] m.
-        node_room: [N].
+    embeddings: np.ndarray
+    xy_w: np.ndarray
+    room: np.ndarray
+
+
+def localisation_scores(queries: Places, nodes: Places) -> dict[str, float]:
+    """Return how well `nearest_node` does in one scene.
 
     Returns:
         `node`: share of queries given the node that is nearest in truth; `room`: share given a node of their own
         room; `error_m`: median distance to the node given; `least_error_m`: the same for the nearest in truth.
     """
-    each = queries.shape[1]
-    query_xy_w, query_room = np.repeat(query_xy_w, each, 0), np.repeat(query_room, each)
-    found, _ = nearest_node(queries.reshape(-1, queries.shape[-1]), nodes)
-    away = np.linalg.norm(query_xy_w[:, None] - node_xy_w, axis=-1)
+    each = queries.embeddings.shape[1]
+    xy_w, room = np.repeat(queries.xy_w, each, 0), np.repeat(queries.room, each)
+    node, _ = nearest_node(queries.embeddings.reshape(-1, queries.embeddings.shape[-1]), nodes.embeddings)
+    away = np.linalg.norm(xy_w[:, None] - nodes.xy_w, axis=-1)
     return {
-        "node": float((found == away.argmin(1)).mean()),
-        "room": float((node_room[found] == query_room).mean()),
-        "error_m": float(np.median(away[np.arange(len(found)), found])),
+        "node": float((node == away.argmin(1)).mean()),
+        "room": float((nodes.room[node] == room).mean()),
+        "error_m": float(np.median(away[np.arange(len(node)), node])),
         "least_error_m": float(np.median(away.min(1))),
     }

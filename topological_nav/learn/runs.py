@@ -19,12 +19,12 @@ import yaml
 from interactive_nav_common.errors import readable, regular
 from interactive_nav_common.files import append_text, whole_file, write_text
 from interactive_nav_common.locks import alone_in
-from interactive_nav_common.records import Reader, read_metrics
+from interactive_nav_common.records import METRICS, Reader, read_metrics, write_metrics
 from interactive_nav_common.untrusted.reading import Loader, unpack
 from interactive_nav_common.versions import versions
 from topological_nav.errors import Host, RunError, Stopped
 
-CONFIG, METRICS, CHECKPOINT = "config.yaml", "metrics.jsonl", "checkpoint.msgpack"
+CONFIG, CHECKPOINT = "config.yaml", "checkpoint.msgpack"
 WEIGHTS, DESCRIPTION, RESULTS = "weights.msgpack", "network.json", "results.json"
 PACKED_WEIGHTS = f"{WEIGHTS}.xz"
 """Of an exported run."""
@@ -185,4 +185,4 @@ def _cut_metrics(path: Path, phase: str, last: int) -> None:
     """Drops a phase's lines after its last epoch that a checkpoint holds: these epochs are run again."""
     if path.is_file():
         kept = [line for line in read_metrics(path) if line["phase"] != phase or line["epoch"] <= last]
-        write_text(path, "".join(json.dumps(line) + "\n" for line in kept))
+        write_metrics(path, kept)

@@ -11,7 +11,7 @@ RUN/config.yaml      settings; a run that is started again with the same ones go
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ from topological_nav.learn.learning import (
     variable_shapes,
     with_backbone,
 )
-from topological_nav.learn.localise import localisation_scores
+from topological_nav.learn.localise import Places, localisation_scores
 from topological_nav.learn.networks import Contrast, Network
 from topological_nav.learn.runs import (
     CHECKPOINT,
@@ -84,15 +84,15 @@ class Trained:
             raise RunError(
                 f"images are {images.shape[-3:]}, expected {expected}, the size that the network learned from"
             )
-        method_of = _applied(self.network, method)  # type: ignore[arg-type]  (flax modules are hashable)
-        found = in_batches(functools.partial(method_of, self.variables), images.reshape(-1, *expected))
-        return found.reshape(*images.shape[:-3], *found.shape[1:])
+        method_of = functools.partial(_applied, self.network, method, self.variables)
+        rows = in_batches(method_of, images.reshape(-1, *expected))
+        return rows.reshape(*images.shape[:-3], *rows.shape[1:])
 
 
-@functools.cache
-def _applied(network: Network, method: str) -> Callable[..., jax.Array]:
-    """A network's method, compiled once."""
-    return jax.jit(lambda variables, images: network.apply(variables, images, method=method))  # type: ignore[return-value]
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _applied(network: Network, method: str, variables: Any, images: jax.Array) -> Any:
+    """Return a network's method of images."""
+    return network.apply(variables, images, method=method)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -284,10 +284,11 @@ def localisation(
     for name, mine in rows_by_scene(rooms).items():
         nodes, queries = mine & ~rooms.test, there.get(name, np.zeros_like(asked.test)) & asked.test
         if nodes.any() and queries.any():
+            looked = asked_by.embed(asked.images[queries][:, level, ::3]), trained.embed(rooms.images[nodes][:, level])
             rows[name] = localisation_scores(
-                asked_by.embed(asked.images[queries][:, level, ::3]), asked.xy_w[queries], asked.label[queries],
-                trained.embed(rooms.images[nodes][:, level]), rooms.xy_w[nodes], rooms.label[nodes],
-            )  # fmt: skip
+                Places(looked[0], asked.xy_w[queries], asked.label[queries]),
+                Places(looked[1], rooms.xy_w[nodes], rooms.label[nodes]),
+            )
             weights.append(int(queries.sum()))
     if rows:
         keys = next(iter(rows.values()))

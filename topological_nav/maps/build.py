@@ -27,7 +27,7 @@ from topological_nav.learn.runs import DESCRIPTION
 from topological_nav.learn.training import Trained
 from topological_nav.maps.graph import TopologicalMap, assemble, lengths
 from topological_nav.maps.nodes import place_nodes
-from topological_nav.maps.sight import NetworkSight, Sight
+from topological_nav.maps.sight import NetworkSight, Sight, place_distances
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
 from topological_nav.scenes.rooms import Rooms, scene_rooms
 from topological_nav.scenes.space import FreeSpace, free_space
@@ -141,19 +141,13 @@ def localisation_check(
     sight: Sight, made: TopologicalMap, images: np.ndarray, heading_rad: np.ndarray, xy_w: np.ndarray
 ) -> dict[str, str]:
     """How well a map localises, in words, by all images of a place and by its first alone."""
-    count, around = images.shape[:2]
-    each = sight.distances(images.reshape(-1, *images.shape[2:]), np.tile(heading_rad, count))
-    each = each.reshape(count, around, -1)
-    away = np.linalg.norm(xy_w[:, None] - made.xy_w, axis=-1)
-    said = {}
-    for what, evidence in (
-        (f"{around} images", each.sum(1) if sight.summed else each.min(1)),
-        ("1 image", each[:, 0]),
-    ):
-        found = evidence.argmin(-1)
-        error = away[np.arange(count), found]
+    each, summed = place_distances(sight, images, heading_rad)
+    away, said = np.linalg.norm(xy_w[:, None] - made.xy_w, axis=-1), {}
+    for what, evidence in ((f"{len(heading_rad)} images", summed), ("1 image", each[:, 0])):
+        node = evidence.argmin(-1)
+        error = away[np.arange(len(node)), node]
         said[f"localised by {what}, {'aligned' if sight.summed else 'nearest'}"] = (
-            f"nearest node {(found == away.argmin(-1)).mean():.3f}, within 1.5 m {(error < 1.5).mean():.3f}, "
+            f"nearest node {(node == away.argmin(-1)).mean():.3f}, within 1.5 m {(error < 1.5).mean():.3f}, "
             f"median error {np.median(error):.2f} m (least possible {np.median(away.min(-1)):.2f} m)"
         )
     return said

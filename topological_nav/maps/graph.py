@@ -133,16 +133,9 @@ class TopologicalMap:
         number = np.full(len(self.xy_w), -1, np.int32)
         number[rows] = np.arange(len(rows))
         edges = (number[self.edges] >= 0).all(1)
-        return dataclasses.replace(
-            self,
-            xy_w=self.xy_w[rows],
-            room=self.room[rows],
-            embeddings=self.embeddings[rows],
-            edges=number[self.edges[edges]],
-            p=self.p[edges],
-            angle_rad=self.angle_rad[edges],
-            about={**self.about, "thinned": share, "thinned_seed": seed},
-        )
+        kept = {name: getattr(self, name)[rows] for name in ("xy_w", "room", "embeddings")}
+        kept |= {"edges": number[self.edges[edges]], "p": self.p[edges], "angle_rad": self.angle_rad[edges]}
+        return dataclasses.replace(self, **kept, about={**self.about, "thinned": share, "thinned_seed": seed})
 
 
 def parts_of(edges: np.ndarray, count: int, both_ways: bool = False) -> list[list[int]]:
@@ -205,21 +198,15 @@ def assemble(
     """
     edges = near_pairs(xy_w, edge_m)
     angle = angles(xy_w, edges)
-    p = np.asarray(probability(edges, angle), np.float32)
-    return TopologicalMap(
-        scene,
-        digest,
-        np.asarray(xy_w, np.float32),
-        np.asarray(room, np.int32),
-        np.asarray(embeddings, np.float32),
-        edges,
-        p,
-        np.asarray(angle, np.float32),
-        about,
-    )
+    arrays = {"xy_w": xy_w, "room": room, "embeddings": embeddings}
+    arrays |= {"edges": edges, "p": probability(edges, angle), "angle_rad": angle}
+    typed: Any = {name: np.asarray(value, _ARRAYS[name]) for name, value in arrays.items()}
+    return TopologicalMap(scene, digest, **typed, about=about)
 
 
-_ARRAYS = ("xy_w", "room", "embeddings", "edges", "p", "angle_rad")
+_F32, _I32 = np.float32, np.int32
+_ARRAYS = {"xy_w": _F32, "room": _I32, "embeddings": _F32, "edges": _I32, "p": _F32, "angle_rad": _F32}
+"""Array of a map's file -> its type."""
 
 
 def save_map(made: TopologicalMap, path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from topological_nav.errors import MapError
-from topological_nav.learn.localise import nearest_turn
+from topological_nav.learn.localise import nearest_turn, squares_between
 from topological_nav.learn.training import Trained
 from topological_nav.maps.graph import TopologicalMap
 from topological_nav.scenes.space import FreeSpace
@@ -36,6 +36,14 @@ class Sight(Protocol):
         A number is a length for all images, and gives [n].
         """
         ...
+
+
+def place_distances(sight: Sight, images: np.ndarray, heading_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far each node is from places, by each image [P, K, N] and by all [P, N]; images [P, K, ...]."""
+    count, around = images.shape[:2]
+    each = sight.distances(images.reshape(count * around, *images.shape[2:]), np.tile(heading_rad, count))
+    each = each.reshape(count, around, -1)
+    return each, each.sum(1) if sight.summed else each.min(1)
 
 
 class NetworkSight:
@@ -104,9 +112,8 @@ class TrueSight:
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """[n, m] Euclidean distances of rows [n, D] and [m, D], in double precision as in `localise.nearest_node`."""
-    squares = (a**2).sum(-1)[:, None] + (b**2).sum(-1) - 2.0 * a @ b.T
-    return np.sqrt(np.maximum(squares, 0.0))
+    """Return the Euclidean distances [n, m] of rows [n, D] and [m, D] in double precision."""
+    return np.sqrt(np.maximum(squares_between(a, b), 0.0))
 
 
 class PassagePolicy:

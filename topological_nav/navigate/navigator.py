@@ -12,7 +12,7 @@
               edge that was driven in vain costs more from now on. Plan anew from there: FACE
 
 `Navigator.step` is a pure function of arrays, a phase for each episode, so that thousands run in one batch. It never
-sees a position, and looks at images only through `sight.Sight`. `Pilot` keeps the state for those who drive one robot.
+sees a position, and looks at images only through `sight.Sight`.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ from topological_nav.config import NavigatorConfig
 from topological_nav.drives.driving import LocalPolicy
 from topological_nav.learn.learning import padded_size
 from topological_nav.maps.graph import TopologicalMap
-from topological_nav.maps.sight import Sight
+from topological_nav.maps.sight import Sight, place_distances
 from topological_nav.navigate.state import (
     ARRIVED,
     DRIVE,
@@ -77,10 +77,7 @@ class Navigator:
 
     def goal_nodes(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
         """[B] i32: the nodes nearest to goals, by the images [B, K, ...] taken there along headings [K]."""
-        batch, count = images.shape[:2]
-        away = self.sight.distances(images.reshape(batch * count, *images.shape[2:]), np.tile(heading_rad, batch))
-        away = away.reshape(batch, count, -1)
-        return (away.sum(1) if self.sight.summed else away.min(1)).argmin(-1).astype(np.int32)
+        return place_distances(self.sight, images, heading_rad)[1].argmin(-1).astype(np.int32)
 
     def start(self, goal: np.ndarray) -> State:
         """B fresh episodes.
@@ -181,7 +178,9 @@ class Navigator:
         done = rows[s.looks[rows] >= self.config.images]
         self._found(s, done, s.evidence[done].argmin(-1).astype(np.int32))
         s.localised[done] = True
-        self._decide(s, done, heading)
+        there = done[s.node[done] == s.goal[done]]
+        s.phase[there], s.arrived[there] = ARRIVED, True
+        self._plan(s, done[s.node[done] != s.goal[done]], heading)
 
     def _found(self, s: Work, rows: np.ndarray, node: np.ndarray) -> None:
         """Where the robots are; an edge that was driven and did not lead nearer to its head costs more."""
@@ -191,12 +190,6 @@ class Navigator:
         failed = (edge >= 0) & (node != head) & ~(self.map.left[head, node] < self.map.left[head, tail])
         s.penalty[rows[failed], edge[failed]] += self.config.retry_cost
         s.driven[rows] = -1
-
-    def _decide(self, s: Work, rows: np.ndarray, heading: np.ndarray) -> None:
-        """Where to go from the nodes found."""
-        there = rows[s.node[rows] == s.goal[rows]]
-        s.phase[there], s.arrived[there] = ARRIVED, True
-        self._plan(s, rows[s.node[rows] != s.goal[rows]], heading)
 
     def _plan(self, s: Work, rows: np.ndarray, heading: np.ndarray) -> None:
         for i in rows:
@@ -322,27 +315,6 @@ class Navigator:
         s.linear[rows] = 0.0
         s.angular[rows] = np.clip(config.kp * error + s.integral[rows] + config.kd * rate, -most, most)
         s.error_rad[rows] = error
-
-
-class Pilot:
-    """One robot's navigator, or a batch of them, that remembers its own state: what a ROS node holds."""
-
-    def __init__(self, navigator: Navigator, goal_images: np.ndarray, goal_heading_rad: np.ndarray):
-        """Finds the goals' nodes.
-
-        Args:
-            goal_images: [B, K, ...] taken at the goals.
-            goal_heading_rad: [K] along which headings.
-        """
-        self.navigator = navigator
-        self.state = navigator.start(navigator.goal_nodes(goal_images, goal_heading_rad))
-
-    def step(
-        self, images: np.ndarray, heading_rad: np.ndarray, time_s: np.ndarray | float
-    ) -> tuple[np.ndarray, np.ndarray, Events]:
-        """Images [B, ...], headings [B] and time to linear [B] and angular [B] velocity, and events."""
-        self.state, linear, angular, events = self.navigator.step(self.state, images, heading_rad, time_s)
-        return linear, angular, events
 
 
 def _asked_m(length_m: np.ndarray, config: NavigatorConfig) -> np.ndarray:

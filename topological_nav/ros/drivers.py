@@ -13,7 +13,8 @@ from topological_nav.ros.config import HeadingConfig
 
 if TYPE_CHECKING:
     from interactive_nav.sensing.base import Lens
-    from topological_nav.navigate.navigator import Pilot
+    from topological_nav.navigate.navigator import Navigator
+    from topological_nav.navigate.state import State
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,14 +76,15 @@ class HeadingDriver:
 
 
 class PilotDriver:
-    """The navigator as a driver: it is done where it arrived, or ran out of time."""
+    """Drive one robot by the navigator: done where it arrived, or ran out of time."""
 
-    def __init__(self, pilot: Pilot, lens: Lens):
-        """Takes what it needs."""
-        self._pilot, self.lens = pilot, lens
+    def __init__(self, navigator: Navigator, state: State, lens: Lens):
+        """Take the navigator and its state, of `Navigator.start`."""
+        self._navigator, self._state, self.lens = navigator, state, lens
 
     def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> Command:
         """See `Driver.step`."""
-        linear, angular, events = self._pilot.step(image[None], np.array([heading_rad]), np.array([time_s]))
+        seen = image[None], np.array([heading_rad]), np.array([time_s])
+        self._state, linear, angular, events = self._navigator.step(self._state, *seen)
         done = bool(events.arrived[0]) or bool(events.timed_out[0])
         return Command(0.0, 0.0, done=True) if done else Command(float(linear[0]), float(angular[0]))

@@ -198,11 +198,11 @@ def twist_command(message: Any) -> tuple[float, float]:
 
 
 def transform_fields(
-    parent: str, child: str, pos_m: tuple[float, float, float], quat: Mapping[str, float]
+    stamp: Any, parent: str, child: str, pos_m: tuple[float, float, float], quat: Mapping[str, float]
 ) -> dict[str, Any]:
     """geometry_msgs/TransformStamped: where the child's frame is in the parent's."""
     return {
-        "header": {"frame_id": parent},
+        "header": {"stamp": stamp, "frame_id": parent},
         "child_frame_id": child,
         "transform": {"translation": _vector(np.asarray(pos_m)), "rotation": dict(quat)},
     }

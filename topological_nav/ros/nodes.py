@@ -166,11 +166,8 @@ class SimulatorNode:
         self._send_transforms(topics.TF_STATIC, links, self._stamp(0.0))
 
     def _send_transforms(self, topic: str, links: list[Any], stamp: Any) -> None:
-        made = []
-        for link in links:
-            message = messages.set_fields(self._ros.geometry_msgs.TransformStamped(), messages.transform_fields(*link))
-            message.header.stamp = stamp
-            made.append(message)
+        kind = self._ros.geometry_msgs.TransformStamped
+        made = [messages.set_fields(kind(), messages.transform_fields(stamp, *link)) for link in links]
         self._out[topic].publish(self._ros.tf2_msgs.TFMessage(made))
 
     def _stamp(self, time_s: float) -> Any:
@@ -188,26 +185,17 @@ class SimulatorNode:
         self._out[topics.STRUCTURE].publish(now.touches_structure)
         self._out[topics.FORCE].publish(now.force_n)
         config = simulator.config
+        odometry = messages.odometry_fields(now.odometry, now.linear_b, now.angular_b)
+        scanner = config.lidar_fov_deg, simulator.range_min_m, config.lidar_range_m, simulator.dt_s
         for name, frame, fields in (
             (topics.HEADING, topics.BASE, messages.imu_fields(now.heading_rad, now.angular_b)),
-            (
-                topics.ODOMETRY,
-                topics.ODOM,
-                {"child_frame_id": topics.BASE, **messages.odometry_fields(now.odometry, now.linear_b, now.angular_b)},
-            ),
-            (
-                topics.SCAN,
-                topics.LIDAR,
-                messages.scan_fields(
-                    now.scan, config.lidar_fov_deg, simulator.range_min_m, config.lidar_range_m, simulator.dt_s
-                ),
-            ),
+            (topics.ODOMETRY, topics.ODOM, {"child_frame_id": topics.BASE, **odometry}),
+            (topics.SCAN, topics.LIDAR, messages.scan_fields(now.scan, *scanner)),
             (topics.INFO, topics.OPTICAL, messages.camera_info_fields(simulator.lens)),
             (topics.IMAGE, topics.OPTICAL, messages.image_fields(now.rgb)),
         ):
-            message = messages.set_fields(topics.message_class(ros, topics.TOPICS[name])(), fields)
-            message.header.stamp, message.header.frame_id = stamp, frame
-            self._out[name].publish(message)
+            fields["header"] = {"stamp": stamp, "frame_id": frame}
+            self._out[name].publish(messages.set_fields(topics.message_class(ros, topics.TOPICS[name])(), fields))
 
 
 class NavigatorNode:

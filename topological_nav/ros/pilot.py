@@ -14,7 +14,7 @@ from topological_nav.drives.driving import local_policy
 from topological_nav.learn.pairs import load_networks
 from topological_nav.maps.graph import load_map
 from topological_nav.maps.sight import NetworkSight
-from topological_nav.navigate.navigator import Navigator, Pilot
+from topological_nav.navigate.navigator import Navigator
 from topological_nav.ros.drivers import PilotDriver
 from topological_nav.ros.messages import seen_through
 from topological_nav.weights.packaged import Choice
@@ -37,7 +37,8 @@ def topological_driver(
         raise ConfigError("the navigator has no goal; name a picture taken there: --goal PICTURE")
     pictures = np.stack([seen_through(_picture(path), lens.fov_deg, lens) for path in goals])
     around = goal_heading_rad + 2 * np.pi * np.arange(len(pictures)) / len(pictures)
-    return PilotDriver(Pilot(Navigator(made, sight, policy, config), pictures[None], around), lens)
+    navigator = Navigator(made, sight, policy, config)
+    return PilotDriver(navigator, navigator.start(navigator.goal_nodes(pictures[None], around)), lens)
 
 
 def _picture(path: Path) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from topological_nav.learn.localise import localisation_scores, nearest_node
+from topological_nav.learn.localise import Places, localisation_scores, nearest_node
 
 
 def test_the_node_of_the_nearest_image_wins():
@@ -28,7 +28,9 @@ def test_scores_by_hand():
     node_xy, node_room = np.array([[0.0, 0.0], [1.0, 0.0], [4.0, 0.0]]), np.array([0, 0, 1])
     # Looks like node 0, 1, 2; taken 0.1 m from node 0, 0.6 m from node 0 (0.4 from 1), 0.5 m from node 1.
     xy = np.array([[0.1, 0.0], [0.6, 0.0], [1.5, 0.0]])
-    scores = localisation_scores(np.arange(3.0)[:, None, None], xy, np.zeros(3, int), nodes, node_xy, node_room)
+    scores = localisation_scores(
+        Places(np.arange(3.0)[:, None, None], xy, np.zeros(3, int)), Places(nodes, node_xy, node_room)
+    )
     assert scores["node"] == pytest.approx(2 / 3)
     assert scores["room"] == pytest.approx(2 / 3)
     assert scores["error_m"] == pytest.approx(0.4)  # of 0.1, 0.4 and 2.5

@@ -481,16 +481,3 @@ def test_goals_are_found_by_their_images():
 def test_images_must_be_a_share_of_the_maps():
     with pytest.raises(ConfigError, match="images is 4, expected a divisor of 6"):
         square(images=4)
-
-
-def test_a_pilot_remembers(monkeypatch):
-    navigator = square()
-    pilot = nav.Pilot(navigator, np.array([[(2, 0)] * 6], float), 2 * np.pi * np.arange(6) / 6)
-    robot = Robot(navigator, goal=2)
-    for t in range(30):
-        heading = robot.heading
-        linear, angular, events = pilot.step(seen((0, 0.9)), np.array([heading]), 0.1 * t)
-        robot.state, *expected = navigator.step(robot.state, seen((0, 0.9)), np.array([heading]), 0.1 * t)
-        assert linear == expected[0] and angular == expected[1] and events.localised == expected[2].localised
-        robot.heading += 0.1 * float(angular[0])
-    assert pilot.state.goal[0] == 2 and pilot.state.looks[0] > 0

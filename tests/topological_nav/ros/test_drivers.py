@@ -35,25 +35,29 @@ def test_it_turns_the_short_way_then_drives_for_its_time():
 
 
 class Three:
-    """A pilot that is done at its third step."""
+    """A navigator that is done at its third step."""
 
     def __init__(self, how):
         self.how, self.asked = how, []
 
-    def step(self, images, heading_rad, time_s):
+    def step(self, state, images, heading_rad, time_s):
         self.asked.append((images.shape, heading_rad.tolist(), time_s.tolist()))
         over = np.array([len(self.asked) == 3])
         events = {"arrived": np.array([False]), "timed_out": np.array([False]), self.how: over}
-        return np.array([0.3]), np.array([-0.2]), SimpleNamespace(**events)
+        return state + 1, np.array([0.3]), np.array([-0.2]), SimpleNamespace(**events)
 
 
 @pytest.mark.parametrize("how", ["arrived", "timed_out"])
-def test_the_navigators_pilot_is_asked_as_a_batch_of_one_and_ends_the_episode(how):
-    pilot, lens = Three(how), Lens(4, 3, 90.0)
-    driver = PilotDriver(pilot, lens)  # type: ignore[arg-type]
+def test_the_navigator_is_asked_as_a_batch_of_one_and_ends_the_episode(how):
+    navigator, lens = Three(how), Lens(4, 3, 90.0)
+    driver = PilotDriver(navigator, 0, lens)  # type: ignore[arg-type]
     commands = [driver.step(np.zeros((3, 4, 3), np.uint8), 0.5, 1.0 + 0.1 * k) for k in range(3)]
     assert commands == [Command(0.3, -0.2), Command(0.3, -0.2), Command(0.0, 0.0, done=True)]
-    assert pilot.asked == [((1, 3, 4, 3), [0.5], [1.0 + 0.1 * k]) for k in range(3)] and driver.lens is lens
+    assert (
+        driver._state == 3
+        and navigator.asked == [((1, 3, 4, 3), [0.5], [1.0 + 0.1 * k]) for k in range(3)]
+        and driver.lens is lens
+    )
 
 
 def test_velocities_that_are_not_finite_are_refused():

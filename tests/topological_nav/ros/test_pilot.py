@@ -34,7 +34,7 @@ def test_the_goal_is_the_node_that_looks_like_its_picture(made, goal):
     driver = topological_driver(made.map, seeing(made), (goal[0],), 0.0, NavigatorConfig(match="aligned"))
     read, trained = load_map(made.map), load_trained(made.rooms)
     away = np.linalg.norm(read.embeddings[:, 0] - trained.embed(goal[1][None])[0], axis=-1)
-    assert driver._pilot.state.goal.tolist() == [int(away.argmin())]  # type: ignore[attr-defined]
+    assert driver._state.goal.tolist() == [int(away.argmin())]  # type: ignore[attr-defined]
     assert driver.lens is not None and (driver.lens.width, driver.lens.height) == goal[1].shape[1::-1]
     # It begins with a look about: on the spot, to the nearest of the map's headings, and then 20 degrees on.
     first = driver.step(goal[1], math.radians(5), 0.0)
