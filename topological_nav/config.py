@@ -135,14 +135,8 @@ class NetworkTrainConfig(Settings):
     """Adam's, of them."""
 
 
-def room_config() -> NetworkTrainConfig:
-    """The report's room classifier."""
-    return NetworkTrainConfig()
-
-
-def passage_config() -> NetworkTrainConfig:
-    """The report's passage detector, but without hidden layers."""
-    return NetworkTrainConfig(batch=32, epochs=20)
+TASKS = {"rooms": NetworkTrainConfig(), "passages": NetworkTrainConfig(batch=32, epochs=20)}
+"""The report's room classifier, and its passage detector, but without hidden layers."""
 
 
 @dataclasses.dataclass(frozen=True)

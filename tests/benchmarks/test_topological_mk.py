@@ -14,14 +14,13 @@ from interactive_nav_common.config import overridden
 from topological_nav.__main__ import parser
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.config import (
+    TASKS,
     DataConfig,
     DriveConfig,
     EvaluationConfig,
     ExportConfig,
     MapConfig,
     PolicyConfig,
-    passage_config,
-    room_config,
 )
 from train.config_io import load
 
@@ -38,7 +37,7 @@ def settings_of(arguments):
     if arguments.command == "data":
         return DriveConfig() if arguments.drives else DataConfig()
     if arguments.command == "train":
-        return {"rooms": room_config, "passages": passage_config, "policy": PolicyConfig}[arguments.task]()
+        return {**TASKS, "policy": PolicyConfig()}[arguments.task]
     return {"map": MapConfig, "evaluate": EvaluationConfig, "adapt": AdaptConfig, "export": ExportConfig}[
         arguments.command
     ]()

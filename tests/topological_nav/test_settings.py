@@ -4,7 +4,7 @@ import pytest
 
 from interactive_nav_common.config import overlay, overridden, settings_help, to_dict
 from interactive_nav_common.errors import ConfigError
-from topological_nav.config import DataConfig, NetworkTrainConfig, passage_config, room_config
+from topological_nav.config import TASKS, DataConfig, NetworkTrainConfig
 
 
 def test_words_are_read_by_the_types_of_the_settings():
@@ -43,7 +43,7 @@ def test_settings_written_down_are_read_back():
 
 
 def test_defaults_are_the_reports():
-    rooms, passages = room_config(), passage_config()
+    rooms, passages = TASKS["rooms"], TASKS["passages"]
     assert (rooms.batch, rooms.epochs, rooms.learning_rate, rooms.hidden) == (20, 15, 1e-4, 512)
     assert (passages.batch, passages.epochs, passages.learning_rate) == (32, 20, 1e-4)
     data = DataConfig()

@@ -12,12 +12,11 @@ from topological_nav.config import (
     DATASET,
     DRIVES,
     RUNS,
+    TASKS,
     CameraConfig,
     DataConfig,
     DriveConfig,
     PolicyConfig,
-    passage_config,
-    room_config,
 )
 from topological_nav.data.dataset import make_dataset
 from topological_nav.data.folders import folder_bytes
@@ -28,8 +27,6 @@ from topological_nav.figures.drive_figures import drives_figure, policy_figure
 from topological_nav.figures.maps import curves_figure, dataset_figure, save
 from topological_nav.learn.localise import in_words
 from topological_nav.learn.training import train as train_network
-
-TASKS = {"rooms": room_config, "passages": passage_config}
 
 
 def data(arguments: argparse.Namespace) -> None:
@@ -80,7 +77,7 @@ def train(arguments: argparse.Namespace) -> None:
     refuse_unused(arguments, "--localiser --detector --grid", f"in 'train {arguments.task}'")
     if arguments.task == "passages":
         refuse_unused(arguments, "hidden pitch label_smoothing", "in 'train passages'")
-    config = overridden(TASKS[arguments.task](), arguments.settings)
+    config = overridden(TASKS[arguments.task], arguments.settings)
     if config.init != "selfsup":
         refuse_unused(arguments, "selfsup_epochs selfsup_batch selfsup_learning_rate", f"with init={config.init}")
     out = arguments.out or RUNS / arguments.task

@@ -12,18 +12,18 @@ from topological_nav.config import (
     DATASET,
     DRIVES,
     RUNS,
+    TASKS,
     DataConfig,
     DriveConfig,
     EvaluationConfig,
     ExportConfig,
     MapConfig,
     PolicyConfig,
-    room_config,
 )
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "data": {"": DataConfig(), " of drives": DriveConfig()},
-    "train": {"": room_config(), " of policy": PolicyConfig()},
+    "train": {"": TASKS["rooms"], " of policy": PolicyConfig()},
     "map": {"": MapConfig()},
     "navigate": {"": EvaluationConfig()},
     "evaluate": {"": EvaluationConfig()},

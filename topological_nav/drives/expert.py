@@ -8,6 +8,9 @@ what the lidar sees and the map holds. The map adds what a planar scan misses, s
 scan sees, in the middle of its way, the robot stops, because no way round is planned.
 """
 
+import functools
+from collections.abc import Callable
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -172,16 +175,17 @@ def command(
     times = config.horizon_s * (jnp.arange(config.horizon_steps) + 1.0) / config.horizon_steps
     ways_b = arcs(linear, angular, times)
     ways_w = moved(pose_w, ways_b)
-    origin, resolution = terrain.origin_w[scene], terrain.resolution_m[scene]
+    plan = {"origin_w": terrain.origin_w[scene], "resolution_m": terrain.resolution_m[scene]}
+    to_go = functools.partial(sample, terrain.to_go_m[goal], **plan)
     seen = scan_gap(ways_b, points_b, half_m)
     rim = outline(half_m)[None, None]
     cos, sin = jnp.cos(ways_w[..., 2])[..., None], jnp.sin(ways_w[..., 2])[..., None]
     x = ways_w[..., :1] + cos * rim[..., 0] - sin * rim[..., 1]
     y = ways_w[..., 1:2] + sin * rim[..., 0] + cos * rim[..., 1]
-    known = sample(terrain.clearance_m[scene], origin, resolution, jnp.stack([x, y], -1)).min(-1)
+    known = sample(terrain.clearance_m[scene], xy_w=jnp.stack([x, y], -1), **plan).min(-1)
     gap = jnp.minimum(seen, known).min(-1)
-    left, end = _left(terrain.to_go_m[goal], origin, resolution, ways_w, linear, config)
-    heading = _fall(terrain.to_go_m[goal], origin, resolution, end[:, :2])
+    left, end = _left(to_go, ways_w, linear, config)
+    heading = _fall(to_go, end[:, :2])
     turn = jnp.abs(wrap_angle(heading - end[:, 2])) / jnp.pi
     cost = (
         config.weigh_progress * left / (config.linear_m_s * config.horizon_s)
@@ -195,18 +199,13 @@ def command(
 
 
 def _left(
-    field: jax.Array,
-    origin: jax.Array,
-    resolution: jax.Array,
-    ways_w: jax.Array,
-    linear: jax.Array,
-    config: ExpertConfig,
+    to_go: Callable[..., jax.Array], ways_w: jax.Array, linear: jax.Array, config: ExpertConfig
 ) -> tuple[jax.Array, jax.Array]:
-    """Way left [C] at the ends of ways [C, K, 3], and the poses [C, 3] where it is read.
+    """Return the way left [C] at the ends of ways [C, K, 3], and the poses [C, 3] where it is read.
 
     A way past the goal ends there, and what it drives on counts as if it led farther: nobody stops at a node.
     """
-    values = sample(field, origin, resolution, ways_w[..., :2])
+    values = to_go(xy_w=ways_w[..., :2])
     steps = values.shape[1]
     near = values < config.reached_m
     at = jnp.where(near.any(1), near.argmax(1), steps - 1)
@@ -215,10 +214,10 @@ def _left(
     return values[rows, at] - beyond, ways_w[rows, at]
 
 
-def _fall(field: jax.Array, origin: jax.Array, resolution: jax.Array, xy: jax.Array) -> jax.Array:
-    """Headings [C] in which a field falls at points [C, 2]."""
+def _fall(to_go: Callable[..., jax.Array], xy_w: jax.Array) -> jax.Array:
+    """Return the headings [C] in which a field falls at points [C, 2]."""
     offsets = _SLOPE_M * jnp.asarray([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    values = sample(field, origin, resolution, xy[:, None] + offsets[None])
+    values = to_go(xy_w=xy_w[:, None] + offsets[None])
     return jnp.arctan2(values[:, 3] - values[:, 2], values[:, 1] - values[:, 0])
 
 

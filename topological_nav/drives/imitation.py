@@ -164,7 +164,7 @@ def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: 
         truth = (batch["linear"], batch["angular"])
         logits, next_after = _applied(policy, forward, params, scale, u)
         guesses = next_after(_one_hot(policy, *truth)), next_after([nn.softmax(value) for value in logits])
-        loss, parts = policy_loss(logits, *truth, batch["valid"], *guesses, u[:, 1:], batch["followed"], **weights)
+        loss, parts = policy_loss(logits, batch, guesses, u[:, 1:], **weights)
         right = {
             f"{name}_accuracy": ((one.argmax(-1) == t) & batch["valid"]).sum() / batch["valid"].sum()
             for name, one, t in zip(("linear", "angular"), logits, truth, strict=True)

@@ -1,5 +1,6 @@
 """Embeddings in, classes of velocities out: the local policy's two memories, its forward model and their loss."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import flax.linen as nn
@@ -108,13 +109,9 @@ def mean_over(values: jax.Array, mask: jax.Array) -> jax.Array:
 
 def policy_loss(
     logits: tuple[jax.Array, jax.Array],
-    linear: jax.Array,
-    angular: jax.Array,
-    valid: jax.Array,
-    predicted: jax.Array,
-    consistent: jax.Array,
+    truth: Mapping[str, jax.Array],
+    guesses: tuple[jax.Array, jax.Array],
     following: jax.Array,
-    followed: jax.Array,
     alpha: jax.Array | float,
     lam: jax.Array | float,
     jointly: jax.Array | float = 1.0,
@@ -123,23 +120,18 @@ def policy_loss(
 
     Args:
         logits: [B, T, L] and [B, T, A] of the policy.
-        linear: [B, T] i32 the expert's classes.
-        angular: [B, T] i32.
-        valid: [B, T] bool: steps that count.
-        predicted: [B, T, D] f(u, a), from the expert's action a.
-        consistent: [B, T, D] f(u, a_hat), from the policy's.
+        truth: `linear`, `angular` (the expert's classes), `valid` and `followed` of `sequences.Sequences`.
+        guesses: [B, T, D] each: f(u, a), from the expert's action a, and f(u, a_hat), from the policy's.
         following: [B, T, D] u, the embedding of the next step.
-        followed: [B, T] bool: there is a next step.
         jointly: 0 leaves the forward model's own error alone.
 
     Returns:
         The loss, and its parts by name: ce_linear, ce_angular, forward, consistency.
     """
     cross = [
-        mean_over(optax.softmax_cross_entropy_with_integer_labels(one, truth), valid)
-        for one, truth in zip(logits, (linear, angular), strict=True)
+        mean_over(optax.softmax_cross_entropy_with_integer_labels(one, truth[name]), truth["valid"])
+        for one, name in zip(logits, ("linear", "angular"), strict=True)
     ]
-    forward = mean_over(jnp.square(following - predicted).sum(-1), followed)
-    consistency = mean_over(jnp.square(following - consistent).sum(-1), followed)
+    forward, consistency = (mean_over(jnp.square(following - u).sum(-1), truth["followed"]) for u in guesses)
     loss = forward + jointly * (alpha * (cross[1] + cross[0]) + lam * consistency)
     return loss, {"ce_linear": cross[0], "ce_angular": cross[1], "forward": forward, "consistency": consistency}

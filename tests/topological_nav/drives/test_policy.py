@@ -103,16 +103,9 @@ def test_the_loss_by_hand():
     angular_logits = jnp.log(jnp.asarray([[[0.1, 0.1, 0.6, 0.1, 0.1], [0.2, 0.2, 0.2, 0.2, 0.2]]]))
     following = jnp.asarray([[[1.0, 0.0], [9.0, 9.0]]])
     predicted, consistent = jnp.asarray([[[0.5, 0.0], [0.0, 0.0]]]), jnp.asarray([[[1.0, 2.0], [0.0, 0.0]]])
-    arguments = (
-        (linear_logits, angular_logits),
-        jnp.asarray([[0, 2]]),
-        jnp.asarray([[2, 4]]),
-        jnp.asarray([[True, True]]),
-        predicted,
-        consistent,
-        following,
-        jnp.asarray([[True, False]]),
-    )
+    truth = {"linear": [[0, 2]], "angular": [[2, 4]], "valid": [[True, True]], "followed": [[True, False]]}
+    truth = {name: jnp.asarray(value) for name, value in truth.items()}
+    arguments = ((linear_logits, angular_logits), truth, (predicted, consistent), following)
     ce_linear = -(np.log(0.5) + np.log(0.6)) / 2
     ce_angular = -(np.log(0.6) + np.log(0.2)) / 2
     loss, parts = policy_loss(*arguments, alpha=10.0, lam=0.5)
