@@ -134,8 +134,7 @@ def adapt_features(
 ) -> dict[str, Any]:
     """Adapt a run's embedding to another domain, or continue the adaptation at `out`.
 
-    Returns:
-        The content of results.json: localisation before, with the target's statistics alone, and after.
+    Return the content of results.json: localisation before, with the target's statistics alone, and after.
     """
     trained = load_trained(run)
     near, far = load_rooms(source), target_rooms(target, config)

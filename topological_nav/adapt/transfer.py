@@ -50,8 +50,7 @@ def passage_configurations(
 ) -> dict[str, Any]:
     """Score a passage detector in another domain, learned from the source or not, fine-tuned or not.
 
-    Returns:
-        The content of results.json.
+    Return the content of results.json.
     """
     trained = load_trained(run)
     need_task(trained.about, "passages", f"{run}:")
@@ -79,12 +78,10 @@ def passage_configurations(
 
 
 def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detector_run: Path, config: AdaptConfig):
-    """A map of images collected in the target domain: its dataset's training positions, no image drawn for the map.
+    """Build a map of images collected in the target domain: its training positions, no image drawn for the map.
 
-    An edge is judged by the image of its node nearest to it in angle, 10 degrees off at most for 18 headings.
-
-    Returns:
-        `build.Built`; its scores tell how held-out images of the target are localised on it.
+    An edge is judged by the image of its node nearest to it in angle, 10 degrees off at most for 18 headings. Scores of
+    the `build.Built` say how held-out images of the target are localised on it.
     """
     localiser, detector = load_trained(localiser_run), load_trained(detector_run)
     need_task(detector.about, "passages", "the detector")

@@ -26,8 +26,7 @@ def say(line: str) -> None:
 def bar(signals: list[int] | None = None) -> Iterator[Progress]:
     """Show a bar with the time left on a terminal, a line every tenth elsewhere; raise `Stopped` before the end.
 
-    Args:
-        signals: of a `stop_signals` around it; None: it collects its own.
+    `signals` are those of a `stop_signals` around it; None: it collects its own.
     """
     console = SafeConsole(stderr=True)
     collected = stop_signals() if signals is None else nullcontext(signals)

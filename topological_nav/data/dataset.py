@@ -121,14 +121,7 @@ def plan_scene(scene: Scene, space: FreeSpace, config: DataConfig) -> ScenePlan:
 def make_dataset(
     scene_folders: Sequence[Path], out: Path, config: DataConfig, progress: Progress = lambda *_: None
 ) -> dict[str, Any]:
-    """Makes a dataset, or what is missing of it.
-
-    Args:
-        out: the dataset's folder.
-
-    Returns:
-        The content of dataset.json.
-    """
+    """Make a dataset in the folder `out`, or what is missing of it; return the content of dataset.json."""
     scenes = load_scenes(scene_folders, config.engine)
     robot = get_robot(config.robot)
     plans = [plan_scene(scene, free_space(scene, robot.height_m), config) for scene in scenes]

@@ -66,11 +66,10 @@ class TrainedPolicy:
 def load_policy(
     run_folder: Path | str, localiser: Path | str | None = None, detector: Path | str | None = None
 ) -> TrainedPolicy:
-    """The policy of a finished run.
+    """Return the policy of a finished run.
 
-    Args:
-        localiser: run folder of the room classifier that embeds its images; None: where it was when it learned, seen
-            from the run folder.
+    `localiser` and `detector` are run folders of the networks that embed its images; None: where they were when it
+    learned, seen from the run folder.
     """
     run = Path(run_folder)
     about = read_description(run, "policy", "policy")

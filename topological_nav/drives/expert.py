@@ -92,12 +92,10 @@ def sample(grid: jax.Array, origin_w: jax.Array, resolution_m: jax.Array, xy_w: 
 
 
 def window(velocity: jax.Array, config: ExpertConfig) -> tuple[jax.Array, jax.Array]:
-    """Velocities that can be reached within a control period: linear [C] and angular [C], every pair of a lattice.
+    """Return the velocities that can be reached within a control period: linear [C] and angular [C], all pairs.
 
-    What of the lattice is out of reach is brought as near as can be reached.
-
-    Args:
-        velocity: [2] commanded last, m/s and rad/s.
+    What of the lattice is out of reach is brought as near as can be reached. `velocity` [2] is the last command (m/s,
+    rad/s).
     """
 
     def around(now, change, lattice):

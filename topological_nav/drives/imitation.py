@@ -47,11 +47,7 @@ LEAST_SPREAD = 0.3
 
 
 def train_policy(frames: Frames, out: Path, config: PolicyConfig, host: Host = ALONE) -> dict[str, Any]:
-    """Train a policy, or continue the run at `out`.
-
-    Returns:
-        The content of results.json.
-    """
+    """Train a policy, or continue the run at `out`; return the content of results.json."""
     if config.mirror and not frames.mirrored:
         raise RunError("mirror is set, but mirrored images were not embedded; embed them too or set mirror=false")
     values = class_values(config, frames.config.linear_m_s, frames.config.angular_rad_s)
@@ -237,8 +233,7 @@ def _scores(
 def train_grid(frames: Frames, out: Path, config: PolicyConfig, host: Host = ALONE) -> list[dict[str, Any]]:
     """Train a policy for every alpha and lambda of the report, each in a folder of its own under `out`.
 
-    Returns:
-        The results, also written to grid.json and, as a table, to grid.md.
+    Return the results, also written to grid.json and, as a table, to grid.md.
     """
     rows = []
     for alpha, lam in GRID:

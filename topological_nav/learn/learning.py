@@ -171,8 +171,7 @@ def keyed_batches(batch: int) -> Callable[[jax.Array, jax.Array], tuple[jax.Arra
 def descent_epoch(steps: Callable[..., Any], loss_of: Callable[..., Any], tx: optax.GradientTransformation) -> Epoch:
     """Build an epoch of gradient descent; see `compiled_epoch`.
 
-    Args:
-        loss_of: params, batch_stats, images, labels and a step to the loss, new batch_stats and other means.
+    `loss_of` takes params, batch_stats, images, labels and a step to the loss, new batch_stats and other means.
     """
 
     def update(learner, images, labels, step):
@@ -185,13 +184,11 @@ def descent_epoch(steps: Callable[..., Any], loss_of: Callable[..., Any], tx: op
 
 
 def compiled_epoch(steps: Callable[..., Any], update: Callable[..., Any]) -> Epoch:
-    """An epoch of updates: one program on an accelerator, one program an update on a CPU.
+    """Build an epoch of updates: one program on an accelerator, one program an update on a CPU.
 
-    XLA's CPU convolutions are about eight times slower inside a loop of the program (53 against 441 images/s,
-    ResNet-18 of width 8 at 64 x 48 on two busy cores).
-
-    Args:
-        steps: images and key to a tree of arrays [S, ...], one row an update.
+    XLA's CPU convolutions are about eight times slower inside a loop of the program (53 against 441 images/s, ResNet-18
+    of width 8 at 64 x 48 on two busy cores). `steps` takes images and a key to a tree of arrays [S, ...], one row an
+    update.
     """
     planned, one = jax.jit(steps), jax.jit(update, donate_argnums=0)
 

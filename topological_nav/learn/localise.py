@@ -7,14 +7,9 @@ import numpy as np
 
 
 def nearest_node(queries: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The node with the nearest embedding, over all images of all nodes.
+    """Return the node with the nearest embedding over all images of all nodes, and the distance to that image.
 
-    Args:
-        queries: [Q, D] embeddings.
-        nodes: [N, K, D] embeddings of each node's images.
-
-    Returns:
-        [Q] i32 nodes, of equals the first, and [Q] f32 Euclidean distances to their nearest image.
+    Queries [Q, D] and nodes [N, K, D] give [Q] i32 nodes, of equals the first, and [Q] f32 Euclidean distances.
     """
     # In double precision: images of neighbouring nodes differ by less than single precision loses here.
     queries, flat = queries.astype(float), nodes.reshape(-1, nodes.shape[-1]).astype(float)
@@ -52,9 +47,8 @@ class Places(NamedTuple):
 def localisation_scores(queries: Places, nodes: Places) -> dict[str, float]:
     """Return how well `nearest_node` does in one scene.
 
-    Returns:
-        `node`: share of queries given the node that is nearest in truth; `room`: share given a node of their own
-        room; `error_m`: median distance to the node given; `least_error_m`: the same for the nearest in truth.
+    `node` is the share of queries given the node that is nearest in truth; `room`: share given a node of their own
+    room; `error_m`: median distance to the node given; `least_error_m`: the same for the nearest in truth.
     """
     each = queries.embeddings.shape[1]
     xy_w, room = np.repeat(queries.xy_w, each, 0), np.repeat(queries.room, each)

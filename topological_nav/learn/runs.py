@@ -69,13 +69,10 @@ def run_epochs(
     host: Host,
     checkpoint: str = CHECKPOINT,
 ) -> State:
-    """Epochs of one phase of a run; those that the checkpoint holds are not run again.
+    """Run the epochs of one phase of a run, without those that the checkpoint holds, and return the learner.
 
-    Args:
-        epoch: learner, the epoch's number from 0 and its key to learner and means over the epoch, `loss` among them.
-
-    Returns:
-        The learner.
+    `epoch` takes the learner, the epoch's number from 0 and its key to the learner and means over the epoch, `loss`
+    among them.
     """
     saved, first = read_checkpoint(out / checkpoint), 0
     if saved and saved.get("phase", phase) == phase:

@@ -122,11 +122,7 @@ class _Work:
 
 
 def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host: Host = ALONE) -> dict[str, Any]:
-    """Train a network for rooms or passages, or continue the run at `out`.
-
-    Returns:
-        The content of results.json.
-    """
+    """Train a network for rooms or passages, or continue the run at `out`; return the content of results.json."""
     header, data = read_header(dataset)
     work = _work(task, dataset, config)
     with claimed(out, {"task": task, "dataset": header, **to_dict(config)}):
@@ -271,13 +267,10 @@ def length_scores(logits: np.ndarray, free: np.ndarray, lengths_m: Sequence[floa
 def localisation(
     trained: Trained, rooms: RoomImages, asked_by: Trained | None = None, asked: RoomImages | None = None
 ) -> dict[str, Any]:
-    """Scores of an embedding: training positions as nodes, every third level image of test positions as queries.
+    """Score an embedding: training positions as nodes, every third level image of test positions as queries.
 
-    Each scene on its own; `mean` weighs them by queries. See `localise.localisation_scores`.
-
-    Args:
-        asked_by: embeds the queries; None: the same network.
-        asked: the queries'; None: the same images. Scenes are those of both, by name.
+    Each scene on its own; `mean` weighs them by queries. See `localise.localisation_scores`. Queries are images of
+    `asked` (None: the same images) that `asked_by` embeds (None: the same network); scenes are those of both, by name.
     """
     asked_by, asked = asked_by or trained, asked or rooms
     level, rows, weights, there = PITCHES.index("level"), {}, [], rows_by_scene(asked)

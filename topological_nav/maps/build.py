@@ -118,11 +118,9 @@ def judged_map(
     about: dict[str, Any],
     look: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
 ) -> Built:
-    """Build the map of given nodes, and compare its edges with the plan.
+    """Build the map of nodes with images [N, K, H, W, 3] u8 around each, and compare its edges with the plan.
 
-    Args:
-        images: [N, K, H, W, 3] u8 around each node.
-        look: edges [E, 2] and headings [E] to the images that edges are judged by; None: the node's nearest.
+    `look` takes edges [E, 2] and headings [E] to the images that edges are judged by; None: the node's nearest.
     """
     margin_m, points = judged_by(networks.detector)
 
@@ -170,10 +168,9 @@ def true_map(scene: Scene, space: FreeSpace, rooms: Rooms, config: MapConfig, da
 
 
 def drawn_for(data: DataConfig, supersample: int | None) -> DataConfig:
-    """How a navigator's images are drawn: as networks learned, but so many times larger before they are averaged.
+    """Return how a navigator's images are drawn: as networks learned, but larger by `supersample` before averaging.
 
-    Args:
-        supersample: as asked for; None: as they learned, on a CPU at most `CPU_SUPERSAMPLE`.
+    Without `supersample` as they learned, on a CPU at most `CPU_SUPERSAMPLE`.
     """
     need_engine(data.engine)
     if supersample is None:

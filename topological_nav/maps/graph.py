@@ -139,12 +139,9 @@ class TopologicalMap:
 
 
 def parts_of(edges: np.ndarray, count: int, both_ways: bool = False) -> list[list[int]]:
-    """Nodes that edges join, the largest part first.
+    """Return the nodes that edges [E, 2] between `count` nodes join, the largest part first.
 
-    Args:
-        edges: [E, 2].
-        count: of nodes.
-        both_ways: edges are directed, and nodes of a part must reach each other.
+    With `both_ways` edges are directed, and nodes of a part must reach each other.
     """
     joined = csr_array((np.ones(len(edges)), tuple(edges.T)), shape=(count, count))
     _, label = connected_components(joined, directed=both_ways, connection="strong")
@@ -184,17 +181,9 @@ def assemble(
     probability: Callable[[np.ndarray, np.ndarray], np.ndarray],
     about: dict[str, Any],
 ) -> TopologicalMap:
-    """A map of given nodes.
+    """Build the map of given nodes [N, ...]; those nearer than `edge_m` are joined, both ways.
 
-    Args:
-        scene: its name.
-        digest: of its files.
-        xy_w: [N, 2] m.
-        room: [N].
-        embeddings: [N, K, D].
-        edge_m: nodes nearer than this are joined, both ways.
-        probability: edges [E, 2] and headings [E] to [E] probabilities.
-        about: kept with the map.
+    `probability` takes edges [E, 2] and headings [E] to [E] probabilities; for the others see `TopologicalMap`.
     """
     edges = near_pairs(xy_w, edge_m)
     angle = angles(xy_w, edges)

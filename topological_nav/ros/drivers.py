@@ -42,12 +42,7 @@ class Driver(Protocol):
         ...
 
     def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> Command:
-        """The next command.
-
-        Args:
-            image: [H, W, 3] u8, level and straight ahead.
-            heading_rad: yaw of the robot in the map's frame.
-        """
+        """Return the next command, by a level image [H, W, 3] u8 straight ahead and the yaw in the map's frame."""
         ...
 
 

@@ -95,13 +95,9 @@ def info_lens(message: Any) -> Lens:
 
 
 def seen_through(rgb: np.ndarray, fov_deg: float, lens: Lens) -> np.ndarray:
-    """What a narrower or coarser pinhole lens on the same axis would have seen.
+    """Return what a narrower or coarser pinhole lens on the same axis would have seen of a picture [H, W, 3] u8.
 
-    Args:
-        rgb: [H, W, 3] u8.
-
-    Returns:
-        [h, w, 3] u8: the middle of the picture, averaged over each wanted pixel.
+    It is [h, w, 3] u8: the middle of the picture, averaged over each wanted pixel.
     """
     height, width, _ = rgb.shape
     have = Lens(width, height, fov_deg)
@@ -122,13 +118,10 @@ def seen_through(rgb: np.ndarray, fov_deg: float, lens: Lens) -> np.ndarray:
 def scan_fields(
     readings: np.ndarray, fov_deg: float, range_min_m: float, range_max_m: float, period_s: float
 ) -> dict[str, Any]:
-    """sensor_msgs/LaserScan of the lidar of `interactive_nav.sensing.sensors`.
+    """Return the sensor_msgs/LaserScan of the lidar of `interactive_nav.sensing.sensors`.
 
-    Args:
-        readings: [n] in [0, 1]: distances over `range_max_m`, 1 where nothing is nearer; from right to left.
-
-    Returns:
-        Ranges in m; positive infinity where nothing was met (REP-117).
+    Readings [n] in [0, 1] are distances over `range_max_m`, 1 where nothing is nearer, from right to left; the
+    message's ranges are in m, positive infinity where nothing was met (REP-117).
     """
     step = math.radians(fov_deg) / len(readings)
     first = -math.radians(fov_deg) / 2
@@ -161,12 +154,9 @@ def quat_yaw(quat: Any) -> float:
 
 
 def odometry_fields(pose: np.ndarray, linear_b: np.ndarray, angular_b: np.ndarray) -> dict[str, Any]:
-    """nav_msgs/Odometry.
+    """Return the nav_msgs/Odometry of a pose, x, y (m) and yaw (rad) in the frame of the start.
 
-    Args:
-        pose: (3,) x, y (m) and yaw (rad) in the frame of the start.
-        linear_b: (3,) m/s in the robot's frame, the message's child frame.
-        angular_b: (3,) rad/s.
+    Velocities (3,), m/s and rad/s, are in the robot's frame, the message's child frame.
     """
     x, y, yaw = (float(v) for v in pose)
     return {

@@ -23,11 +23,7 @@ from topological_nav.weights.packaged import Choice
 def topological_driver(
     map_file: Path, seeing: Choice, goals: Sequence[Path], goal_heading_rad: float, config: NavigatorConfig
 ) -> PilotDriver:
-    """The navigator, with its goal.
-
-    Args:
-        goal_heading_rad: of the first, in the map's frame.
-    """
+    """Return the navigator with its goal; the first picture of it looks along `goal_heading_rad` in the map's frame."""
     networks, made = load_networks(seeing.localiser, seeing.detector), load_map(map_file)
     lens = lens_of(networks.camera, get_robot(networks.camera.robot))
     sight = NetworkSight(made, networks.localiser, networks.detector, config.match)

@@ -57,11 +57,7 @@ class Rooms:
 
 
 def cluster(points: np.ndarray, method: str, count: int, seed: int) -> np.ndarray:
-    """[n] i32 labels of points [n, 2], numbered by the clusters' means along x, then y.
-
-    Args:
-        points: coordinates, m.
-    """
+    """Return labels [n] i32 of points [n, 2] (m), numbered by the clusters' means along x, then y."""
     if method not in METHODS:
         raise ConfigError(f"method is '{method}', expected one of {', '.join(METHODS)}")
     if not 1 <= count <= len(points):

@@ -51,15 +51,9 @@ class FreeSpace:
         return np.where(inside, self.clearance_m[cell[..., 1], cell[..., 0]], 0.0)
 
     def segment_free(self, start_w: np.ndarray, end_w: np.ndarray, points: int, margin_m: float) -> np.ndarray:
-        """Whether straight ways are free: every looked-up point has the margin.
+        """Return whether straight ways between points [..., 2] (m) are free, [...] bool.
 
-        Args:
-            start_w: [..., 2] m.
-            end_w: [..., 2] m.
-            margin_m: clearance that each needs; 0: its cell is free.
-
-        Returns:
-            [...] bool.
+        Every looked-up point has the margin as its clearance; 0: its cell is free.
         """
         share = np.linspace(0.0, 1.0, points)[:, None]
         start_w, end_w = np.asarray(start_w, float), np.asarray(end_w, float)
@@ -93,12 +87,7 @@ def free_space(scene: Scene, height_m: float) -> FreeSpace:
 
 
 def spread(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Indices of `count` points (all, where there are fewer), far from each other: each next one is the farthest.
-
-    Args:
-        points: [n, 2].
-        count: at least 0.
-    """
+    """Return the indices of `count` points of [n, 2] (all, where there are fewer): each next one is the farthest."""
     if count <= 0 or not len(points):
         return np.zeros(0, int)
     picked = [int(rng.integers(len(points)))]
