@@ -60,10 +60,10 @@ class Adapting:
 
 def embed_training(network: Network, variables: Any, images: jax.Array) -> tuple[jax.Array, Any]:
     """Embeddings [N, D] by the batch's own statistics, and the running ones updated."""
-    found, new = network.apply(
+    embeddings, new = network.apply(
         variables, images, method=lambda module, x: joined(module.body(normalised(x), True)), mutable=["batch_stats"]
     )
-    return found, new.get("batch_stats", variables["batch_stats"])  # type: ignore[union-attr,return-value]
+    return embeddings, new.get("batch_stats", variables["batch_stats"])  # type: ignore[union-attr,return-value]
 
 
 def make_adapting(
@@ -103,14 +103,14 @@ def adversarial_epoch(network: Network, critic: Critic, config: AdaptConfig):
         x = images[rows]
         drawn = source[jax.random.randint(key, (len(rows),), 0, len(source))]
         target, _ = embed_training(network, {"params": state.params, "batch_stats": state.batch_stats}, x)
-        (told, right), slope = jax.value_and_grad(critic_loss, has_aux=True)(state.critic, drawn, target)
+        (critics, right), slope = jax.value_and_grad(critic_loss, has_aux=True)(state.critic, drawn, target)
         change, critic_opt = critic_tx.update(slope, state.critic_opt_state, state.critic)
         weights: Any = optax.apply_updates(state.critic, change)
         grad = jax.value_and_grad(extractor_loss, has_aux=True)
         (loss, stats), slope = grad(state.params, state.batch_stats, weights, x)
         change, opt = tx.update(slope, state.opt_state, state.params)
         new = Adapting(optax.apply_updates(state.params, change), stats, opt, weights, critic_opt)
-        return new, {"loss": loss, "critic_loss": told, "critic_accuracy": right}
+        return new, {"loss": loss, "critic_loss": critics, "critic_accuracy": right}
 
     return compiled_epoch(keyed_batches(config.batch), update)
 

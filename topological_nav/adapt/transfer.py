@@ -118,10 +118,10 @@ def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> 
     """Target images to learn from and to test, as many free as blocked, no source in both."""
     passages = load_passages(target)
     if list(passages.lengths_m) != list(lengths_m):
-        told = ",".join(f"{length:g}" for length in lengths_m)
+        lengths = ",".join(f"{length:g}" for length in lengths_m)
         raise DatasetError(
             f"{target}: passages are labelled for {list(passages.lengths_m)} m, the detector judges {list(lengths_m)}; "
-            f"make it again with passage_lengths_m=[{told}]"
+            f"make it again with passage_lengths_m=[{lengths}]"
         )
     scored = passages.free[:, passages.scored]
     images = as_seen(passages.images, preset(config.domain), PASSAGES_STREAM)
@@ -140,8 +140,8 @@ def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> 
 
 def _scores(trained: Trained, tested: PassageImages) -> dict[str, Any]:
     logits = trained.logits(tested.images)
-    found, truth = logits[:, tested.scored] > 0, tested.free[:, tested.scored]
+    predicted, truth = logits[:, tested.scored] > 0, tested.free[:, tested.scored]
     return {
-        **class_scores(truth, found, 2),
+        **class_scores(truth, predicted, 2),
         "lengths": length_scores(logits, tested.free, trained.about["lengths_m"]),
     }

@@ -58,9 +58,9 @@ def export_runs(arguments: argparse.Namespace) -> None:
     config = overridden(ExportConfig(), arguments.settings)
     with bar() as tell:
         runs = (arguments.localiser, arguments.detector, arguments.policy, arguments.maps)
-        made = export(*runs, arguments.images, arguments.out, config, tell)
+        exported = export(*runs, arguments.images, arguments.out, config, tell)
     picture = arguments.picture or arguments.out.with_name(f"{arguments.out.name}.png")
-    save(export_figure(made, config.limit_mib), picture)
-    for name, value in made.compared.scores.items():
+    save(export_figure(exported, config.limit_mib), picture)
+    for name, value in exported.compared.scores.items():
         print(f"{name.replace('_', ' ')}: {value:.3g}")
-    print(f"{arguments.out}: {size_lines(made.sizes, config.limit_mib)}; drawn in {picture}")
+    print(f"{arguments.out}: {size_lines(exported.sizes, config.limit_mib)}; drawn in {picture}")

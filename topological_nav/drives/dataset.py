@@ -161,12 +161,12 @@ def simulate_drives(
             if not path.is_file():
                 fleet = fleet or Fleet(make_env(scene_folders, config), terrain, config)
 
-                def told(ended: int, mine: np.ndarray = mine) -> None:
+                def tell(ended: int, mine: np.ndarray = mine) -> None:
                     progress("drives", int(mine[0]) + min(ended, len(mine) - 1), total)  # the padding's are no news
 
                 # Padded by its last drive: one size, one program.
                 rows = np.minimum(mine[0] + np.arange(config.batch), total - 1)
-                _write_batch(path, fleet.drive(tasks.take(rows), told), len(mine))
+                _write_batch(path, fleet.drive(tasks.take(rows), tell), len(mine))
             progress("drives", int(mine[-1]) + 1, total)
         return load_drives(out)
 

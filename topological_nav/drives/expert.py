@@ -73,8 +73,8 @@ def way_field(space: FreeSpace, goals_w: np.ndarray, config: ExpertConfig, limit
     far = dijkstra(graph, directed=False, indices=source, limit=limit_m).reshape(-1, rows, columns)
     out = np.empty(far.shape, np.float32)
     for i, field in enumerate(far):
-        known = np.isfinite(field)
-        away, at = scipy.ndimage.distance_transform_edt(~known, return_indices=True)  # type: ignore[misc]
+        reached = np.isfinite(field)
+        away, at = scipy.ndimage.distance_transform_edt(~reached, return_indices=True)  # type: ignore[misc]
         out[i] = field[at[0], at[1]] + 4.0 * space.resolution_m * np.asarray(away)
     return out
 
@@ -175,13 +175,13 @@ def command(
     ways_w = moved(pose_w, ways_b)
     plan = {"origin_w": terrain.origin_w[scene], "resolution_m": terrain.resolution_m[scene]}
     to_go = functools.partial(sample, terrain.to_go_m[goal], **plan)
-    seen = scan_gap(ways_b, points_b, half_m)
+    scanned = scan_gap(ways_b, points_b, half_m)
     rim = outline(half_m)[None, None]
     cos, sin = jnp.cos(ways_w[..., 2])[..., None], jnp.sin(ways_w[..., 2])[..., None]
     x = ways_w[..., :1] + cos * rim[..., 0] - sin * rim[..., 1]
     y = ways_w[..., 1:2] + sin * rim[..., 0] + cos * rim[..., 1]
-    known = sample(terrain.clearance_m[scene], xy_w=jnp.stack([x, y], -1), **plan).min(-1)
-    gap = jnp.minimum(seen, known).min(-1)
+    mapped = sample(terrain.clearance_m[scene], xy_w=jnp.stack([x, y], -1), **plan).min(-1)
+    gap = jnp.minimum(scanned, mapped).min(-1)
     left, end = _left(to_go, ways_w, linear, config)
     heading = _fall(to_go, end[:, :2])
     turn = jnp.abs(wrap_angle(heading - end[:, 2])) / jnp.pi

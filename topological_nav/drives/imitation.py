@@ -211,17 +211,17 @@ def _scores(
         rows = np.minimum(np.arange(first, first + config.batch), len(held_out) - 1)
         part = held_out.take(rows)
         u = jnp.asarray(features[part.rows], jnp.float32)
-        told = _judged(policy, forward, learner.params, learner.batch_stats, u, part.linear, part.angular)
-        columns.append([np.asarray(c)[: len(held_out) - first] for c in told])
+        judged = _judged(policy, forward, learner.params, learner.batch_stats, u, part.linear, part.angular)
+        columns.append([np.asarray(c)[: len(held_out) - first] for c in judged])
     linear, angular, predicted, still = (np.concatenate(c) for c in zip(*columns, strict=True))
     out: dict[str, Any] = {"steps": int(held_out.valid.sum())}
-    for name, found, truth, count in (
+    for name, chosen, truth, count in (
         ("linear", linear, held_out.linear, config.linear_classes),
         ("angular", angular, held_out.angular, config.angular_classes),
     ):
-        found, truth = found[held_out.valid], truth[held_out.valid]
+        chosen, truth = chosen[held_out.valid], truth[held_out.valid]
         out[name] = {
-            **class_scores(truth, found, count),
+            **class_scores(truth, chosen, count),
             "commonest": float(np.bincount(truth, minlength=count).max() / len(truth)),
         }
     followed = held_out.followed

@@ -22,13 +22,13 @@ class SummedCell(nn.Module):
     hidden: int
 
     @nn.compact
-    def __call__(self, own: jax.Array, total: jax.Array, x: jax.Array) -> jax.Array:
+    def __call__(self, hidden: jax.Array, total: jax.Array, x: jax.Array) -> jax.Array:
         """[B, H] memory, [B, H] sum and [B, D] input to the new memory [B, H]."""
         from_x = jnp.split(nn.Dense(3 * self.hidden, name="inputs")(x), 3, -1)
         from_total = jnp.split(nn.Dense(3 * self.hidden, name="memory")(total), 3, -1)
         reset, keep = (nn.sigmoid(a + b) for a, b in zip(from_x[:2], from_total[:2], strict=True))
         new = nn.tanh(from_x[2] + reset * from_total[2])
-        return (1.0 - keep) * new + keep * own
+        return (1.0 - keep) * new + keep * hidden
 
 
 class Policy(nn.Module):
@@ -57,7 +57,7 @@ class Policy(nn.Module):
         if self.project is not None:
             x = nn.relu(self.project(x))
         total = memory[0] + memory[1]
-        new = tuple(cell(own, total, x) for cell, own in zip(self.cells, memory, strict=True))
+        new = tuple(cell(hidden, total, x) for cell, hidden in zip(self.cells, memory, strict=True))
         return new, tuple(head(h) for head, h in zip(self.heads, new, strict=True))  # type: ignore[return-value]
 
     def fresh(self, batch: int) -> Memory:

@@ -193,15 +193,15 @@ def compiled_epoch(steps: Callable[..., Any], update: Callable[..., Any]) -> Epo
     planned, one = jax.jit(steps), jax.jit(update, donate_argnums=0)
 
     def whole(learner, images, labels, key):
-        learner, told = jax.lax.scan(lambda state, row: update(state, images, labels, row), learner, steps(images, key))
-        return learner, jax.tree.map(jnp.mean, told)
+        learner, each = jax.lax.scan(lambda state, row: update(state, images, labels, row), learner, steps(images, key))
+        return learner, jax.tree.map(jnp.mean, each)
 
     def by_updates(learner, images, labels, key):
-        rows, told = jax.device_get(planned(images, key)), []  # to cut and mean arrays of JAX costs more than to learn
+        rows, each = jax.device_get(planned(images, key)), []  # to cut and mean arrays of JAX costs more than to learn
         for i in range(len(jax.tree.leaves(rows)[0])):
             learner, numbers = one(learner, images, labels, jax.tree.map(lambda x, i=i: x[i], rows))
-            told.append(numbers)
-        return learner, jax.tree.map(lambda *x: np.mean(x), *jax.device_get(told))
+            each.append(numbers)
+        return learner, jax.tree.map(lambda *x: np.mean(x), *jax.device_get(each))
 
     return by_updates if jax.default_backend() == "cpu" else jax.jit(whole, donate_argnums=0)
 
@@ -214,10 +214,10 @@ def in_batches(function: Callable[[jax.Array], jax.Array], images: np.ndarray) -
         size = next((n for n in sizes if n >= len(images) - first), sizes[-1])
         part = images[first : first + size]
         padded = np.concatenate([part, np.zeros((size - len(part), *part.shape[1:]), part.dtype)])
-        asked = function(jnp.asarray(padded)), len(part)
+        call = function(jnp.asarray(padded)), len(part)
         if waiting is not None:  # copied while an accelerator works on the next
             rows.append(np.asarray(waiting[0]))
-        waiting, first = asked, first + size
+        waiting, first = call, first + size
     rows.append(np.asarray(waiting[0])[: waiting[1]])  # cut here: on a device each length would be compiled
     return np.concatenate(rows)
 

@@ -154,11 +154,11 @@ def read_weights(run: Path, template: Any, about: dict[str, Any]) -> Any:
     with readable(path, RunError, "train again"):
         content = weights_content(run)
         zeros = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), template)
-        found = flax.serialization.from_bytes(zeros, content)
-    own = about.get("export", {}).get("weights_digest")
-    if own and hashlib.sha256(content).hexdigest() != own:
+        variables = flax.serialization.from_bytes(zeros, content)
+    digest = about.get("export", {}).get("weights_digest")
+    if digest and hashlib.sha256(content).hexdigest() != digest:
         raise RunError(f"{path}: is not the file that was exported with its {DESCRIPTION}; export the run again")
-    return jax.tree.map(lambda s, x: jnp.asarray(x, s.dtype), template, found)
+    return jax.tree.map(lambda s, x: jnp.asarray(x, s.dtype), template, variables)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any] | None:

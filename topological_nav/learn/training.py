@@ -238,22 +238,25 @@ def _scores(trained: Trained, work: _Work) -> dict[str, Any]:
         logits, truth = trained.logits(work.held_out), work.truth
         if work.task == "passages":
             results["lengths"] = length_scores(logits, truth, work.lengths_m)
-            found, truth = (logits[:, work.scored] > 0).astype(np.int32), truth[:, work.scored]
+            chosen, truth = (logits[:, work.scored] > 0).astype(np.int32), truth[:, work.scored]
         else:
-            found = logits.argmax(1)
+            chosen = logits.argmax(1)
         results["groups"] = {
-            name: {"images": len(rows), **class_scores(truth[rows], found[rows])} for name, rows in work.groups.items()
+            name: {"images": len(rows), **class_scores(truth[rows], chosen[rows])} for name, rows in work.groups.items()
         }
         if work.task == "passages":
-            results["confusion"] = confusion_matrix(truth, found, labels=[0, 1]).tolist()
+            results["confusion"] = confusion_matrix(truth, chosen, labels=[0, 1]).tolist()
     results["localisation"] = localisation(trained, work.rooms)
     return results
 
 
-def class_scores(truth: np.ndarray, found: np.ndarray, classes: int = 0) -> dict[str, Any]:
+def class_scores(truth: np.ndarray, chosen: np.ndarray, classes: int = 0) -> dict[str, Any]:
     """Accuracy and macro F1 of [N] classes; with how many there are also the confusion, a row for each true one."""
-    out = {"accuracy": float((found == truth).mean()), "macro_f1": float(f1_score(truth, found, average="macro"))}
-    return out | ({"confusion": confusion_matrix(truth, found, labels=range(classes)).tolist()} if classes else {})
+    out = {
+        "accuracy": float((chosen == truth).mean()),
+        "macro_f1": float(f1_score(truth, chosen, average="macro")),
+    }
+    return out | ({"confusion": confusion_matrix(truth, chosen, labels=range(classes)).tolist()} if classes else {})
 
 
 def length_scores(logits: np.ndarray, free: np.ndarray, lengths_m: Sequence[float]) -> list[dict[str, float]]:

@@ -118,10 +118,10 @@ def _stations(space: FreeSpace, way: np.ndarray, edge_m: float, margin_m: float,
     while at < len(way) - 1:
         ahead = way[at + 1 :]
         reach = np.linalg.norm(ahead - way[at], axis=1) < edge_m
-        seen = reach & space.segment_free(np.broadcast_to(way[at], ahead.shape), ahead, points, margin_m)
-        last = at + 1 + int(np.flatnonzero(seen)[-1])
+        reachable = reach & space.segment_free(np.broadcast_to(way[at], ahead.shape), ahead, points, margin_m)
+        last = at + 1 + int(np.flatnonzero(reachable)[-1])
         if last < len(way) - 1:
-            steps = at + 1 + np.flatnonzero(seen)
+            steps = at + 1 + np.flatnonzero(reachable)
             steps = steps[steps - at > (last - at) // 2][::-1]  # of equals the farthest
             last = int(steps[room_m[steps].argmax()])
         at = last

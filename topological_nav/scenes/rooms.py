@@ -93,7 +93,7 @@ def choose_count(points: np.ndarray, method: str, seed: int, most: int = MAX_ROO
 
 
 def find_rooms(
-    space: FreeSpace, method: str, num_rooms: int | None, known: np.ndarray | None, seed: int, clearance_m: float
+    space: FreeSpace, method: str, num_rooms: int | None, recorded: np.ndarray | None, seed: int, clearance_m: float
 ) -> Rooms:
     """Clusters a scene's free positions."""
     centres = space.centres(clearance_m)
@@ -101,8 +101,8 @@ def find_rooms(
     points = centres[np.sort(rng.choice(len(centres), min(CLUSTERED, len(centres)), replace=False))]
     if num_rooms is not None:
         count, by = num_rooms, "config"
-    elif known is not None:
-        count, by = len(known), "recorded"
+    elif recorded is not None:
+        count, by = len(recorded), "recorded"
     else:
         count, by = choose_count(points, method, seed)
     if count > len(points):
@@ -112,8 +112,8 @@ def find_rooms(
 
 def scene_rooms(scene: Scene, space: FreeSpace, config: DataConfig) -> Rooms:
     """A scene's rooms as a dataset of these settings has them; see `find_rooms`."""
-    known = recorded_rooms(scene.digest)
-    return find_rooms(space, config.room_method, config.num_rooms, known, config.seed, config.clearance_m)
+    recorded = recorded_rooms(scene.digest)
+    return find_rooms(space, config.room_method, config.num_rooms, recorded, config.seed, config.clearance_m)
 
 
 def recorded_rooms(digest: str) -> np.ndarray | None:
@@ -121,16 +121,16 @@ def recorded_rooms(digest: str) -> np.ndarray | None:
     return np.array(RECORDED[digest]) if digest in RECORDED else None
 
 
-def room_of(known: np.ndarray, xy_w: np.ndarray) -> np.ndarray:
+def room_of(recorded: np.ndarray, xy_w: np.ndarray) -> np.ndarray:
     """[n] i32: the recorded room that holds each point [n, 2], or in a doorway the nearest one."""
-    low, high = known[None, :, :2], known[None, :, 2:]
+    low, high = recorded[None, :, :2], recorded[None, :, 2:]
     outside = np.maximum(np.maximum(low - xy_w[:, None], xy_w[:, None] - high), 0.0)
     return np.linalg.norm(outside, axis=-1).argmin(1).astype(np.int32)
 
 
-def agreement(rooms: Rooms, known: np.ndarray) -> float:
-    """Adjusted Rand index of the rooms found with the recorded ones: 1 the same, 0 as good as chance."""
-    return float(adjusted_rand_score(room_of(known, rooms.points_w), rooms.labels))
+def agreement(rooms: Rooms, recorded: np.ndarray) -> float:
+    """Return the adjusted Rand index of the rooms with the recorded ones: 1 the same, 0 as good as chance."""
+    return float(adjusted_rand_score(room_of(recorded, rooms.points_w), rooms.labels))
 
 
 def _mixture(points: np.ndarray, count: int, seed: int) -> GaussianMixture:
