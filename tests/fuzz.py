@@ -190,7 +190,10 @@ def runs() -> dict[str, Target]:
     from train.sweep import spec
     from train.sweep.folder import SweepFolder
 
-    weights = {"params": {"kernel": np.ones((3, 2), np.float32), "bias": np.zeros(2, np.float32)}}
+    weights = {
+        "params": {"kernel": np.ones((3, 2), np.float32), "bias": np.zeros(2, np.float32)},
+        "normalizer_params": {},
+    }
     small = {
         "versions.json": {"device": {"kind": "cpu"}, "commit": "a"},
         "summary.json": {"completed": False, "env_steps": 9},

@@ -11,6 +11,9 @@ from interactive_nav_common.config import AtLeastOne, NotNegative, Positive, See
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import check_name
 
+AUTO: dict[str, dict[str, dict[str, int]]] = yaml.safe_load((Path(__file__).parent / "sizes.yaml").read_text())
+"""Algorithm, and the section of its settings -> backend -> the sizes that None means."""
+
 
 @dataclasses.dataclass(frozen=True)
 class EnvConfig(NavConfig):
@@ -142,7 +145,7 @@ class OffPolicyConfig(Settings):
 
     @property
     def replay_slots(self) -> int:
-        """Steps of each environment that the replay keeps."""
+        """Return the steps of each environment that the replay keeps."""
         assert self.max_replay_size and self.num_envs, "the config must be resolved"
         return self.max_replay_size // self.num_envs
 
@@ -240,7 +243,7 @@ class TrainConfig(Settings):
 
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
     """The task."""
-    algorithm: Literal["ppo", "sac", "ddpg"] = "ppo"
+    algorithm: Literal[tuple(AUTO)] = "ppo"  # type: ignore[valid-type]
     """Learner; the section of its name holds its settings."""
     network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
     """Encoders of images."""
@@ -254,12 +257,8 @@ class TrainConfig(Settings):
     """The run."""
 
 
-AUTO: dict[str, dict[str, dict[str, int]]] = yaml.safe_load((Path(__file__).parent / "sizes.yaml").read_text())
-"""Section -> backend -> what its None means."""
-
-
 def resolve(config: TrainConfig, backend: str) -> TrainConfig:
-    """The config with the backend named and every None of the learners filled in, checked across fields."""
+    """Return the config with the backend named and every None of the learners filled in, checked across fields."""
     sections: dict[str, Any] = {}
     for name, auto in AUTO.items():
         if backend not in auto:
@@ -273,7 +272,7 @@ def resolve(config: TrainConfig, backend: str) -> TrainConfig:
 
 
 def validate(config: TrainConfig) -> None:
-    """Raises `ConfigError` where values exclude each other; what is still None is not looked at."""
+    """Raise `ConfigError` where values exclude each other; what is still None is not looked at."""
     if not config.env.scenes:
         raise ConfigError("env.scenes is empty, expected at least one scene folder: env.scenes=PATH[,PATH...]")
     _validate_used(config)
@@ -291,7 +290,7 @@ def validate(config: TrainConfig) -> None:
 
 
 def _validate_used(config: TrainConfig) -> None:
-    """Raises `ConfigError` where a setting of a section that is not used was changed."""
+    """Raise `ConfigError` where a setting of a section that is not used was changed."""
     images = any(name in config.env.observations for name in IMAGES)
     for name in ("network", *AUTO):
         section, auto = getattr(config, name), AUTO.get(name, {}).values()
@@ -301,12 +300,12 @@ def _validate_used(config: TrainConfig) -> None:
             value = getattr(section, field.name)
             if value not in (field.default, *(sizes.get(field.name) for sizes in auto)):  # `resolve` fills all sections
                 needs = "images among env.observations" if name == "network" else f"algorithm {name}"
-                told = f"{name}.{field.name} is {value!r}, which changes nothing here"
-                raise ConfigError(f"{told}: expected {needs}; or leave it out")
+                problem = f"{name}.{field.name} is {value!r}, which changes nothing here"
+                raise ConfigError(f"{problem}: expected {needs}; or leave it out")
 
 
 def _validate_replay(name: str, config: OffPolicyConfig, num_timesteps: int) -> None:
-    """Raises `ConfigError` where the replay could never be learned from."""
+    """Raise `ConfigError` where the replay could never be learned from."""
     if config.min_replay_size and config.min_replay_size >= num_timesteps:
         raise ConfigError(
             f"{name}.min_replay_size is {config.min_replay_size}, expected less than run.num_timesteps "

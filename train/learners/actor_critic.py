@@ -1,9 +1,9 @@
-"""What SAC and DDPG are alike in: a policy and critics, how they begin, and one step down both of their losses."""
+"""Share what actor-critic learners have in common: networks, first parameters, and a step down both losses."""
 
 import abc
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import flax.struct
 import jax
@@ -21,7 +21,7 @@ from train.learners.networks import ObservationSize
 
 @flax.struct.dataclass
 class ActorCriticState:
-    """All that learning changes."""
+    """Holds all that learning changes."""
 
     policy_optimizer_state: optax.OptState
     policy_params: Any
@@ -35,25 +35,22 @@ class ActorCriticState:
 
 @dataclasses.dataclass(frozen=True)
 class ActorCritic(abc.ABC):
-    """All that learning does not change; SAC and DDPG add what makes them SAC and DDPG."""
+    """Holds all that learning does not change; a subclass adds its losses, targets and exploration."""
 
-    SECTION: ClassVar[str]
-    """Of the config."""
-
+    section: str
+    """The name of its settings in the config."""
     config: OffPolicyConfig
     networks: sac_networks.SACNetworks
     """[..., outputs] and [..., critics] of observations, and actions."""
     size: ObservationSize
     action_size: int
     shared: bool
-    """The policy looks through the critics' encoder: its own parameters are then `{"head": ...}` alone."""
+    """The policy looks through the critics' encoder: its parameters are then `{"head": ...}` alone."""
 
     @classmethod
     def of(cls, env: Any, config: TrainConfig) -> Self:
-        """The networks and settings for an environment's observations and actions; with images the critics look
-        through one encoder.
-        """
-        c, network, size = getattr(config, cls.SECTION), config.network, env.observation_size
+        """Build networks for an environment's observations and actions; with images the critics share an encoder."""
+        c, network, size = getattr(config, config.algorithm), config.network, env.observation_size
         distribution = cls.distribution(env.action_size)
         outputs, critics = distribution.param_size if distribution else env.action_size, getattr(c, "num_critics", 2)
         prepare: Any = networks.preprocess(c.normalize_observations)
@@ -70,48 +67,49 @@ class ActorCritic(abc.ABC):
             q = brax_networks.make_q_network(
                 size, env.action_size, prepare, hidden_layer_sizes=q_layers, n_critics=critics, layer_norm=norm
             )
-        made = sac_networks.SACNetworks(policy, q, distribution)  # type: ignore[call-arg]
-        return cls(c, made, size, env.action_size, network.share_encoder and isinstance(size, Mapping))
+        both = sac_networks.SACNetworks(policy, q, distribution)  # type: ignore[call-arg]
+        shared = network.share_encoder and isinstance(size, Mapping)
+        return cls(config.algorithm, c, both, size, env.action_size, shared)
 
     @staticmethod
     def distribution(action_size: int) -> Any:
-        """Of actions, as the policy's outputs parametrise it; None: they are actions before tanh."""
+        """Return the distribution that the policy's outputs parametrise; None: they are actions before tanh."""
         return None
 
     @property
     def steps_per_update(self) -> int:
-        """Environment steps collected for one update."""
+        """Return the environment steps collected for one update."""
         return (self.config.num_envs or 0) * (self.config.steps_per_update or 0)
 
     @property
     @abc.abstractmethod
     def optimizers(self) -> tuple[optax.GradientTransformation, ...]:
-        """Of policy, of critics, and of what else the algorithm learns."""
+        """Return the optimizers of policy, critics, and whatever else the algorithm learns, in this order."""
 
     @abc.abstractmethod
     def init(self, key_networks: jax.Array, key: jax.Array) -> Any:
-        """A learner that has learned nothing; `key` is what its updates will draw from."""
+        """Return a new learner; `key` is what its updates will draw from."""
 
     @abc.abstractmethod
     def policy(self, learner: Any, deterministic: bool) -> types.Policy:
-        """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
+        """Return (observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
 
     @abc.abstractmethod
     def init_noise(self) -> Any:
-        """Exploration noise of every environment at the start of an episode."""
+        """Return the exploration noise of every environment at the start of an episode."""
 
     @abc.abstractmethod
     def explore(self, learner: Any, observation: Any, noise: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-        """Actions [envs, A] in [-1, 1] to learn from, and the noise after them."""
+        """Return actions [envs, A] in [-1, 1] to learn from, and the noise after them."""
 
     @abc.abstractmethod
     def gradient_step(
         self, learner: Any, transitions: types.Transition, key: jax.Array
     ) -> tuple[Any, dict[str, jax.Array]]:
-        """The learner after one gradient step on transitions [batch, ...], and its scalar metrics."""
+        """Return the learner after one gradient step on transitions [batch, ...], and scalar metrics."""
 
-    def begun(self, key: jax.Array) -> dict[str, Any]:
-        """The fields of a learner that has learned nothing."""
+    def first_fields(self, key: jax.Array) -> dict[str, Any]:
+        """Return the fields of a new `ActorCriticState`, without its key."""
         key_policy, key_q = jax.random.split(key)
         policy_params = self.networks.policy_network.init(key_policy)
         policy_params = {"head": policy_params["head"]} if self.shared else policy_params
@@ -127,42 +125,37 @@ class ActorCritic(abc.ABC):
         }
 
     def whole_policy(self, policy_params: Any, q_params: Any) -> Any:
-        """The parameters of the whole policy network.
-
-        Args:
-            policy_params: what the policy's optimiser moves.
-            q_params: whose encoder it looks through, if one is shared; the policy's loss does not move it.
-        """
+        """Return the parameters of the whole policy network, with the critics' encoder if it is shared."""
         return {**policy_params, "encoder": q_params["encoder"]} if self.shared else policy_params
 
     def descended(
         self,
         learner: Any,
         critic_loss: Callable[..., jax.Array],
-        seen_by_critic: tuple[Any, ...],
+        critic_inputs: tuple[Any, ...],
         actor_loss: Callable[..., jax.Array],
-        seen_by_actor: tuple[Any, ...],
+        actor_inputs: tuple[Any, ...],
         transitions: types.Transition,
     ) -> tuple[dict[str, Any], dict[str, jax.Array]]:
-        """One step of critics and policy, each from the other's parameters before it.
+        """Step critics and policy, each from the other's parameters before the step.
 
-        Args:
-            actor_loss: (whole policy's parameters, normalizer_params, q_params, *seen_by_actor) -> ().
+        The actor's loss is (whole policy's parameters, normalizer_params, q_params, *actor_inputs) -> (); a shared
+        encoder does not move with it.
 
         Returns:
-            The learner's fields that change, its targets left out; scalar metrics, with the mean value that the critics
-            saw in what was done.
+            The learner's fields that change, without its targets; scalar metrics, with the mean value of the
+            transitions' actions.
         """
 
-        def own_loss(policy_params: Any, q_params: Any, *rest: Any) -> jax.Array:
+        def policy_loss(policy_params: Any, q_params: Any, *rest: Any) -> jax.Array:
             whole = self.whole_policy(policy_params, q_params)
             return actor_loss(whole, learner.normalizer_params, q_params, *rest)
 
         critic_loss_value, q_params, q_optimizer_state = descend(critic_loss, self.optimizers[1])(
-            learner.q_params, *seen_by_critic, optimizer_state=learner.q_optimizer_state
+            learner.q_params, *critic_inputs, optimizer_state=learner.q_optimizer_state
         )
-        actor_loss_value, policy_params, policy_optimizer_state = descend(own_loss, self.optimizers[0])(
-            learner.policy_params, learner.q_params, *seen_by_actor, optimizer_state=learner.policy_optimizer_state
+        actor_loss_value, policy_params, policy_optimizer_state = descend(policy_loss, self.optimizers[0])(
+            learner.policy_params, learner.q_params, *actor_inputs, optimizer_state=learner.policy_optimizer_state
         )
         values = self.networks.q_network.apply(
             learner.normalizer_params, learner.q_params, transitions.observation, transitions.action
@@ -178,12 +171,19 @@ class ActorCritic(abc.ABC):
         return changed, metrics
 
 
+def policy_part(learner: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the part of a learner, as nested dicts, that its policy reads."""
+    policy, q = learner["policy_params"], learner["q_params"]
+    encoder = {"encoder": q["encoder"]} if "encoder" in q and "encoder" not in policy else {}  # it is shared
+    return {"policy_params": policy, "q_params": encoder, "normalizer_params": learner["normalizer_params"]}
+
+
 def descend(loss: Callable[..., jax.Array], optimizer: optax.GradientTransformation) -> Callable[..., Any]:
-    """A step down a loss: (params, *rest, optimizer_state=) -> (loss, params, optimizer_state)."""
+    """Return a step down a loss: (params, *rest, optimizer_state=) -> (loss, params, optimizer_state)."""
     # No axis to average gradients over: one device.
     return gradients.gradient_update_fn(loss, optimizer, None)  # type: ignore[arg-type]
 
 
 def soft_update(target: Any, online: Any, tau: float | jax.Array) -> Any:
-    """Targets moved by `tau` towards the networks they follow, written as Brax writes it."""
+    """Move targets by `tau` towards the networks they follow, written as Brax writes it."""
     return jax.tree.map(lambda x, y: x * (1 - tau) + y * tau, target, online)

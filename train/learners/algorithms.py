@@ -1,8 +1,8 @@
-"""Names of algorithms -> the learners behind them: one face for training, checkpoints and evaluation."""
+"""Name the algorithms, and train, restore and play each in the same way."""
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -10,13 +10,13 @@ from brax.envs import Env
 from brax.training import types
 
 from train.config import TrainConfig
-from train.learners import ddpg, offpolicy, ppo, sac
+from train.learners import actor_critic, ddpg, offpolicy, ppo, sac
 from train.learners.learner import Callbacks, Snapshot, TrainResult, Update, reset_envs, run_loop
 
 
 @dataclasses.dataclass(frozen=True)
 class Algorithm:
-    """How an algorithm begins and what it does in an update."""
+    """Says how an algorithm starts, what an update does, and which part of its learner is the policy."""
 
     make_agent: Callable[[Any, TrainConfig], Any]
     """Networks and settings, which learning does not change; raises ConfigError where they do not fit an environment's
@@ -24,33 +24,36 @@ class Algorithm:
     start: Callable[[Any, Env, int], Snapshot]
     """(agent, env, seed) -> the first state of learner and environments."""
     update: Callable[[Any, Env, Any, Any], tuple[Any, Any, Update]]
-    """(agent, env, learner, env_state) -> both after one update, and what is told of it."""
+    """(agent, env, learner, env_state) -> both after one update, and its metrics."""
+    policy_part: Callable[[Mapping[str, Any]], Mapping[str, Any]]
+    """(learner as nested dicts) -> the part that `agent.policy` reads, parameters and normaliser: all that an exported
+    policy holds."""
 
     def train(self, env: Env, config: TrainConfig, callbacks: Callbacks) -> TrainResult:
-        """Trains a policy."""
+        """Train a policy."""
         agent = self.make_agent(env, config)
-        begin = self.start(agent, env, config.run.seed)
-        restored = callbacks.restore(begin)
-        if restored is not None and restored.env_state is None:
-            key = jax.random.fold_in(jax.random.PRNGKey(config.run.seed), restored.env_steps)
-            fresh, data = reset_envs(agent, env, key), begin.env_state
+        first = self.start(agent, env, config.run.seed)
+        snapshot = callbacks.restore(first) or first
+        if snapshot.env_state is None:
+            key = jax.random.fold_in(jax.random.PRNGKey(config.run.seed), snapshot.env_steps)
+            fresh, data = reset_envs(agent, env, key), first.env_state
             state = data.replace(env_state=fresh) if isinstance(data, offpolicy.OffPolicyData) else fresh
-            restored = dataclasses.replace(restored, env_state=state)
+            snapshot = dataclasses.replace(snapshot, env_state=state)
         update_fn = functools.partial(self.update, agent, env)
-        return run_loop(update_fn, restored or begin, agent.steps_per_update, config.run, callbacks)
+        return run_loop(update_fn, snapshot, agent.steps_per_update, config.run, callbacks)
 
     def template(self, env: Any, config: TrainConfig) -> Any:
-        """A learner in the shapes that this config's checkpoints have."""
+        """Return a learner in the shapes that this config's checkpoints have."""
         key = jax.random.PRNGKey(0)
         return self.make_agent(env, config).init(key, key)
 
     def policy(self, env: Any, config: TrainConfig, learner: Any, deterministic: bool) -> types.Policy:
-        """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
+        """Return (observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
         return self.make_agent(env, config).policy(learner, deterministic)
 
 
 ALGORITHMS = {
-    "ppo": Algorithm(ppo.make_agent, ppo.start, ppo.update),
-    "sac": Algorithm(sac.make_agent, offpolicy.start, offpolicy.update),
-    "ddpg": Algorithm(ddpg.make_agent, offpolicy.start, offpolicy.update),
+    "ppo": Algorithm(ppo.make_agent, ppo.start, ppo.update, ppo.policy_part),
+    "sac": Algorithm(sac.SAC.of, offpolicy.start, offpolicy.update, actor_critic.policy_part),
+    "ddpg": Algorithm(ddpg.DDPG.of, offpolicy.start, offpolicy.update, actor_critic.policy_part),
 }

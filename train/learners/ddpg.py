@@ -23,19 +23,19 @@ from train.learners.actor_critic import ActorCritic, ActorCriticState, soft_upda
 
 
 def action_of(networks: SACNetworks, normalizer_params: Any, policy_params: Any, observation: Any) -> jax.Array:
-    """The policy's actions [..., A] in [-1, 1]."""
+    """Return the policy's actions [..., A] in [-1, 1]."""
     return jnp.tanh(networks.policy_network.apply(normalizer_params, policy_params, observation))
 
 
 @flax.struct.dataclass
 class DDPGState(ActorCriticState):
-    """With a target of the policy too."""
+    """Adds a target of the policy."""
 
     target_policy_params: Any
 
 
 def make_losses(ddpg_network: SACNetworks, reward_scaling: float, discounting: float) -> tuple[Any, Any]:
-    """The losses of critic and policy, with arguments in Brax's order."""
+    """Return the losses of critic and policy, with arguments in Brax's order."""
 
     def critic_loss(
         q_params: Any,
@@ -71,23 +71,22 @@ def make_losses(ddpg_network: SACNetworks, reward_scaling: float, discounting: f
 
 @dataclasses.dataclass(frozen=True)
 class DDPG(ActorCritic):
-    """All that learning does not change."""
+    """Holds all that learning does not change."""
 
-    SECTION = "ddpg"
     config: DDPGConfig
 
     @property
     def optimizers(self) -> tuple[optax.GradientTransformation, ...]:
-        """Of policy and critic."""
+        """Return the optimizers of policy and critic."""
         return optax.adam(self.config.actor_learning_rate), optax.adam(self.config.critic_learning_rate)
 
     def init(self, key_networks: jax.Array, key: jax.Array) -> DDPGState:
-        """A learner that has learned nothing."""
-        common = self.begun(key_networks)
+        """Return a new learner."""
+        common = self.first_fields(key_networks)
         return DDPGState(**common, target_policy_params=common["policy_params"], key=key)
 
     def policy(self, learner: DDPGState, deterministic: bool = True) -> types.Policy:
-        """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras); never random, whatever is asked."""
+        """Return (observation [N, ...], key) -> (action [N, A] in [-1, 1], extras), which is never random."""
         del deterministic
         params = self.whole_policy(learner.policy_params, learner.q_params)
 
@@ -98,13 +97,13 @@ class DDPG(ActorCritic):
         return act
 
     def init_noise(self) -> jax.Array:
-        """Zeros [envs, A]."""
+        """Return zeros [envs, A]."""
         return jnp.zeros((self.config.num_envs or 1, self.action_size))
 
     def explore(
         self, learner: DDPGState, observation: Any, noise: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """The policy's actions with noise added, cut to [-1, 1]."""
+        """Return the policy's actions with noise added, clipped to [-1, 1]."""
         c = self.config
         sd = jnp.linspace(c.noise_sd[0], c.noise_sd[-1], noise.shape[0])[:, None]
         kept = 1.0 - c.noise_damping if c.noise == "ou" else 0.0
@@ -115,7 +114,7 @@ class DDPG(ActorCritic):
     def gradient_step(
         self, learner: DDPGState, transitions: types.Transition, key: jax.Array
     ) -> tuple[DDPGState, dict[str, jax.Array]]:
-        """Critic, policy, and where they are due the targets."""
+        """Step critic and policy, and the targets when they are due."""
         del key  # nothing is drawn
         c = self.config
         critic_loss, actor_loss = make_losses(self.networks, c.reward_scaling, c.discounting)
@@ -134,6 +133,3 @@ class DDPG(ActorCritic):
             target_policy_params=soft_update(learner.target_policy_params, changed["policy_params"], tau),
             target_q_params=soft_update(learner.target_q_params, changed["q_params"], tau),
         ), metrics
-
-
-make_agent = DDPG.of

@@ -1,7 +1,7 @@
-"""What SAC and DDPG share: acting into the replay, learning from it, beginning and resuming.
+"""Act into the replay, learn from it, start and resume: what off-policy algorithms share.
 
 One update steps every environment `steps_per_update` times and then takes `grad_steps_per_update` gradient steps, each
-on a batch of its own. Until the replay holds `min_replay_size` transitions it takes none (`gradient_steps` in the
+on a new batch. Until the replay holds `min_replay_size` transitions it takes none (`gradient_steps` in the
 metrics says so), and a learner that never took any acts at random meanwhile, so every update is one and the same
 program and logs and checkpoints fall where they always do.
 
@@ -31,7 +31,7 @@ from train.learners.replay_buffer import Replay
 
 @flax.struct.dataclass
 class OffPolicyData:
-    """All that acting changes: the environments and what was seen of them."""
+    """Holds all that acting changes: environments, replay and noise."""
 
     env_state: Any
     replay: Replay
@@ -40,19 +40,19 @@ class OffPolicyData:
 
     @property
     def info(self) -> dict[str, Any]:
-        """The environments' own `info`."""
+        """Return the environments' `info`."""
         return self.env_state.info
 
     @property
     def note(self) -> str:
-        """What a user should know before training starts, in one line."""
+        """Return what a user should know before training starts, in one line."""
         return replay_buffer.describe(self.replay)
 
 
 def collect(
     agent: ActorCritic, env: Env, learner: Any, data: OffPolicyData, key: jax.Array
 ) -> tuple[OffPolicyData, Any]:
-    """Acts for one update.
+    """Act for one update.
 
     Returns:
         The data with `steps_per_update` more steps of every environment in the replay; and those steps without their
@@ -70,7 +70,7 @@ def collect(
         after = env.step(before, action)
         done, truncated = after.done, after.info["truncation"]
         replay = replay_buffer.insert(data.replay, before.obs, action, after.reward, done, truncated)
-        seen = {
+        collected = {
             "observation": networks.vector_part(before.obs),
             "action": action,
             "reward": after.reward,
@@ -82,13 +82,13 @@ def collect(
         noise = jax.tree.map(
             lambda x, start: jnp.where(ended.reshape(-1, *[1] * (x.ndim - 1)), start, x), noise, agent.init_noise()
         )
-        return OffPolicyData(after, replay, noise), seen
+        return OffPolicyData(after, replay, noise), collected
 
     return jax.lax.scan(step, data, jax.random.split(key, agent.config.steps_per_update))
 
 
 def learn(agent: ActorCritic, learner: Any, replay: Replay, key: jax.Array) -> tuple[Any, dict[str, jax.Array], Any]:
-    """Takes gradient steps, if the replay is full enough.
+    """Take gradient steps, if the replay is full enough.
 
     Returns:
         The learner; means of its metrics, 0 where no step was taken; and one batch learned from, the first that
@@ -123,35 +123,35 @@ def learn(agent: ActorCritic, learner: Any, replay: Replay, key: jax.Array) -> t
 
 
 def update(agent: ActorCritic, env: Env, learner: Any, data: OffPolicyData) -> tuple[Any, OffPolicyData, Update]:
-    """Acts, then learns."""
+    """Act, then learn."""
     key_act, key_learn, key_next = jax.random.split(learner.key, 3)
-    data, seen = collect(agent, env, learner, data, key_act)
-    sums = jax.tree.map(jnp.sum, seen.pop("sums"))
-    normalizer = networks.update_normalizer(learner.normalizer_params, seen["observation"])
+    data, collected = collect(agent, env, learner, data, key_act)
+    sums = jax.tree.map(jnp.sum, collected.pop("sums"))
+    normalizer = networks.update_normalizer(learner.normalizer_params, collected["observation"])
     learner, losses, batch = learn(agent, learner.replace(normalizer_params=normalizer), data.replay, key_learn)
     learner = learner.replace(key=key_next)
     losses = {
         **losses,
-        "reward_per_step": jnp.mean(seen["reward"]),
+        "reward_per_step": jnp.mean(collected["reward"]),
         "replay_size": replay_buffer.size(data.replay).astype(jnp.float32),
     }
     finite = all_finite((losses, learner))
-    return learner, data, Update(losses, sums, finite, {"collected": seen, "learned": batch})
+    return learner, data, Update(losses, sums, finite, {"collected": collected, "learned": batch})
 
 
 def start(agent: ActorCritic, env: Env, seed: int) -> Snapshot:
-    """The first state of learner, environments and replay, derived from the seed."""
+    """Return the first state of learner, environments and replay, derived from the seed."""
     c = agent.config
     key_networks, key_env, key_updates = jax.random.split(jax.random.PRNGKey(seed), 3)
     env_state = reset_envs(agent, env, key_env)
     make_replay = functools.partial(replay_buffer.init, c.replay_slots, env_state.obs, env.action_size, c.replay_dtype)
-    check_memory(c, jax.eval_shape(make_replay), agent.SECTION)
+    check_memory(c, jax.eval_shape(make_replay), agent.section)
     data = OffPolicyData(env_state, make_replay(), agent.init_noise())
     return Snapshot(0, jax.jit(agent.init)(key_networks, key_updates), data)
 
 
 def check_memory(config: OffPolicyConfig, replay: Replay, section: str) -> None:
-    """Raises `ConfigError` where the replay, or one of such shapes, takes more than `replay_limit_gb`."""
+    """Raise `ConfigError` where the replay, or one of such shapes, takes more than `replay_limit_gb`."""
     if replay_buffer.nbytes(replay) > config.replay_limit_gb * 1e9:
         images = isinstance(replay.observation, Mapping)
         smaller = "env.image_dtype=uint8" if images else f"{section}.replay_dtype=float16"

@@ -1,6 +1,6 @@
 """A batched environment and a config in, a policy trained by PPO out; Brax's losses, networks and unrolls.
 
-Brax's own `ppo.train` cannot be stopped and continued: it gives out parameters only, not the optimiser or the
+Brax's `ppo.train` cannot be stopped and continued: it gives out parameters only, not the optimiser or the
 random key, and keeps its loop to itself. So the loop is ours (`learner.run_loop`) and the update below is
 Brax's, with its keys split in the same places: a test compares the parameters after an update with those of
 `brax.training.agents.ppo.train`. What differs is one device instead of pmap, and less memory: episode scores
@@ -15,6 +15,7 @@ cut for V after it, and it multiplies V by `reward_scaling`. We do not use it.
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 from typing import Any
 
 import flax.struct
@@ -36,7 +37,7 @@ from train.learners.networks import ObservationSize
 
 @flax.struct.dataclass
 class SharedParams:
-    """Parameters of an actor and a critic that look through one encoder."""
+    """Holds the parameters of an actor and a critic that look through one encoder."""
 
     encoder: Any
     policy: Any
@@ -47,7 +48,7 @@ class SharedParams:
 
 @flax.struct.dataclass
 class PPOState:
-    """All that learning changes."""
+    """Holds all that learning changes."""
 
     optimizer_state: optax.OptState
     params: ppo_losses.PPONetworkParams | SharedParams
@@ -57,7 +58,7 @@ class PPOState:
 
 @dataclasses.dataclass(frozen=True)
 class PPOParts:
-    """All that learning does not change."""
+    """Holds all that learning does not change."""
 
     config: PPOConfig
     nets: nets.PpoNetworks
@@ -68,13 +69,13 @@ class PPOParts:
 
     @property
     def steps_per_update(self) -> int:
-        """Environment steps collected for one update."""
+        """Return the environment steps collected for one update."""
         c = self.config
         assert c.batch_size and c.num_minibatches and c.unroll_length, "the config must be resolved"
         return c.batch_size * c.num_minibatches * c.unroll_length
 
     def init(self, key_networks: jax.Array, key: jax.Array) -> PPOState:
-        """A learner that has learned nothing; `key` is what its updates will draw from."""
+        """Return a new learner; `key` is what its updates will draw from."""
         key_policy, key_value = jax.random.split(key_networks)
         policy = self.nets.networks.policy_network.init(key_policy)  # type: ignore[call-arg]
         value = self.nets.networks.value_network.init(key_value)  # type: ignore[call-arg]
@@ -90,15 +91,15 @@ class PPOParts:
         )
 
     def policy(self, learner: PPOState, deterministic: bool) -> types.Policy:
-        """(observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
+        """Return (observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
         make = ppo_networks.make_inference_fn(self.nets.networks)
         return make((learner.normalizer_params, *whole_params(learner.params)), deterministic)
 
 
 def make_agent(env: Any, config: TrainConfig) -> PPOParts:
-    """Networks and optimiser for an environment's observations and actions."""
+    """Build networks and optimiser for an environment's observations and actions."""
     network, size, c = config.network, env.observation_size, config.ppo
-    made = nets.make_ppo_networks(
+    built = nets.make_ppo_networks(
         network,
         size,
         env.action_size,
@@ -110,11 +111,17 @@ def make_agent(env: Any, config: TrainConfig) -> PPOParts:
     if c.learning_rate_schedule == "adaptive_kl":
         adam = optax.inject_hyperparams(optax.adam)(learning_rate=c.learning_rate)
     optimizer = optax.chain(optax.clip_by_global_norm(c.max_grad_norm), adam)
-    return PPOParts(c, made, optimizer, size, network.share_encoder and made.policy is not None)
+    return PPOParts(c, built, optimizer, size, network.share_encoder and built.policy is not None)
+
+
+def policy_part(learner: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the part of a learner, as nested dicts, that its policy reads."""
+    params = {name: value for name, value in learner["params"].items() if name != "value"}
+    return {"params": params, "normalizer_params": learner["normalizer_params"]}
 
 
 def whole_params(params: ppo_losses.PPONetworkParams | SharedParams) -> tuple[Any, Any]:
-    """Parameters of the policy and the value network as `PPOParts.networks` take them."""
+    """Return the parameters of the policy and the value network as `PPOParts.networks` take them."""
     if isinstance(params, SharedParams):
         return (
             {"encoder": params.encoder, "head": params.policy},
@@ -126,7 +133,7 @@ def whole_params(params: ppo_losses.PPONetworkParams | SharedParams) -> tuple[An
 def collect(
     parts: PPOParts, env: Env, state: PPOState, env_state: Any, key: jax.Array
 ) -> tuple[Any, types.Transition, dict[str, jax.Array]]:
-    """Acts for one update.
+    """Act for one update.
 
     Returns:
         The environments' new state; transitions with leaves [sequences, time, ...]; sums over ended episodes.
@@ -177,7 +184,7 @@ def shared_loss(
     encode: Any,
     **settings: Any,
 ) -> tuple[jax.Array, types.Metrics]:
-    """Brax's loss of the two heads, on features that are computed once."""
+    """Return Brax's loss of the two heads, on features that are computed once."""
     data = data._replace(
         observation=encode(normalizer_params, params.encoder, data.observation),
         next_observation=encode(normalizer_params, params.encoder, data.next_observation),
@@ -189,7 +196,7 @@ def shared_loss(
 def minibatch_step(
     parts: PPOParts, normalizer_params: Any, carry: tuple[Any, Any, jax.Array], data: types.Transition
 ) -> tuple[tuple[Any, Any, jax.Array], dict[str, jax.Array]]:
-    """One gradient step on transitions [batch, time, ...]; carry is (optimiser state, params, key)."""
+    """Take a gradient step on transitions [batch, time, ...]; carry is (optimiser state, params, key)."""
     optimizer_state, params, key = carry
     key, key_loss = jax.random.split(key)
     config = parts.config
@@ -229,7 +236,7 @@ def sgd_pass(
     carry: tuple[Any, Any, jax.Array],
     _: None,
 ) -> tuple[tuple[Any, Any, jax.Array], dict[str, jax.Array]]:
-    """One pass over the data in shuffled minibatches; carry is (optimiser state, params, key)."""
+    """Pass over the data once, in shuffled minibatches; carry is (optimiser state, params, key)."""
     optimizer_state, params, key = carry
     key, key_perm, key_grad = jax.random.split(key, 3)
 
@@ -245,13 +252,13 @@ def sgd_pass(
 
 
 def update(parts: PPOParts, env: Env, state: PPOState, env_state: Any) -> tuple[PPOState, Any, Update]:
-    """Collects one batch and learns from it: Brax's training step."""
+    """Collect a batch and learn from it: Brax's training step."""
     key_sgd, key_unroll, key_next = jax.random.split(state.key, 3)
     env_state, data, sums = collect(parts, env, state, env_state, key_unroll)
     # As in Brax: with adaptive_kl the old policy's outputs must stay comparable, so normalise afterwards.
     late = parts.config.learning_rate_schedule == "adaptive_kl"
-    seen = nets.update_normalizer(state.normalizer_params, data.observation)
-    normalizer_params = state.normalizer_params if late else seen
+    statistics = nets.update_normalizer(state.normalizer_params, data.observation)
+    normalizer_params = state.normalizer_params if late else statistics
     (optimizer_state, params, _), losses = jax.lax.scan(
         functools.partial(sgd_pass, parts, data, normalizer_params),
         (state.optimizer_state, state.params, key_sgd),
@@ -259,13 +266,13 @@ def update(parts: PPOParts, env: Env, state: PPOState, env_state: Any) -> tuple[
         length=parts.config.num_updates_per_batch,
     )
     losses = {**jax.tree.map(jnp.mean, losses), "reward_per_step": jnp.mean(data.reward)}
-    new_state = PPOState(optimizer_state=optimizer_state, params=params, normalizer_params=seen, key=key_next)
-    finite = all_finite((losses, params, seen.mean, seen.std))
+    new_state = PPOState(optimizer_state=optimizer_state, params=params, normalizer_params=statistics, key=key_next)
+    finite = all_finite((losses, params, statistics.mean, statistics.std))
     return new_state, env_state, Update(losses, sums, finite, data)
 
 
 def start(parts: PPOParts, env: Env, seed: int) -> Snapshot:
-    """The first state of learner and environments; keys are derived from the seed as Brax derives them."""
+    """Return the first state of learner and environments; keys are derived from the seed as Brax derives them."""
     key_networks, key_local = jax.random.split(jax.random.PRNGKey(seed))
     key_local, key_env, _ = jax.random.split(jax.random.fold_in(key_local, 0), 3)
     key_updates = jax.random.split(jax.random.split(key_local)[0], 1)[0]

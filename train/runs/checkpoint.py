@@ -53,7 +53,7 @@ class CheckpointMeta:
 
 
 def save(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, env_state_limit_mb: float) -> Path:
-    """Writes `root/<env steps>/` and removes what is no longer kept: the newest `keep` stay, and the best.
+    """Write `root/<env steps>/` and remove what is no longer kept: the newest `keep` stay, and the best.
 
     Only the newest holds the environments, and only if they take no more than the limit.
     """
@@ -113,7 +113,7 @@ def verify(folder: Path) -> CheckpointMeta:
 
 
 def best_checkpoint(checkpoints: list[CheckpointMeta]) -> CheckpointMeta | None:
-    """The one with the highest score; of equals the newest, and None before any has a score."""
+    """Return the checkpoint with the highest score; of equals the newest, and None before any has a score."""
     scored = [c for c in checkpoints if c.score is not None]
     return max(scored, key=lambda c: (c.score, c.env_steps), default=None)
 
@@ -170,12 +170,12 @@ def read_meta(folder: Path) -> CheckpointMeta:
 
 
 def is_whole(folder: Path) -> bool:
-    """Whether a checkpoint holds all of the learner; one that was exported holds the policy alone."""
+    """Return whether a checkpoint holds all of the learner; one that was exported holds the policy alone."""
     return (folder / LEARNER).is_file() or not (folder / policy_file.POLICY).is_file()
 
 
 def keep_policy(folder: Path, target: Path, step: float = policy_file.STEP) -> None:
-    """Writes what evaluating a checkpoint needs to another folder: `policy.npz` and `meta.json`."""
+    """Write what evaluating a checkpoint needs to another folder: `policy.npz` and `meta.json`."""
     meta = read_meta(folder)
     target.mkdir(parents=True)
     if is_whole(folder):
@@ -187,16 +187,16 @@ def keep_policy(folder: Path, target: Path, step: float = policy_file.STEP) -> N
 
 
 def weights_digest(folder: Path) -> str:
-    """SHA-256 of a checkpoint's weights."""
+    """Return the SHA-256 of a checkpoint's weights."""
     return _sha256(folder / (LEARNER if is_whole(folder) else policy_file.POLICY))
 
 
 def load_learner(folder: Path, template: Any) -> Any:
-    """The learner of a checkpoint, as arrays in the template's structure; of an exported one only the policy counts."""
+    """Return a checkpoint's learner as arrays in the template's structure; of an exported one the policy counts."""
     path = folder / LEARNER
     if not is_whole(folder):
         path = folder / policy_file.POLICY
-        learner = policy_file.read(path, template)
+        learner = policy_file.read(path, template, read_meta(folder).algorithm)
     else:
         try:
             learner = flax.serialization.from_bytes(template, regular(path).read_bytes())
@@ -222,7 +222,7 @@ def load_learner(folder: Path, template: Any) -> Any:
 
 
 def load_env_state(folder: Path, template: Any) -> Any | None:
-    """The environments of a checkpoint in the template's structure; None if it has none that fit it."""
+    """Return the environments of a checkpoint in the template's structure; None if it has none that fit it."""
     path = folder / ENV_STATE
     if not path.is_file():
         return None
@@ -241,23 +241,23 @@ def load_env_state(folder: Path, template: Any) -> Any | None:
 
 
 def plain_size(size: int | Mapping[str, tuple[int, ...]]) -> int | dict[str, list[int]]:
-    """An observation's size as JSON holds it."""
+    """Return an observation's size as JSON holds it."""
     return {name: list(shape) for name, shape in size.items()} if isinstance(size, Mapping) else int(size)
 
 
 def megabytes(tree: Any) -> float:
-    """Memory of a tree's arrays."""
+    """Return the memory of a tree's arrays."""
     return sum(_raw(x).nbytes for x in jax.tree.leaves(tree)) / 1e6
 
 
 def remove_partial(root: Path) -> None:
-    """Removes what a killed run had begun to write."""
+    """Remove what a killed run left half written."""
     for left_over in root.glob(".partial-*"):
         shutil.rmtree(left_over, ignore_errors=True)
 
 
 def _remove(folder: Path) -> None:
-    """Whole for a reader, or not there at all."""
+    """Remove a folder at once: a reader sees all of it or nothing."""
     gone = folder.with_name(f".partial-gone-{folder.name}")
     os.replace(folder, gone)
     shutil.rmtree(gone)

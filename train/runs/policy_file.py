@@ -1,4 +1,4 @@
-"""What acting needs of a learner, small: a checkpoint of 9 to 18 MiB in, a file of a quarter MiB out, and back.
+"""Write the policy of a checkpoint of 9 to 18 MiB as a file of a quarter MiB, and read it back.
 
 Optimisers, critics and targets are left out, and large weights are rounded to multiples of a share of their spread. A
 policy read from such a file acts nearly as the original did (docs/results.md says how nearly); it cannot be trained
@@ -28,29 +28,23 @@ SCALE, SHAPE = ":scale", ":shape"
 _LEVELS = 127
 
 
-def acting_part(learner: Mapping[str, Any], algorithm: str) -> dict[str, Any]:
-    """The leaves of a learner that its policy reads.
+def policy_leaves(path: Path, learner: Mapping[str, Any], algorithm: str) -> dict[str, Any]:
+    """Return the leaves of a learner that its policy reads, by names such as "params/policy/..."."""
+    from train.learners.algorithms import ALGORITHMS  # takes seconds, and `--help` needs none
 
-    Returns:
-        "params/policy/..." -> array.
-    """
-    flat: dict[str, Any] = flax.traverse_util.flatten_dict(dict(learner), sep="/")
-    if algorithm == "ppo":
-        return {k: v for k, v in flat.items() if k.startswith(("params/", "normalizer_params/")) and "/value/" not in k}
-    wanted = ["policy_params/", "normalizer_params/"]
-    if not any(k.startswith("policy_params/encoder/") for k in flat):  # it looks through the critics'
-        wanted.append("q_params/encoder/")
-    return {k: v for k, v in flat.items() if k.startswith(tuple(wanted))}
+    try:
+        return flax.traverse_util.flatten_dict(ALGORITHMS[algorithm].policy_part(learner), sep="/")
+    except (AttributeError, KeyError, TypeError):
+        names = ", ".join(ALGORITHMS)
+        raise CheckpointError(f"{path}: holds no policy of {algorithm!r}, expected one of {names}") from None
 
 
 def packed(leaves: Mapping[str, Any], step: float = STEP) -> dict[str, np.ndarray]:
-    """Large weights as Huffman codes (u8) of i8, with their shapes under `<name>:shape` and the f32 scales of their
-    last axis under `<name>:scale`; others as f16; vectors as is.
+    """Return large weights as Huffman codes (u8) of i8, with their shapes under `<name>:shape` and the f32 scales of
+    their last axis under `<name>:scale`; others as f16; vectors as is.
 
-    Rounded weights hold no repetitions, which is all that zip's own methods would add: those take a tenth more.
-
-    Args:
-        step: of the rounding, in standard deviations of each output's weights.
+    Rounding is to multiples of `step` standard deviations of each output's weights. Rounded weights hold no
+    repetitions, which is all that zip's own methods would add: those take a tenth more.
     """
     out: dict[str, np.ndarray] = {}
     for name, leaf in leaves.items():
@@ -72,7 +66,7 @@ def packed(leaves: Mapping[str, Any], step: float = STEP) -> dict[str, np.ndarra
 
 
 def unpacked(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Back from `packed`, to within half a scale."""
+    """Return the leaves that `packed` was given, to within half a scale."""
     out: dict[str, np.ndarray] = {}
     for name, array in arrays.items():
         if name + SHAPE in arrays:
@@ -84,24 +78,24 @@ def unpacked(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def write(source: Path, algorithm: str, target: Path, step: float = STEP) -> None:
-    """A `learner.msgpack` as a `policy.npz`."""
+    """Write the policy of a `learner.msgpack` as a `policy.npz`."""
     learner = flax.serialization.msgpack_restore(regular(source).read_bytes())
     with whole_file(target) as partial, open(partial, "wb") as file:
-        np.savez(file, **packed(acting_part(learner, algorithm), step))  # type: ignore[arg-type]
+        np.savez(file, **packed(policy_leaves(source, learner, algorithm), step))  # type: ignore[arg-type]
 
 
-def read(path: Path, template: Any) -> Any:
-    """A learner in the template's structure whose policy is the file's; what acting does not read is the template's."""
+def read(path: Path, template: Any, algorithm: str) -> Any:
+    """Return a learner with the file's policy in the template's structure; the rest is the template's."""
     with read_npz(path, CheckpointError, "export the run again") as stored:
         leaves = unpacked({name: stored[name] for name in stored.files})
-    own = flax.serialization.to_state_dict(template)
-    flat = flax.traverse_util.flatten_dict(own, sep="/", keep_empty_nodes=True)
+    state = flax.serialization.to_state_dict(template)
+    flat = flax.traverse_util.flatten_dict(state, sep="/", keep_empty_nodes=True)
     unknown = sorted(set(leaves) - set(flat))
     if unknown:
         raise CheckpointError(
             f"{path}: holds {unknown[0]}, which this learner has not; use the config that it was trained with"
         )
-    missing = sorted(set(acting_part(own, "ppo" if "params" in own else "")) - set(leaves))
+    missing = sorted(set(policy_leaves(path, state, algorithm)) - set(leaves))
     if missing:
         raise CheckpointError(f"{path}: lacks {missing[0]}, which this learner's policy reads; export the run again")
     nested = flax.traverse_util.unflatten_dict({**flat, **leaves}, sep="/")

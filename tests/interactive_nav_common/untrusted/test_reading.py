@@ -82,7 +82,7 @@ def test_bombs_in_the_files_of_runs_are_refused(tmp_path, monkeypatch):
     codes = np.frombuffer(zlib.compress(bytes(2**20 + 1)), np.uint8)
     np.savez(tmp_path / "policy.npz", **{"a": codes, "a:shape": np.array([1]), "a:scale": np.ones(1)})  # pyright: ignore
     with pytest.raises(UserError, match=r"policy.npz: not readable .*unpacks to more than 1 MiB"):
-        policy_file.read(tmp_path / "policy.npz", {})
+        policy_file.read(tmp_path / "policy.npz", {}, "ppo")
 
 
 @pytest.mark.parametrize("special", ["fifo", "zero"])

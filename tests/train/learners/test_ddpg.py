@@ -25,7 +25,7 @@ from train.learners.algorithms import ALGORITHMS
 def make(env: ToyEnv, network: NetworkConfig = SMALL, **settings: Any) -> ddpg.DDPG:
     section = DDPGConfig(**{**SIZES, **settings})
     config = TrainConfig(env=EnvConfig(scenes=("toy",)), algorithm="ddpg", network=network, ddpg=section)
-    return ddpg.make_agent(batched(env), config)
+    return ddpg.DDPG.of(batched(env), config)
 
 
 # One number each: policy p * o before tanh, critics (q * o + a, q * o - a).

@@ -21,9 +21,9 @@ from train.config import DDPGConfig, EnvConfig, OffPolicyConfig, RunConfig, SACC
 from train.errors import DivergedError
 from train.learners import offpolicy, replay_buffer
 from train.learners.algorithms import ALGORITHMS
-from train.learners.ddpg import make_agent as make_ddpg
+from train.learners.ddpg import DDPG
 from train.learners.learner import Snapshot, Update
-from train.learners.sac import make_agent as make_sac
+from train.learners.sac import SAC
 
 STEPS = 16 * 4
 """Environment steps in an update of `tiny`."""
@@ -138,7 +138,7 @@ def test_collect_writes_what_happened_and_restarts_noise_with_the_episode():
     """DDPG on episodes of three steps: the ring holds every step, and noise is 0 where an episode just ended."""
     config = tiny("ddpg", 1, steps_per_update=7)
     env = batched(ToyEnv(ToyConfig(episode_steps=3)))
-    agent = make_ddpg(env, config)
+    agent = DDPG.of(env, config)
     begin = offpolicy.start(agent, env, 0)
     collect = jax.jit(lambda s, d: offpolicy.collect(agent, env, s, d, s.key))
     data, seen = collect(begin.learner, begin.env_state)
@@ -162,7 +162,7 @@ def test_the_compiled_update_writes_the_replay_in_place_and_normalises_no_image(
     """With images: the ring is an argument that the result overwrites, and no temporary is as large as it."""
     config = dataclasses.replace(tiny("sac", 1, max_replay_size=16 * 16384), network=SMALL)
     env = batched(ToyPixels())
-    agent = make_sac(env, config)
+    agent = SAC.of(env, config)
     begin = offpolicy.start(agent, env, 0)
     data: Any = begin.env_state
     size = replay_buffer.nbytes(data.replay)

@@ -27,7 +27,7 @@ KEY = jax.random.PRNGKey(5)
 def make(env: ToyEnv, network: NetworkConfig = SMALL, **settings: Any) -> sac.SAC:
     section = SACConfig(**{**SIZES, **settings})
     config = TrainConfig(env=EnvConfig(scenes=("toy",)), algorithm="sac", network=network, sac=section)
-    return sac.make_agent(batched(env), config)
+    return sac.SAC.of(batched(env), config)
 
 
 def transitions(size: networks.ObservationSize, count: int = 12) -> types.Transition:

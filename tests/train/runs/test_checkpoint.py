@@ -120,7 +120,8 @@ def test_a_run_does_not_continue_in_a_scene_that_changed(tmp_path):
 
 
 def test_an_exported_policy_has_a_digest_of_its_own(tmp_path):
-    snapshot = types.SimpleNamespace(learner={"params": {"policy": np.ones((3, 2), np.float32)}}, env_state=None)
+    learner = {"params": {"policy": np.ones((3, 2), np.float32)}, "normalizer_params": {}}
+    snapshot = types.SimpleNamespace(learner=learner, env_state=None)
     path = checkpoint.save(tmp_path, snapshot, dataclasses.replace(META, env_steps=7), 1, 0.0)
     checkpoint.keep_policy(path, tmp_path / "exported" / path.name)
     kept, _ = checkpoint.find(tmp_path / "exported", "last")

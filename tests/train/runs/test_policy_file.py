@@ -81,7 +81,7 @@ def test_what_acting_reads_and_no_more(tmp_path, monkeypatch, env, share, algori
     lost = next(name for name in arrays if "policy" in name and ":" not in name)
     np.savez(tmp_path / "less.npz", **{k: v for k, v in arrays.items() if k.partition(":")[0] != lost})
     with pytest.raises(CheckpointError, match=f"lacks {lost}, which this learner's policy reads"):
-        policy_file.read(tmp_path / "less.npz", ALGORITHMS[algorithm].template(env, config))
+        policy_file.read(tmp_path / "less.npz", ALGORITHMS[algorithm].template(env, config), algorithm)
     assert not checkpoint.is_whole(kept) and checkpoint.is_whole(path)
     assert sum(p.stat().st_size for p in kept.iterdir()) < 0.5 * sum(p.stat().st_size for p in path.iterdir())
     template = ALGORITHMS[algorithm].template(env, config)
@@ -90,8 +90,11 @@ def test_what_acting_reads_and_no_more(tmp_path, monkeypatch, env, share, algori
     assert 0 < np.abs(after - before).mean() < 0.02 and np.abs(after - before).max() < 0.3
     # Everything else may be anything; none of what is kept may.
     state = flax.serialization.to_state_dict(learner)
-    acting = policy_file.acting_part(state, algorithm)
+    acting = policy_file.policy_leaves(path, state, algorithm)
+    parts = {"ppo": "params/policy/ normalizer_params/"}.get(algorithm, "policy_params/ normalizer_params/").split()
+    parts += [{"ppo": "params/encoder/"}.get(algorithm, "q_params/encoder/")] if share else []
     flat: dict[str, Any] = flax.traverse_util.flatten_dict(state, sep="/", keep_empty_nodes=True)
+    assert list(acting) == [name for name in flat if name.startswith(tuple(parts))]  # in the order of the learner
     broken = {k: v if k in acting or not hasattr(v, "dtype") else jnp.full_like(v, 7) for k, v in flat.items()}
     other = flax.serialization.from_state_dict(template, flax.traverse_util.unflatten_dict(broken, sep="/"))
     np.testing.assert_array_equal(actions(env, config, other), before)
@@ -143,6 +146,12 @@ def test_foreign_and_damaged_files_are_told(tmp_path):
     other = dataclasses.replace(resolve(TrainConfig(env=TOY), "native"), network=config.network)
     with pytest.raises(CheckpointError, match="policy_params/.*which this learner has not"):
         checkpoint.load_learner(kept, ALGORITHMS["ppo"].template(ToyPixels(), other))
+    unknown = dataclasses.replace(checkpoint.read_meta(path), algorithm="ppo2")
+    (path / checkpoint.META).write_text(json.dumps(dataclasses.asdict(unknown)))
+    with pytest.raises(
+        CheckpointError, match="learner.msgpack: holds no policy of 'ppo2', expected one of ppo, sac, d"
+    ):
+        checkpoint.keep_policy(path, tmp_path / "unknown")
     files = (path, checkpoint.LEARNER), (kept, policy_file.POLICY)
     digests = [hashlib.sha256((home / name).read_bytes()).hexdigest() for home, name in files]
     assert [checkpoint.weights_digest(home) for home in (path, kept)] == digests

@@ -104,7 +104,8 @@ def swept(tmp_path):
         if k_int == 0.0:
             meta = checkpoint.CheckpointMeta(5, 1.0, 0.5, "ppo", "turtlebot", ("goal",), 3, 2)
             state = {"x": np.zeros(4)}
-            snapshot = type("S", (), {"learner": {"params": {"w": np.full(3, seed, np.float32)}}, "env_state": state})()
+            learner = {"params": {"w": np.full(3, seed, np.float32)}, "normalizer_params": {}}
+            snapshot = type("S", (), {"learner": learner, "env_state": state})()
             checkpoint.save(home / "checkpoints", snapshot, meta, 1, 1.0)
     return folder
 
@@ -138,7 +139,7 @@ def test_what_is_kept(swept, tmp_path, capsys):
         (kept,) = out.rglob("policy.npz")
         assert kept.parts[-4] == "k_int0-seed1" and not list(out.rglob(checkpoint.ENV_STATE))
         path, _ = checkpoint.find(out / "runs" / "k_int0-seed1" / "checkpoints", "best")
-        learner = checkpoint.load_learner(path, {"params": {"w": np.zeros(3, np.float32)}})
+        learner = checkpoint.load_learner(path, {"params": {"w": np.zeros(3, np.float32)}, "normalizer_params": {}})
         np.testing.assert_array_equal(learner["params"]["w"], [1.0] * 3)
     # A policy that was kept alone, brought back into a sweep's folder, is kept as it is.
     path, _ = checkpoint.find(out / "runs" / "k_int0-seed1" / "checkpoints", "best")
