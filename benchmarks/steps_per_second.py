@@ -167,7 +167,7 @@ def simulation(
         "steps": CHUNK * len(rates),
         "env_steps": CHUNK * len(rates) * num_envs,
         **totals,
-        "running": {name: int(getattr(nav, name).sum()) for name in FAILURES if hasattr(nav, name)},
+        "running": {name: int(nav.memory[name].sum()) for name in FAILURES if name in nav.memory},
         "peak_memory_mib": _peak_memory_mib(),
         "gpu_memory_mib": [m for m in (memory[0], memory[1], memory[-1]) if m is not None],
         "nv": tiers[-1].window.model.nv if tiers else physics.nv,

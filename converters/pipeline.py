@@ -136,11 +136,7 @@ def _structure_visual(
 
 
 def _object_visuals(
-    raw: RawScene,
-    vertices_w: np.ndarray,
-    owner: np.ndarray,
-    annotated: tuple[PlacedObject, ...],
-    config: ConvertConfig,
+    raw: RawScene, vertices_w: np.ndarray, owner: np.ndarray, annotated: tuple[PlacedObject, ...], config: ConvertConfig
 ) -> list[Drawn]:
     """Draw every object, model by model, side by side in processes."""
     models: dict[tuple[str, bytes], list[int]] = {}

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from interactive_nav.robots import get_robot, robot_names
     from interactive_nav.scenes.scene import load_scene
     from interactive_nav.task.env import InteractiveNav
+    from interactive_nav.task.terms import Term
     from interactive_nav.task.wrappers import wrap_for_brax_training
 
 _HOME = {
@@ -55,12 +56,13 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'interactive_nav' has no attribute {name!r}; it has {', '.join(__all__)}")
 
 
-def make(robot: str, scenes: Sequence[str | Path], **settings: Any) -> InteractiveNav:
-    """Builds an environment.
+def make(robot: str, scenes: Sequence[str | Path], terms: Sequence[Term] = (), **settings: Any) -> InteractiveNav:
+    """Build an environment.
 
     Args:
         robot: a name from `robot_names()`.
         scenes: scene folders, or sets of them (`cluttered/train`); each episode draws one.
+        terms: reward terms, metrics and observations to add (`interactive_nav.task.terms`).
         **settings: of `NavConfig`'s parts, such as backend, num_objects, observations, k_int, episode_steps; or
             `variant="code"` for the values of the original's code where it differs from its paper.
 
@@ -81,7 +83,7 @@ def make(robot: str, scenes: Sequence[str | Path], **settings: Any) -> Interacti
         raise ConfigError(f"scenes is {str(scenes)!r}, expected a list of scene folders; write [{str(scenes)!r}]")
     config = make_config(**settings)
     spec = get_robot(robot, config.rules.control_mode)
-    return InteractiveNav(spec, tuple(load_scene(s) for s in scene_folders(scenes)), config)
+    return InteractiveNav(spec, tuple(load_scene(s) for s in scene_folders(scenes)), config, terms)
 
 
 __all__ = [

@@ -1,19 +1,14 @@
 """Records that travel through `reset` and `step`: frozen structs of arrays; shapes are those of one environment."""
 
+from typing import Any
+
 import flax.struct
 import jax
 
 FAILURES = ("nonfinite", "overflow_steps", "left_out_steps", "unconverged_steps")
 """Metrics of an episode that count what physics lost (`interactive_nav.physics.base.StepSignals`)."""
-EPISODE_METRICS = (
-    *("success", "path_efficiency", "effort_efficiency", "kinematic_effort", "dynamic_effort", "ins_0.5"),
-    *("robot_path_m", "shortest_path_m", "object_displacement_kg_m", "force_sum_n", "episode_steps"),
-    *(FAILURES[0], "interaction_steps", "structure_steps", *FAILURES[1:]),
-    *("objects_dropped", "off_distance", "lifted"),
-)
-"""What an episode's last step reports, in the order of the columns of rows."""
 OF_OBJECTS = ("object_path_m", "object_contact_steps", "object_force_sum_n")
-"""Of `NavInfo`, what rows tell by category."""
+"""Terms whose memory rows report by category."""
 
 
 @flax.struct.dataclass
@@ -104,38 +99,12 @@ class NavInfo:
     furniture with `potential_round`."""
     shortest_path_m: jax.Array
     """[] f32 L*: the distance among static structure at the start."""
-    robot_path_m: jax.Array
-    """[] f32 l_0."""
-    object_path_m: jax.Array
-    """(M,) f32 l_i."""
-    object_contact_steps: jax.Array
-    """(M,) i32 control steps in which the robot touched it."""
-    object_force_sum_n: jax.Array
-    """(M,) f32 sum over control steps of the largest net force, over substeps, on it."""
-    force_sum_n: jax.Array
-    """[] f32 sum of F_t."""
-    interaction_steps: jax.Array
-    """[] i32 control steps with a touched movable."""
-    structure_steps: jax.Array
-    """[] i32 control steps with a touched wall."""
-    overflow_steps: jax.Array
-    """[] i32 control steps in which a contact or constraint buffer overflowed."""
-    left_out_steps: jax.Array
-    """[] i32 control steps in which an object within reach was not simulated (MJX's window was full)."""
-    unconverged_steps: jax.Array
-    """[] i32 control steps in which the solver met its iteration limit."""
-    lifted_steps: jax.Array
-    """[] i32 control steps with the base 0.2 m above its standing height."""
     objects_dropped: jax.Array
     """[] i32 small objects for which no free place was found: parked outside."""
     step_count: jax.Array
     """[] i32 control steps done."""
-    odometry: jax.Array
-    """(3,) f32 x, y (m) and yaw (rad) reckoned from the start's frame."""
-    touching: jax.Array
-    """(2,) bool: a movable object, a wall was touched in the last control step."""
-    trail_w: jax.Array
-    """(T, 2) f32, m: where the base was, latest first, every `TRAIL_STEPS` control steps; T is 0 if not observed."""
+    memory: dict[str, Any]
+    """What each term remembers, by its name (`interactive_nav.task.terms`)."""
     round_field: tuple[GoalField, jax.Array] | None = None
     """With `potential_round`: what the geodesic round heavy furniture needs to know, and [] bool whether it counts."""
 

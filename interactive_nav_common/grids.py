@@ -47,6 +47,12 @@ def cell_centres(cells: np.ndarray, cell_m: float, origin_w: tuple[float, float]
     return np.asarray(origin_w) + (np.stack([columns, rows], -1) + 0.5) * cell_m
 
 
+def value_near(values: np.ndarray, cell_m: float, origin_w: tuple[float, float], xy_w: np.ndarray) -> np.ndarray:
+    """Return the values [..., n] of the cells that hold world points [n, 2], or are nearest to those off the grid."""
+    columns, rows = np.floor((np.asarray(xy_w) - origin_w) / cell_m).astype(int).T
+    return values[np.clip(rows, 0, values.shape[0] - 1), np.clip(columns, 0, values.shape[1] - 1)]
+
+
 def nearest_cell(mask: np.ndarray) -> np.ndarray:
     """Return the (row, column) of the nearest set cell of each cell: [2, rows, columns]."""
     return np.asarray(ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True))

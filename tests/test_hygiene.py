@@ -70,11 +70,14 @@ def test_programs_that_tests_start_compile_as_the_tests_do():
 def test_a_nan_and_a_leaked_tracer_are_refused():
     kept = []
 
+    def progress_of(before_m, after_m):
+        return reward.interactive_navigation_reward(0.0, before_m, after_m, 0.0, 0.1)[1]["potential"]
+
     def keeps(before_m, after_m):
         kept.append(before_m)
-        return reward.potential_reward(before_m, after_m)
+        return progress_of(before_m, after_m)
 
-    progress = checked(reward.potential_reward)
+    progress = checked(progress_of)
     assert progress(np.float32(2.0), np.float32(1.0)) == 1.0
     with pytest.raises(FloatingPointError, match="nan"):
         progress(np.float32(np.inf), np.float32(np.inf))

@@ -16,6 +16,7 @@ import jax
 
 from interactive_nav.episodes import load, starts_of
 from interactive_nav.pictures import replay
+from interactive_nav.task.rollout import episode_keys
 from interactive_nav_common.config import refuse_unused
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.jobs.progress import SafeConsole
@@ -25,7 +26,6 @@ from train.config import EnvConfig
 from train.runs.run import config_to_play, make_env
 from train.runs.run_folder import RunFolder, claim
 from train.scoring.evaluation import POLICIES, SEED, make_policies
-from train.scoring.rollout import episode_keys
 
 
 def parser() -> argparse.ArgumentParser:

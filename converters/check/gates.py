@@ -93,8 +93,7 @@ def physical_values(model: mujoco.MjModel, named: dict[str, str] | None = None) 
     run(model, data, DRIFT_S)
     mujoco.mj_forward(model, data)
     moved = np.maximum(
-        np.linalg.norm(data.xipos[bodies] - start_com, axis=1),
-        np.linalg.norm(data.xpos[bodies] - start_pos, axis=1),
+        np.linalg.norm(data.xipos[bodies] - start_com, axis=1), np.linalg.norm(data.xpos[bodies] - start_pos, axis=1)
     )
     cosine = np.abs((data.xquat[bodies] * start_quat).sum(axis=1))
     turned = np.degrees(2 * np.arccos(np.clip(cosine, 0, 1)))

@@ -24,7 +24,7 @@ from interactive_nav.interop.gym_steps import NONFINITE_ACTIONS, reset_where, st
 from interactive_nav.interop.torch_bridge import to_jax, to_torch
 from interactive_nav.pictures.views import ThirdPerson
 from interactive_nav.robots import robot_names
-from interactive_nav.task.env import EPISODE_METRICS, REWARD_TERMS, InteractiveNav
+from interactive_nav.task.env import InteractiveNav
 from interactive_nav.task.wrappers import reset_all, scene_of_slot
 from interactive_nav_common.errors import ConfigError, MissingPackage, missing
 from scenes_mjcf.robot_facts import title
@@ -41,8 +41,6 @@ except ImportError as error:
 ARRAYS = ("numpy", "jax", "torch")
 SCENES = ("scenes_mjcf/apartment_0",)
 """Come with the package; taken where none are given."""
-STEP_INFO = (*REWARD_TERMS, NONFINITE_ACTIONS)
-"""What `info` holds at every step."""
 VERSION = 0
 """Raised whenever reported numbers would move."""
 
@@ -133,7 +131,7 @@ class InteractiveNavEnv(gymnasium.Env):
     `terminated` on success or a state that is no longer finite, `truncated` at the time limit.
     `info` holds the step's reward terms (`reward/...`), how many entries of the action were not finite and counted as
     0 (`nonfinite_actions`) and, on an episode's last step, its scores
-    (`EPISODE_METRICS`: success, path_efficiency, effort_efficiency, ins_0.5, ...).
+    (`env.metric_names`: success, path_efficiency, effort_efficiency, ins_0.5, ...).
     `reset(options={"start": EpisodeStart})` plays a given episode.
     """
 
@@ -194,10 +192,10 @@ class InteractiveNavEnv(gymnasium.Env):
         action = np.asarray(action, np.float32)
         self._state = state = self._step(self._state, jnp.asarray(action))
         done, truncated = bool(state.done > 0), bool(state.info["truncation"] > 0)
-        info = {name: float(state.metrics[name]) for name in REWARD_TERMS}
+        info = {name: float(state.metrics[name]) for name in self.env.reward_names}
         info[NONFINITE_ACTIONS] = float((~np.isfinite(action)).sum())
         if done:
-            info |= {name: float(state.metrics[name]) for name in EPISODE_METRICS}
+            info |= {name: float(state.metrics[name]) for name in self.env.metric_names}
         return _to_numpy(state.obs), float(state.reward), done and not truncated, truncated, info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
@@ -343,24 +341,25 @@ class InteractiveNavVectorEnv(VectorEnv):
     def _info(self, obs: Any, metrics: dict[str, jax.Array], was_over: jax.Array) -> dict[str, Any]:
         """Values with their masks `_name`, in the places where `SyncVectorEnv` has them."""
         same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
+        steps = (*self.env.reward_names, NONFINITE_ACTIONS)
         if self.arrays != "numpy":
-            terms = {name: metrics[name] for name in STEP_INFO}
-            scores = {name: metrics[name] for name in EPISODE_METRICS}
+            terms = {name: metrics[name] for name in steps}
+            scores = {name: metrics[name] for name in self.env.metric_names}
             final = {"final_obs": obs, "final_info": {**terms, **scores}} if same_step else scores
             return self._out({**terms, **final, **{f"_{name}": self._ended for name in final}})
         ended = np.array(self._ended)
         running = ~ended if same_step else ~np.array(was_over)
-        info = _masked({name: metrics[name] for name in STEP_INFO}, running)
+        info = _masked({name: metrics[name] for name in steps}, running)
         if not ended.any():
             return info
-        scores = {name: metrics[name] for name in EPISODE_METRICS}
+        scores = {name: metrics[name] for name in self.env.metric_names}
         if not same_step:
             return info | _masked(scores, ended)
         rows = _to_numpy(obs)
         final_obs = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended):
             final_obs[i] = jax.tree.map(lambda x, i=i: x[i].copy(), rows)
-        final_info = _masked({name: metrics[name] for name in (*STEP_INFO, *EPISODE_METRICS)}, ended)
+        final_info = _masked({name: metrics[name] for name in (*steps, *self.env.metric_names)}, ended)
         masks = {"_final_obs": ended, "_final_info": ended.copy()}
         return {**info, "final_obs": final_obs, "final_info": final_info, **masks}
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from interactive_nav.interop.gym_env import AutoresetMode, InteractiveNavVectorEnv
-from interactive_nav.task.env import EPISODE_METRICS
 
 try:
     from stable_baselines3.common.monitor import Monitor  # pyright: ignore[reportMissingImports]
@@ -24,7 +23,7 @@ class SB3VecEnv(VecEnv):
     """`InteractiveNavVectorEnv` behind Stable-Baselines3's interface.
 
     A finished episode's info has `terminal_observation`, `TimeLimit.truncated`, its scores
-    (`EPISODE_METRICS`) and Monitor's `episode` with return `r` and length `l`, so no `VecMonitor` is needed.
+    (`env.metric_names`) and Monitor's `episode` with return `r` and length `l`, so no `VecMonitor` is needed.
     """
 
     def __init__(self, robot: str, scenes: Sequence[str], num_envs: int = 16, **settings: Any):
@@ -60,7 +59,7 @@ class SB3VecEnv(VecEnv):
         infos: list[dict[str, Any]] = [{"TimeLimit.truncated": bool(t)} for t in truncated]
         done = terminated | truncated
         for i in np.flatnonzero(done):
-            scores = {name: float(info["final_info"][name][i]) for name in EPISODE_METRICS}
+            scores = {name: float(info["final_info"][name][i]) for name in self.envs.env.metric_names}
             infos[i] |= scores
             infos[i]["terminal_observation"] = info["final_obs"][i]
             infos[i]["episode"] = {"r": float(self._returns[i]), "l": int(scores["episode_steps"])}

@@ -5,25 +5,22 @@ alone: without the policy, the physics, or the other scenes of the environment t
 """
 
 import dataclasses
-import functools
 import json
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.pictures.scene_model import world_poses
 from interactive_nav.scenes.object_folders import small_objects
 from interactive_nav.scenes.objects import SmallObject
-from interactive_nav.task.env import EPISODE_METRICS, InteractiveNav
+from interactive_nav.task.env import InteractiveNav
+from interactive_nav.task.rollout import HostPolicy, Player, PolicyFn, Recorder
 from interactive_nav.types import EpisodeStart
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.files import write_arrays
-from interactive_nav_common.signals import signals_wait
 from interactive_nav_common.untrusted.reading import read_npz
 from scenes_mjcf.categories import MaskClasses
 
@@ -78,7 +75,7 @@ class Replay:
     touches_structure: np.ndarray
     """[T] bool."""
     metrics: dict[str, float]
-    """The episode's scores, `EPISODE_METRICS`."""
+    """The episode's scores."""
     small_objects: str = "train"
     """Whose models the small objects are; this and what follows is not in older files."""
     objects: tuple[str, ...] = ()
@@ -106,28 +103,27 @@ class Replay:
         return self.body_pos_w[:, 0, :2]
 
 
-class EpisodePlayer:
-    """Plays episodes of one environment with one policy, compiled once."""
+def _read(state: Any, action: jax.Array) -> dict[str, jax.Array]:
+    memory, counts = state.info["nav"].memory, ("force_sum_n", "interaction_steps", "structure_steps")
+    values = {"qpos": state.pipeline_state.qpos, "action": action, "reward": state.reward}
+    return values | {name: memory[name] for name in counts}
 
-    def __init__(
-        self,
-        env: InteractiveNav,
-        policy: Callable[[jax.Array, jax.Array], jax.Array],
-        name: str = "policy",
-        label: str = "",
-    ):
-        """Wires it.
 
-        Args:
-            env: one environment, not batched, not resetting itself.
-            policy: pure (observation, key) -> action (A,) in [-1, 1].
-            name: of the policy, for captions.
-            label: where the policy comes from, for captions.
-        """
-        self.env, self.name, self.label = env, name, label
-        self._reset, self._reset_to = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.reset_to))
-        self._policy = jax.jit(functools.partial(_action, policy))
-        self._step = jax.jit(functools.partial(_play_step, env))
+class EpisodePlayer(Player):
+    """Plays episodes of one environment with one policy, compiled once.
+
+    Args:
+        env: one environment, not batched, not resetting itself.
+        policy: pure (observation, key) -> action (A,) in [-1, 1], or one on the host.
+        name: of the policy, for captions.
+        label: where the policy comes from, for captions.
+    """
+
+    def __init__(self, env: InteractiveNav, policy: PolicyFn | HostPolicy, name: str = "policy", label: str = ""):
+        metrics = Recorder(lambda state, action: {key: state.metrics[key] for key in env.metric_names})
+        start = Recorder(lambda state, action: state.pipeline_state.qpos, "start")
+        super().__init__(env, {"steps": Recorder(_read, "step"), "metrics": metrics, "qpos": start})
+        self.policy, self.name, self.label = policy, name, label
 
     def play(
         self,
@@ -136,29 +132,18 @@ class EpisodePlayer:
         on_progress: Callable[[int], None] = lambda step: None,
         start: EpisodeStart | None = None,
     ) -> Replay:
-        """Plays one episode, drawn from the key or from `start` (leaves [1, ...]), to its end.
+        """Play one episode, drawn from the key or from `start` (leaves [1, ...]), to its end.
 
-        `on_progress` is told the number of steps after each.
+        `on_progress` is called with the number of steps now and then.
         """
-        state = self._reset(key[None]) if start is None else self._reset_to(start, key[None])
-        policy_key = policy_key_of(key)
-        first = jax.tree.map(lambda x: np.asarray(x)[0], state.info["nav"])
-        start_qpos, told = np.asarray(state.pipeline_state.qpos), []
-        while not told or not told[-1]["done"]:
-            action = self._policy(state.obs, policy_key, len(told))
-            # Raised within the physics' callbacks it is another error; physics left behind crashes.
-            with signals_wait():
-                state, out = jax.block_until_ready(self._step(state, action))
-            told.append(jax.tree.map(np.asarray, out))
-            on_progress(len(told))
-        joined = {name: np.stack([out[name] for out in told]) for name in told[0]}
-        return _replay_of(self, episode, first, joined, np.concatenate([start_qpos, joined["qpos"]]))
+        played = self.rollout(self.policy, key[None], start, on_progress=lambda finished, step: on_progress(step))
+        first, values = jax.tree.map(lambda x: x[0], (played.first, played.values))
+        return _replay_of(self, episode, first, values)
 
 
-def _replay_of(
-    player: EpisodePlayer, episode: int, first: Any, joined: dict[str, np.ndarray], qpos: np.ndarray
-) -> Replay:
-    env = player.env
+def _replay_of(player: EpisodePlayer, episode: int, first: Any, values: dict[str, Any]) -> Replay:
+    env, joined = player.env, values["steps"]
+    qpos = np.concatenate([values["qpos"][None], joined["qpos"]])
     scene = int(first.scene_index)
     bodies, num_robot, pos, quat = world_poses(env.world, scene, qpos)
     counts = {name: np.diff(joined[name], prepend=0) > 0 for name in ("interaction_steps", "structure_steps")}
@@ -182,39 +167,13 @@ def _replay_of(
         force_n=np.diff(joined["force_sum_n"], prepend=0.0).astype(np.float32),
         touches_movable=counts["interaction_steps"],
         touches_structure=counts["structure_steps"],
-        metrics={name: float(joined[f"metrics/{name}"][-1]) for name in EPISODE_METRICS},
+        metrics={name: float(values["metrics"][name]) for name in env.metric_names},
         small_objects=env.config.rules.small_objects,
         objects=tuple(str(Path(folder).absolute()) for folder in env.config.rules.objects),
         segmentation_classes=env.config.sensors.segmentation_classes,
         success_distance_m=env.success_distance_m,
         image_fov_deg=env.sensors.lens.fov_deg,
     )
-
-
-def policy_key_of(key: jax.Array) -> jax.Array:
-    """The key of a policy's chances in an episode drawn from `key`: none that the environment draws from."""
-    return jax.random.fold_in(key, zlib.crc32(b"policy"))
-
-
-def _action(policy: Any, obs: Any, key: jax.Array, step: jax.Array) -> jax.Array:
-    """[1, A] for observations with leaves [1, ...]."""
-    action = policy(jax.tree.map(lambda x: x[0], obs), jax.random.fold_in(key, step))
-    return jnp.asarray(action, jnp.float32)[None]
-
-
-def _play_step(env: InteractiveNav, state: Any, action: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
-    state = jax.vmap(env.step)(state, action)
-    nav = state.info["nav"]
-    out = {
-        "qpos": state.pipeline_state.qpos[0],
-        "action": action[0],
-        "reward": state.reward[0],
-        "done": state.done[0],
-        "force_sum_n": nav.force_sum_n[0],
-        "interaction_steps": nav.interaction_steps[0],
-        "structure_steps": nav.structure_steps[0],
-    }
-    return state, out | {f"metrics/{name}": state.metrics[name][0] for name in EPISODE_METRICS}
 
 
 def replay_path(run: Path, policy: str, episode: int) -> Path:

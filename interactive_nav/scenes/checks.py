@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from scipy import ndimage
 
-from interactive_nav_common.grids import clearance, largest_component
+from interactive_nav_common.grids import clearance, largest_component, value_near
 from scenes_mjcf.agreement import differences
 from scenes_mjcf.robot_facts import SMALLEST
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps
@@ -56,13 +56,9 @@ def objects_apart(maps: SceneMaps, movables: Sequence[Any]) -> list[str]:
     """Return the objects more than `BESIDE_M` away from the largest piece of floor that a small robot fits on."""
     piece = largest_component(clearance(maps.traversable, maps.resolution_m) >= SMALLEST.radius_m)
     away_m = np.asarray(ndimage.distance_transform_edt(~piece, sampling=maps.resolution_m))
-    apart = []
-    for movable in movables:
-        at = (movable.pos_w[:2] - maps.origin_w) / maps.resolution_m
-        column, row = np.clip(np.floor(at).astype(int), 0, np.array(piece.shape)[::-1] - 1)
-        if away_m[row, column] > BESIDE_M:
-            apart.append(movable.name)
-    return apart
+    xy_w = np.array([movable.pos_w[:2] for movable in movables]).reshape(-1, 2)
+    apart = value_near(away_m, maps.resolution_m, maps.origin_w, xy_w) > BESIDE_M
+    return [movable.name for movable, is_apart in zip(movables, apart, strict=True) if is_apart]
 
 
 def _wall_faults(maps: SceneMaps, walls: np.ndarray) -> list[str]:

@@ -117,12 +117,7 @@ class Renderer(abc.ABC):
 
     @abc.abstractmethod
     def images_batch(
-        self,
-        names: tuple[str, ...],
-        scene: jax.Array,
-        qpos: jax.Array,
-        camera: CameraPose,
-        look: Look | None = None,
+        self, names: tuple[str, ...], scene: jax.Array, qpos: jax.Array, camera: CameraPose, look: Look | None = None
     ) -> dict[str, jax.Array]:
         """Draws a batch in several ways.
 
@@ -138,12 +133,7 @@ class Renderer(abc.ABC):
         """
 
     def images(
-        self,
-        names: tuple[str, ...],
-        scene: jax.Array,
-        qpos: jax.Array,
-        camera: CameraPose,
-        look: Look | None = None,
+        self, names: tuple[str, ...], scene: jax.Array, qpos: jax.Array, camera: CameraPose, look: Look | None = None
     ) -> dict[str, jax.Array]:
         """One environment's `images_batch`; under any number of `vmap`s all environments are drawn in one call."""
         drawn = (scene, qpos, camera) if look is None else (scene, qpos, camera, look)

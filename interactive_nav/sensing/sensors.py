@@ -22,6 +22,7 @@ step alone.
 import dataclasses
 import math
 import zlib
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +36,7 @@ from interactive_nav.sensing import Lens, Renderer, build_boxes, make_renderer
 from interactive_nav.sensing.boxes import rotate
 from interactive_nav.sensing.mount import Mount, make_mount
 from interactive_nav.sensing.noise import disturbed
-from interactive_nav.sensing.observation import task_parts, waypoints_in_body
+from interactive_nav.sensing.observation import task_parts
 from interactive_nav.sensing.rays import cast_fan
 from interactive_nav.sensing.shading import draw_look
 from interactive_nav.types import NavInfo
@@ -75,8 +76,13 @@ class Sensors:
 
     renderer: Renderer | None
 
-    def __init__(self, world: World, settings: NavConfig, backend: str):
-        """Builds tables, and the renderer if images are asked for; `backend` is that of the physics."""
+    def __init__(self, world: World, settings: NavConfig, backend: str, extra: Mapping[str, int] | None = None):
+        """Build tables, and the renderer if images are observed.
+
+        Args:
+            backend: of the physics.
+            extra: parts appended to the vector -> their lengths; `observe` is given their values.
+        """
         rules, config = settings.rules, settings.sensors
         self._layout, self._config = world.layout, config
         model = world.models[0]
@@ -106,7 +112,7 @@ class Sensors:
             "lidar": config.lidar_rays,
             "trail": 2 * len(TRAIL),
         }
-        self.sizes = {name: size for name, size in sizes.items() if name in config.observations}
+        self.sizes = {name: size for name, size in sizes.items() if name in config.observations} | dict(extra or {})
         """Parts of the vector in order -> their lengths."""
 
     @property
@@ -122,9 +128,16 @@ class Sensors:
             shapes |= {f"pixels/{camera.prefix}{name}": shape for name, shape in own.items()}
         return shapes
 
-    def observe(self, physics: PhysicsState, nav: NavInfo, rng: jax.Array) -> jax.Array | dict[str, jax.Array]:
-        """The observation of one environment; the episode's key is read for sensor noise and not consumed."""
-        vector = self._vector(physics, nav, rng)
+    def observe(
+        self, physics: PhysicsState, nav: NavInfo, rng: jax.Array, remembered: Mapping[str, jax.Array] | None = None
+    ) -> jax.Array | dict[str, jax.Array]:
+        """Return the observation of one environment.
+
+        Args:
+            rng: key of the episode, read for noise and not consumed.
+            remembered: part -> its value, of `odometry`, `trail` and the `extra` parts where they are observed.
+        """
+        vector = self._vector(physics, nav, rng, remembered or {})
         if not self._images:
             return vector
         out = {"state": vector} if self.sizes else {}
@@ -165,14 +178,9 @@ class Sensors:
             look = draw_look(key, config.random_colours, config.random_light, self.boxes.classes)
         return camera.renderer.images(self._drawn, nav.scene_index, qpos, camera.mount.pose(qpos), look)
 
-    def odometry_error(self, rng: jax.Array, step_count: jax.Array) -> jax.Array:
-        """(2,) relative errors of a step's distance and angle."""
-        if not self._config.odometry_noise:
-            return jnp.zeros(2)
-        key = stream(rng, "odometry", step_count)
-        return self._config.odometry_noise * jax.random.normal(key, (2,))
-
-    def _vector(self, physics: PhysicsState, nav: NavInfo, rng: jax.Array) -> jax.Array:
+    def _vector(
+        self, physics: PhysicsState, nav: NavInfo, rng: jax.Array, remembered: Mapping[str, jax.Array]
+    ) -> jax.Array:
         v, q = self._layout.robot_qvel, self._layout.robot_qpos
         rotation = matrix_from_quat(physics.qpos[q + 3 : q + 7])
         values = task_parts(
@@ -182,13 +190,11 @@ class Sensors:
             physics.qvel[v + 3 : v + 6],
             nav.goal_xy_w,
             nav.waypoints_b,
-        )
+        ) | dict(remembered)
         if "localisation" in self.sizes:
             values["localisation"] = jnp.append(nav.robot_pos_w[:2], nav.yaw_rad)
-        if "odometry" in self.sizes:
-            values["odometry"] = nav.odometry.at[2].set(wrap_angle(nav.odometry[2]))
         if "collision" in self.sizes:
-            values["collision"] = nav.touching.astype(jnp.float32)
+            values["collision"] = nav.memory["touching"].astype(jnp.float32)
         if "joints" in self.sizes:
             position, velocity, turns = self._joints
             angle = physics.qpos[position]
@@ -196,8 +202,6 @@ class Sensors:
             values["joints"] = jnp.concatenate([angle, physics.qvel[velocity]])
         if "lidar" in self.sizes:
             values["lidar"] = self._scan(physics, nav, rotation, rng)
-        if "trail" in self.sizes:
-            values["trail"] = waypoints_in_body(nav.trail_w[jnp.array(TRAIL)], nav.robot_pos_w, rotation).reshape(-1)
         return jnp.concatenate([values[name] for name in self.sizes] or [jnp.zeros(0)])
 
     def _scan(self, physics: PhysicsState, nav: NavInfo, rotation: jax.Array, rng: jax.Array) -> jax.Array:

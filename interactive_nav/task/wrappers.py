@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from brax.envs.base import State, Wrapper
 
-from interactive_nav.task.env import EPISODE_METRICS, InteractiveNav
+from interactive_nav.task.env import InteractiveNav
 from interactive_nav_common.errors import ConfigError
 
 DRAW_SHARE = 16
@@ -136,7 +136,7 @@ class AutoResetEnv(Wrapper):
             "steps": zero,
             "episode_done": zero,
             "running_reward": zero,
-            "episode_metrics": {name: zero for name in (*EPISODE_METRICS, "length", "sum_reward")},
+            "episode_metrics": {name: zero for name in (*self.env.metric_names, "length", "sum_reward")},
         }
         return state.replace(info=info)
 
@@ -152,7 +152,7 @@ class AutoResetEnv(Wrapper):
         steps = stepped.info["nav"].step_count.astype(jnp.float32)
         steps = jnp.where(done, stepped.metrics["episode_steps"], steps)
         total = state.info["running_reward"] + stepped.reward
-        finished = {name: stepped.metrics[name] for name in EPISODE_METRICS}
+        finished = {name: stepped.metrics[name] for name in self.env.metric_names}
         finished |= {"length": steps, "sum_reward": total}
         last = state.info["episode_metrics"]
         episode_metrics = {name: jnp.where(done, finished[name], last[name]) for name in last}

@@ -32,7 +32,7 @@ def field_to(goal_xy_w, free, cell_m: float, origin_w=(0.0, 0.0)) -> np.ndarray:
 
 def test_open_space_is_straight_within_1_3_percent():
     free = np.ones((40, 60), bool)
-    field = field_to((2.05, 1.05), free, 0.1)
+    field = np.asarray(geodesic.distance_field(free, 0.1, (2.05, 1.05), origin=(0.0, 0.0)))
     x, y = (np.arange(60) + 0.5) * 0.1, (np.arange(40) + 0.5) * 0.1
     straight = np.hypot(x[None, :] - 2.05, y[:, None] - 1.05)
     assert field[10, 20] == pytest.approx(0.0, abs=1e-6)
@@ -45,7 +45,7 @@ def test_a_wall_is_walked_around():
     # A wall on row 5 from column 0 to 8 of a 10-wide grid: the way from (2, 4.5) to (8, 4.5) passes column 9.
     free = np.ones((11, 10), bool)
     free[5, :9] = False
-    field = field_to((4.5, 8.5), free, 1.0)
+    field = np.asarray(geodesic.distance_field(free, 1.0, (4.5, 8.5)))
     # From (4.5, 2.5) to (9.5, 4.5), straight up through the gap to (9.5, 6.5), on to (4.5, 8.5).
     shortest = 2 * math.hypot(5, 2) + 2
     assert shortest <= field[2, 4] + 1e-5 and field[2, 4] <= 1.02 * shortest
@@ -54,17 +54,38 @@ def test_a_wall_is_walked_around():
 def test_blocked_unreachable_and_outside_goals():
     free = np.ones((6, 6), bool)
     free[:, 3] = False
-    field = field_to((0.5, 0.5), free, 1.0)
+    field = np.asarray(geodesic.distance_field(free, 1.0, (0.5, 0.5)))
     assert np.isinf(field[:, 3:]).all() and np.isfinite(field[:, :3]).all()
-    assert np.isinf(field_to((3.5, 0.5), free, 1.0)).all()
-    assert np.isinf(field_to((99.0, 0.5), free, 1.0)).all()
+    assert np.isinf(np.asarray(geodesic.distance_field(free, 1.0, (3.5, 0.5)))).all()
+    assert np.isinf(np.asarray(geodesic.distance_field(free, 1.0, (99.0, 0.5)))).all()
 
 
 def test_paths_do_not_slip_between_blocked_diagonals():
     free = np.ones((4, 4), bool)
     free[0, 1] = free[1, 0] = False
-    field = field_to((0.5, 0.5), free, 1.0)
+    field = np.asarray(geodesic.distance_field(free, 1.0, (0.5, 0.5)))
     assert np.isinf(field[1, 1])
+
+
+def test_field_is_vmappable_over_goals_and_refuses_bad_maps():
+    free = np.ones((8, 9), bool)
+    goals = np.array([[0.5, 0.5], [8.5, 7.5]], np.float32)
+    fields = jax.jit(jax.vmap(lambda g: geodesic.distance_field(free, 1.0, g)))(goals)
+    np.testing.assert_allclose(fields[0], np.asarray(fields[1])[::-1, ::-1], rtol=1e-5)
+    with pytest.raises(ValueError, match="expected \\[rows, columns\\]"):
+        geodesic.distance_field(np.ones(4, bool), 1.0, (0.5, 0.5))
+    with pytest.raises(ValueError, match="resolution is 0"):
+        geodesic.distance_field(free, 0, (0.5, 0.5))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_field_in_jax_is_that_of_dijkstras_algorithm_on_the_graph_of_moves(seed):
+    free = grids.clearance(random_room(seed), 0.05)[::2, ::2] >= RADIUS_M
+    rows, columns = np.nonzero(free)
+    goal = (np.array([columns[seed], rows[seed]]) + 0.3) * 0.1 - 1.0
+    field = geodesic.distance_field(free, 0.1, goal, (-1.0, -1.0))
+    assert np.isfinite(field).sum() > 100
+    np.testing.assert_allclose(field, field_to(goal, free, 0.1, (-1.0, -1.0)), atol=1e-4)
 
 
 @settings(max_examples=20, deadline=None)

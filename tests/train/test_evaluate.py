@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
-from interactive_nav.task.env import EPISODE_METRICS
+from interactive_nav.task.terms import EPISODE_METRICS
 from interactive_nav_common.config import replace
 from interactive_nav_common.errors import FileError, UserError
 from interactive_nav_common.rows import write_parquet
@@ -131,14 +131,14 @@ def test_runs_of_one_kind_are_evaluated_in_one_go_into_a_dataset(run, second, ev
         return built[-1]
 
     traced = []
-    usual = rollout._play_chunk
+    usual = rollout.BatchPlayer._play_chunk
 
     def counted(*arguments):
         traced.append(arguments)
         return usual(*arguments)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rollout, "_play_chunk", counted)
+        patch.setattr(rollout.BatchPlayer, "_play_chunk", counted)
         words = ["--policies", "learned", "--episodes", "12", "--seed", "4", "--dataset", str(tmp_path)]
         assert evaluate.main([str(run.path), str(second.path), *words], build_env=build) == 0
         once = len(traced)

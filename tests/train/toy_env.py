@@ -18,7 +18,7 @@ from brax.envs import Env, State
 
 from interactive_nav.config import NavConfig
 from interactive_nav.robots import get_robot
-from interactive_nav.task.env import EPISODE_METRICS
+from interactive_nav.task.terms import EPISODE_METRICS
 from interactive_nav.task.wrappers import AutoResetEnv
 from scenes_mjcf.schema import SceneMaps
 
@@ -39,10 +39,7 @@ class ToyNav:
     robot_pos_w: jax.Array
     yaw_rad: jax.Array
     object_pos_w: jax.Array
-    object_path_m: jax.Array
-    object_contact_steps: jax.Array
-    object_force_sum_n: jax.Array
-    robot_path_m: jax.Array
+    memory: dict[str, jax.Array]
     step_count: jax.Array
     velocity: jax.Array
     """[2] speed along heading (m/s) and turning (rad/s) in the last step."""
@@ -53,11 +50,11 @@ class ToyEnv(Env):
 
     def __init__(self, config: NavConfig | None = None, nan_at_step: int | None = None, **_: Any):
         self.config = config or ToyConfig()
-        self.robot = get_robot("turtlebot")
+        self.robot, self.metric_names = get_robot("turtlebot"), EPISODE_METRICS
         maps = SceneMaps(np.ones((80, 80), bool), 0.1, (-4.0, -4.0), 0.0)
         self.scenes = (SimpleNamespace(name="plane", split="train", maps=maps, task_digest="task-1:plane"),)
         self.sensors = SimpleNamespace(sizes={"waypoints": 20, "goal": 3, "velocity": 6})
-        self.world = SimpleNamespace(names=(("box_0",),), categories=(("box",),))
+        self.world = SimpleNamespace(slots=SimpleNamespace(names=(("box_0",),), categories=(("box",),)))
         self.furniture_map = lambda scene: np.zeros((80, 80), bool)
         self.nan_at_step = nan_at_step
 
@@ -86,7 +83,7 @@ class ToyEnv(Env):
 
     def _metrics(self, nav: ToyNav, success: jax.Array, done: jax.Array) -> dict[str, jax.Array]:
         shortest = jnp.linalg.norm(nav.goal_xy_w - nav.start_xy_w)
-        p_eff = success * jnp.clip(shortest / jnp.maximum(nav.robot_path_m, 1e-6), 0.0, 1.0)
+        p_eff = success * jnp.clip(shortest / jnp.maximum(nav.memory["robot_path_m"], 1e-6), 0.0, 1.0)
         scores = {name: jnp.zeros(()) for name in EPISODE_METRICS} | {
             "success": success,
             "path_efficiency": p_eff,
@@ -94,7 +91,7 @@ class ToyEnv(Env):
             "kinematic_effort": jnp.ones(()),
             "dynamic_effort": jnp.ones(()),
             "ins_0.5": 0.5 * p_eff + 0.5,
-            "robot_path_m": nav.robot_path_m,
+            "robot_path_m": nav.memory["robot_path_m"],
             "shortest_path_m": shortest,
             "episode_steps": nav.step_count.astype(jnp.float32),
         }
@@ -112,10 +109,12 @@ class ToyEnv(Env):
             robot_pos_w=jnp.zeros(3),
             yaw_rad=2 * jnp.pi * yaw,
             object_pos_w=jnp.array([[3.0, 3.0, 0.0]]),
-            object_path_m=jnp.zeros(1),
-            object_contact_steps=jnp.zeros(1, jnp.int32),
-            object_force_sum_n=jnp.zeros(1),
-            robot_path_m=jnp.zeros(()),
+            memory={
+                "object_path_m": jnp.zeros(1),
+                "object_contact_steps": jnp.zeros(1, jnp.int32),
+                "object_force_sum_n": jnp.zeros(1),
+                "robot_path_m": jnp.zeros(()),
+            },
             step_count=jnp.zeros((), jnp.int32),
             velocity=jnp.zeros(2),
         )
@@ -153,7 +152,7 @@ class ToyEnv(Env):
         nav = nav.replace(  # type: ignore[attr-defined]
             robot_pos_w=pos,
             yaw_rad=yaw,
-            robot_path_m=nav.robot_path_m + jnp.linalg.norm(move),
+            memory=nav.memory | {"robot_path_m": nav.memory["robot_path_m"] + jnp.linalg.norm(move)},
             step_count=steps,
             velocity=jnp.stack([speed, turn]),
         )

@@ -128,11 +128,13 @@ class Fleet:
         asked = jnp.where(going[:, None], asked, 0.0)
         action = self._env.robot.drive(asked[:, 0], asked[:, 1], jnp)
         state = jax.vmap(self._env.step)(state, action)
-        nav = state.info["nav"]
+        nav, memory = state.info["nav"], state.info["nav"].memory
         away = jnp.linalg.norm(nav.robot_pos_w[:, :2] - tasks["goals_w"][rows, carry["leg"]], axis=-1)
         arrived = going & (away < config.reached_m)
         leg = carry["leg"] + arrived
-        broken = going & ((state.metrics["nonfinite"] > 0) | (nav.overflow_steps > 0) | (nav.left_out_steps > 0))
+        broken = going & (
+            (state.metrics["nonfinite"] > 0) | (memory["overflow_steps"] > 0) | (memory["left_out_steps"] > 0)
+        )
         done = arrived & (leg >= tasks["legs"]) & ~broken
         leg_steps = jnp.where(arrived, 0, carry["leg_steps"] + going)
         out = {
@@ -145,4 +147,4 @@ class Fleet:
             "reached": carry["reached"] | done,
             "broken": carry["broken"] | broken,
         }
-        return out, {"pose_w": pose, "command": asked, "gap_m": gap, "touching": nav.touching}
+        return out, {"pose_w": pose, "command": asked, "gap_m": gap, "touching": memory["touching"]}

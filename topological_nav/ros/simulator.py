@@ -101,7 +101,7 @@ class RosSimulator:
 
     def step(self, linear_mps: float, angular_radps: float) -> Sensed:
         """Drives for one control step; commands beyond what the robot can do are cut."""
-        self._force_before = float(self._state.info["nav"].force_sum_n)
+        self._force_before = float(self._state.info["nav"].memory["force_sum_n"])
         action = self._env.robot.drive(jnp.float32(linear_mps), jnp.float32(angular_radps), jnp)
         self._state = self._step(self._state, action)
         if float(self._state.metrics["nonfinite"]) > 0:
@@ -113,7 +113,7 @@ class RosSimulator:
         nav, values = self._state.info["nav"], self._parts()
         by = self.config.supersample
         drawn = self._camera.frame(self._state, self.lens.width * by, self.lens.height * by, ("rgb",), "robot")["rgb"]
-        movable, structure = (bool(t) for t in np.asarray(nav.touching))
+        movable, structure = (bool(t) for t in np.asarray(nav.memory["touching"]))
         return Sensed(
             time_s=int(nav.step_count) * self.dt_s,
             rgb=shrink(drawn[None], by)[0],
@@ -124,7 +124,7 @@ class RosSimulator:
             heading_rad=float(values["localisation"][2]),
             touches_movable=movable,
             touches_structure=structure,
-            force_n=float(nav.force_sum_n) - self._force_before,
+            force_n=float(nav.memory["force_sum_n"]) - self._force_before,
             truth_w=values["localisation"],
         )
 

@@ -136,7 +136,10 @@ class Simulator:
         """Where the robots are."""
         if self._last is None or self._last[0] is not state:
             nav = state.info["nav"]
-            of = (nav.robot_pos_w, nav.yaw_rad, nav.robot_path_m, nav.touching, nav.overflow_steps + nav.left_out_steps)
+            path_m, touching, *lost = (
+                nav.memory[name] for name in ("robot_path_m", "touching", "overflow_steps", "left_out_steps")
+            )
+            of = (nav.robot_pos_w, nav.yaw_rad, path_m, touching, lost[0] + lost[1])
             told = np.asarray(self._packed(of, state.metrics["nonfinite"], state.pipeline_state.qpos)).astype(float)
             xy, (yaw, path), (movable, wall, broken) = told[:, :2], told[:, 2:4].T, told[:, 4:7].T > 0
             self._last = state, Seen(xy, yaw, path, movable, wall, told[:, 7:], broken)

@@ -10,10 +10,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from interactive_nav.task.rollout import HostPolicy
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.words import first_line, import_function
 from train.errors import PolicyError
-from train.scoring.planners import HostPolicy
 
 TAKEN = ("learned", "random", "follower", "avoider", "namo")
 EXPECTED = "expected [name=]module:factory or [name=]path/to/file.py:factory"

@@ -13,6 +13,7 @@ import pyarrow as pa
 from rich.console import Console
 
 from interactive_nav.episodes import EpisodeFile, starts_of
+from interactive_nav.task.rollout import HostPolicy, PolicyFn, episode_keys
 from interactive_nav_common.files import write_arrays
 from interactive_nav_common.jobs.progress import progress_bar
 from interactive_nav_common.versions import versions
@@ -23,9 +24,8 @@ from train.runs.checkpoint import CheckpointMeta
 from train.runs.run import check_fits
 from train.runs.run_folder import RunFolder
 from train.scoring.brought import BroughtPolicy
-from train.scoring.planners import HostPolicy
-from train.scoring.policies import BASELINES, PolicyFn, make_baseline
-from train.scoring.rollout import BatchPlayer, PlayedEpisodes, episode_keys
+from train.scoring.policies import BASELINES, make_baseline
+from train.scoring.rollout import BatchPlayer, PlayedEpisodes
 from train.scoring.row_files import EvaluationAsked
 from train.scoring.rows import episode_table
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from interactive_nav.navigation.ways import Ways
 from interactive_nav.robots.spec import RobotSpec, TwistMap
+from interactive_nav.task.rollout import HostPolicy
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.rotations import wrap_angle
 
@@ -62,23 +63,6 @@ class Plan:
     object_pos_w: np.ndarray
     """[M, 3] of the objects when it was made."""
     step: int
-
-
-class HostPolicy:
-    """Acts on the host, step by step, for a batch of episodes."""
-
-    note = ""
-    """What a reader of its scores should know."""
-
-    def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> np.ndarray:
-        """Actions [N, A] of one control step.
-
-        Args:
-            state: of the environments, leaves [N, ...].
-            episode: [N] the episode that each plays.
-            running: [N] bool; the others get an action that means nothing.
-        """
-        raise NotImplementedError
 
 
 class Planner(HostPolicy):

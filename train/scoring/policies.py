@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 
 from interactive_nav.robots import RobotSpec
+from interactive_nav.task.rollout import PolicyFn
 from interactive_nav_common.errors import UserError
 from train.scoring.planners import Planner, need_twist, velocity_towards
 
 Observation = jax.Array | Mapping[str, jax.Array]
-PolicyFn = Callable[[Observation, jax.Array], jax.Array]
 
 LOOK_AHEAD_M = 0.4
 CRUISE_M_S = 0.5

@@ -20,12 +20,7 @@ from interactive_nav_common.statistics import RESAMPLES, mean_text
 if TYPE_CHECKING:
     from train.scoring.rollout import PlayedEpisodes
 
-SCORES = {
-    "success": "success",
-    "path_efficiency": "P_eff",
-    "effort_efficiency": "E_eff",
-    "ins_0.5": "INS_0.5",
-}
+SCORES = {"success": "success", "path_efficiency": "P_eff", "effort_efficiency": "E_eff", "ins_0.5": "INS_0.5"}
 
 
 TYPES: dict[str, pa.DataType] = {
@@ -121,8 +116,7 @@ def _by_category(episodes: PlayedEpisodes, episode: int, categories: Sequence[st
 def score_table(rows: pa.Table, title: str) -> Table:
     """Success, P_eff, E_eff and INS_0.5 of each policy, with intervals."""
     made = Table(
-        title=title,
-        caption=f"mean [95 % interval]: Wilson for success, bootstrap ({RESAMPLES:,} resamples) elsewhere",
+        title=title, caption=f"mean [95 % interval]: Wilson for success, bootstrap ({RESAMPLES:,} resamples) elsewhere"
     )
     made.add_column("policy")
     for label in (*SCORES.values(), "episodes"):

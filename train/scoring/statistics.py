@@ -108,12 +108,7 @@ def cells(means: Sequence[RunMean]) -> dict[tuple[str, str, float], list[RunMean
 
 
 def contrast(
-    means: Sequence[RunMean],
-    axis: str,
-    left: Any,
-    right: Any,
-    score: Callable[[RunMean], float],
-    **where: Any,
+    means: Sequence[RunMean], axis: str, left: Any, right: Any, score: Callable[[RunMean], float], **where: Any
 ) -> Contrast | None:
     """Compares two values of an axis.
 

@@ -149,9 +149,7 @@ class Models:
             twice = mesh.corner_uv
             assert twice is not None
             mesh = dataclasses.replace(
-                mesh,
-                faces=np.vstack([mesh.faces, mesh.faces[:, ::-1]]),
-                corner_uv=np.vstack([twice, twice[:, ::-1]]),
+                mesh, faces=np.vstack([mesh.faces, mesh.faces[:, ::-1]]), corner_uv=np.vstack([twice, twice[:, ::-1]])
             )
             group = np.tile(group, 2)
         pitch, roll = number(element, "pitch", 0.0), number(element, "roll", 0.0)

@@ -12,11 +12,10 @@ import numpy as np
 from PIL import Image, ImageDraw
 from rich.console import Console
 
-from interactive_nav.pictures.replay import policy_key_of
+from interactive_nav.task.rollout import episode_keys, policy_key_of
 from train.runs.run import config_to_play, make_env
 from train.runs.run_folder import RunFolder
 from train.scoring.evaluation import SEED, load_policy
-from train.scoring.rollout import episode_keys
 
 _GAP_PX, _LABEL_PX, _FONT_PX = 4, 34, 13
 WIDTH_PX = 760

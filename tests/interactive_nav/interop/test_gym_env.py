@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import interactive_nav
 from interactive_nav.interop import gym_env
 from interactive_nav.interop.gym_env import InteractiveNavVectorEnv, env_id
-from interactive_nav.task.env import EPISODE_METRICS, REWARD_TERMS
+from interactive_nav.task.terms import EPISODE_METRICS, REWARD_TERMS
 from interactive_nav_common.errors import ConfigError, UserError
 
 ID = "InteractiveNav-TurtleBot-v0"

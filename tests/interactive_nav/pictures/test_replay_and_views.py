@@ -36,6 +36,7 @@ from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.slots import bodies_by_name
 from interactive_nav.sensing.base import Lens, look_along
+from interactive_nav.task.rollout import policy_key_of
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.rotations import yaw_from_quat
 from scenes_mjcf.categories import CATEGORIES, SEGMENTATIONS, class_id
@@ -63,7 +64,7 @@ def played(env):
 def test_a_replay_is_what_the_environment_kept_account_of(env, played):
     key = jax.random.PRNGKey(3)
     state = jax.jit(env.reset)(key)
-    step, policy_key = jax.jit(env.step), replay.policy_key_of(key)
+    step, policy_key = jax.jit(env.step), policy_key_of(key)
     robot, objects = [state.info["nav"].robot_pos_w], state.info["nav"].object_pos_w
     for t in range(played.num_steps):
         state = step(state, straight(state.obs, jax.random.fold_in(policy_key, t)))
@@ -71,9 +72,9 @@ def test_a_replay_is_what_the_environment_kept_account_of(env, played):
     nav = state.info["nav"]
     assert state.done and (played.policy, played.episode, played.label) == ("straight", 4, "by hand")
     np.testing.assert_allclose(played.body_pos_w[:, 0], robot, atol=2e-3)
-    assert played.force_n.sum() == pytest.approx(float(nav.force_sum_n), rel=0.02)
-    assert played.touches_movable.sum() == nav.interaction_steps
-    assert played.touches_structure.sum() == nav.structure_steps
+    assert played.force_n.sum() == pytest.approx(float(nav.memory["force_sum_n"]), rel=0.02)
+    assert played.touches_movable.sum() == nav.memory["interaction_steps"]
+    assert played.touches_structure.sum() == nav.memory["structure_steps"]
     assert played.metrics["ins_0.5"] == pytest.approx(float(state.metrics["ins_0.5"]), abs=0.01)
     assert np.linalg.norm(np.diff(played.body_pos_w[:, 0], axis=0), axis=1).sum() == pytest.approx(
         played.metrics["robot_path_m"], abs=1e-3
@@ -198,7 +199,7 @@ def test_the_robots_pictures_have_the_episodes_field_of_view(room, env, played):
 def test_a_policy_draws_from_another_key_than_the_environment(env):
     key = jax.random.PRNGKey(3)
     own = jax.jit(env.reset)(key).info["rng"]
-    assert (own == jax.random.fold_in(key, 0)).all() and (replay.policy_key_of(key) != own).any()
+    assert (own == jax.random.fold_in(key, 0)).all() and (policy_key_of(key) != own).any()
 
 
 def test_a_replay_of_before_can_be_read(played, tmp_path):

@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 from brax.envs import State
 
-from interactive_nav.pictures import replay
 from interactive_nav.pictures.replay import EpisodePlayer
+from interactive_nav.task import rollout
+
+
+class Nav(NamedTuple):
+    step_count: jax.Array
+    memory: dict[str, jax.Array]
 
 
 class Pose(NamedTuple):
@@ -20,11 +25,12 @@ class Pose(NamedTuple):
 class OnHost:
     """Physics as a callback, within whose third step a signal comes."""
 
-    steps = 0
+    steps, action_size, backend, metric_names = 0, 2, "native", ()
 
     def reset(self, key):
-        none = jnp.zeros(())
-        return State(Pose(jnp.zeros(3)), jnp.zeros(2), none, none, {}, {"nav": none})  # pyright: ignore[reportArgumentType]
+        zero, count = jnp.zeros(()), jnp.zeros((), jnp.int32)
+        nav = Nav(count, {"force_sum_n": zero, "interaction_steps": count, "structure_steps": count})
+        return State(Pose(jnp.zeros(3)), jnp.zeros(2), zero, zero, {}, {"nav": nav})  # pyright: ignore[reportArgumentType]
 
     def reset_to(self, start, key):
         return self.reset(key)
@@ -35,16 +41,14 @@ class OnHost:
             signal.raise_signal(signal.SIGINT)
         return np.asarray(action)
 
+    def step(self, state, action):
+        return state.replace(obs=jax.pure_callback(self.move, action, action, vmap_method="expand_dims"))
 
-def test_a_signal_within_the_physics_comes_after_the_step(monkeypatch):
+
+def test_a_signal_within_the_physics_comes_after_the_steps_of_the_compiled_program(monkeypatch):
     """Raised within it, it would be an error of JAX's."""
-
-    def play_step(env, state, action):
-        moved = jax.pure_callback(env.move, action, action, vmap_method="expand_dims")
-        return state, {"done": jnp.zeros((), bool), "moved": moved}
-
-    monkeypatch.setattr(replay, "_play_step", play_step)
+    monkeypatch.setattr(rollout, "CHUNK_STEPS", 5)
     env = OnHost()
     with pytest.raises(KeyboardInterrupt):
         EpisodePlayer(env, lambda obs, key: obs).play(jax.random.PRNGKey(0))  # pyright: ignore[reportArgumentType]
-    assert env.steps == 3
+    assert env.steps == 5

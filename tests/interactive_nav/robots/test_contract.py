@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import interactive_nav
-from interactive_nav.task.env import EPISODE_METRICS, REWARD_TERMS
+from interactive_nav.task.terms import EPISODE_METRICS, REWARD_TERMS
 from interactive_nav_common.errors import UserError
 from tests.toys import write_room
 

@@ -137,10 +137,13 @@ def fly(env, action, steps, xy=(0.0, 0.0), goal=(1.5, -1.0)):
 def test_it_stays_below_the_ceiling_and_within_the_walls(tmp_path, mode, backend):
     env = interactive_nav.make("quadrotor", [room(tmp_path)], backend=backend, num_objects=0, control_mode=mode)
     nav, metrics = fly(env, {"thrust": [1.0] * 4, "kinematic": [1.0, 0, 1, 0, 0, 0]}.get(mode, [1.0, 0, 1, 0]), 60)
-    assert 1.0 < float(nav.robot_pos_w[2]) < CEILING_M and float(nav.overflow_steps) == float(metrics["nonfinite"]) == 0
+    assert (
+        1.0 < float(nav.robot_pos_w[2]) < CEILING_M
+        and float(nav.memory["overflow_steps"]) == float(metrics["nonfinite"]) == 0
+    )
     assert abs(float(nav.robot_pos_w[0])) < 2 and abs(float(nav.robot_pos_w[1])) < 1.5
     if mode == "thrust":  # straight up: the ceiling is no wall
-        assert float(nav.structure_steps) == float(nav.force_sum_n) == 0
+        assert float(nav.memory["structure_steps"]) == float(nav.memory["force_sum_n"]) == 0
 
 
 def test_its_goal_has_a_height(tmp_path):
@@ -161,8 +164,8 @@ def test_its_goal_has_a_height(tmp_path):
 def test_climbing_counts_as_path(tmp_path):
     env = interactive_nav.make("quadrotor", [room(tmp_path)], backend="native", num_objects=0)
     nav, _ = fly(env, [0.0, 0, 1, 0], 8)
-    assert float(nav.robot_path_m) == pytest.approx(float(nav.robot_pos_w[2]) - 0.8, abs=0.02)
-    assert float(nav.robot_path_m) > 0.1
+    assert float(nav.memory["robot_path_m"]) == pytest.approx(float(nav.robot_pos_w[2]) - 0.8, abs=0.02)
+    assert float(nav.memory["robot_path_m"]) > 0.1
 
 
 @pytest.mark.parametrize("robot", ["turtlebot", "fetch", "ant"])

@@ -20,9 +20,11 @@ from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing.observation import advance_odometry
 from interactive_nav.sensing.sensors import Sensors, stream
 from interactive_nav.sensing.shading import FLOOR_COLOUR, draw_look
+from interactive_nav.task.terms import TERMS, Moment
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import NavInfo
 from interactive_nav_common.errors import UserError
+from interactive_nav_common.rotations import matrix_from_quat
 
 YAW = 0.3
 SEES = {"observations": ("depth",)}
@@ -51,9 +53,11 @@ def moment(world):
         "yaw_rad": jnp.asarray(YAW),
         "waypoints_b": jnp.zeros((10, 2)),
         "step_count": jnp.asarray(7, jnp.int32),
-        "odometry": jnp.asarray([0.5, -0.1, 4.0]),
-        "touching": jnp.asarray([True, False]),
-        "trail_w": jnp.stack([-1.0 + 0.1 * jnp.arange(65), jnp.full(65, 0.2)], -1),
+        "memory": {
+            "odometry": jnp.asarray([0.5, -0.1, 4.0]),
+            "touching": jnp.asarray([True, False]),
+            "trail": jnp.stack([-1.0 + 0.1 * jnp.arange(65), jnp.full(65, 0.2)], -1),
+        },
     }
     fields: dict[str, Any] = zeros | told
     nav = NavInfo(**fields)
@@ -62,7 +66,12 @@ def moment(world):
 
 def sense(world, moment, **settings):
     sensors = Sensors(world, NavConfig.of(num_objects=0, **settings), "native")
-    return sensors, jax.jit(sensors.observe)(*moment)
+    physics, nav, rng = moment
+    rotation = matrix_from_quat(physics.qpos[world.layout.robot_qpos + 3 :][:4])
+    at = Moment(NavConfig(), None, 1.0, nav, physics, rotation)  # type: ignore[arg-type]
+    parts = [t for t in TERMS if t.kind == "observation" and t.name in sensors.sizes]
+    remembered = {t.name: t.value(nav.memory[t.name], at) for t in parts if t.value}
+    return sensors, jax.jit(sensors.observe)(physics, nav, rng, remembered)
 
 
 def test_signals_stand_behind_the_tasks_29_numbers(world, moment):

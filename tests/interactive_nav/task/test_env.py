@@ -7,7 +7,7 @@ import pytest
 
 import interactive_nav
 from interactive_nav import metrics
-from interactive_nav.task.env import EPISODE_METRICS, SETTLE_STEPS
+from interactive_nav.task.terms import EPISODE_METRICS, SETTLE_STEPS
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav_common.errors import UserError
 
@@ -86,7 +86,7 @@ def test_observation_holds_goal_waypoints_and_velocity_in_the_robot_frame(env, p
     np.testing.assert_allclose(obs[:, 21], want_y, atol=0.02)
     np.testing.assert_allclose(obs[:, :20].reshape(N, 10, 2), nav.waypoints_b, atol=1e-6)
     # Wheels at -12.5 + 0.6 * 37.5 = 10 rad/s: 0.35 m/s ahead, for robots that met nothing.
-    free = np.asarray(nav.force_sum_n) == 0
+    free = np.asarray(nav.memory["force_sum_n"]) == 0
     assert free.any()
     np.testing.assert_allclose(obs[free, 23], 10 * 0.0352, rtol=0.05)
     np.testing.assert_allclose(obs[free, 24:29], 0, atol=0.1)
@@ -133,7 +133,7 @@ def test_starts_and_goals_keep_their_distance_and_nothing_touches_at_the_start(e
     still = (0 + 12.5) / 18.75 - 1
     for i in range(11):
         after = step(jax.tree.map(lambda x, i=i: x[i], batches), jnp.full((N, 2), still))
-        assert float(after.info["nav"].force_sum_n.max()) == 0.0
+        assert float(after.info["nav"].memory["force_sum_n"].max()) == 0.0
 
 
 def test_following_the_path_succeeds_and_the_reward_adds_up(programs):
@@ -195,12 +195,12 @@ def test_scores_equal_a_plain_python_oracle_over_real_physics(env, programs):
         for i in range(N):
             if not done_at[i]:
                 tracks[i].append(np.vstack([nav.robot_pos_w[i], nav.object_pos_w[i]]))
-                touched[i].append(np.asarray(nav.object_contact_steps[i]) > 0)
-                forces[i].append(float(nav.force_sum_n[i]) - previous[i])
+                touched[i].append(np.asarray(nav.memory["object_contact_steps"][i]) > 0)
+                forces[i].append(float(nav.memory["force_sum_n"][i]) - previous[i])
                 if state.done[i]:
                     done_at[i] = {k: float(v[i]) for k, v in state.metrics.items()}
                     done_at[i]["shortest"] = float(nav.shortest_path_m[i])
-        previous = np.asarray(nav.force_sum_n)
+        previous = np.asarray(nav.memory["force_sum_n"])
     pushed = 0.0
     for i in range(N):
         got = done_at[i]
@@ -237,7 +237,9 @@ def test_auto_reset_draws_a_new_episode_and_nothing_leaks(batched):
             seen[i].add(tuple(np.asarray(nav.goal_xy_w[i]).round(3)))
         # A new episode starts from nothing; a running one goes on.
         assert (np.asarray(nav.step_count)[done] == 0).all()
-        assert (np.asarray(nav.robot_path_m)[done] == 0).all() and (np.asarray(nav.force_sum_n)[done] == 0).all()
+        assert (np.asarray(nav.memory["robot_path_m"])[done] == 0).all() and (
+            np.asarray(nav.memory["force_sum_n"])[done] == 0
+        ).all()
         np.testing.assert_array_equal(nav.step_count[~done], np.asarray(old.info["nav"].step_count)[~done] + 1)
         np.testing.assert_array_equal(state.info["episode_done"], state.done)
         lengths = np.asarray(state.info["episode_metrics"]["length"])

@@ -14,7 +14,7 @@ import pytest
 import interactive_nav
 from interactive_nav.config import ORIGINAL_CODE, make_config
 from interactive_nav.scenes.contacts import from_sensors, rolling_geoms, sensor_addresses
-from interactive_nav.task.env import SETTLE_STEPS
+from interactive_nav.task.terms import SETTLE_STEPS
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import EpisodeStart
 from interactive_nav_common.config import replace
@@ -85,7 +85,8 @@ def play(env, actions, goal=(1.6, 0.0), x=-0.7):
 
 
 def value(states, name):
-    return np.array([np.asarray(getattr(s.info["nav"], name))[0] for s in states])
+    infos = [s.info["nav"] for s in states]
+    return np.array([np.asarray(nav.memory[name] if name in nav.memory else getattr(nav, name))[0] for nav in infos])
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +149,7 @@ def test_a_lifted_robot_is_recorded_and_fails_if_asked(pushed):
 def test_interaction_with_walls_costs_only_if_asked(pushed):
     for what, cost in (("movables", 0.0), ("anything", -0.1)):
         last = play(make(pushed, interaction_with=what), [-1.0] * 12, x=-1.7)[-1]  # -0.44 m/s to the wall at x = -2
-        assert float(last.info["nav"].structure_steps[0]) > 3
+        assert float(last.info["nav"].memory["structure_steps"][0]) > 3
         assert float(last.metrics["reward/interaction"][0]) == pytest.approx(cost)
 
 
@@ -166,9 +167,9 @@ def test_kinematic_sum_from_the_first_touch_on(pushed, paper):
     for kind, counted in (("touched", False), ("all", True)):
         env = make(pushed, kinematic_sum=kind)
         after = stepper(env)(state.replace(pipeline_state=physics), jnp.full((N, 2), STILL))
-        assert (float(after.info["nav"].object_path_m[0, 0]) > 0.03) == counted
+        assert (float(after.info["nav"].memory["object_path_m"][0, 0]) > 0.03) == counted
     both = [play(make(pushed, kinematic_sum="touched"), [AHEAD] * 30)[-1], paper[-1]]
-    paths = [float(s.info["nav"].object_path_m[0, 0]) for s in both]
+    paths = [float(s.info["nav"].memory["object_path_m"][0, 0]) for s in both]
     assert paths[0] == pytest.approx(paths[1], abs=2e-3) and paths[0] > 0.2  # only the robot moves it
 
 
@@ -233,7 +234,7 @@ def test_wheels_and_casters_are_exempt_where_the_original_exempts_them(pushed):
         forces_n = [0.0]
         for _ in range(12):
             state = step(state, jnp.full((N, 2), STILL))
-            forces_n.append(float(state.info["nav"].force_sum_n[0]))
+            forces_n.append(float(state.info["nav"].memory["force_sum_n"][0]))
         assert np.abs(np.asarray(state.info["nav"].robot_pos_w[0]) - pose).max() < 0.01  # stands there
         assert np.diff(forces_n)[-3:].mean() == pytest.approx(force_n, rel=0.03, abs=1e-3)
         assert float(state.metrics["reward/interaction"][0]) == pytest.approx(cost)
@@ -251,9 +252,9 @@ def test_robot_mass_variants_and_gravity(pushed, paper):
         assert env.score_mass_kg == pytest.approx(mass)
         last = play(env, [AHEAD] * 30)[-1]
         nav = last.info["nav"]
-        work = mass * float(nav.robot_path_m[0])
-        kinematic = work / (work + MASS_KG * float(nav.object_path_m[0, 0]))
-        dynamic = mass * 9.8 * 30 / (mass * 9.8 * 30 + float(nav.force_sum_n[0]))
+        work = mass * float(nav.memory["robot_path_m"][0])
+        kinematic = work / (work + MASS_KG * float(nav.memory["object_path_m"][0, 0]))
+        dynamic = mass * 9.8 * 30 / (mass * 9.8 * 30 + float(nav.memory["force_sum_n"][0]))
         assert float(last.metrics["kinematic_effort"][0]) == pytest.approx(kinematic, rel=1e-4)
         assert float(last.metrics["dynamic_effort"][0]) == pytest.approx(dynamic, rel=1e-4)
     heavy = dataclasses.replace(env.robot, root_link_kg=1.0)
@@ -407,7 +408,7 @@ def test_the_trail_is_where_the_base_was_a_second_ago_and_longer(pushed):
     places = value(states, "robot_pos_w")[:, :2]
     nav = states[25].info["nav"]
     # Every ten control steps: after 10 and 20; before that the start, which stands for all that is longer ago.
-    np.testing.assert_allclose(nav.trail_w[0], [places[20], places[10], *[places[0]] * 63], atol=1e-6)
+    np.testing.assert_allclose(nav.memory["trail"][0], [places[20], places[10], *[places[0]] * 63], atol=1e-6)
     seen = np.asarray(jax.vmap(env.observe)(states[25]).obs)[0, 3:].reshape(7, 2)
     ago = np.array([places[10], *[places[0]] * 6]) - places[25]
     cos, sin = math.cos(float(nav.yaw_rad[0])), math.sin(float(nav.yaw_rad[0]))

@@ -12,7 +12,7 @@ import pytest
 
 import interactive_nav
 from interactive_nav.physics import native
-from interactive_nav.task.env import EPISODE_METRICS
+from interactive_nav.task.terms import EPISODE_METRICS
 from interactive_nav.types import EpisodeStart
 from tests.toys import write_room
 
@@ -149,7 +149,7 @@ def test_every_score_and_reward(played, scored, i):
     for name, value in want.items():
         assert float(last.metrics[name][i]) == pytest.approx(value, rel=1e-3, abs=2e-4), name
     for name, values in of_objects.items():
-        got = np.asarray(getattr(last.info["nav"], name)[i])
+        got = np.asarray(last.info["nav"].memory[name][i])
         np.testing.assert_allclose(got, values, rtol=1e-3, atol=2e-4, err_msg=name)
     for t, terms in enumerate(rewards, 1):
         for name, value in terms.items():

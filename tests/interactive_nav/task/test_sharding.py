@@ -61,7 +61,7 @@ sharded = ShardedEnv(env)
 state = jax.jit(lambda: sharded.reset(jax.random.split(jax.random.PRNGKey(0), 4)))()
 for _ in range(3):
     state = jax.jit(sharded.step)(state, jnp.zeros((4, 2)))
-mean = jax.jit(lambda s: jnp.mean(s.info["nav"].robot_path_m))(state)
+mean = jax.jit(lambda s: jnp.mean(s.info["nav"].memory["robot_path_m"]))(state)
 print("devices", jax.device_count(), "local", jax.local_device_count(), "mean", round(float(mean), 6))
 """
 

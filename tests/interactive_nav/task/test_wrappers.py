@@ -69,10 +69,10 @@ def test_brax_own_wrappers_begin_again_after_each_time_limit(env, brax_first, li
         first, again = states[t], states[limit + t]
         np.testing.assert_allclose(again.obs, first.obs, atol=1e-4)
         np.testing.assert_allclose(again.reward, first.reward, atol=1e-4)
-        for name in ("step_count", "robot_path_m", "geodesic_m", "robot_pos_w", "object_path_m", "odometry"):
-            got, expected = (getattr(s.info["nav"], name) for s in (again, first))
+        for name in ("step_count", "robot_path_m", "geodesic_m", "robot_pos_w", "object_path_m", "touching"):
+            got, expected = (s.info["nav"].memory.get(name, getattr(s.info["nav"], name, None)) for s in (again, first))
             np.testing.assert_allclose(got, expected, atol=1e-4, err_msg=name)
-    assert (np.asarray(states[limit - 1].info["nav"].robot_path_m) > 0.02).all()
+    assert (np.asarray(states[limit - 1].info["nav"].memory["robot_path_m"]) > 0.02).all()
 
 
 def test_success_is_paid_once_and_the_end_stays(room, batch, auto):

@@ -13,13 +13,14 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from interactive_nav.task.rollout import episode_keys
 from interactive_nav_common.errors import ConfigError
 from tests.train.toy_env import ToyEnv
 from tests.train.toy_run import build_toy
 from train import evaluate
 from train.scoring.brought import BroughtPolicy, _on_host, named, told
 from train.scoring.policies import make_follower
-from train.scoring.rollout import BatchPlayer, episode_keys
+from train.scoring.rollout import BatchPlayer
 
 KEYS = episode_keys(5, 8)
 

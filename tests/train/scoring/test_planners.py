@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 import interactive_nav
+from interactive_nav.task.rollout import episode_keys
 from interactive_nav.types import EpisodeStart
 from interactive_nav_common.errors import UserError
 from tests.toys import write_room
 from train.scoring.planners import Planner
 from train.scoring.policies import make_baseline
-from train.scoring.rollout import BatchPlayer, episode_keys
+from train.scoring.rollout import BatchPlayer
 
 
 @pytest.fixture(scope="module")

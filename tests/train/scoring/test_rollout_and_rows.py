@@ -12,14 +12,14 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from interactive_nav.task import rollout
+from interactive_nav.task.rollout import HostPolicy, episode_keys
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.rows import read_notes, read_rows, write_parquet
 from interactive_nav_common.statistics import interval
 from tests.train.toy_env import ToyConfig, ToyEnv
-from train.scoring import rollout
-from train.scoring.planners import HostPolicy
 from train.scoring.policies import make_follower, make_random
-from train.scoring.rollout import BatchPlayer, episode_keys
+from train.scoring.rollout import BatchPlayer, Paths, PlayedEpisodes
 from train.scoring.row_files import EvaluationAsked, files_of_run
 from train.scoring.rows import episode_table
 
@@ -177,13 +177,13 @@ def test_bootstrap_interval_is_near_the_normal_one():
 
 
 def test_rows_and_file(tmp_path):
-    paths = rollout.Paths(*(np.zeros(0) for _ in range(6)))
+    paths = Paths(*(np.zeros(0) for _ in range(6)))
     of_objects = {
         "object_path_m": np.array([[0.5, 0.0, 0.25, 0.0], [0.0] * 4], np.float32),
         "object_contact_steps": np.array([[3, 0, 2, 0], [0] * 4]),
         "object_force_sum_n": np.array([[8.0, 0.0, 4.0, 0.0], [0.0] * 4], np.float32),
     }
-    played = rollout.PlayedEpisodes(np.array([1, 0]), {"success": np.array([1.0, 0.0], np.float32)}, of_objects, paths)
+    played = PlayedEpisodes(np.array([1, 0]), {"success": np.array([1.0, 0.0], np.float32)}, of_objects, paths)
     scenes = (SimpleNamespace(name="a", split="train"), SimpleNamespace(name="b", split="test"))
     categories = (("toy", "", "chair", ""), ("toy", "chair", "chair", ""))
     table = episode_table(played, scenes, categories, {"run": "r", "k_int": 0.1})

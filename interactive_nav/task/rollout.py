@@ -1,0 +1,256 @@
+"""Play episodes of an environment with any policy, and record them: the only loop over episodes."""
+
+import dataclasses
+import functools
+import operator
+import zlib
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from interactive_nav.physics import compiler_options
+from interactive_nav_common.signals import signals_wait
+
+CHUNK_STEPS = 50
+"""Control steps in one call of the compiled program."""
+FEWEST, MANY = 16, 256
+"""On the CPU a batch becomes smaller as episodes end: by a quarter above `MANY`, by half below, down to about `FEWEST`.
+Each size costs a compilation, and saves stepping the rest. On an accelerator a step costs about the same for fewer."""
+PolicyFn = Callable[[Any, jax.Array], jax.Array]
+"""Pure (observation, key) -> action (A,) in [-1, 1], of one environment."""
+
+
+class HostPolicy:
+    """A policy that acts on the host, step by step, for a batch of episodes."""
+
+    note = ""
+    """What a reader of its scores should know."""
+
+    def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> np.ndarray:
+        """Return the actions [N, A] of one control step.
+
+        Args:
+            state: of the environments, leaves [N, ...].
+            episode: [N] number of the episode in each environment.
+            running: [N] bool; the actions of the others have no effect.
+        """
+        raise NotImplementedError
+
+
+@dataclasses.dataclass(frozen=True)
+class Recorder:
+    """A quantity to record of episodes."""
+
+    read: Callable[[Any, jax.Array], Any]
+    """Pure (states, actions [N, A]) after a control step -> pytree of [N, ...]."""
+    at: Literal["start", "end", "step"] = "end"
+    """When its value is kept: before the first step (with actions of 0), in the last one, or in all of them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Rollout:
+    """N finished episodes, in the order of their keys."""
+
+    first: Any
+    """`NavInfo` at the start, NumPy leaves [N, ...]."""
+    num_steps: np.ndarray
+    """[N] i32."""
+    values: dict[str, Any]
+    """Recorder -> [N, ...]; of those at each step [E, T, ...] of the first E episodes, where what follows an episode's
+    end means nothing."""
+
+
+def episode_keys(seed: int, episodes: int) -> jax.Array:
+    """Return keys [N, 2] of fixed episodes: number i is the same whatever their number and whichever policy plays."""
+    return jax.vmap(functools.partial(jax.random.fold_in, jax.random.PRNGKey(seed)))(jnp.arange(episodes))
+
+
+def policy_key_of(key: jax.Array) -> jax.Array:
+    """Return the key of a policy's randomness in an episode drawn from `key`: none that the environment draws from."""
+    return jax.random.fold_in(key, zlib.crc32(b"policy"))
+
+
+class Player:
+    """Plays episodes of one environment, not batched and not resetting itself.
+
+    What is compiled is kept: policies that are `jax.tree_util.Partial`s of one function share it, as do chunks of one
+    size.
+    """
+
+    def __init__(self, env: Any, recorders: Mapping[str, Recorder]):
+        self.env = env
+        self._at_start, self._at_end, self._at_step = (
+            {name: r.read for name, r in recorders.items() if r.at == when} for when in ("start", "end", "step")
+        )
+        self._reset = jax.jit(jax.vmap(env.reset))
+        self._reset_to = jax.jit(jax.vmap(env.reset_to)) if hasattr(env, "reset_to") else None
+        self._begin = jax.jit(self._carry)
+        self._chunk = jax.jit(self._play_chunk, compiler_options=compiler_options())
+        self._step = jax.jit(self._play_step, compiler_options=compiler_options())
+
+    def rollout(
+        self,
+        policy: PolicyFn | HostPolicy,
+        keys: jax.Array,
+        starts: Any = None,
+        scene_index: np.ndarray | None = None,
+        record: int | None = None,
+        batch: int | None = None,
+        on_progress: Callable[[int, int], None] = lambda finished, step: None,
+        on_note: Callable[[str], None] = lambda note: None,
+    ) -> Rollout:
+        """Play every episode to its end.
+
+        Args:
+            keys: [N, 2]; an episode is drawn, and its policy's randomness is, from its own key alone.
+            starts: `EpisodeStart`s, leaves [N, ...]: these episodes instead of drawn ones.
+            scene_index: [N] i32, the scene of each drawn episode; None: drawn as well.
+            record: E of the recorders at each step; None: all.
+            batch: episodes played at a time; None: all. Where the device's memory does not hold so many, half as
+                many are tried.
+            on_progress: called with the numbers of finished episodes and of steps.
+        """
+        count = len(keys)
+        size, record = min(batch or count, count), count if record is None else record
+        parts: list[Rollout] = []
+        done = 0
+        while done < count:
+            try:
+                parts.append(self._play_batch(policy, keys, done, size, (starts, scene_index, record, on_progress)))
+            except jax.errors.JaxRuntimeError as error:
+                if "RESOURCE_EXHAUSTED" not in str(error) or size == 1:
+                    raise
+                on_note(f"{size} episodes at a time do not fit into the device's memory, going on with {size // 2}")
+                size //= 2
+                continue
+            done += size
+        values = {name: jax.tree.map(_joined, *(part.values[name] for part in parts)) for name in self._at_step}
+        of_episodes = self._at_start | self._at_end
+        whole = [(part.first, part.num_steps, {n: part.values[n] for n in of_episodes}) for part in parts]
+        first, num_steps, others = jax.tree.map(lambda *x: np.concatenate(x), *whole)
+        return Rollout(first, num_steps, values | others)
+
+    def _play_batch(self, policy: Any, keys: jax.Array, done: int, size: int, options: tuple[Any, ...]) -> Rollout:
+        """Play the next `size` episodes; the last one, over from the start, fills a batch that is too large."""
+        starts, scenes, record, on_progress = options
+        chosen, count = np.minimum(np.arange(done, done + size), len(keys) - 1), min(size, len(keys) - done)
+        keys, starts, scenes = jax.tree.map(operator.itemgetter(chosen), (keys, starts, scenes))
+        record = max(0, min(record - done, count))
+        if starts is None:
+            state = self._reset(keys, *(() if scenes is None else (jnp.asarray(scenes),)))
+        else:
+            assert self._reset_to is not None
+            state = self._reset_to(starts, keys)
+        policy_keys = jax.vmap(policy_key_of)(keys)
+        first = jax.tree.map(np.asarray, state.info["nav"])
+        episode_of = np.arange(size)  # episode played by each place in the batch
+        finished = episode_of >= count
+        act: Any = policy  # a pytree argument of the program, so that its numbers are none of its constants
+        if not isinstance(policy, (jax.tree_util.Partial, HostPolicy)):
+            act = jax.tree_util.Partial(policy)
+        step, tracks = 0, []
+        carry, at_start = self._begin(state, jnp.asarray(finished))
+        ends = jax.tree.map(np.array, carry[2])
+        while not finished.all():
+            if isinstance(policy, HostPolicy):
+                carry, track = self._play_on_host(policy, carry, done + episode_of, step)
+            else:
+                with signals_wait():  # what is raised within the physics' callbacks is another error, and may crash
+                    carry, track = jax.block_until_ready(self._chunk(act, carry, policy_keys[episode_of], step))
+            step += CHUNK_STEPS
+            new = np.flatnonzero(np.asarray(carry[1]) & ~finished[episode_of])
+            _write(ends, episode_of[new], carry[2], new)
+            finished[episode_of[new]] = True
+            kept = np.flatnonzero(episode_of < record)
+            places = jax.tree.map(lambda x: np.zeros((record, CHUNK_STEPS, *x.shape[2:]), x.dtype), track)
+            _write(places, episode_of[kept], jax.tree.map(lambda x: np.asarray(x).swapaxes(0, 1), track), kept)
+            tracks.append(places)
+            on_progress(done + int(finished[:count].sum()), step)
+            if self.env.backend == "native":
+                left = going_on(finished[episode_of])
+                if len(left) < len(episode_of):
+                    carry, episode_of = jax.tree.map(operator.itemgetter(left), carry), episode_of[left]
+        first, at_start, (num_steps, values) = jax.tree.map(lambda x: np.asarray(x[:count]), (first, at_start, ends))
+        longest = int(num_steps[:record].max(initial=0))
+        track = jax.tree.map(lambda *x: np.concatenate(x, axis=1)[:, :longest], *tracks)
+        return Rollout(first, num_steps, track | values | at_start)
+
+    def _carry(self, state: Any, ended: jax.Array) -> Any:
+        """Return what `_play_step` hands on (the state, which episodes are over, what they ended with), and values at
+        the start."""
+        action = jnp.zeros((ended.shape[0], self.env.action_size))
+        starts, ends = (
+            {name: read(state, action) for name, read in of.items()} for of in (self._at_start, self._at_end)
+        )
+        return (state, ended, (state.info["nav"].step_count, ends)), starts
+
+    def _play_step(self, carry: Any, action: jax.Array) -> tuple[Any, Any]:
+        """Step all environments; what belongs to an episode is frozen at the step that ended it."""
+        state, ended, kept = carry
+        state = jax.vmap(self.env.step)(state, action)
+        ends = (state.done > 0) & ~ended
+        new = state.info["nav"].step_count, {name: read(state, action) for name, read in self._at_end.items()}
+        kept = jax.tree.map(lambda x, old: jnp.where(ends.reshape(-1, *[1] * (x.ndim - 1)), x, old), new, kept)
+        return (state, ended | ends, kept), {name: read(state, action) for name, read in self._at_step.items()}
+
+    def _play_chunk(self, policy: PolicyFn, carry: Any, keys: jax.Array, step: int) -> tuple[Any, Any]:
+        """Play `CHUNK_STEPS` of all environments; return what `_carry` does, and values at steps [T, N, ...]."""
+
+        def one_step(carry: Any, t: jax.Array) -> tuple[Any, Any]:
+            action = jax.vmap(policy)(carry[0].obs, jax.vmap(jax.random.fold_in, (0, None))(keys, step + t))
+            return self._play_step(carry, action)
+
+        return jax.lax.scan(one_step, carry, jnp.arange(CHUNK_STEPS))
+
+    def _play_on_host(self, policy: HostPolicy, carry: Any, episode_of: np.ndarray, step: int) -> tuple[Any, Any]:
+        """Play a chunk as `_play_chunk`, with a policy on the host."""
+        tracks = []
+        for t in range(CHUNK_STEPS):
+            running = ~np.asarray(carry[1])
+            if not running.any():
+                break
+            actions = policy.act(carry[0], episode_of, running, step + t)
+            with signals_wait():
+                carry, track = jax.block_until_ready(self._step(carry, actions))
+            tracks.append(jax.tree.map(np.asarray, track))
+        tracks += [tracks[-1]] * (CHUNK_STEPS - len(tracks))
+        return carry, jax.tree.map(lambda *x: np.stack(x), *tracks)
+
+
+def rollout(
+    env: Any, policy: PolicyFn | HostPolicy, starts: Any, recorders: Mapping[str, Recorder], **options: Any
+) -> Rollout:
+    """Play episodes once; see `Player.rollout`, which keeps what it compiles.
+
+    Args:
+        starts: keys [N, 2] of the episodes.
+        options: of `Player.rollout`.
+    """
+    return Player(env, recorders).rollout(policy, starts, **options)
+
+
+def going_on(over: np.ndarray) -> np.ndarray:
+    """Return the places of a batch that go on: all that run, then as many others as fill it.
+
+    [n] i64, n the smallest of N's sizes (see `FEWEST`) that holds all that run. So all batches of N episodes have the
+    same few, and what is compiled for one serves the next.
+    """
+    size, running = len(over), int((~over).sum())
+    while size > FEWEST and running <= (smaller := -(-size * 3 // 4) if size > MANY else -(-size // 2)):
+        size = smaller
+    return np.argsort(over, kind="stable")[:size]
+
+
+def _write(target: Any, to: np.ndarray, values: Any, at: np.ndarray) -> None:
+    """Write rows `at` of the values into rows `to` of the target, leaf by leaf."""
+    for into, new in zip(jax.tree.leaves(target), jax.tree.leaves(values), strict=True):
+        into[to] = np.asarray(new)[at]
+
+
+def _joined(*parts: np.ndarray) -> np.ndarray:
+    """Return recordings [E, T, ...] of batches one after the other, as long as the longest."""
+    longest = max(part.shape[1] for part in parts)
+    return np.concatenate([np.pad(p, [(0, 0), (0, longest - p.shape[1])] + [(0, 0)] * (p.ndim - 2)) for p in parts])

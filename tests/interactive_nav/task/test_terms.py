@@ -1,0 +1,102 @@
+"""Terms: values by hand, memory over resets, and every place that takes them from the environment."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import interactive_nav
+from interactive_nav.interop.gym_env import InteractiveNavEnv
+from interactive_nav.pictures.replay import EpisodePlayer
+from interactive_nav.task.rollout import HostPolicy, Recorder, episode_keys, rollout
+from interactive_nav.task.terms import EPISODE_METRICS, REWARD_TERMS, TERMS, Term
+from interactive_nav.task.wrappers import AutoResetEnv
+from interactive_nav_common.errors import ConfigError
+from tests.toys import write_room
+
+STEPS = 5
+WALL = Term("wall", "Minus 0.5 in a step in which the robot touches a wall.", "reward",
+            lambda _, step: -0.5 * step.hits_structure)  # fmt: skip
+FARTHEST = Term("farthest_m", "Largest distance from the start.", "metric", lambda far_m, step: far_m,
+                start=lambda nav: jnp.zeros(()),
+                update=lambda far_m, step: jnp.maximum(
+                    far_m, jnp.linalg.norm(step.nav.robot_pos_w[:2] - step.nav.start_xy_w)))  # fmt: skip
+BEFORE = Term("before", "Robot's position one control step ago, world frame.", "observation",
+              lambda pos_w, at: pos_w, start=lambda nav: nav.robot_pos_w[:2],
+              update=lambda pos_w, step: step.last.robot_pos_w[:2], size=2)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def env(tmp_path_factory):
+    room = write_room(tmp_path_factory.mktemp("terms") / "room", (4.0, 3.0), (("basket", 0.0, 0.3, 1.0, 0.4),))
+    return interactive_nav.make("turtlebot", [room], (WALL, FARTHEST, BEFORE), backend="native", num_objects=1,
+                                episode_steps=STEPS)  # fmt: skip
+
+
+def test_the_benchmarks_terms_have_names_of_their_own_and_say_what_they_are():
+    assert EPISODE_METRICS[:6] == (
+        *("success", "path_efficiency", "effort_efficiency", "kinematic_effort", "dynamic_effort", "ins_0.5"),
+    )
+    assert REWARD_TERMS == ("reward/success", "reward/potential", "reward/interaction")
+    assert all(term.doc.endswith(".") and (term.size > 0) == (term.kind == "observation") for term in TERMS)
+
+
+def test_a_batch_rewards_reports_and_observes_added_terms_and_forgets_at_a_reset(env):
+    auto = AutoResetEnv(env)
+    step = jax.jit(auto.step)
+    states = [jax.jit(auto.reset)(jax.random.split(jax.random.PRNGKey(0), 3))]
+    assert auto.observation_size == 31 and states[0].obs.shape == (3, 31)
+    for _ in range(STEPS + 2):
+        states.append(step(states[-1], jnp.full((3, 2), 0.6)))
+    for last, state in zip(states, states[1:], strict=False):
+        begun = np.asarray(state.info["nav"].step_count) == 0
+        want = np.where(begun[:, None], state.info["nav"].robot_pos_w[:, :2], last.info["nav"].robot_pos_w[:, :2])
+        np.testing.assert_allclose(state.obs[:, 29:], want, atol=1e-6)
+        terms = sum(np.asarray(state.metrics[name]) for name in env.reward_names)
+        np.testing.assert_allclose(state.reward, terms, atol=1e-6)
+        hits = np.asarray(state.metrics["reward/wall"])
+        assert set(hits.tolist()) <= {0.0, -0.5}
+    # The clock ends all three episodes at once, unless one reached its goal before.
+    end = states[STEPS]
+    path_m, far_m = (np.asarray(end.info["episode_metrics"][name]) for name in ("robot_path_m", "farthest_m"))
+    assert (far_m > 0.05).all() and (far_m <= path_m + 1e-5).all()
+    assert (np.asarray(end.info["nav"].memory["farthest_m"]) == 0).all()
+
+
+def test_gymnasium_replays_and_rollouts_report_them(env):
+    def forwards(obs, key):
+        return jnp.full(2, 0.6)
+
+    class Forwards(HostPolicy):
+        def act(self, state, episode, running, step):
+            return np.full((len(episode), 2), 0.6, np.float32)
+
+    recorders = {
+        "far_m": Recorder(lambda state, action: state.metrics["farthest_m"]),
+        "start_m": Recorder(lambda state, action: state.info["nav"].memory["farthest_m"], "start"),
+        "xy_w": Recorder(lambda state, action: state.info["nav"].robot_pos_w[:, :2], "step"),
+    }
+    keys = episode_keys(3, 4)
+    played, on_host = (rollout(env, policy, keys, recorders, batch=3) for policy in (forwards, Forwards()))
+    assert played.values["far_m"].shape == (4,) and (played.values["start_m"] == 0).all()
+    assert played.values["xy_w"].shape == (4, played.num_steps.max(), 2) and (played.num_steps <= STEPS).all()
+    for i, steps in enumerate(played.num_steps):
+        away = np.linalg.norm(played.values["xy_w"][i, :steps] - played.first.start_xy_w[i], axis=-1)
+        assert played.values["far_m"][i] == pytest.approx(away.max(), abs=1e-6)
+        np.testing.assert_allclose(on_host.values["xy_w"][i, :steps], played.values["xy_w"][i, :steps], atol=1e-5)
+    replay = EpisodePlayer(env, Forwards()).play(keys[2])
+    assert replay.metrics["farthest_m"] == pytest.approx(float(played.values["far_m"][2]), abs=1e-5)
+    assert replay.num_steps == played.num_steps[2]
+    gym = InteractiveNavEnv("turtlebot", [str(env.scenes[0].path)], terms=(WALL, FARTHEST), backend="native",
+                            num_objects=1, episode_steps=1)  # fmt: skip
+    gym.reset(seed=0)
+    info = gym.step(np.zeros(2, np.float32))[-1]
+    assert info["reward/wall"] == 0.0 and 0 <= info["farthest_m"] < 0.1
+
+
+def test_two_terms_of_one_name_are_refused(env):
+    twice = Term("success", "Twice.", "reward", lambda _, step: jnp.zeros(()))
+    with pytest.raises(ConfigError, match="two are called 'reward/success', expected names of their own; rename one"):
+        env.__class__(env.robot, env.scenes, env.config, (twice,))
