@@ -20,7 +20,7 @@ def test_an_episode_with_lost_contacts_or_left_out_bodies_is_broken(room):
     assert simulator.seen(state).broken.tolist() == [False] * 3
     for name in ("overflow_steps", "left_out_steps"):
         nav = state.info["nav"]
-        lost = nav.replace(**{name: jnp.asarray([0, 1, 0], getattr(nav, name).dtype)})
+        lost = nav.replace(memory=nav.memory | {name: jnp.asarray([0, 1, 0], nav.memory[name].dtype)})
         seen = simulator.seen(state.replace(info={**state.info, "nav": lost}))
         assert seen.broken.tolist() == [False, True, False]
         assert seen.xy_w == pytest.approx(simulator.seen(state).xy_w)
