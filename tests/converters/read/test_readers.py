@@ -7,13 +7,17 @@ import math
 
 import numpy as np
 import pytest
+import trimesh
 
 from converters.geometry.faces import merge_vertices
+from converters.pipeline import ConvertConfig, convert
 from converters.read.annotations import parse_annotations, trs_matrix
+from converters.read.files import SourceFolder
 from converters.read.gibson import read_gibson
 from converters.read.scan2cad import read_scan2cad
-from converters.read.source import detect_format
+from converters.read.source import FILES, READERS, detect_format, read_source
 from converters.records.errors import SceneRejected
+from converters.records.raw import CEILING, FLOOR, WALL, ScanMesh
 from tests.converters import tiny_raw
 
 LABELS = "scan/scene_tiny_vh_clean_2.labels.ply"
@@ -369,3 +373,39 @@ def test_a_damaged_texture_costs_colour_only(gibson_raw):
 def test_no_known_layout(tmp_path):
     refused(detect_format, tmp_path, "no known layout", "mesh_z_up.obj", "full_annotations.json")
     refused(detect_format, tmp_path / "absent", "no such file or folder")
+
+
+def read_room(root, strict=False, chosen=None):
+    """Reads an empty room from a file with its length, width and height in m: a reader as docs/extend.md describes."""
+    source = SourceFolder(root, strict)
+    name = source.inside(chosen) if chosen else "home.room"
+    path = source.use(name, "write length, width and height of the room into it")
+    try:
+        size = np.array([float(word) for word in path.read_text().split()]).reshape(3)
+    except ValueError:
+        raise SceneRejected(f"{path}: expected three numbers; write length, width and height in m") from None
+    room = trimesh.creation.box(size).apply_translation(size / 2)
+    triangles = room.vertices[room.faces[:, ::-1]]  # which look into the room
+    heights = triangles[:, :, 2]
+    labels = np.where((heights == 0).all(1), FLOOR, np.where((heights == size[2]).all(1), CEILING, WALL))
+    corners = triangles.reshape(-1, 3)  # labels are of vertices, and a corner would belong to three faces
+    faces, grey = np.arange(len(corners)).reshape(-1, 3), np.full((len(corners), 3), 200, np.uint8)
+    return source.scene("room", ScanMesh(corners, faces, labels.repeat(3), grey), licence="CC0", floor_height_m=0.0)
+
+
+def test_a_reader_of_a_new_layout(tmp_path, monkeypatch):
+    monkeypatch.setitem(READERS, "room", (lambda root: (root / "home.room").is_file(), read_room))
+    monkeypatch.setitem(FILES, (".room",), (lambda path: path.resolve().parent, read_room))
+    path = tmp_path / "flat" / "home.room"
+    path.parent.mkdir()
+    path.write_text("4 3 2.5")
+    assert detect_format(path.parent) == "room"
+    (path.parent / "attic.room").write_text("2 2 2")
+    attic, flat = read_source(path.parent / "attic.room"), read_source(path.parent, "room")
+    assert (attic.name, flat.name) == ("attic", "flat") and list(attic.sources) == ["attic.room"]
+    np.testing.assert_array_equal(flat.scan.vertices.max(0), [4, 3, 2.5])
+    scene = convert(path.parent, tmp_path / "scene", ConvertConfig(structure_texture=128))
+    assert scene.manifest.floor_area_m2 == pytest.approx(12.0, rel=0.1) and scene.manifest.source["format"] == "room"
+    assert all(gate.passed for gate in scene.gates), scene.gates
+    path.write_text("4 3")
+    refused(read_source, path.parent, "home.room: expected three numbers")

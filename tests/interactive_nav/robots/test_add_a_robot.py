@@ -1,5 +1,6 @@
 """A user's URDF and MJCF become robots that drive; the documentation's code runs; what cannot be used is refused."""
 
+import functools
 import re
 import warnings
 from pathlib import Path
@@ -8,11 +9,16 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+import yaml
 
+import interactive_nav
 from docs.studies.robots import evidence
 from docs.studies.robots.pictures import stage
 from interactive_nav import robots
+from interactive_nav.robots import build
+from interactive_nav.robots.models import wheeled
 from interactive_nav_common.errors import UserError
+from interactive_nav_common.records import read_packaged
 from tests.toys import write_room
 
 DOC = Path(__file__).parents[3] / "docs" / "add-a-robot.md"
@@ -67,6 +73,27 @@ def test_the_documents_code_runs(tmp_path, monkeypatch, registry, capsys):
     assert env.action_size == 2 and names["drive"].robot.action_names == ("forward m/s", "turn rad/s")
     state = jax.jit(env.step)(jax.jit(env.reset)(jax.random.PRNGKey(0)), np.ones(2, np.float32))
     assert state.obs.shape == (29,) and np.isfinite(state.obs).all()
+
+
+def test_a_model_and_a_row_add_a_wheeled_robot(tmp_path, monkeypatch, registry):
+    """The steps of docs/extend.md, on copies of the package's files."""
+    model, table = build.FOLDER / "turtlebot.xml", Path(wheeled.__file__).with_suffix(".yaml")
+    _write(tmp_path, model.read_text().replace('model="turtlebot"', 'model="puck"'), "puck.xml")
+    monkeypatch.setattr(build, "FOLDER", tmp_path)
+    rows = yaml.safe_load(table.read_text())
+    (row,) = [row for row in rows if row["base"]["name"] == "turtlebot"]
+    row["base"] |= {"name": "puck", "max_linear_m_s": 0.5}
+    (row,) = read_packaged(_write(tmp_path, yaml.safe_dump([row]), "wheeled.yaml"), tuple[wheeled._Row, ...])
+    robots._FACTORIES["puck"] = functools.partial(build.wheeled_robot, row.base, **row.figures("base"))
+    assert "puck" in robots.robot_names()
+    scene = write_room(tmp_path / "room", (4.0, 3.0), ())
+    env = interactive_nav.make("puck", [scene], num_objects=0, control_mode="twist", backend="native")
+    assert env.robot.action_high[0] == 0.5
+    state, step = jax.jit(env.reset)(jax.random.PRNGKey(0)), jax.jit(env.step)
+    start_m = state.info["nav"].robot_pos_w[:2]
+    for _ in range(5):
+        state = step(state, np.array([1.0, 0.0], np.float32))
+    assert 0.05 < np.linalg.norm(state.info["nav"].robot_pos_w[:2] - start_m) < 0.25  # 0.5 s at up to 0.5 m/s
 
 
 def test_a_urdf_keeps_its_masses_and_limits_and_gets_its_figures_from_its_shapes(tmp_path):

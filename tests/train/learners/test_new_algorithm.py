@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from interactive_nav.task.rollout import episode_keys
 from tests.train.learners.td3 import ALGORITHM, TD3, TrainConfigWithTD3
 from tests.train.learners.test_sac import KEY, transitions
 from tests.train.toy_env import batched
@@ -23,7 +24,7 @@ from train.runs import checkpoint
 from train.runs.run import train_run
 from train.runs.run_folder import RunFolder
 from train.scoring.evaluation import load_policy
-from train.scoring.rollout import BatchPlayer, episode_keys
+from train.scoring.rollout import BatchPlayer
 
 WORDS = (
     *("algorithm=td3", "td3.num_envs=16", "td3.steps_per_update=8", "td3.grad_steps_per_update=4", "td3.batch_size=32"),
