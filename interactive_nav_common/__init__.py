@@ -1,4 +1,4 @@
-"""What every package here needs and none owns: whole-file writes, locks, errors, settings, rows, statistics.
+"""Provide what every package here shares: whole-file writes, locks, errors, settings, rows, statistics.
 
 A leaf: it imports no other package of the project.
 """

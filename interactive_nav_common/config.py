@@ -1,4 +1,4 @@
-"""`key=value` words and plain mappings -> a frozen dataclass of settings; every mistake named in one line.
+"""Read `key=value` words and plain mappings into a frozen dataclass of settings; each mistake is reported in one line.
 
 A setting's type says what it may be: `Literal` for choices, `Annotated` with `Bounds` (or a plain pair) for ranges. A
 dataclass may be composed of others: in files and on the command line they are sections (`ppo.learning_rate`), or flat,
@@ -40,7 +40,7 @@ class Bounds(NamedTuple):
     """Both ends are excluded."""
 
     def hold(self, value: float) -> bool:
-        """Whether a number is within."""
+        """Return whether a number is within the bounds."""
         return self.low < value < self.high if self.open else self.low <= value <= self.high
 
     def __str__(self) -> str:
@@ -60,7 +60,7 @@ Share = Annotated[float, (0.0, 1.0)]
 
 
 def flat(kind: Callable[[], Config]) -> Config:
-    """A field of a dataclass of settings: another one, whose settings stand among those of the whole."""
+    """Declare a field that is itself a dataclass of settings, which stand among those of the whole."""
     return dataclasses.field(default_factory=kind, metadata={"flat": True})
 
 
@@ -83,10 +83,10 @@ class Settings:
         for names, needs, used in self.IDLE:
             for name in () if used(self) else names.split():
                 if (value := getattr(self, name)) not in (0, getattr(type(self), name, 0)):
-                    told = f"{name} is {value!r}, which changes nothing here"
-                    raise ConfigError(f"{told}: expected {needs}; or leave it out")
+                    problem = f"{name} is {value!r}, which changes nothing here"
+                    raise ConfigError(f"{problem}: expected {needs}; or leave it out")
 
-    if not TYPE_CHECKING:  # the house itself reads settings from their sections, where types are known
+    if not TYPE_CHECKING:  # the project itself reads settings from their sections, where type checkers see them
 
         def __getattr__(self, name: str) -> Any:
             section, _ = _places(type(self)).get(name, ("", None))
@@ -96,13 +96,13 @@ class Settings:
 
     @classmethod
     def of(cls, **settings: Any) -> Self:
-        """The defaults but for these settings, wherever they stand."""
+        """Return the defaults with these settings replaced, wherever they stand."""
         return replace(cls(), **settings)
 
 
 @functools.cache
 def _places(config_type: type) -> dict[str, tuple[str, Any]]:
-    """Name of each setting -> the flat section that it is in ('': none), and its type."""
+    """Return, by the name of each setting, the flat section that it is in ('': none) and its type."""
     hints = typing.get_type_hints(config_type, include_extras=True)
     places: dict[str, tuple[str, Any]] = {}
     for field in dataclasses.fields(config_type):
@@ -113,7 +113,7 @@ def _places(config_type: type) -> dict[str, tuple[str, Any]]:
 
 
 def _check(name: str, value: Any, hint: Any) -> None:
-    """Raises `ConfigError` for a value that its type does not allow; None is still to be chosen."""
+    """Raise `ConfigError` for a value that its type does not allow; None is still to be chosen."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if value is None or origin is None:
         return
@@ -133,21 +133,21 @@ def _check(name: str, value: Any, hint: Any) -> None:
 
 
 def replace(config: Config, **changes: Any) -> Config:
-    """As `dataclasses.replace`, with settings of flat sections by their own names."""
-    places, own, inner = _places(type(config)), {}, {}
+    """Do as `dataclasses.replace` does, with settings of flat sections by their plain names."""
+    places, direct, inner = _places(type(config)), {}, {}
     for name, value in changes.items():
         if name not in places:
             near = nearest(name, list(places)).removeprefix(", ")
-            known = f"known settings: {', '.join(sorted(places))}"
-            raise ConfigError(f"unknown setting {name!r}; {f'{near} ' if near else ''}{known}")
+            available = f"known settings: {', '.join(sorted(places))}"
+            raise ConfigError(f"unknown setting {name!r}; {f'{near} ' if near else ''}{available}")
         section = places[name][0]
-        (inner.setdefault(section, {}) if section else own)[name] = value
-    own |= {section: replace(getattr(config, section), **values) for section, values in inner.items()}
-    return dataclasses.replace(config, **own)  # type: ignore[type-var]
+        (inner.setdefault(section, {}) if section else direct)[name] = value
+    direct |= {section: replace(getattr(config, section), **values) for section, values in inner.items()}
+    return dataclasses.replace(config, **direct)  # type: ignore[type-var]
 
 
 def _walk(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
-    """Every setting in order of definition: its dotted name, the dataclass that it is a field of, its own name."""
+    """Yield each setting in order of definition: its dotted name, the dataclass whose field it is, its plain name."""
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if dataclasses.is_dataclass(value):
@@ -157,12 +157,12 @@ def _walk(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
 
 
 def flatten(config: Any) -> dict[str, Any]:
-    """Dotted name -> value of every setting, in order of definition."""
+    """Return the value of every setting by its dotted name, in order of definition."""
     return {dotted: getattr(part, name) for dotted, part, name in _walk(config)}
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """Nested plain values as YAML holds them: lists for tuples, `auto` for None."""
+    """Return nested plain values as YAML holds them: lists for tuples, `auto` for None."""
 
     def plain(value: Any) -> Any:
         return AUTO if value is None else list(value) if isinstance(value, tuple) else value
@@ -171,7 +171,7 @@ def to_dict(config: Any) -> dict[str, Any]:
 
 
 def nested(settings: Iterable[tuple[str, Any]], where: str = "settings") -> dict[str, Any]:
-    """Dotted names taken apart; mappings among the values are merged."""
+    """Split dotted names into nested mappings; mappings among the values are merged."""
     whole: dict[str, Any] = {}
     for name, value in settings:
         *sections, last = str(name).split(".")
@@ -189,7 +189,7 @@ def nested(settings: Iterable[tuple[str, Any]], where: str = "settings") -> dict
 
 
 def read_words(words: Sequence[str], example: str = "ppo.learning_rate=1e-4") -> dict[str, Any]:
-    """`dotted.name=value` words as a nested mapping; values are read as YAML.
+    """Return `dotted.name=value` words as a nested mapping; values are read as YAML.
 
     All words at once, so that two values that only fit together may both change.
     """
@@ -208,7 +208,7 @@ def read_words(words: Sequence[str], example: str = "ppo.learning_rate=1e-4") ->
 
 @functools.cache
 def field_docs(config_type: type) -> dict[str, str]:
-    """Field name -> the docstring written under it, of the class and the classes it extends."""
+    """Return the docstring under each field by its name, for the class and the classes that it extends."""
     docs: dict[str, str] = {}
     for cls in reversed(config_type.__mro__[:-1]):
         (class_node,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
@@ -220,15 +220,15 @@ def field_docs(config_type: type) -> dict[str, str]:
     return docs
 
 
-def overlay(base: Config, plain: Any, where: str, prefix: str = "", known: Sequence[str] = ()) -> Config:
-    """A dataclass of settings with nested plain values laid over it, here and in other programs.
+def overlay(base: Config, plain: Any, where: str, prefix: str = "", elsewhere: Sequence[str] = ()) -> Config:
+    """Return a dataclass of settings with nested plain values laid over it; other programs use it, too.
 
     Args:
         base: what `plain` does not name.
         plain: nested mapping as read from YAML; None, as of an empty file or section: nothing.
         where: file or word the values come from, for messages.
         prefix: dotted name of `base` inside the whole, with its dot.
-        known: dotted names elsewhere that a wrong key may have meant.
+        elsewhere: dotted names outside of `base` that a wrong key may have meant.
     """
     plain = {} if plain is None else plain
     if not isinstance(plain, Mapping):
@@ -239,26 +239,26 @@ def overlay(base: Config, plain: Any, where: str, prefix: str = "", known: Seque
     for key, value in plain.items():
         name = f"{prefix}{key}"
         if key not in places:
-            names = [*(f"{prefix}{field}" for field in places), *known]
+            names = [*(f"{prefix}{field}" for field in places), *elsewhere]
             raise ConfigError(f"{where}: unknown key {name!r}{nearest(name, names)} (--help lists them)")
         hint = places[key][1]
         if dataclasses.is_dataclass(hint):
-            changes[key] = overlay(getattr(base, key), value, where, f"{name}.", known)
+            changes[key] = overlay(getattr(base, key), value, where, f"{name}.", elsewhere)
         else:
             changes[key] = _convert(value, hint, f"{where}: {name}")
     try:
         return replace(base, **changes)
-    except ConfigError as error:  # the dataclass's own check: "<field> is <value>, expected ..."
+    except ConfigError as error:  # the dataclass's check: "<field> is <value>, expected ..."
         raise ConfigError(f"{where}: {prefix}{error}") from None
 
 
 def overridden(config: Config, words: Sequence[str]) -> Config:
-    """The config with `name=value` words laid over it; values are read as YAML."""
+    """Return the config with `name=value` words laid over it; values are read as YAML."""
     return overlay(config, read_words(words, "seed=1"), "setting")
 
 
 def refuse_unused(arguments: argparse.Namespace, names: str, why: str) -> None:
-    """Refuses options and settings that were given but would change nothing.
+    """Refuse options and settings that were given but would change nothing.
 
     Args:
         arguments: of a command line, its `key=value` words in `settings`; what is None, False or empty was not given.
@@ -274,7 +274,7 @@ def refuse_unused(arguments: argparse.Namespace, names: str, why: str) -> None:
 
 
 def settings_help(config: Any, notes: Mapping[str, str] | None = None, equals: str = "=") -> str:
-    """One line a setting: dotted name, default, meaning, choices, and the note of its name."""
+    """Return one line per setting: dotted name, default, meaning, choices, and the note of its name."""
     lines = []
     for dotted, part, name in _walk(config):
         value, doc, hint = getattr(part, name), field_docs(type(part))[name], _places(type(part))[name][1]
@@ -287,7 +287,7 @@ def settings_help(config: Any, notes: Mapping[str, str] | None = None, equals: s
 
 
 def _convert(value: Any, kind: Any, where: str) -> Any:
-    """One value as the type of its field, or a `ConfigError` that says what was expected."""
+    """Return a value as the type of its field, or raise a `ConfigError` that says what was expected."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (types.UnionType, typing.Union):  # `X | None`
         if value is None or value == AUTO:
@@ -314,7 +314,7 @@ def _convert(value: Any, kind: Any, where: str) -> Any:
 
 
 def _scalar(value: Any, kind: type) -> Any:
-    """`value` as `kind`, or None where it is not one. YAML takes 1e-4 for text: text is read as a number."""
+    """Return `value` as `kind`, or None where it is not one. YAML takes 1e-4 for text; text is read as a number."""
     if kind is bool or isinstance(value, bool):
         return value if kind is bool and isinstance(value, bool) else None
     if kind is str:
@@ -331,13 +331,13 @@ def _scalar(value: Any, kind: type) -> Any:
     return float(value)
 
 
-def nearest(word: str, known: Sequence[str]) -> str:
-    """`, did you mean 'X'?` for the known name that a wrong one looks like, or nothing."""
-    tails = {name.rpartition(".")[2]: name for name in reversed(known)}  # of equal names the first section's
+def nearest(word: str, candidates: Sequence[str]) -> str:
+    """Return `, did you mean 'X'?` for the candidate that a wrong name looks like, or an empty string."""
+    tails = {name.rpartition(".")[2]: name for name in reversed(candidates)}  # of equal names the first section's
     tail = word.rpartition(".")[2]
     if tail in tails:  # the right name in the wrong section, or without its section
         return f", did you mean {tails[tail]!r}?"
-    near = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
+    near = difflib.get_close_matches(word, candidates, n=1, cutoff=0.6)
     near = near or [tails[match] for match in difflib.get_close_matches(tail, list(tails), n=1, cutoff=0.6)]
     return f", did you mean {near[0]!r}?" if near else ""
 

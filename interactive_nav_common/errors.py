@@ -1,4 +1,4 @@
-"""What a user can cause or mend: each error is one clear line (what, got, expected, remedy)."""
+"""Report what a user can cause or fix: each error is one clear line (what, got, expected, remedy)."""
 
 import contextlib
 import errno
@@ -73,9 +73,9 @@ def readable(path: str | Path, kind: type[UserError], remedy: str, what: str = "
     except UserError:
         raise
     except Exception as error:  # noqa: BLE001
-        told = " ".join(f"{type(error).__name__}: {error}".replace(str(path), Path(path).name).split())[:300]
-        told = "it is empty" if Path(path).is_file() and not Path(path).stat().st_size else told
-        raise kind(f"{path}: not readable{what} ({told}); {remedy}") from error
+        cause = " ".join(f"{type(error).__name__}: {error}".replace(str(path), Path(path).name).split())[:300]
+        cause = "it is empty" if Path(path).is_file() and not Path(path).stat().st_size else cause
+        raise kind(f"{path}: not readable{what} ({cause}); {remedy}") from error
 
 
 _REFUSED = {errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EACCES, errno.ENAMETOOLONG}
@@ -130,12 +130,12 @@ class MissingPackage(ConfigError, ImportError):
 
 
 def missing(user: str, package: str, extra: str, otherwise: str = "") -> str:
-    """The line: what needs the package, the extra that brings it, and another remedy. It holds beside a wheel, too."""
+    """Return the line: what needs the package, the extra that installs it, another remedy. It also suits a wheel."""
     return f"{user} needs {package}, which is not installed; pip install 'interactive-nav[{extra}]'{otherwise}"
 
 
 def optional(module: str, line: str, kind: type[UserError] = MissingPackage) -> Any:
-    """A module of an optional package."""
+    """Import a module of an optional package."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all."""
+"""Write files and folders whole or not at all."""
 
 import contextlib
 import errno
@@ -28,13 +28,13 @@ LONGEST_NAME = 100
 
 
 def cache_folder() -> Path:
-    """`$INTERACTIVE_NAV_CACHE`, else `$XDG_CACHE_HOME/interactive_nav`, else `~/.cache/interactive_nav`."""
-    own = os.environ.get("INTERACTIVE_NAV_CACHE")
-    return Path(own or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "interactive_nav")
+    """Return `$INTERACTIVE_NAV_CACHE`, else `$XDG_CACHE_HOME/interactive_nav`, else `~/.cache/interactive_nav`."""
+    override = os.environ.get("INTERACTIVE_NAV_CACHE")
+    return Path(override or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "interactive_nav")
 
 
 def check_name(name: str, what: str, error: type[UserError] = FileError) -> str:
-    """A name that comes from a file or a user and becomes one part of a path."""
+    """Check a name that comes from a file or a user and becomes one part of a path; return it."""
     good = name.isprintable() and name[:1] not in ("", ".") and not set("/\\") & set(name)
     if not good or len(name.encode()) > LONGEST_NAME:
         shown = repr(name if len(name) <= 40 else f"{name[:37]}...")
@@ -47,7 +47,7 @@ def check_name(name: str, what: str, error: type[UserError] = FileError) -> str:
 
 @contextlib.contextmanager
 def writing(place: object, remedy: str, what: str = "cannot be written") -> Iterator[None]:
-    """Says in one line what could not be written in the block, why, and what helps."""
+    """Report in one line what could not be written in the block, why, and what helps."""
     try:
         yield
     except OSError as error:
@@ -56,9 +56,9 @@ def writing(place: object, remedy: str, what: str = "cannot be written") -> Iter
 
 @contextlib.contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
-    """Yields a temporary path beside `path` of the same ending, which replaces it once the block has written it.
+    """Yield a temporary path beside `path` of the same ending, which replaces it once the block has written it.
 
-    Each writer has its own temporary file, locked while it writes: of two that write one path at the same time, the
+    Each writer has a temporary file, locked while it writes: of two that write one path at the same time, the
     last one stands.
     """
     path = Path(path)
@@ -87,7 +87,7 @@ def _is_young(path: Path) -> bool:
 
 
 def remove_partial(folder: Path) -> None:
-    """Removes unfinished files of a folder whose writers were killed; those of writers that run are locked and stay."""
+    """Remove unfinished files of a folder whose writers were killed; those of writers that run are locked and stay."""
     for path in folder.glob(f"{PARTIAL}*"):
         with contextlib.suppress(OSError, FileError):
             lock = None if _is_young(path) else take_lock(path)
@@ -103,20 +103,20 @@ def append_text(path: Path, text: str) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Writes a text file (UTF-8) whole or not at all."""
+    """Write a text file (UTF-8) whole or not at all."""
     with whole_file(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
 
 def write_arrays(path: str | Path, **arrays: Any) -> None:
-    """Writes arrays as a packed npz file, whole or not at all."""
+    """Write arrays as a packed npz file, whole or not at all."""
     with whole_file(path) as partial, open(partial, "wb") as file:
         np.savez_compressed(file, **arrays)
 
 
 @contextlib.contextmanager
 def whole_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
-    """An empty folder beside `target`, which becomes it once the block has filled it."""
+    """Yield an empty folder beside `target`, which becomes it once the block has filled it."""
     with part_folder(target, overwrite) as part:
         yield part
         publish({part: target}, overwrite)
@@ -124,7 +124,7 @@ def whole_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def part_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
-    """An empty, locked folder beside `target`, to be filled and published; gone at the end unless it was.
+    """Yield an empty, locked folder beside `target`, to be filled and published; else it is removed at the end.
 
     Args:
         target: of the folder, where it shall stand in the end.
@@ -153,7 +153,7 @@ def part_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
 
 
 def publish(folders: Mapping[Path, Path], overwrite: bool = True) -> None:
-    """Renames finished folders to their targets, all or none.
+    """Rename finished folders to their targets, all or none.
 
     Signals wait until it is done: a few renames take no time, and half of them would be worse. Of two that replace one
     target at the same time, the last one stands.
@@ -188,7 +188,7 @@ def publish(folders: Mapping[Path, Path], overwrite: bool = True) -> None:
 
 
 def _take_place(folder: Path, target: Path) -> bool:
-    """Renames a folder; False where a filled one stands at `target`."""
+    """Rename a folder; return False where a filled one stands at `target`."""
     try:
         folder.rename(target)
     except OSError as error:
@@ -199,7 +199,7 @@ def _take_place(folder: Path, target: Path) -> bool:
 
 
 def remove_stale(target: Path) -> None:
-    """Removes what a writer of `target` left that was killed (SIGKILL, power): its unfinished folder.
+    """Remove what a writer of `target` left that was killed (SIGKILL, power): its unfinished folder.
 
     Was it killed while it replaced an older `target`, that one is put back. Folders of writers that run are locked and
     stay.

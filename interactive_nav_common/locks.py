@@ -1,4 +1,4 @@
-"""Advisory locks on files and folders, freed by the system however their holder ends."""
+"""Take advisory locks on files and folders, which the system frees however their holder ends."""
 
 import contextlib
 import fcntl
@@ -15,12 +15,12 @@ PATIENCE_S = 0.5
 
 
 def take_lock(path: Path) -> int | None:
-    """Holds a lock as long as the file descriptor that it returns is open, here or in a child.
+    """Hold a lock as long as the file descriptor that it returns is open, here or in a child.
 
     A lock and not a process id in a file: ids are used again, and mean nothing in another container.
 
     Args:
-        path: of a folder that is there, or of a file, which is made and tells who holds it.
+        path: of a folder that is there, or of a file, which is created and names its holder.
 
     Returns:
         The descriptor, or None where another holds the lock.
@@ -44,17 +44,17 @@ def take_lock(path: Path) -> int | None:
 
 
 def release(descriptor: int | None) -> None:
-    """Frees a lock; None is none."""
+    """Free a lock; None is none."""
     if descriptor is not None:
         os.close(descriptor)
 
 
 def is_locked(path: Path) -> bool:
-    """Whether somebody holds a lock for itself; asking does not take it."""
+    """Return whether another process holds the lock; the check does not take it."""
     try:
         descriptor = _open(path, os.O_RDONLY)
     except FileError as error:
-        if isinstance(error.__cause__, FileNotFoundError | NotADirectoryError):  # by now another may have made it
+        if isinstance(error.__cause__, FileNotFoundError | NotADirectoryError):  # by now another may have created it
             return False
         raise
     try:
@@ -64,7 +64,7 @@ def is_locked(path: Path) -> bool:
 
 
 def holder(path: Path) -> str:
-    """Who holds a lock file, as it says itself: `process 123 on host`."""
+    """Return who holds a lock file, as the file says: `process 123 on host`."""
     with contextlib.suppress(OSError, ValueError):
         pid, host = path.read_text().split()
         return f"process {pid} on {host}"
@@ -73,7 +73,7 @@ def holder(path: Path) -> str:
 
 @contextlib.contextmanager
 def locked(path: Path, busy: str) -> Iterator[None]:
-    """Holds a lock file for the block.
+    """Hold a lock file for the block.
 
     Args:
         path: of the lock file.
@@ -114,10 +114,10 @@ LOCK = ".lock"
 
 @contextlib.contextmanager
 def alone_in(out: Path) -> Iterator[None]:
-    """Makes a folder and keeps other processes out of it for the block."""
+    """Create a folder and keeps other processes out of it for the block."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise FileError(f"{out}: no folder can be made there ({error.strerror}); choose another one (-o)") from None
+        raise FileError(f"{out}: cannot create a folder there ({error.strerror}); choose another one (-o)") from None
     with locked(out / LOCK, f"{out}: {{holder}} works there; wait for it or choose another folder (-o)"):
         yield

@@ -1,4 +1,4 @@
-"""JSON and YAML files in, plain values and typed records out; every mistake is one line that names file and key.
+"""Read JSON and YAML files into plain values and typed records; every mistake is one line that names file and key.
 
 A record is a dataclass: its types say what its keys may hold, `Annotated` with `Bounds` how large numbers may be.
 Lines of metrics too, packed or not, and back.
@@ -38,13 +38,13 @@ KINDS: dict[Any, tuple[type | types.UnionType, str]] = {
 
 @functools.cache
 def _fields(cls: type) -> dict[str, tuple[Any, bool]]:
-    """Name of each field -> its type, and whether it must be given."""
+    """Return the type of each field by its name, and whether it must be given."""
     hints, none = typing.get_type_hints(cls, include_extras=True), dataclasses.MISSING
     return {f.name: (hints[f.name], f.default is none and f.default_factory is none) for f in dataclasses.fields(cls)}
 
 
 def shown(value: Any, most: int = 60) -> str:
-    """A decoded value as a file writes it, cut to `most` characters."""
+    """Return a decoded value as a file writes it, cut to `most` characters."""
     try:
         text = json.dumps(value, default=repr)
     except (ValueError, TypeError, RecursionError):  # a number of thousands of digits, a key of another kind, a circle
@@ -64,7 +64,7 @@ class Reader:
     """All numbers must be finite and below 2**64; measured scores may be none."""
 
     def json(self, path: Path, absent: Any = None) -> Any:
-        """The decoded file; `absent`, unless None, where there is none."""
+        """Return the decoded file; `absent`, unless None, where there is none."""
         try:
             return self.decoded(read_bytes(path), "JSON", str(path))
         except OSError as error:
@@ -73,18 +73,18 @@ class Reader:
             raise self.error(f"{path}: cannot be read ({error.strerror or error}); {self.remedy}") from None
 
     def decoded(self, text: str | bytes, kind: Literal["JSON", "YAML"], where: str, loader: Any = Loader) -> Any:
-        """As `json`, of a file's text."""
+        """Return what `json` does, from a file's text."""
         try:
             value = json.loads(text) if kind == "JSON" else yaml.load(text, loader)
         except (ValueError, RecursionError, yaml.YAMLError) as error:  # no UTF-8, a number too long, brackets too deep
-            told = " ".join(str(error).split())[:200]
-            raise self.error(f"{where}: not readable as {kind} ({told}); {self.remedy}") from None
+            reason = " ".join(str(error).split())[:200]
+            raise self.error(f"{where}: not readable as {kind} ({reason}); {self.remedy}") from None
         if self.finite:
             self._check_numbers(value, where)
         return value
 
     def record(self, data: Any, cls: type[Record], where: str, others: bool = False) -> Record:
-        """A decoded mapping as a record: lists become tuples, mappings records where the types say so.
+        """Return a decoded mapping as a record: lists become tuples, mappings records where the types say so.
 
         `where` is named in errors; with `others`, keys that the record lacks are passed over.
         """
@@ -94,16 +94,16 @@ class Reader:
         data = {key: value for key, value in data.items() if key in fields} if others else data
         for key in data:
             if key not in fields:
-                known = sorted(fields)
-                near = nearest(str(key), known)
-                raise self.error(f"{where}: unknown key '{key!s:.60}'{near}; known keys: {', '.join(known)}")
+                expected = sorted(fields)
+                near = nearest(str(key), expected)
+                raise self.error(f"{where}: unknown key '{key!s:.60}'{near}; known keys: {', '.join(expected)}")
         for key, (_, required) in fields.items():
             if required and key not in data:
                 raise self.error(f"{where}: missing key '{key}'; {self.remedy}")
         return cls(**{key: self.typed(value, fields[key][0], f"{where}: {key}") for key, value in data.items()})
 
     def typed(self, value: Any, hint: Any, where: str) -> Any:
-        """A decoded value as its type wants it."""
+        """Return a decoded value as its type requires it."""
         origin, arguments = typing.get_origin(hint), typing.get_args(hint)
         if hint is Any or (origin in (types.UnionType, typing.Union) and value is None and type(None) in arguments):
             return value
@@ -119,8 +119,8 @@ class Reader:
             return self.typed(value, last, where)
         if origin is Literal:
             if not isinstance(value, str) or value not in arguments:
-                told = repr(value) if isinstance(value, str) and len(value) < 60 else shown(value)
-                raise self.error(f"{where} is {told}, expected one of {', '.join(map(str, arguments))}; {self.remedy}")
+                got = repr(value) if isinstance(value, str) and len(value) < 60 else shown(value)
+                raise self.error(f"{where} is {got}, expected one of {', '.join(map(str, arguments))}; {self.remedy}")
             return value
         if origin is Annotated:
             bounds = Bounds(*arguments[1])
@@ -129,19 +129,19 @@ class Reader:
                 raise self.error(f"{where} is {shown(value)}, expected {what}; {self.remedy}")
             return value
         kinds, words = KINDS[origin or hint]
-        found: Any = value
+        items: Any = value
         if not isinstance(value, kinds) or (isinstance(value, bool) and hint is not bool):
             raise self.error(f"{where} is {shown(value)}, expected {words}; {self.remedy}")
         if origin is dict:
-            return {key: self.typed(item, arguments[1], f"{where}: {key!s:.60}") for key, item in found.items()}
+            return {key: self.typed(item, arguments[1], f"{where}: {key!s:.60}") for key, item in items.items()}
         if origin is list:
-            return [self.typed(item, arguments[0], f"{where}[{i}]") for i, item in enumerate(found)]
+            return [self.typed(item, arguments[0], f"{where}[{i}]") for i, item in enumerate(items)]
         if origin is tuple:
-            each = [arguments[0]] * len(found) if arguments[1:] == (...,) else arguments
-            if len(each) != len(found):
+            each = [arguments[0]] * len(items) if arguments[1:] == (...,) else arguments
+            if len(each) != len(items):
                 raise self.error(f"{where} is {shown(value)}, expected a list of {len(each)}; {self.remedy}")
             return tuple(
-                self.typed(v, kind, f"{where}[{i}]") for i, (v, kind) in enumerate(zip(found, each, strict=True))
+                self.typed(v, kind, f"{where}[{i}]") for i, (v, kind) in enumerate(zip(items, each, strict=True))
             )
         return value
 
@@ -164,13 +164,13 @@ METRICS, PACKED_METRICS = "metrics.jsonl", "metrics.jsonl.gz"
 
 
 def read_packaged(path: Path, hint: Any) -> Any:
-    """A YAML table that comes with the package, as the type `hint`."""
+    """Return a YAML table that comes with the package, as the type `hint`."""
     reader = Reader(FileError, "install the package again", finite=False)
     return reader.typed(reader.decoded(path.read_bytes(), "YAML", str(path), PACKAGED), hint, str(path))
 
 
 def write_metrics(path: Path, lines: Sequence[dict[str, Any]]) -> None:
-    """Writes a metrics.jsonl, or, where the name ends in .gz, a packed one."""
+    """Write a metrics.jsonl, or, where the name ends in .gz, a packed one."""
     text = "".join(json.dumps(line) + "\n" for line in lines)
     if path.suffix == ".gz":
         with whole_file(path) as partial:
@@ -180,14 +180,14 @@ def write_metrics(path: Path, lines: Sequence[dict[str, Any]]) -> None:
 
 
 def mean_over_episodes(lines: Sequence[dict[str, Any]], name: str) -> float | None:
-    """Mean of a score over the episodes of some lines of metrics; None where none ended."""
+    """Return the mean of a score over the episodes of some lines of metrics; None where none ended."""
     scored = [(line[name], line["episodes"]) for line in lines if name in line]
     episodes = sum(count for _, count in scored)
     return sum(score * count for score, count in scored) / episodes if episodes else None
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The lines of a metrics.jsonl, packed or not; an unfinished last line (a killed run) is left out."""
+    """Return the lines of a metrics.jsonl, packed or not, without an unfinished last line (a killed run)."""
     with readable(path, FileError, "expected the metrics of a run"):
         everything = read_bytes(path)
         everything = unpack(everything, "gzip") if path.suffix == ".gz" else everything

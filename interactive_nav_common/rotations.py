@@ -1,4 +1,4 @@
-"""Rotations of NumPy or JAX arrays: quaternions w x y z, angles in rad, matrices with the body's axes as columns."""
+"""Compute rotations with NumPy or JAX: quaternions w x y z, angles in rad, matrices with the body's axes as columns."""
 
 import math
 from typing import Any
@@ -12,13 +12,13 @@ Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def namespace(*values: Array) -> Any:
-    """`jax.numpy` when any value is a JAX array or tracer, else `numpy`."""
+    """Return `jax.numpy` when any value is a JAX array or tracer, else `numpy`."""
     spaces = {v.__array_namespace__() for v in values if hasattr(v, "__array_namespace__")} - {np}
     return spaces.pop() if spaces else np
 
 
 def matrix_from_quat(quat: Array) -> Array:
-    """[..., 4] unit quaternions -> [..., 3, 3]."""
+    """Return the matrices [..., 3, 3] of unit quaternions [..., 4]."""
     xp = namespace(quat)
     w, x, y, z = xp.moveaxis(xp.asarray(quat), -1, 0)
     rows = [
@@ -30,14 +30,14 @@ def matrix_from_quat(quat: Array) -> Array:
 
 
 def yaw_from_quat(quat: Array) -> Array:
-    """[..., 4] unit quaternions -> [...] heading of the body's x axis."""
+    """Return the heading [...] of the body's x axis of unit quaternions [..., 4]."""
     xp = namespace(quat)
     w, x, y, z = xp.moveaxis(xp.asarray(quat), -1, 0)
     return xp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def rotate(quat: Array, vector: Array) -> Array:
-    """Vectors [..., 3] of a body with unit quaternion [..., 4], in the world."""
+    """Return vectors [..., 3] of a body with unit quaternion [..., 4] in the world frame."""
     xp = namespace(quat, vector)
     w, axis = quat[..., :1], quat[..., 1:]
     t = 2.0 * xp.cross(axis, vector)
@@ -45,13 +45,13 @@ def rotate(quat: Array, vector: Array) -> Array:
 
 
 def rotate_back(quat: Array, vector: Array) -> Array:
-    """World vectors [..., 3] in the frame of a body with unit quaternion [..., 4]."""
+    """Return world vectors [..., 3] in the frame of a body with unit quaternion [..., 4]."""
     xp = namespace(quat, vector)
     return rotate(xp.concatenate([quat[..., :1], -quat[..., 1:]], -1), vector)
 
 
 def yaw_matrix(yaw_rad: float) -> np.ndarray:
-    """[3, 3] rotation about z."""
+    """Return the [3, 3] rotation about z."""
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -69,5 +69,5 @@ def transformed(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 
 def wrap_angle(angle_rad: Array, period_rad: float = 2 * math.pi) -> Array:
-    """Angles in [-period/2, period/2)."""
+    """Return the angles wrapped to [-period/2, period/2)."""
     return (angle_rad + period_rad / 2) % period_rad - period_rad / 2

@@ -1,4 +1,4 @@
-"""Records of arrays taken in part and joined; tables of rows as Parquet files, whole or not at all, and as Markdown."""
+"""Take parts of records of arrays and join them; write tables of rows as Parquet files, whole or not at all."""
 
 import dataclasses
 import inspect
@@ -22,13 +22,13 @@ if "max_rows_per_page" in inspect.signature(pq.ParquetWriter).parameters:
 
 
 def markdown(header: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
-    """A table for people."""
+    """Return a table for people."""
     rows = [list(header), ["---"] * len(header), *([str(cell) for cell in line] for line in lines)]
     return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
 
 
 def write_parquet(table: pa.Table, path: Path, notes: dict[str, str] | None = None, small: bool = False) -> None:
-    """Writes rows, with notes beside them in the file, whole or not at all.
+    """Write rows, with notes beside them in the file, whole or not at all.
 
     A small one is a tenth smaller and takes thirty times as long to write: for files that are kept.
     """
@@ -53,12 +53,12 @@ def write_parquet(table: pa.Table, path: Path, notes: dict[str, str] | None = No
 
 
 def read_notes(path: Path) -> dict[str, str]:
-    """What `write_parquet` kept beside the rows; nothing where the file is damaged."""
+    """Return what `write_parquet` kept beside the rows; nothing where the file is damaged."""
     try:
-        found = pq.read_schema(path).metadata or {}
+        metadata = pq.read_schema(path).metadata or {}
     except (OSError, pa.ArrowInvalid):
         return {}
-    return {key.decode(): value.decode() for key, value in found.items()}
+    return {key.decode(): value.decode() for key, value in metadata.items()}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Columns:
 
 
 def read_rows(paths: Sequence[Path], check: Callable[[pa.Table, Path], None] | None = None) -> pa.Table:
-    """The rows of several files as one table, each checked; a column that a file lacks is empty there.
+    """Return the rows of several files as one table, each checked; a column that a file lacks is empty there.
 
     An episode that stands in several files (`IDENTITY`) is taken once, from the last of them by name.
     """
@@ -129,11 +129,11 @@ class Rows:
         return len(getattr(self, dataclasses.fields(self)[0].name))  # type: ignore[arg-type]
 
     def take(self, which: Any) -> Self:
-        """Some of the rows, by index or mask."""
+        """Return some of the rows, by index or mask."""
         return type(self)(*(getattr(self, f.name)[which] for f in dataclasses.fields(self)))  # type: ignore[arg-type]
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """The rows of all parts, one part after the other."""
+        """Return the rows of all parts, one part after the other."""
         names = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))

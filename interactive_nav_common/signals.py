@@ -1,4 +1,4 @@
-"""SIGINT, SIGTERM and SIGHUP: collected by programs that save before they end, held back, or never lost."""
+"""Collect SIGINT, SIGTERM and SIGHUP for programs that save before they end, hold them back, or never lose them."""
 
 import contextlib
 import os
@@ -17,10 +17,10 @@ _LOST_IN = ("<frozen importlib._bootstrap>", "jax/_src/compiler.py", "jax/_src/c
 
 
 def heard(handler: Handler) -> Handler:
-    """A handler that raises, where what it raises is not lost.
+    """Wrap a handler that raises, so that what it raises is not lost.
 
     Some modules catch all that happens while they import others, and nothing leaves a destructor or a callback of the
-    garbage collector or of a weak reference. JAX makes an error of its own of what leaves a callback, and a compilation
+    garbage collector or of a weak reference. JAX turns what leaves a callback into another error, and a compilation
     that is left runs on and crashes the interpreter at its end. There the signal comes again a moment later.
     """
 
@@ -42,13 +42,13 @@ def heard(handler: Handler) -> Handler:
 
 
 def number_of(stop: KeyboardInterrupt) -> int:
-    """The signal that raised it."""
+    """Return the signal that raised it."""
     return getattr(stop, "signal_number", signal.SIGINT)
 
 
 def _lost_again(before: Callable[[Any], Any]) -> Callable[[Any], Any]:
     def hook(unraisable: Any) -> None:
-        """What Python cannot raise: a signal comes again, all else is for the hook before."""
+        """Handle what Python cannot raise: a signal comes again, all else is for the hook before."""
         number = getattr(unraisable.exc_value, "signal_number", None)
         _come_again(number) if number else before(unraisable)
 
@@ -103,18 +103,18 @@ def stop_signals(second_ends: bool = True) -> Iterator[list[int]]:
         second_ends: a second one acts as it always would; False: it is collected too (a sweep waits for its runs,
             which save).
     """
-    seen: list[int] = []
+    collected: list[int] = []
     usual: dict[int, Any] = {n: signal.getsignal(n) for n in STOPS}
     if usual[signal.SIGHUP] is signal.SIG_IGN:
         del usual[signal.SIGHUP]
 
     def remember(number: int, _: FrameType | None) -> None:
-        seen.append(number)
+        collected.append(number)
         if second_ends:
             signal.signal(number, usual[number])
 
     with _handled(dict.fromkeys(usual, remember)):
-        yield seen
+        yield collected
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""Samples in; means with their intervals, and the tests between them, out."""
+"""Compute the means of samples with their intervals, and tests between samples."""
 
 import dataclasses
 import math
@@ -15,14 +15,14 @@ RESAMPLES = 10_000
 
 
 def interval(name: str, values: np.ndarray) -> tuple[float, float]:
-    """95 % confidence interval of a mean: Wilson's for success (0 or 1), bootstrap percentiles elsewhere."""
+    """Return the 95 % confidence interval of a mean: Wilson's for success (0 or 1), bootstrap percentiles elsewhere."""
     if name == "success":
         test = stats.binomtest(int(values.sum()), len(values))
-        found = test.proportion_ci(CONFIDENCE, method="wilson")
-        return float(found.low), float(found.high)
+        result = test.proportion_ci(CONFIDENCE, method="wilson")
+        return float(result.low), float(result.high)
     if len(values) < 2 or np.ptp(values) == 0.0:  # nothing to resample
         return float(values.mean()), float(values.mean())
-    found = stats.bootstrap(
+    result = stats.bootstrap(
         (values,),
         np.mean,
         n_resamples=RESAMPLES,
@@ -30,11 +30,11 @@ def interval(name: str, values: np.ndarray) -> tuple[float, float]:
         method="percentile",
         rng=np.random.default_rng(0),
     ).confidence_interval
-    return float(found.low), float(found.high)
+    return float(result.low), float(result.high)
 
 
 def mean_text(name: str, values: np.ndarray) -> str:
-    """A mean with its `interval`, for tables."""
+    """Return a mean with its `interval`, for tables."""
     low, high = interval(name, values)
     return f"{values.mean():.3f} [{low:.3f}, {high:.3f}]"
 
@@ -50,7 +50,7 @@ class Estimate:
 
     @property
     def half(self) -> float:
-        """Half the interval's width."""
+        """Return half the interval's width."""
         return 0.5 * (self.high - self.low)
 
     def __str__(self) -> str:
@@ -70,7 +70,7 @@ class Contrast:
 
     @property
     def verdict(self) -> str:
-        """higher, lower or undecided, at the 5 % level."""
+        """Return higher, lower or undecided, at the 5 % level."""
         if math.isnan(self.p_value) or self.p_value >= LEVEL:
             return "undecided"
         return "higher" if self.difference > 0 else "lower"
@@ -82,17 +82,17 @@ class Contrast:
 
 
 def _constant(values: np.ndarray) -> bool:
-    """No spread but rounding: nothing to test."""
+    """Return whether there is no spread but rounding: nothing to test."""
     return bool(np.ptp(values) < 1e-9)
 
 
 def p_text(p: float) -> str:
-    """A p-value as papers print it, with its sign."""
+    """Return a p-value as papers print it, with its sign."""
     return "< 0.001" if p < 0.001 else f"= {p:.3f}"
 
 
 def estimate(values: Iterable[float]) -> Estimate:
-    """Mean and 95 % interval by Student's t: what three seeds can say, wide as it is."""
+    """Return the mean and its 95 % interval by Student's t: what three seeds support, wide as it is."""
     x = np.asarray(list(values), float)
     if len(x) < 2:
         return Estimate(float(x.mean()) if len(x) else math.nan, math.nan, math.nan, len(x))
@@ -101,7 +101,7 @@ def estimate(values: Iterable[float]) -> Estimate:
 
 
 def welch(a: np.ndarray, b: np.ndarray) -> Contrast:
-    """Welch's two-sided t test of mean(a) - mean(b)."""
+    """Return Welch's two-sided t test of mean(a) - mean(b)."""
     difference = float(np.mean(a) - np.mean(b))
     if len(a) < 2 or len(b) < 2 or (_constant(a) and _constant(b)):
         return Contrast(difference, math.nan, math.nan, math.nan, len(a), len(b))

@@ -1,4 +1,4 @@
-"""What a result depends on: packages, device, cores, commit, command."""
+"""Collect what a result depends on: packages, device, cores, commit, command."""
 
 import contextlib
 import importlib.metadata
@@ -19,7 +19,7 @@ PACKAGES = (
 
 
 def versions() -> dict[str, Any]:
-    """Packages, Python, platform, device and commit that a result depends on."""
+    """Return the packages, Python, platform, device and commit that a result depends on."""
     device = jax.devices()[0]
     return {
         "packages": package_versions(PACKAGES),
@@ -34,23 +34,23 @@ def versions() -> dict[str, Any]:
 
 
 def package_versions(names: Iterable[str]) -> dict[str, str]:
-    """Versions of those packages that are installed."""
-    found = {}
+    """Return the versions of those packages that are installed."""
+    installed = {}
     for name in names:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            found[name] = importlib.metadata.version(name)
-    return found
+            installed[name] = importlib.metadata.version(name)
+    return installed
 
 
 def command() -> list[str]:
-    """What was run, without the folder that it lies in on this machine."""
+    """Return what was run, without the folder that it lies in on this machine."""
     program = Path(sys.argv[0])
     module = program.parent.name if program.name == "__main__.py" else program.name
     return [module, *sys.argv[1:]]
 
 
 def commit() -> str | None:
-    """The project's git commit, with `+dirty` if files differ from it; None outside a git checkout.
+    """Return the project's git commit, with `+dirty` if files differ from it; None outside a git checkout.
 
     The environment variable GIT_COMMIT says it for a copy of the files whose git knows another.
     """
@@ -72,5 +72,5 @@ def commit() -> str | None:
 
 
 def usable_cores() -> int:
-    """Of the machine, those that this process may use."""
+    """Return the number of the machine's cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

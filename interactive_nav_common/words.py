@@ -1,4 +1,4 @@
-"""YAML tables of command lines in, the words of argparse parsers out.
+"""Build argparse parsers from YAML command tables.
 
 A command has its `help` and its `words`: `name` or `-o, --out` -> what `add_argument` takes, `type` by its name in
 `KINDS`. `{name}` stands for a value that only code knows.
@@ -31,7 +31,7 @@ PROJECT = "interactive-nav"
 
 
 def positive(text: str) -> int:
-    """A whole number above 0."""
+    """Return a whole number above 0."""
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{value} is not a positive number")
@@ -39,7 +39,7 @@ def positive(text: str) -> int:
 
 
 def positive_number(text: str) -> float:
-    """A number above 0."""
+    """Return a number above 0."""
     value = float(text)
     if not 0 < value < 1e6:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
@@ -66,27 +66,27 @@ class Command:
     writes: tuple[str, ...] = ()
     """Patterns of the files that it may write; {} is where it writes."""
     actions: dict[str, Command] = dataclasses.field(default_factory=dict)
-    """Commands of its own."""
+    """Its subcommands."""
 
 
 def read_commands(path: Path) -> dict[str, Command]:
-    """The table of a file that comes with the package."""
+    """Return the table of a file that comes with the package."""
     return read_packaged(path, dict[str, Command])
 
 
-def add_words(to: argparse._ActionsContainer, words: Mapping[str, Mapping[str, Any]], **known: Any) -> None:
-    """Adds words to a parser or to a group of one.
+def add_words(to: argparse._ActionsContainer, words: Mapping[str, Mapping[str, Any]], **values: Any) -> None:
+    """Add words to a parser or to a group of one.
 
     Args:
         to: takes them.
         words: of a `Command`.
-        **known: what `{name}` stands for; a value that is nothing but `{name}` becomes it, of whatever type.
+        **values: what `{name}` stands for; a value that is nothing but `{name}` becomes it, of whatever type.
     """
 
     def filled(value: Any) -> Any:
         if not isinstance(value, str):
             return value
-        return known[value[1:-1]] if value[1:-1] in known and value[0] == "{" else value.format(**known)
+        return values[value[1:-1]] if value[1:-1] in values and value[0] == "{" else value.format(**values)
 
     for names, row in words.items():
         about = {key: filled(value) for key, value in row.items()}
@@ -111,7 +111,7 @@ def version() -> str:
 
 
 class Parser(argparse.ArgumentParser):
-    """Show what was typed, and the version; say which option, of its own or of its commands, a wrong one looks like."""
+    """Show what was typed, and the version; say which option (also of its commands) a wrong one looks like."""
 
     def __init__(self, *arguments: Any, **about: Any) -> None:
         super().__init__(*arguments, **about)
@@ -119,7 +119,7 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--version", action="version", version=version(), help="print the version and exit")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As argparse does; a setting behind `--scenes A` (env.x=1) is a setting, not one more scene."""
+        """Parse as argparse does; a setting behind `--scenes A` (env.x=1) is a setting, not one more scene."""
         words = list(sys.argv[1:] if args is None else args)
         if "--scenes" in words and any(a.dest in ("words", "overrides") for a in self._actions):
             at = words.index("--scenes")
@@ -130,7 +130,7 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(words, namespace)
 
     def error(self, message: str) -> NoReturn:
-        """Usage, the message, exit code 2."""
+        """Print the usage and the message; exit with code 2."""
         wrong = [word for word in message.split() if word.startswith("--")]
         about = nearest(wrong[0].split("=")[0], list(_options(self))) if wrong and "unrecognized" in message else ""
         super().error(message + about)
@@ -143,20 +143,20 @@ def _options(parser: argparse.ArgumentParser) -> Iterator[str]:
             yield from _options(command)
 
 
-def program(table: Path, name: str, epilog: str | None = None, **known: Any) -> argparse.ArgumentParser:
-    """The parser of `python -m PACKAGE.name`, where PACKAGE is the table's folder.
+def program(table: Path, name: str, epilog: str | None = None, **values: Any) -> argparse.ArgumentParser:
+    """Return the parser of `python -m PACKAGE.name`, where PACKAGE is the table's folder.
 
     Args:
         table: file of `read_commands`; its row `name` is taken.
         name: of the program.
         epilog: printed as it is.
-        **known: as of `add_words`.
+        **values: as of `add_words`.
     """
     row, how = read_commands(table)[name], argparse.RawDescriptionHelpFormatter
     prog = f"python -m {table.parent.name}.{name}"
-    made = Parser(prog=prog, description=row.help, epilog=epilog, formatter_class=how)
-    add_words(made, row.words, **known)
-    return made
+    parser = Parser(prog=prog, description=row.help, epilog=epilog, formatter_class=how)
+    add_words(parser, row.words, **values)
+    return parser
 
 
 def first_line(error: BaseException) -> str:
@@ -175,13 +175,13 @@ def import_function(place: str, word: str, expected: str, kind: type[UserError])
         loaded = _import_file(Path(module)) if is_file else importlib.import_module(module)
     except (Exception, SystemExit) as error:
         raise kind(f"{word}: cannot import {module} ({first_line(error)}); {expected}") from error
-    made = getattr(loaded, name, None)
-    if not callable(made):
-        own = [n for n, v in vars(loaded).items() if callable(v) and getattr(v, "__module__", "") == loaded.__name__]
+    function = getattr(loaded, name, None)
+    if not callable(function):
+        names = [n for n, v in vars(loaded).items() if callable(v) and getattr(v, "__module__", "") == loaded.__name__]
         has = hasattr(loaded, name)
-        got = f"{name!r} of type {type(made).__name__}" if has else f"no {name!r}{nearest(name, own)}"
-        raise kind(f"{word}: {module} has {got}; expected one of its functions: {', '.join(own) or 'it has none'}")
-    return made
+        got = f"{name!r} of type {type(function).__name__}" if has else f"no {name!r}{nearest(name, names)}"
+        raise kind(f"{word}: {module} has {got}; expected one of its functions: {', '.join(names) or 'it has none'}")
+    return function
 
 
 def _import_file(path: Path) -> ModuleType:

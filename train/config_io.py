@@ -29,7 +29,7 @@ def from_dict(plain: Any, base: TrainConfig | None = None, where: str = "config"
     Args:
         base: what `plain` does not name; the defaults where None.
     """
-    return overlay(base or TrainConfig(), plain, where, known=list(flatten(TrainConfig())))
+    return overlay(base or TrainConfig(), plain, where, elsewhere=list(flatten(TrainConfig())))
 
 
 def from_yaml(text: str, where: str = "config") -> TrainConfig:
@@ -92,7 +92,7 @@ def with_robot(words: Sequence[str], robot: str | None) -> list[str]:
 
 def apply_overrides(config: TrainConfig, words: Sequence[str]) -> TrainConfig:
     """The config with `dotted.name=value` words laid over it; values are read as YAML."""
-    return overlay(config, read_words(words), "override", known=list(flatten(TrainConfig())))
+    return overlay(config, read_words(words), "override", elsewhere=list(flatten(TrainConfig())))
 
 
 def help_text() -> str:

@@ -1,1 +1,1 @@
-"""Commands in, exit codes out: side by side on this machine (`processes`) or on a Ray cluster (`on_ray`)."""
+"""Run commands and return their exit codes, side by side on this machine (`processes`) or on Ray (`on_ray`)."""

@@ -1,4 +1,4 @@
-"""Jobs on a Ray cluster: an actor a job, on whatever node has room; all nodes see the same folder."""
+"""Run jobs on a Ray cluster: one actor per job, on any node that has room; all nodes see the same folder."""
 
 import logging
 import os
@@ -24,7 +24,7 @@ class Actor:
         self._ray, self._worker, self._code = ray, worker, worker.wait.remote()
 
     def poll(self) -> int | None:
-        """The exit code, or None while it runs."""
+        """Return the exit code, or None while it runs."""
         ready, _ = self._ray.wait([self._code], timeout=0)
         if not ready:
             return None
@@ -36,11 +36,11 @@ class Actor:
         return code
 
     def stop(self) -> None:
-        """Asks the job to save and end."""
+        """Ask the job to save and end."""
         self._worker.stop.remote()
 
     def kill(self) -> None:
-        """Ends the job."""
+        """End the job."""
         self._worker.kill.remote()
 
 
@@ -84,6 +84,6 @@ class RayLauncher(Launcher):
         return Actor(self._ray, room.remote(job, os.getcwd(), fraction)), "ray", give_back
 
     def close(self) -> None:
-        """Leaves the cluster."""
+        """Leave the cluster."""
         if self._mine:
             self._ray.shutdown()

@@ -1,4 +1,4 @@
-"""A command in, its exit code out; it ends with whoever started it, and when it is asked to."""
+"""Run commands as processes that end with whoever started them, and on request; return their exit codes."""
 
 import dataclasses
 import os
@@ -43,7 +43,7 @@ class Job:
     """GPUs, of a cluster's that has any."""
 
     def env_on(self, gpu: str | None, part: float) -> Mapping[str, str]:
-        """More environment on a node of a cluster, with this part of its GPU of this name."""
+        """Return more environment for a node of a cluster, with this part of its GPU of this name."""
         return {}
 
 
@@ -71,26 +71,26 @@ class Child:
                     stderr=subprocess.STDOUT,
                     env={**os.environ, **job.env, **env},
                     pass_fds=held,
-                    start_new_session=True,  # Ctrl-C is for us: the child is told once, by SIGTERM
+                    start_new_session=True,  # Ctrl-C is for us: the child gets it once, as SIGTERM
                 )
         finally:
             for descriptor in held:
                 os.close(descriptor)
 
     def poll(self) -> int | None:
-        """The exit code, `LOCKED`, or None while it runs."""
+        """Return the exit code, `LOCKED`, or None while it runs."""
         return LOCKED if self._process is None else self._process.poll()
 
     def wait(self) -> int:
-        """As `poll`, once it has ended."""
+        """Wait until it has ended; return what `poll` does."""
         return LOCKED if self._process is None else self._process.wait()
 
     def stop(self) -> None:
-        """Asks it to save and end."""
+        """Ask it to save and end."""
         self._signal(signal.SIGTERM)
 
     def kill(self) -> None:
-        """Ends it and its children."""
+        """End it and its children."""
         self._signal(signal.SIGKILL)
 
     def _signal(self, number: signal.Signals) -> None:
@@ -113,11 +113,11 @@ class Launcher:
         """Job, its process (a `Child`, or what has its `poll`, `stop` and `kill`), and what to do when it has ended."""
 
     def _begin(self, job: Job) -> Begun | None:
-        """Starts a job; None: no room now."""
+        """Start a job; return None where there is no room now."""
         raise NotImplementedError
 
     def start(self, job: Job) -> str | None:
-        """Starts a job; where, in a few words, or None where there is no room now."""
+        """Start a job; return where in a few words, or None where there is no room now."""
         begun = self._begin(job)
         if begun is None:
             return None
@@ -126,7 +126,7 @@ class Launcher:
         return where
 
     def ended(self) -> list[tuple[Any, int]]:
-        """The jobs that have ended since it was last asked, with their exit codes (`LOCKED`: not begun)."""
+        """Return the jobs that have ended since the last call, with their exit codes (`LOCKED`: not started)."""
         over, still = [], []
         for running in self._running:
             job, process, give_back = running
@@ -140,17 +140,17 @@ class Launcher:
         return over
 
     def stop(self) -> None:
-        """Asks every job to save and end."""
+        """Ask every job to save and end."""
         for _, process, _ in self._running:
             process.stop()
 
     def kill(self) -> None:
-        """Ends every job."""
+        """End every job."""
         for _, process, _ in self._running:
             process.kill()
 
     def end(self, grace_s: float) -> None:
-        """Stops what still runs, kills it after `grace_s`, and closes."""
+        """Stop what still runs, kills it after `grace_s`, and closes."""
         self.stop()
         deadline = time.monotonic() + grace_s
         while self._running and time.monotonic() < deadline:
@@ -160,7 +160,7 @@ class Launcher:
         self.close()
 
     def close(self) -> None:
-        """After the last job."""
+        """Release what it holds, after the last job."""
 
 
 class LocalLauncher(Launcher):

@@ -1,4 +1,4 @@
-"""Shares of work in, a bar on the console out."""
+"""Show the share of work that is done as a bar on the console."""
 
 import contextlib
 import functools
@@ -31,7 +31,7 @@ class SafeConsole(Console):
 def progress_bar(
     console: Console, what: str, total: float | None = None, transient: bool = False
 ) -> Iterator[Callable[..., None]]:
-    """A bar on a terminal, nothing elsewhere; what updates it takes `Progress.update`'s words, and a `status`."""
+    """Show a bar on a terminal, nothing elsewhere; yield its update, with `Progress.update`'s words and a `status`."""
     plain = functools.partial(TextColumn, markup=False)
     columns = (
         *(plain("{task.description:<14}"), BarColumn(bar_width=24), TaskProgressColumn(), TimeElapsedColumn()),
@@ -43,13 +43,13 @@ def progress_bar(
 
 @contextlib.contextmanager
 def stage_progress(console: Console) -> Iterator[Callable[[str, float], None]]:
-    """One `progress_bar` over the whole work, with the stage's name."""
+    """Show one `progress_bar` over the whole work, with the stage's name."""
     with progress_bar(console, "starting", 1.0) as update:
         yield lambda stage, share: update(description=stage, completed=share)
 
 
 def warn_once(console: Console) -> Callable[[str], None]:
-    """Prints a warning unless it has been printed before: most come while reading, and all again with the result."""
+    """Return a function that prints a warning once: most come while reading, and all again with the result."""
     printed: set[str] = set()
 
     def warn(warning: str) -> None:

@@ -1,1 +1,1 @@
-"""Input from others, kept within bounds: files that they wrote, and requests that they send."""
+"""Keep input from others within bounds: files that they wrote, and requests that they send."""

@@ -1,4 +1,4 @@
-"""viser's server behind a check: who may connect, on exactly the port that was asked for.
+"""Put viser's server behind a check of who may connect, on exactly the requested port.
 
 viser 1.1 has neither. It serves pages and websockets through `websockets.asyncio.server.serve`, which asks a function
 about every request before it answers; ours comes first, so that nothing is sent, the page itself included, before it
@@ -22,7 +22,7 @@ COOKIE = "interactive_nav"
 
 
 def is_local(host: str) -> bool:
-    """Whether an address is reached from this machine alone."""
+    """Return whether an address is reached from this machine alone."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -30,17 +30,17 @@ def is_local(host: str) -> bool:
 
 
 def refusal(path: str, headers: Any, token: str | None) -> str | None:
-    """Why a request is not answered; None: it may be.
+    """Return why a request is refused, or None where it is not.
 
-    Without a token the page must have been asked for under this machine's own name, so that no other site, nor a name
-    that leads here, can reach it through the user's browser; and a websocket must be opened by our own page.
+    Without a token the page must have been requested under this machine's name, so that no other site, nor a name
+    that leads here, can reach it through the user's browser; and a websocket must be opened by our page.
     """
     host, origin = headers.get("Host", ""), headers.get("Origin")
     if origin is not None and urlsplit(origin).netloc != host:
         return "the request comes from another site's page; open this address itself"
     if token is None:
         local = is_local(urlsplit(f"//{host}").hostname or "")
-        return None if local else f"the page was asked for as '{host}', expected localhost"
+        return None if local else f"the page was requested as '{host}', expected localhost"
     try:
         cookie = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)
     except CookieError:
@@ -53,7 +53,7 @@ def refusal(path: str, headers: Any, token: str | None) -> str | None:
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """A listening socket."""
+    """Return a listening socket."""
     try:
         if not 0 <= port < 65536:  # the system would take its last 16 bits
             raise OverflowError("no port has this number")
@@ -105,6 +105,6 @@ def guarded_server(host: str, port: int, label: str, user: str) -> tuple[Any, st
     if not checked:
         server.stop()
         raise ConfigError(f"viser {viser.__version__} cannot be guarded; pip install 'interactive-nav[{user}]'")
-    own = listening.getsockname()[1]
+    bound = listening.getsockname()[1]
     shown = f"[{host}]" if ":" in host else host
-    return server, f"http://{shown}:{own}/" + (f"?token={token}" if token else "")
+    return server, f"http://{shown}:{bound}/" + (f"?token={token}" if token else "")

@@ -1,4 +1,4 @@
-"""Files that others wrote: none blocks or never ends, none unpacks to many times its size."""
+"""Read files that others wrote: none blocks or never ends, none unpacks to many times its size."""
 
 import contextlib
 import lzma
@@ -91,8 +91,8 @@ class Loader(yaml.SafeLoader):
         if is_alias:
             self._repeated += self._sizes.get(node, MOST_REPEATED + 1)  # not complete: it would contain itself
             if self._repeated > MOST_REPEATED:
-                told = f"aliases repeat more than {MOST_REPEATED:,} values, or hold themselves; write them out"
-                raise yaml.composer.ComposerError(None, None, told, mark)
+                problem = f"aliases repeat more than {MOST_REPEATED:,} values, or hold themselves; write them out"
+                raise yaml.composer.ComposerError(None, None, problem, mark)
             return node
         within = node.value if isinstance(node, yaml.CollectionNode) else ()
         pairs = isinstance(node, yaml.MappingNode)

@@ -30,7 +30,7 @@ def test_drives_that_another_process_draws(painted, tmp_path):
 def test_a_folder_that_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file", tmp_path / "file" / "run"):
-        with pytest.raises(FileError, match="no folder can be made there .*; choose another one"), alone_in(out):
+        with pytest.raises(FileError, match="cannot create a folder there .*; choose another one"), alone_in(out):
             pass
 
 

@@ -23,7 +23,7 @@ NEEDS = "viser is not installed (pip install 'viser>=1.1,<1.2')"
         ("/", {"Host": "localhost:8080"}, None, None),
         ("/", {"Host": "[::1]:8080"}, None, None),
         ("/", {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080"}, None, None),
-        ("/", {"Host": "rebound.example:8080"}, None, "asked for as 'rebound.example:8080', expected localhost"),
+        ("/", {"Host": "rebound.example:8080"}, None, "requested as 'rebound.example:8080', expected localhost"),
         ("/", {"Host": "127.0.0.1:8080", "Origin": "http://evil.example"}, None, "another site's page"),
         ("/", {"Host": "host:1"}, "secret", "no token, or a wrong one"),
         ("/?token=secreT", {"Host": "host:1"}, "secret", "no token, or a wrong one"),
