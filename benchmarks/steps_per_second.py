@@ -28,7 +28,7 @@ from benchmarks.measurement import TABLE, append_row, command_line, origin, rand
 from interactive_nav.physics import resolve_backend
 from interactive_nav.physics.nearness import widths_at
 from interactive_nav.physics.tiers import KINDS, propose_tiers
-from interactive_nav.physics.window import Window
+from interactive_nav.physics.window import PhysicsWindow
 from interactive_nav.task.sharding import ShardedEnv
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import FAILURES
@@ -184,7 +184,7 @@ def windows(
     Best on `native`, which simulates everything: a window would hide what it left out.
     """
     env = _make(robot, tuple(scenes), backend, json.dumps(settings))
-    batch, window = AutoResetEnv(env), Window(env.world, env.config)
+    batch, window = AutoResetEnv(env), PhysicsWindow(env.world, env.config)
     state = jax.jit(batch.reset)(jax.random.split(jax.random.PRNGKey(0), num_envs))
     program = jax.jit(random_driving(_counting(batch.step), (num_envs, env.action_size), 10))
     needs = jax.jit(jax.vmap(lambda *x: window.needs(window.measure(*x))))

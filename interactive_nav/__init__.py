@@ -1,4 +1,4 @@
-"""Interactive navigation on MuJoCo MJX: scene folders in, a batched Brax environment out.
+"""Build a batched Brax environment for interactive navigation on MuJoCo MJX from scene folders.
 
     env = interactive_nav.make("turtlebot", scenes=["scenes_mjcf/apartment_0"])
     state = jax.jit(jax.vmap(env.reset))(keys)
@@ -20,7 +20,7 @@ from interactive_nav_common.errors import ConfigError
 
 # The scenes' tables are constants of `reset` and `step`, tens to hundreds of megabytes. Without this, JAX
 # writes them as text into every program that it compiles (measured: 23 s instead of 8 s for a small room).
-# JAX reads it once, at its own import: import interactive_nav first, or set the variable yourself.
+# JAX reads it once, when it is imported: import interactive_nav first, or set the variable yourself.
 os.environ.setdefault("JAX_USE_SIMPLIFIED_JAXPR_CONSTANTS", "1")
 # With one thread (one core) JAX's CPU client never ends a callback whose large argument it has yet to copy (a thousand
 # environments of cluttered homes on native); XLA takes the number of its threads from here.

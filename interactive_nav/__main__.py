@@ -1,4 +1,4 @@
-"""`interactive-nav COMMAND ...`: all programs of the project under one name; each is also `python -m MODULE ...`."""
+"""Run `interactive-nav COMMAND ...`: every program of the project under one name, also as `python -m MODULE ...`."""
 
 import runpy
 import signal
@@ -17,7 +17,7 @@ PROGRAMS = read_packaged(Path(__file__).with_name("programs.yaml"), dict[str, tu
 
 @reports_errors("interactive-nav")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs a program as `python -m` does; its exit code, 2 on a user's error, 128 + signal when stopped."""
+    """Run a program as `python -m` does; return its exit code, 2 on a user's error, 128 + signal when stopped."""
     words = list(sys.argv[1:] if argv is None else argv)
     if words[:1] == ["--version"]:
         print(version())

@@ -1,4 +1,4 @@
-"""Settings of the robot's cameras: where they look, and the errors that they make."""
+"""Define the settings of the robot's cameras: where they look, and their errors."""
 
 import dataclasses
 from typing import Annotated, Any
@@ -52,7 +52,7 @@ class CameraNoise(Settings):
     depth_disparity_step: NotNegative = 0.0
     """Steps that 1 / depth is read in, 1/m (a Kinect's: 0.0028)."""
     depth_grazing_deg: Annotated[float, Bounds(0, 90)] = 0.0
-    """Depth reads 0 on surfaces seen at less than this angle to them."""
+    """Depth reads 0 on surfaces viewed at less than this angle to them."""
     depth_edge_m: NotNegative = 0.0
     """Depth reads 0 where a pixel beside is nearer by more than this."""
     depth_min_m: NotNegative = 0.0

@@ -1,4 +1,4 @@
-"""The environment's settings in three parts (task, physics, sensors), checked on construction."""
+"""Define the environment's settings in three parts (task, physics, sensors), checked on construction."""
 
 import dataclasses
 import itertools
@@ -88,7 +88,7 @@ class TaskRules(Settings):
     effort_on_failure: bool = True
     """E_eff counts on failures; else it is 0 there, as the original's log had it."""
     waypoint_style: Literal["ahead", "grid"] = "ahead"
-    """ahead: at equal arc length ahead; grid: from the robot's own cell, as the original's code."""
+    """ahead: at equal arc length ahead; grid: from the robot's cell, as the original's code."""
     potential: Literal["continuous", "quantised"] = "continuous"
     """Geodesic distance from the robot's position, or quantised: from the centre of its cell."""
     potential_round: Positive | None = None
@@ -126,7 +126,7 @@ class TaskRules(Settings):
 
     @property
     def needs_contacts(self) -> bool:
-        """Whether an option looks at single contacts, not just at each body's net force."""
+        """Return whether an option looks at single contacts, not just at each body's net force."""
         return self.interaction_with == "anything" or self.force_part == "normal" or self.force_sum == "contacts"
 
 
@@ -134,7 +134,7 @@ WINDOW = ("active_furniture", "active_small", "active_doors", "active_walls")
 """Settings that size what MJX simulates at a time."""
 
 
-class Tier(NamedTuple):
+class WindowTier(NamedTuple):
     """A share of the batch, and what there is room for in its windows."""
 
     share: float
@@ -144,10 +144,10 @@ class Tier(NamedTuple):
     walls: int
 
 
-def parse_tiers(words: Sequence[str]) -> tuple[Tier, ...]:
-    """Tiers as the setting `windows` writes them."""
+def parse_window_tiers(words: Sequence[str]) -> tuple[WindowTier, ...]:
+    """Return the tiers that the setting `windows` lists."""
     try:
-        tiers = tuple(Tier(float(s), *map(int, widths)) for s, *widths in map(str.split, words))
+        tiers = tuple(WindowTier(float(s), *map(int, widths)) for s, *widths in map(str.split, words))
         good = all(t.share > 0 and min(t[1:]) >= 0 for t in tiers) and sum(t.share for t in tiers) < 1
         good &= all(a <= b for one, two in itertools.pairwise(tiers) for a, b in zip(one[1:], two[1:], strict=True))
     except (TypeError, ValueError):
@@ -211,17 +211,17 @@ class PhysicsConfig(Settings):
         control, sim = self.control_dt_s, self.sim_dt_s
         if abs(control / sim - round(control / sim)) > 1e-6:
             raise ConfigError(f"sim_dt_s is {sim}, expected a divisor of control_dt_s ({control} s)")
-        parse_tiers(self.windows or ())
+        parse_window_tiers(self.windows or ())
 
     @property
     def substeps(self) -> int:
-        """Physics steps per control step."""
+        """Return the number of physics steps per control step."""
         return round(self.control_dt_s / self.sim_dt_s)
 
 
 _NOISE = {
-    part: " ".join([*own, *(f.name for f in dataclasses.fields(CameraNoise) if f.name.startswith(part))])
-    for part, own in {
+    part: " ".join([*names, *(f.name for f in dataclasses.fields(CameraNoise) if f.name.startswith(part))])
+    for part, names in {
         "depth": ("depth_range_m", "depth_dropout", "depth_noise"),
         "rgb": ("random_colours", "random_light"),
     }.items()
@@ -244,7 +244,7 @@ class SensorConfig(Settings):
     cameras: Sequence[Mapping[str, Any]] = ()
     """Cameras in place of the robot's one, each a mapping of settings of `CameraView`."""
     robot_visible: bool = False
-    """Images show the robot's own body but for the housing of its camera."""
+    """Images show the robot's body but for the housing of its camera."""
     random_colours: NotNegative = 0.0
     """Each episode, each class of things has its colours multiplied by a factor for red, green and blue: the standard
     deviation of their logarithm."""
@@ -260,7 +260,7 @@ class SensorConfig(Settings):
     """Depth is cut off here and divided by it."""
     segmentation_classes: MaskClasses = 4
     """Furniture classes: 4 as in the original's code (desk and table are one), the paper's 5, or all: every category
-    has an id of its own."""
+    has a separate id."""
     depth_dropout: Share = 0.0
     """Share of depth pixels that read 0, drawn anew each step."""
     depth_noise: NotNegative = 0.0
@@ -294,9 +294,9 @@ class SensorConfig(Settings):
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        known = (*SIGNALS, *IMAGES)
-        if not self.observations or len(set(self.observations) & set(known)) != len(self.observations):
-            raise ConfigError(f"observations is {self.observations!r}, expected a choice from {', '.join(known)}")
+        allowed = (*SIGNALS, *IMAGES)
+        if not self.observations or len(set(self.observations) & set(allowed)) != len(self.observations):
+            raise ConfigError(f"observations is {self.observations!r}, expected a choice from {', '.join(allowed)}")
         if self.image_geometry == "meshes" and self.renderer == "rays":
             raise ConfigError("renderer is 'rays', expected auto or warp with image_geometry=meshes")
         if len(self.lidar_pos_m) != 3:
@@ -308,7 +308,7 @@ class SensorConfig(Settings):
 
     @property
     def views(self) -> tuple[CameraView, ...]:
-        """The cameras; where none are listed, the robot's, without a name.
+        """Return the cameras; where none are listed, the robot's, without a name.
 
         Raises:
             ConfigError: `cameras` has an unknown setting or an impossible value.
@@ -320,7 +320,7 @@ class SensorConfig(Settings):
 class NavConfig(Settings):
     """Settings of an interactive navigation environment (defaults: reference benchmark, section 11).
 
-    `NavConfig.of(k_int=1.0, backend="native")` takes settings by their own names, as `interactive_nav.make` does.
+    `NavConfig.of(k_int=1.0, backend="native")` takes settings by their plain names, as `interactive_nav.make` does.
     """
 
     rules: TaskRules = flat(TaskRules)
@@ -332,7 +332,7 @@ class NavConfig(Settings):
 
 
 def make_config(variant: str = "paper", **settings: Any) -> NavConfig:
-    """A `NavConfig` from settings by name.
+    """Build a `NavConfig` from settings by name.
 
     Args:
         variant: `paper`, the defaults, or `code`: where the original's code differs from its paper, the code.

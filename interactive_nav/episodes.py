@@ -1,10 +1,10 @@
-"""Fixed evaluation episodes: an environment and a seed in, a versioned file out, and back into starts.
+"""Draw fixed evaluation episodes into a versioned file, and read them back as starts.
 
 `python -m interactive_nav.episodes make --robot turtlebot --scenes DIR ... --episodes N --seed S -o FILE`
 
 A file names its scenes by the digest of what decides the task in them (`Scene.task_digest`), so the same file means
 the same episodes on every machine and backend; with other scenes, another robot or other objects it is refused.
-Files made before that digest was there name the digest of scene.xml and maps.npz, and are held to that.
+Files from before that digest name the digest of scene.xml and maps.npz, and are held to that.
 """
 
 import dataclasses
@@ -56,7 +56,7 @@ class EpisodeFile:
     of inertia, centre of mass and hulls too; in old files without it, also of their looks."""
     episodes: tuple[dict[str, Any], ...]
     """scene (index into scenes), start_xy_w, start_yaw_rad, goal_xy_w, objects ([x, y, yaw] each, or null for one
-    that found no place), shortest_path_m, and, in newer files, push_needed: whether there is no way round everything
+    that got no place), shortest_path_m, and, in newer files, push_needed: whether there is no way round everything
     that can be moved; metres and radians, world frame."""
 
 
@@ -80,8 +80,8 @@ class EpisodeFileError(UserError):
 _FILES = Reader(EpisodeFileError, "make it again")
 
 
-def draw(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
-    """Draws episodes: number i depends on the seed and i alone, and is what `env.reset` gives for that key.
+def draw_episode_file(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
+    """Draw episodes: number i depends on the seed and i alone, and is what `env.reset` gives for that key.
 
     The environment is not batched.
     """
@@ -117,7 +117,7 @@ def draw(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
 
 
 def _short_float(value: Any) -> float:
-    """A 32-bit float by the fewest digits that tell it from its neighbours."""
+    """Return a 32-bit float by the fewest digits that distinguish it from its neighbours."""
     return float(str(np.float32(value)))
 
 
@@ -127,7 +127,7 @@ def _with_length(env: InteractiveNav, start: EpisodeStart) -> tuple[EpisodeStart
 
 
 def _objects_digests(env: InteractiveNav) -> tuple[str, str]:
-    """Of what decides the task, and as old files have it."""
+    """Return the digest of what decides the task, and the one that old files have."""
     small = env.world.small_objects
     task = [o.task_parts for o in small]
     new, old = (hashlib.sha256(repr(content).encode()).hexdigest() for content in (task, small))
@@ -139,7 +139,7 @@ def _short(digest: str) -> str:
 
 
 def _check_fits(file: EpisodeFile, env: InteractiveNav, where: str) -> dict[str, int]:
-    """Digest -> index of the environment's scenes, once robot, scenes and small objects are those of the file."""
+    """Return digest -> index of the environment's scenes; refuse another robot, other scenes or small objects."""
     if file.robot != env.robot.name:
         raise EpisodeFileError(
             f"{where}: made for robot '{file.robot}', the environment's is '{env.robot.name}'; "
@@ -172,7 +172,7 @@ def _check_fits(file: EpisodeFile, env: InteractiveNav, where: str) -> dict[str,
 
 
 def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -> EpisodeStart:
-    """The file's episodes for `jax.vmap(env.reset_to)`, leaves [N, ...].
+    """Return the file's episodes for `jax.vmap(env.reset_to)`, leaves [N, ...].
 
     Args:
         env: whose scenes must include the file's; their order may differ.
@@ -206,8 +206,8 @@ def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -
     return starts
 
 
-def save(file: EpisodeFile, path: str | Path) -> None:
-    """Writes whole or not at all; packed where the name ends with `.gz`."""
+def save_episode_file(file: EpisodeFile, path: str | Path) -> None:
+    """Write a file whole or not at all, packed where the name ends with `.gz`."""
     data = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(file)}
     head = {k: v for k, v in data.items() if k != "episodes"}
     # One line an episode: readable, and small in a diff.
@@ -218,8 +218,8 @@ def save(file: EpisodeFile, path: str | Path) -> None:
         partial.write_bytes(gzip.compress(data, mtime=0) if Path(path).suffix == PACKED else data)
 
 
-def load(path: str | Path) -> EpisodeFile:
-    """Reads and checks a file."""
+def load_episode_file(path: str | Path) -> EpisodeFile:
+    """Read and check a file."""
     try:
         text = read_bytes(path)
         text = unpack(text, "gzip") if Path(path).suffix == PACKED else text
@@ -247,9 +247,9 @@ def load(path: str | Path) -> EpisodeFile:
     return file
 
 
-def load_all(paths: Sequence[str | Path]) -> tuple[EpisodeFile, str]:
-    """Episodes of several files one after the other, as those of one; and the digest of the files."""
-    files = [load(path) for path in paths]
+def load_episode_files(paths: Sequence[str | Path]) -> tuple[EpisodeFile, str]:
+    """Return the episodes of several files, one after the other, as those of one; and the digest of the files."""
+    files = [load_episode_file(path) for path in paths]
     first = files[0]
     for path, other in zip(paths, files, strict=True):
         if (other.robot, other.objects_digest) != (first.robot, first.objects_digest):
@@ -266,7 +266,7 @@ def load_all(paths: Sequence[str | Path]) -> tuple[EpisodeFile, str]:
 
 @reports_errors("interactive_nav.episodes")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Makes a file; 0 when done, 2 on a user's error."""
+    """Write a file; return 0 when done, 2 on a user's error."""
     parser = Parser(prog="python -m interactive_nav.episodes", description="Fixed episodes.")
     commands = parser.add_subparsers(dest="command", required=True)
     row = read_commands(Path(__file__).with_name("words.yaml"))["episodes"]
@@ -280,8 +280,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         num_objects=arguments.num_objects,
         objects=arguments.objects,
     )
-    file = draw(env, arguments.episodes, arguments.seed)
-    save(file, arguments.out)
+    file = draw_episode_file(env, arguments.episodes, arguments.seed)
+    save_episode_file(file, arguments.out)
     shortest = [row["shortest_path_m"] for row in file.episodes]
     print(
         f"{arguments.out}: {len(shortest)} episodes in {len(file.scenes)} scenes, shortest paths "

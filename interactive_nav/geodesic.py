@@ -34,7 +34,7 @@ def distance_field(
 ):
     """Return the geodesic distance (m) of every cell centre to a goal: [rows, columns] f32, inf where unreachable.
 
-    Paths are made of `MOVES_32`. Jit-able, and vmap-able over goals and maps, but for a positive `radius_m`.
+    Paths consist of `MOVES_32`. Jit-able, and vmap-able over goals and maps, but for a positive `radius_m`.
 
     Args:
         traversable: [rows along y, columns along x] bool, static structure only.
@@ -76,9 +76,9 @@ def distance_field(
 
 
 def navigation_grid(traversable: np.ndarray, resolution_m: float, radius_m: float, cell_m: float) -> np.ndarray:
-    """Free cells of a grid of `cell_m` squares sharing the map's origin: the body fits at their centre.
+    """Return the free cells of a grid of `cell_m` squares sharing the map's origin: the body fits at their centre.
 
-    The erosion is measured at the map's own resolution, so a coarse grid does not widen walls.
+    The erosion is measured at the map's resolution, so a coarse grid does not widen walls.
 
     Args:
         traversable: [rows, columns] bool.
@@ -94,7 +94,7 @@ def navigation_grid(traversable: np.ndarray, resolution_m: float, radius_m: floa
 
 @dataclasses.dataclass(frozen=True)
 class CornerGraph:
-    """All shortest paths among blocked squares, for goals anywhere: V corners, n nodes, at most K seen by one.
+    """All shortest paths among blocked squares, for goals anywhere: V corners, n nodes, at most K visible from one.
 
     Nodes stand for the cells of a coarser grid; a cell without free ground borrows its nearest node, so a
     robot pressed against a wall still has a distance and a path.
@@ -114,12 +114,12 @@ class CornerGraph:
     """[n, 2] float32: a free point of each node's cell."""
     corner_xy_w: np.ndarray
     """[V, 2] float32: convex corners of the blocked squares."""
-    seen: np.ndarray
+    visible: np.ndarray
     """[n, K] int32: corners that each node sees and a shortest path may bend at; V where there are fewer."""
     distance_m: np.ndarray
     """[V, V] float32 between corners."""
     next_corner: np.ndarray
-    """[V, V] int32: the next corner on the way from the row's to the column's; a corner's own is itself."""
+    """[V, V] int32: the next corner on the way from the row's to the column's; a corner's is itself."""
 
 
 _INSET = 0.2
@@ -129,7 +129,7 @@ _SIGHT_STEP = 1.0
 
 
 def _without_pinches(free: np.ndarray) -> np.ndarray:
-    """Blocks one of two free cells that touch only at a corner, until none are left."""
+    """Block one of two free cells that touch only at a corner, until none are left."""
     free = free.copy()
     while True:
         a, b, c, d = free[:-1, :-1], free[:-1, 1:], free[1:, :-1], free[1:, 1:]
@@ -141,7 +141,7 @@ def _without_pinches(free: np.ndarray) -> np.ndarray:
 
 
 def _corners(free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Convex corners of the blocked cells: points [V, 2] (column, row) in cells, and the signs [V, 2] that
+    """Return convex corners of the blocked cells: points [V, 2] (column, row) in cells, and the signs [V, 2] that
     lead from each into its blocked cell."""
     padded = np.pad(free, 1)
     quads = [padded[:-1, :-1], padded[:-1, 1:], padded[1:, :-1], padded[1:, 1:]]
@@ -160,7 +160,7 @@ _CELLS_APART = 2**0.5
 
 
 def sees(free: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Which pairs of points see each other over free cells.
+    """Return which pairs of points see each other over free cells.
 
     Args:
         free: [R, C] bool.
@@ -169,7 +169,7 @@ def sees(free: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
     Returns:
         [P] bool. Halving: the middle first, so that most blocked pairs cost a few samples; a part that lies
-        within what is known to be free around its middle is not halved further.
+        within what is certainly free around its middle is not halved further.
     """
     free = np.pad(free, 1)
     columns = free.shape[1]
@@ -191,10 +191,10 @@ def sees(free: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return out
 
 
-def _seen_corners(
+def _visible_corners(
     free: np.ndarray, points: np.ndarray, corners: np.ndarray, into: np.ndarray, slack: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (point, corner) in sight of which a shortest path may bend at the corner.
+    """Return pairs (point, corner) in sight of which a shortest path may bend at the corner.
 
     A path that comes from the quadrant opposite the blocked cell could be cut short, so it never bends there;
     `slack` (cells) widens what counts, for a point that stands for its surroundings.
@@ -214,7 +214,7 @@ def _seen_corners(
 
 
 def _nodes(free: np.ndarray, ratio: int) -> tuple[np.ndarray, np.ndarray]:
-    """The node of each coarse cell of `ratio` x `ratio` fine ones, and the nodes' points [n, 2] in fine cells."""
+    """Return the node of each coarse cell, `ratio` x `ratio` fine ones, and the nodes' points [n, 2] in fine cells."""
     rows, columns = (-(-n // ratio) for n in free.shape)
     margin = np.zeros((rows * ratio, columns * ratio))
     margin[: free.shape[0], : free.shape[1]] = clearance(free, 1.0)
@@ -223,8 +223,8 @@ def _nodes(free: np.ndarray, ratio: int) -> tuple[np.ndarray, np.ndarray]:
     best = split.argmax(-1)
     has_node = split.max(-1) > 0
     r, c = np.nonzero(has_node)
-    own = best[has_node]
-    points = np.stack([c * ratio + own % ratio + 0.5, r * ratio + own // ratio + 0.5], -1)
+    chosen = best[has_node]
+    points = np.stack([c * ratio + chosen % ratio + 0.5, r * ratio + chosen // ratio + 0.5], -1)
     nearest = nearest_cell(has_node)
     index = np.full(has_node.shape, -1, np.int64)
     index[has_node] = np.arange(len(points))
@@ -232,7 +232,7 @@ def _nodes(free: np.ndarray, ratio: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def corner_graph(free: np.ndarray, fine_m: float, cell_m: float, origin_w: tuple[float, float]) -> CornerGraph:
-    """Prepares shortest paths from anywhere to anywhere on a map of free cells.
+    """Prepare shortest paths from anywhere to anywhere on a map of free cells.
 
     Args:
         free: [R, C] bool: cells that the body's centre may be in.
@@ -255,7 +255,7 @@ def corner_graph(free: np.ndarray, fine_m: float, cell_m: float, origin_w: tuple
     node_of_cell, points = _nodes(free, ratio)
     corners, into = _corners(free)
     count = len(corners)
-    i, j = _seen_corners(free, corners, corners, into, 2 * _INSET)
+    i, j = _visible_corners(free, corners, corners, into, 2 * _INSET)
     both = scipy.sparse.csr_matrix((np.ones(len(i)), (i, j)), shape=(count, count))
     both = scipy.sparse.coo_matrix(both.multiply(both.T))
     i, j = both.row[both.row != both.col], both.col[both.row != both.col]
@@ -267,10 +267,10 @@ def corner_graph(free: np.ndarray, fine_m: float, cell_m: float, origin_w: tuple
         following = np.where(previous.T < 0, np.arange(count)[:, None], previous.T)
     else:
         distance, following = np.zeros((0, 0)), np.zeros((0, 0))
-    i, j = _seen_corners(free, points, corners, into, ratio)
+    i, j = _visible_corners(free, points, corners, into, ratio)
     per_node = np.bincount(i, minlength=len(points))
-    seen = np.full((len(points), max(int(per_node.max()), 1)), count, np.int64)
-    seen[i, np.arange(len(i)) - np.repeat(np.cumsum(per_node) - per_node, per_node)] = j
+    visible = np.full((len(points), max(int(per_node.max()), 1)), count, np.int64)
+    visible[i, np.arange(len(i)) - np.repeat(np.cumsum(per_node) - per_node, per_node)] = j
     return CornerGraph(
         free=free,
         fine_m=fine_m,
@@ -279,7 +279,7 @@ def corner_graph(free: np.ndarray, fine_m: float, cell_m: float, origin_w: tuple
         node_of_cell=node_of_cell.astype(np.int32),
         node_xy_w=(np.asarray(origin_w) + points * fine_m).astype(np.float32),
         corner_xy_w=(np.asarray(origin_w) + corners * fine_m).astype(np.float32).reshape(-1, 2),
-        seen=seen.astype(np.int32),
+        visible=visible.astype(np.int32),
         distance_m=distance.astype(np.float32),
         next_corner=following.astype(np.int32),
     )

@@ -1,4 +1,4 @@
-"""Episode totals in, the Interactive Navigation Score out: pure functions on NumPy or JAX arrays.
+"""Compute the Interactive Navigation Score of episode totals with pure functions on NumPy or JAX arrays.
 
 Interactive Gibson (Xia et al. 2020), section IV. Every function takes any leading batch axes and
 returns arrays of those axes; nothing here reads a simulator.
@@ -11,7 +11,7 @@ GRAVITY = 9.81
 
 
 def path_efficiency(success: Array, shortest_path_m: Array, robot_path_m: Array, clip: bool = True) -> Array:
-    """P_eff = 1_suc * L* / l_0, clipped to [0, 1] (paper section IV; with alpha = 1 the INS is SPL).
+    """Return P_eff = 1_suc * L* / l_0, clipped to [0, 1] (paper section IV; with alpha = 1 the INS is SPL).
 
     A goal is a region, so a robot may succeed on a path shorter than L*: hence the clip. A robot that
     succeeds without moving scores 1.
@@ -34,7 +34,7 @@ def path_efficiency(success: Array, shortest_path_m: Array, robot_path_m: Array,
 
 
 def kinematic_effort(masses_kg: Array, path_lengths_m: Array) -> Array:
-    """m_0 l_0 / sum_i m_i l_i: the share of moved mass that was the robot's own (paper section IV).
+    """Return m_0 l_0 / sum_i m_i l_i: the robot's share of the moved mass (paper section IV).
 
     Args:
         masses_kg: [..., K+1], index 0 is the robot.
@@ -51,7 +51,7 @@ def kinematic_effort(masses_kg: Array, path_lengths_m: Array) -> Array:
 
 
 def dynamic_effort(robot_mass_kg: Array, force_sum_n: Array, num_steps: Array, gravity: float = GRAVITY) -> Array:
-    """T G / (T G + sum_t F_t) with G = m_0 g (paper section IV).
+    """Return T G / (T G + sum_t F_t) with G = m_0 g (paper section IV).
 
     Args:
         robot_mass_kg: [...] m_0.
@@ -72,7 +72,7 @@ def dynamic_effort(robot_mass_kg: Array, force_sum_n: Array, num_steps: Array, g
 def effort_efficiency(
     masses_kg: Array, path_lengths_m: Array, forces_n: Array, num_steps: Array, gravity: float = GRAVITY
 ) -> Array:
-    """E_eff, the mean of the kinematic and the dynamic effort term (paper section IV).
+    """Return E_eff, the mean of the kinematic and the dynamic effort term (paper section IV).
 
     Args:
         masses_kg: [..., K+1], index 0 is the robot; padded objects have path length 0.
@@ -90,7 +90,7 @@ def effort_efficiency(
 
 
 def interactive_navigation_score(p_eff: Array, e_eff: Array, alpha: float | Array) -> Array:
-    """INS_alpha = alpha P_eff + (1 - alpha) E_eff (paper section IV).
+    """Return INS_alpha = alpha P_eff + (1 - alpha) E_eff (paper section IV).
 
     Args:
         p_eff: [...] path efficiency.

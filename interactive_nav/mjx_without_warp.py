@@ -1,4 +1,4 @@
-"""MJX's import without the optional Warp: quiet.
+"""Import MJX quietly where the optional Warp is missing.
 
 `mujoco.mjx.warp` prints `Failed to import warp: ...` on stdout wherever that package is not installed, which is what
 a base install is. Brax imports it too, so the modules of this package that use MJX are no place to catch it.
@@ -15,7 +15,7 @@ NOISY = "mujoco.mjx.warp"
 
 
 class _QuietPrint:
-    """Finds and loads `NOISY` as always, with a `print` of its own that says nothing."""
+    """Find and load `NOISY` as always, with a `print` that prints nothing."""
 
     def find_spec(self, name: str, path: Sequence[str] | None = None, target: Any = None) -> ModuleSpec | None:
         if name != NOISY:
@@ -36,6 +36,6 @@ class _QuietPrint:
 
 
 def hush() -> None:
-    """Lets MJX be imported without a word about Warp where that is not installed; one that is broken still tells."""
+    """Let MJX be imported without a message about Warp where that is missing; a broken one still reports itself."""
     if NOISY not in sys.modules and importlib.util.find_spec("warp") is None:
         sys.meta_path.insert(0, _QuietPrint())  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""`python -m interactive_nav.record REPLAY -o out.mp4`: a replay in, a video out.
+"""Run `python -m interactive_nav.record REPLAY -o out.mp4`: draw a replay as a video.
 
 The picture: the robot from behind, its goal and path painted on the floor; beside it what the robot's camera
 sees, as colour, depth and class mask; below, the step and its reward, force and touches. Or, with `--views`, the home
@@ -22,7 +22,7 @@ from rich.console import Console
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from interactive_nav.pictures.camera import BEHIND_M, clear_way, straight_down
-from interactive_nav.pictures.replay import Replay, ReplayError, load, replay_path
+from interactive_nav.pictures.replay import Replay, ReplayError, load_replay, replay_path
 from interactive_nav.pictures.scene_model import ROBOT, SCENE
 from interactive_nav.pictures.views import (
     INSIDE,
@@ -57,7 +57,7 @@ class Compositor:
     """Frames of one replay."""
 
     def __init__(self, replay: Replay, scene: Scene, height: int = 360, views: Sequence[str] = ()):
-        """Compiles the scene.
+        """Compile the scene.
 
         Args:
             replay: the episode.
@@ -66,7 +66,7 @@ class Compositor:
             views: of `VIEWS`, side by side in place of the view from behind and the robot's camera.
         """
         check_height(height)
-        check_scene(replay, scene)
+        check_replay_scene(replay, scene)
         self.replay, self.height, self.views = replay, height, tuple(views)
         robot = get_robot(replay.robot)
         self._middle_m = 0.6 * robot.height_m
@@ -76,12 +76,12 @@ class Compositor:
         self._yaw = gaussian_filter1d(yaw, _CAMERA_LAG_S / replay.control_dt_s, mode="nearest")
         self._target = gaussian_filter1d(replay.body_pos_w[:, 0], 0.2 / replay.control_dt_s, axis=0, mode="nearest")
         self._cameras = {view: self._positions(view) for view in self.views if view in BEHIND_M}
-        # Pillow's own font has spaces of 0.2 em, which round to nothing between some letters of small sizes.
+        # Pillow's font has spaces of 0.2 em, which round to nothing between some letters of small sizes.
         self._font = ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf"), height / 28)
 
     @property
     def size(self) -> tuple[int, int]:
-        """Columns and rows of a frame."""
+        """Return the columns and rows of a frame."""
         columns = len(self.views) * self._columns or self._columns + self.height // 3
         return columns, self.height + self._strip
 
@@ -94,7 +94,7 @@ class Compositor:
         return self.height // 6
 
     def frame(self, step: int) -> np.ndarray:
-        """[rows, columns, 3] u8: the state after `step` control steps."""
+        """Draw [rows, columns, 3] u8: the state after `step` control steps."""
         replay, height = self.replay, self.height
         self._place(step)
         paint = FloorPaint(replay.goal_xy_w, self._goal_radius_m, _dense(replay.robot_xy_w[: step + 1]))
@@ -102,11 +102,11 @@ class Compositor:
             panes = [self._view.textured(*self._camera(v, step), (*SCENE, ROBOT), paint) for v in self.views]
             return np.concatenate([np.concatenate(panes, 1), self._caption(step)], 0)
         camera = chase_camera(self._target[step], float(self._yaw[step]), height, self._columns)
-        behind = self._view.look(*camera, OUTSIDE, paint).colour
+        behind = self._view.render(*camera, OUTSIDE, paint).colour
         side = height // 3
-        own = [robot_camera(self._view, n, n, replay.image_fov_deg) for n in (side, CAMERA_PIXELS)]
-        colour, seen = self._view.look(*own[0], INSIDE).colour, self._view.look(*own[1], INSIDE)
-        small = [depth_picture(seen.depth_m), mask_picture(seen.classes, replay.segmentation_classes)]
+        cameras = [robot_camera(self._view, n, n, replay.image_fov_deg) for n in (side, CAMERA_PIXELS)]
+        colour, image = self._view.render(*cameras[0], INSIDE).colour, self._view.render(*cameras[1], INSIDE)
+        small = [depth_picture(image.depth_m), mask_picture(image.classes, replay.segmentation_classes)]
         column = [
             colour,
             *(np.asarray(Image.fromarray(x).resize((side, side), Image.Resampling.NEAREST)) for x in small),
@@ -118,7 +118,7 @@ class Compositor:
         self._view.place(self.replay.bodies, self.replay.body_pos_w[step], self.replay.body_quat_w[step])
 
     def _positions(self, view: str) -> np.ndarray:
-        """[T + 1, 3] m: behind the robot and in front of walls and furniture, without jerks."""
+        """Return [T + 1, 3] m: behind the robot and in front of walls and furniture, without jerks."""
         back_m, up_m = BEHIND_M[view]
         steps = _CAMERA_LAG_S / self.replay.control_dt_s
         # Behind where it goes, not where it looks: a robot turns on the spot.
@@ -138,8 +138,8 @@ class Compositor:
             eye = self._cameras[view][step]
             ahead = self._target[step] * [1, 1, 0] + [0, 0, self._middle_m] - eye
             return look_along(eye, ahead), Lens(self._columns, self.height, 60.0)
-        seen = np.vstack([self.replay.robot_xy_w, self.replay.goal_xy_w])
-        return straight_down(seen.min(0) - 1.2, seen.max(0) + 1.2, 4 / 3, 30.0), Lens(self._columns, self.height, 30.0)
+        xy_w = np.vstack([self.replay.robot_xy_w, self.replay.goal_xy_w])
+        return straight_down(xy_w.min(0) - 1.2, xy_w.max(0) + 1.2, 4 / 3, 30.0), Lens(self._columns, self.height, 30.0)
 
     def _caption(self, step: int) -> np.ndarray:
         replay, (columns, _) = self.replay, self.size
@@ -167,19 +167,19 @@ class Compositor:
 
 
 def check_height(height: int) -> None:
-    """Raises `ConfigError` unless every part of a frame of so many rows has whole, even pixels."""
+    """Raise `ConfigError` unless every part of a frame of so many rows has whole, even pixels."""
     if height < 120 or height % 12:
         raise ConfigError(f"height is {height}, expected a multiple of 12 from 120 on")
 
 
 def check_format(path: Path) -> None:
-    """Raises `ReplayError` unless a video can be written to a file of that ending."""
+    """Raise `ReplayError` unless a video can be written to a file of that ending."""
     if path.suffix not in FORMATS:
         raise ReplayError(f"{path}: ends in '{path.suffix}', expected one of {', '.join(FORMATS)}")
 
 
-def check_scene(replay: Replay, scene: Scene) -> None:
-    """Raises `ReplayError` unless the scene's files are those that the replay was recorded in."""
+def check_replay_scene(replay: Replay, scene: Scene) -> None:
+    """Raise `ReplayError` unless the scene's files are those that the replay was recorded in."""
     if scene.digest != replay.scene_digest:
         raise ReplayError(
             f"{scene.path}: scene.xml or maps.npz has changed since the replay was recorded; record the episode again"
@@ -187,7 +187,7 @@ def check_scene(replay: Replay, scene: Scene) -> None:
 
 
 def _dense(path: np.ndarray, step_m: float = 0.03) -> np.ndarray:
-    """[n, 2] path with points at most `step_m` apart."""
+    """Return an [n, 2] path with points at most `step_m` apart."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     at = np.arange(0.0, length[-1] + step_m, step_m)
     return np.stack([np.interp(at, length, path[:, i]) for i in range(2)], -1)
@@ -199,13 +199,13 @@ def write_video(
     every: int = 1,
     on_progress: Callable[[int], None] = lambda frames: None,
 ) -> int:
-    """Writes a video in real time, whole or not at all.
+    """Write a video in real time, whole or not at all.
 
     Args:
         compositor: the frames.
         path: ends in .mp4 (H.264), .gif or .webp.
         every: control steps from one frame to the next.
-        on_progress: told the number of frames written.
+        on_progress: called with the number of frames written.
 
     Returns:
         The number of different frames.
@@ -226,7 +226,7 @@ def _counted(compositor: Compositor, steps: list[int], on_progress: Callable[[in
 
 
 def write_mp4(frames: Iterable[np.ndarray], path: Path, rate: float, hold_s: float = 0.0) -> int:
-    """Writes H.264; returns the number of different frames.
+    """Write H.264; return the number of different frames.
 
     Args:
         frames: [rows, columns, 3] u8, of even numbers, one at least.
@@ -266,7 +266,7 @@ def _write_frames(frames: Iterator[np.ndarray], path: Path, rate: float, hold_s:
 
 
 def replay_of(run: Path, episode: int, policy: str, out: str) -> Path:
-    """Where a run keeps the replay of an episode."""
+    """Return where a run keeps the replay of an episode."""
     path = replay_path(run, policy, episode)
     if not path.is_file():
         words = f"{run} --episode {episode} --policy {policy} -o {out}"
@@ -274,13 +274,13 @@ def replay_of(run: Path, episode: int, policy: str, out: str) -> Path:
     return path
 
 
-def add_picture_words(made: argparse.ArgumentParser) -> None:
-    """What to draw, and where to."""
-    add_words(made, read_commands(Path(__file__).with_name("words.yaml"))["picture"].words, views=VIEWS)
+def add_picture_words(parser: argparse.ArgumentParser) -> None:
+    """Add the words that say what to draw, and where to."""
+    add_words(parser, read_commands(Path(__file__).with_name("words.yaml"))["picture"].words, views=VIEWS)
 
 
 def check_picture_words(arguments: argparse.Namespace) -> None:
-    """Refuses what cannot be drawn, before anything is played."""
+    """Refuse what cannot be drawn, before anything is played."""
     check_format(Path(arguments.out))
     check_height(arguments.height)
     if arguments.every < 1 or arguments.episode < 0:
@@ -290,8 +290,8 @@ def check_picture_words(arguments: argparse.Namespace) -> None:
 
 
 def record(source: Path, arguments: argparse.Namespace, console: Console) -> None:
-    """Draws a replay as the words of `add_picture_words` say."""
-    replay, out = load(source), Path(arguments.out)
+    """Draw a replay as the words of `add_picture_words` say."""
+    replay, out = load_replay(source), Path(arguments.out)
     compositor = Compositor(replay, load_scene(replay.scene), arguments.height, arguments.views)
     with progress_bar(console, "frames", -(-replay.num_steps // arguments.every) + 1, transient=True) as update:
         frames = write_video(compositor, out, arguments.every, lambda n: update(completed=n))
@@ -300,10 +300,10 @@ def record(source: Path, arguments: argparse.Namespace, console: Console) -> Non
 
 @reports_errors("interactive_nav.record")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Records; 0 when done, 2 on a user's error, 130 when interrupted."""
-    made = program(Path(__file__).with_name("words.yaml"), "record")
-    add_picture_words(made)
-    arguments = made.parse_args(argv)
+    """Record a video; return 0 when done, 2 on a user's error, 130 when interrupted."""
+    parser = program(Path(__file__).with_name("words.yaml"), "record")
+    add_picture_words(parser)
+    arguments = parser.parse_args(argv)
     source = Path(arguments.replay)
     try:
         check_picture_words(arguments)

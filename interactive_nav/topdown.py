@@ -1,4 +1,4 @@
-"""`python -m interactive_nav.topdown REPLAY... -o out.png`: replays in, maps of who went where and moved what out.
+"""Run `python -m interactive_nav.topdown REPLAY... -o out.png`: draw maps of who went where and moved what.
 
 One panel a replay, as in figures 7 and 8 of Interactive Gibson: furniture and small objects in outline where
 they stood at the start and filled where they stand at the end, an arrow from the one to the other, and the
@@ -21,9 +21,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, PathPatch
 from matplotlib.path import Path as Outline
 
-from interactive_nav.pictures.replay import Replay, ReplayError, load
+from interactive_nav.pictures.replay import Replay, ReplayError, load_replay
 from interactive_nav.pictures.views import COLOURS
-from interactive_nav.record import check_scene
+from interactive_nav.record import check_replay_scene
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav.scenes.slots import bodies_by_name
@@ -49,11 +49,11 @@ def shadow(boxes: np.ndarray, pos_w: np.ndarray, quat_w: np.ndarray) -> Any:
     return shapely.union_all(hulls)
 
 
-def draw(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "time") -> None:
-    """Draws one replay, its path coloured by "time" (first step dark, last bright) or "contact"."""
+def draw_topdown(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "time") -> None:
+    """Draw one replay, its path coloured by "time" (first step dark, last bright) or "contact"."""
     if colour_by not in COLOUR_BY:
         raise ConfigError(f"colour_by is {colour_by!r}, expected one of {', '.join(COLOUR_BY)}")
-    check_scene(replay, scene)
+    check_replay_scene(replay, scene)
     maps = scene.maps
     extent = maps.extent_w
     axis.imshow(
@@ -95,12 +95,12 @@ def draw(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "time") -> N
 
 
 def panels(replays: Sequence[Replay], scenes: dict[str, Scene], colour_by: str = "time", columns: int = 3) -> Figure:
-    """A figure with one panel a replay.
+    """Return a figure with one panel a replay.
 
     Args:
         replays: at least one.
         scenes: by the path that the replays name.
-        colour_by: see `draw`.
+        colour_by: see `draw_topdown`.
         columns: panels in a row, at most.
     """
     columns = min(columns, len(replays))
@@ -113,7 +113,7 @@ def panels(replays: Sequence[Replay], scenes: dict[str, Scene], colour_by: str =
     for axis in grid.flat[len(replays) :]:
         axis.set_axis_off()
     for axis, replay in zip(grid.flat, replays, strict=False):
-        draw(axis, replay, scenes[replay.scene], colour_by)
+        draw_topdown(axis, replay, scenes[replay.scene], colour_by)
     handles: list[Any] = []
     if colour_by == "time":
         longest = max(r.num_steps * r.control_dt_s for r in replays)
@@ -173,7 +173,7 @@ def _patch(shape: Any, **style: Any) -> PathPatch:
 
 
 def _files(sources: Sequence[str]) -> list[Path]:
-    """Replay files of a list of files, folders of replays and run folders."""
+    """Return the replay files of a list of files, folders of replays and run folders."""
     files: list[Path] = []
     for source in map(Path, sources):
         if source.is_dir():
@@ -189,12 +189,12 @@ def _files(sources: Sequence[str]) -> list[Path]:
 
 @reports_errors("interactive_nav.topdown")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Draws; 0 when done, 2 on a user's error."""
+    """Draw; return 0 when done, 2 on a user's error."""
     parser = program(Path(__file__).with_name("words.yaml"), "topdown", colour_by=COLOUR_BY)
     arguments = parser.parse_args(argv)
     if arguments.columns < 1:
         raise ReplayError(f"--columns is {arguments.columns}, expected at least 1")
-    replays = [load(path) for path in _files(arguments.replays)]
+    replays = [load_replay(path) for path in _files(arguments.replays)]
     scenes = {path: load_scene(path) for path in dict.fromkeys(r.scene for r in replays)}
     figure = panels(replays, scenes, arguments.colour_by, arguments.columns)
     with whole_file(arguments.out) as partial:

@@ -1,4 +1,4 @@
-"""Records that travel through `reset` and `step`: frozen structs of arrays; shapes are those of one environment."""
+"""Define the records of `reset` and `step`: frozen structs of arrays, with the shapes of one environment."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ class SceneTables:
     """[S, 2] f32 outer corner of cell [0, 0]."""
     node_xy_w: jax.Array
     """[S, n, 2] f32 free points that the nodes stand at."""
-    seen: jax.Array
+    visible: jax.Array
     """[S, n, K] u16 or i32 corners in each node's sight."""
     corner_xy_w: jax.Array
     """[S, V + 1, 2] f32."""
@@ -52,8 +52,8 @@ class SceneTables:
     """[S, q, 2] f32 middles of fine cells all over which the largest small object lies clear."""
     num_clutter: jax.Array
     """[S] i32."""
-    known_pairs_xy_w: jax.Array
-    """[S, k, 2, 2] f32 starts and goals (middles of fine cells) as far apart as asked, for where drawing finds none."""
+    fallback_pairs_xy_w: jax.Array
+    """[S, k, 2, 2] f32 starts and goals (middles of fine cells) as far apart as required, where drawing finds none."""
     cell_m: float = flax.struct.field(pytree_node=False, default=0.1)
     """Side of a navigation cell."""
     fine_m: float = flax.struct.field(pytree_node=False, default=0.05)
@@ -95,12 +95,12 @@ class NavInfo:
     object_pos_w: jax.Array
     """(M, 3) f32, m: centres of mass."""
     geodesic_m: jax.Array
-    """[] f32 distance to the goal for the body, which the potential is made of: among static structure, and round heavy
-    furniture with `potential_round`."""
+    """[] f32 distance to the goal for the body, from which the potential follows: among static structure, and round
+    heavy furniture with `potential_round`."""
     shortest_path_m: jax.Array
     """[] f32 L*: the distance among static structure at the start."""
     objects_dropped: jax.Array
-    """[] i32 small objects for which no free place was found: parked outside."""
+    """[] i32 small objects without a free place: parked outside."""
     step_count: jax.Array
     """[] i32 control steps done."""
     memory: dict[str, Any]

@@ -1,4 +1,4 @@
-"""`python -m interactive_nav.view SCENE`: a scene folder in, MuJoCo's viewer with a robot and clutter in it.
+"""Run `python -m interactive_nav.view SCENE`: open a scene in MuJoCo's viewer with a robot and clutter in it.
 
 A window where the machine has a screen, else a page in the browser (mjviser, an optional dependency).
 """
@@ -40,7 +40,7 @@ class ViewError(UserError):
 
 
 def can_open_window() -> bool:
-    """Whether GLFW, which MuJoCo's viewer draws with, finds a screen."""
+    """Return whether GLFW, which MuJoCo's viewer draws with, finds a screen."""
     try:
         glfw = importlib.import_module("glfw")
     except ImportError:
@@ -54,7 +54,7 @@ def can_open_window() -> bool:
 
 
 def has_browser_viewer() -> bool:
-    """Whether mjviser is installed."""
+    """Return whether mjviser is installed."""
     return importlib.util.find_spec("mjviser") is not None
 
 
@@ -123,11 +123,11 @@ def build_model(folder: Path, robot: RobotSpec | None, small: Sequence[SmallObje
 
 
 def _show_robot(model: mujoco.MjModel, robot: RobotSpec) -> None:
-    """A robot of collision shapes only is shown by these: viewers hide groups 3 and up."""
+    """Show a robot of collision shapes only by these: viewers hide groups 3 and up."""
     base = model.body(robot.base_body).id
-    own = np.flatnonzero(model.body_rootid[model.geom_bodyid] == base)
-    if len(own) and (model.geom_group[own] > VISUAL_GROUP).all():
-        model.geom_group[own] = VISUAL_GROUP
+    geoms = np.flatnonzero(model.body_rootid[model.geom_bodyid] == base)
+    if len(geoms) and (model.geom_group[geoms] > VISUAL_GROUP).all():
+        model.geom_group[geoms] = VISUAL_GROUP
 
 
 def aim_at_robot(model: mujoco.MjModel, data: mujoco.MjData, robot: RobotSpec) -> None:
@@ -139,8 +139,8 @@ def aim_at_robot(model: mujoco.MjModel, data: mujoco.MjData, robot: RobotSpec) -
         camera = robot.footprint_radius_m + away_m, elevation, azimuth
         ways = parts_w - (eye_w := model.stat.center - _ahead(*camera))
         met = cast(model, data, eye_w, ways / np.linalg.norm(ways, axis=1)[:, None], range(VISUAL_GROUP + 1))[0]
-        if (seen := float(np.mean((met >= 0) & is_robot[met]))) > best:
-            best = seen
+        if (visible := float(np.mean((met >= 0) & is_robot[met]))) > best:
+            best = visible
             model.stat.extent, model.vis.global_.elevation, model.vis.global_.azimuth = camera[0] / 1.5, *camera[1:]
         if best == 1.0:
             return
@@ -153,7 +153,7 @@ def _ahead(distance_m: float, elevation_deg: float, azimuth_deg: float) -> np.nd
 
 
 def open_window(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Opens MuJoCo's own viewer; returns when its window is closed."""
+    """Open MuJoCo's viewer; return when its window is closed."""
     importlib.import_module("mujoco.viewer").launch(model, data)
 
 
@@ -186,10 +186,10 @@ def open_browser(model: mujoco.MjModel, data: mujoco.MjData, host: str, port: in
 
 @reports_errors("interactive_nav.view")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Opens a viewer; 0 when it was closed, 2 with one line on stderr when none can open."""
+    """Open a viewer; return 0 when it was closed, 2 with one line on stderr when none can open."""
     table = Path(__file__).with_name("words.yaml")
-    made = program(table, "view", robots=", ".join(robot_names()), splits=SPLITS)
-    arguments = made.parse_args(argv)
+    parser = program(table, "view", robots=", ".join(robot_names()), splits=SPLITS)
+    arguments = parser.parse_args(argv)
     robot = None if arguments.robot == "none" else get_robot(arguments.robot)
     small = pick(arguments.objects, arguments.small_objects)
     if arguments.view != "whole" and robot is None:

@@ -133,7 +133,7 @@ def scenes() -> dict[str, Target]:
     """What the converters write, and lists of it."""
     from converters.recipes import load_recipes
     from converters.single_object import ObjectConfig, convert_object
-    from interactive_nav import episodes as episode_files
+    from interactive_nav.episodes import load_episode_file
     from interactive_nav.scenes.object_folders import load_object
     from interactive_nav.scenes.scene import load_scene
     from scenes_mjcf.schema import load_manifest, load_maps
@@ -173,7 +173,7 @@ def scenes() -> dict[str, Target]:
         "recipes": Target(
             part("cluttered/recipes.yaml", "scenes"), lambda root: load_recipes(root / "recipes.yaml")
         ),
-        "episodes": Target(part(episodes, "episodes"), lambda root: [episode_files.load(root / n) for n in names]),
+        "episodes": Target(part(episodes, "episodes"), lambda root: [load_episode_file(root / n) for n in names]),
         "object": Target(small, load_object, ("object.*", "assets/*hull*")),
     }  # fmt: skip
 

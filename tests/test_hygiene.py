@@ -20,7 +20,7 @@ import pytest
 import interactive_nav
 from interactive_nav import metrics, reward
 from interactive_nav.navigation.lookup import geodesic_at, goal_field, waypoints_at
-from interactive_nav.sensing.observation import task_parts, waypoints_in_body
+from interactive_nav.sensing.observation import task_observation, waypoints_in_body
 from interactive_nav.task.wrappers import AutoResetEnv
 from tests.train.learners.test_offpolicy import tiny
 from tests.train.learners.test_ppo import make_config
@@ -111,7 +111,7 @@ def test_ways_and_observations(env):
         field = goal_field(env.tables, scene, goal)
         pos = jnp.append(xy, 0.1)
         waypoints = waypoints_in_body(waypoints_at(env.tables, scene, field, xy, 4, 0.2), pos, turned)
-        return geodesic_at(env.tables, scene, field, xy), task_parts(
+        return geodesic_at(env.tables, scene, field, xy), task_observation(
             pos, turned, jnp.zeros(3), jnp.zeros(3), goal, waypoints
         )
 

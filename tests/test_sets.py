@@ -10,7 +10,7 @@ import pytest
 from converters.__main__ import main
 from converters.generate.homes.config import TIERS, HomeConfig
 from converters.recipes import load_recipes
-from interactive_nav.episodes import load
+from interactive_nav.episodes import load_episode_file
 from interactive_nav.scenes.scene import load_scene
 from scenes_mjcf.schema import SceneError, load_manifest
 from scenes_mjcf.sets import (
@@ -77,7 +77,7 @@ def test_fixed_episodes_are_in_the_scenes_of_their_split(tier: str, robot: str) 
     listed = read_set(ROOT / "scenes_mjcf" / tier / "set.json").scenes
     arrives = 0.0
     for split in ("train", "test"):
-        file = load(ROOT / "scenes_mjcf" / "episodes" / f"{tier}-{robot}-{split}.json.gz")
+        file = load_episode_file(ROOT / "scenes_mjcf" / "episodes" / f"{tier}-{robot}-{split}.json.gz")
         of_split = [name for name, member in listed.items() if member.split == split]
         assert [name for name, _ in file.scenes] == of_split
         assert len(file.episodes) == 1000 and file.robot == robot and len(file.objects) == 4
@@ -87,7 +87,7 @@ def test_fixed_episodes_are_in_the_scenes_of_their_split(tier: str, robot: str) 
     low, high = ARRIVES[tier, robot]
     assert low <= arrives <= high
     if tier == "cluttered":  # in each home to test in
-        test = load(ROOT / "scenes_mjcf" / "episodes" / f"{tier}-{robot}-test.json.gz").episodes
+        test = load_episode_file(ROOT / "scenes_mjcf" / "episodes" / f"{tier}-{robot}-test.json.gz").episodes
         for k in range(3):
             free = [not row["push_needed"] for row in test if row["scene"] == k]
             assert low <= sum(free) / len(free) <= high
@@ -95,7 +95,7 @@ def test_fixed_episodes_are_in_the_scenes_of_their_split(tier: str, robot: str) 
 
 @pytest.mark.parametrize(("robot", "pushes"), [("turtlebot", 3), ("fetch", 0)])
 def test_fixed_episodes_of_the_aws_house_are_in_the_scene_that_is_there(robot: str, pushes: int) -> None:
-    file = load(ROOT / "scenes_mjcf" / "episodes" / f"aws_house-{robot}.json.gz")
+    file = load_episode_file(ROOT / "scenes_mjcf" / "episodes" / f"aws_house-{robot}.json.gz")
     assert file.scenes == (("aws_house", load_scene(ROOT / "scenes_mjcf" / "aws_house").task_digest),)
     assert len(file.episodes) == 200 and (file.robot, file.seed, len(file.objects)) == (robot, 7, 4)
     assert sum(row["push_needed"] for row in file.episodes) == pushes

@@ -12,7 +12,7 @@ from typing import Any
 import pyarrow as pa
 from rich.console import Console
 
-from interactive_nav.episodes import EpisodeFile, EpisodeFileError, load_all
+from interactive_nav.episodes import EpisodeFile, EpisodeFileError, load_episode_files
 from interactive_nav.types import FAILURES
 from interactive_nav_common.config import refuse_unused, replace
 from interactive_nav_common.errors import ConfigError, reports_errors
@@ -41,7 +41,7 @@ ROWS = "evaluation/episodes.parquet"
 def _read_episodes(paths: Sequence[str], most: int | None) -> tuple[EpisodeFile, str]:
     """The first episodes of files, or all, and the files' digest."""
     try:
-        file, digest = load_all([str(installed(path)) for path in paths])
+        file, digest = load_episode_files([str(installed(path)) for path in paths])
     except EpisodeFileError as error:
         raise ConfigError(f"--episode-file: {error}") from None
     if most is not None and most > len(file.episodes):

@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 
-from interactive_nav.episodes import load, starts_of
+from interactive_nav.episodes import load_episode_file, starts_of
 from interactive_nav.pictures import replay
 from interactive_nav.task.rollout import episode_keys
 from interactive_nav_common.config import refuse_unused
@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
     seed, starts = SEED if arguments.seed is None else arguments.seed, None
     if arguments.episode_file:
         refuse_unused(arguments, "--seed", "with --episode-file, whose episodes are fixed")
-        file = load(installed(arguments.episode_file))
+        file = load_episode_file(installed(arguments.episode_file))
         if max(episodes) >= len(file.episodes):
             raise ConfigError(f"--episodes has {max(episodes)}, expected less than the file's {len(file.episodes)}")
         seed, starts = file.seed, starts_of(file, env, "--episode-file")
@@ -71,7 +71,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
                     None if starts is None else jax.tree.map(lambda x, k=episode: x[k : k + 1], starts),
                 )
             path = replay.replay_path(folder.path, name, episode)
-            replay.save(played, path)
+            replay.save_replay(played, path)
             score = played.metrics["ins_0.5"]
             console.print(f"{path}: {played.num_steps} steps, INS_0.5 {score:.2f}", highlight=False, soft_wrap=True)
     return 0

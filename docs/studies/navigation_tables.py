@@ -131,7 +131,7 @@ def build(name: str, free: np.ndarray, origin_w: tuple[float, float]) -> CornerG
     graph = corner_graph(free, FINE_M, CELL_M, origin_w)
     print(
         f"{name}: {time.process_time() - began:.1f} s of CPU, {len(graph.corner_xy_w)} corners, "
-        f"{len(graph.node_xy_w)} nodes, at most {graph.seen.shape[1]} corners seen by one",
+        f"{len(graph.node_xy_w)} nodes, at most {graph.visible.shape[1]} corners seen by one",
         flush=True,
     )
     return graph

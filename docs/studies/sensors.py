@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 import interactive_nav
-from interactive_nav.pictures.camera import ENGINES, STREAMS, VIEWS, Camera
+from interactive_nav.pictures.camera import ENGINES, STREAMS, VIEWS, PictureCamera
 from interactive_nav.sensing.shading import PALETTES
 from scenes_mjcf.categories import SEGMENTATIONS
 
@@ -23,7 +23,7 @@ def as_rgb(stream: str, image: np.ndarray, depth_range_m: float = DEPTH_RANGE_M)
 
     Args:
         stream: rgb, normals, depth or segmentation.
-        image: as `Camera.frame` gives it.
+        image: as `PictureCamera.frame` gives it.
         depth_range_m: depth at which grey ends.
     """
     if stream == "rgb":
@@ -70,7 +70,7 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     env = interactive_nav.make(args.robot, [args.scene], backend="native")
     state = jax.jit(env.reset)(jax.random.PRNGKey(args.seed))
-    frame = Camera(env, args.engine).frame(state, args.size, args.size, STREAMS, args.view)
+    frame = PictureCamera(env, args.engine).frame(state, args.size, args.size, STREAMS, args.view)
     step, down = args.size + _GAP_PX, args.size + _LABEL_PX
     sheet = Image.new("RGB", (2 * step - _GAP_PX, -(-len(STREAMS) // 2) * down), "white")
     for i, stream in enumerate(STREAMS):

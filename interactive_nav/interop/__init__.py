@@ -1,1 +1,1 @@
-"""The environment for other libraries: Gymnasium, Stable-Baselines3, PyTorch."""
+"""Offer the environment to other libraries: Gymnasium, Stable-Baselines3, PyTorch."""

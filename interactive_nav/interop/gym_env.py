@@ -1,4 +1,4 @@
-"""The environment for those who do not use JAX: Gymnasium's API, NumPy arrays (or PyTorch tensors) in and out.
+"""Offer the environment to those who do not use JAX, with Gymnasium's API on NumPy arrays or PyTorch tensors.
 
     import gymnasium
     import interactive_nav.interop.gym_env  # registers the ids
@@ -7,7 +7,7 @@
 Ids are InteractiveNav-<Robot>-v0, one for each name in `robot_names()`. `make` gives one environment,
 `make_vec` a batch that steps as one compiled program. Keyword arguments are those of `interactive_nav.make`.
 Environment i of a batch reset with seed s plays the episodes of a single environment reset with seed s + i; with
-`scene_choice="slot"` it keeps scene i modulo their number, as a single one made with `slot=i`.
+`scene_choice="slot"` it keeps scene i modulo their number, as a single one built with `slot=i`.
 """
 
 import functools
@@ -64,13 +64,13 @@ def _refuse_fork() -> None:
 
 
 def env_id(robot: str) -> str:
-    """Gymnasium's id of a robot's environment: turtlebot -> InteractiveNav-TurtleBot-v0."""
+    """Return Gymnasium's id of a robot's environment: turtlebot -> InteractiveNav-TurtleBot-v0."""
     name = title(robot) or "".join(part.capitalize() for part in robot.split("_"))
     return f"InteractiveNav-{name}-v{VERSION}"
 
 
 def register_envs() -> None:
-    """Registers every robot's environment with Gymnasium; a second call changes nothing."""
+    """Register every robot's environment with Gymnasium; a second call changes nothing."""
     for robot in robot_names():
         if env_id(robot) not in gymnasium.registry:
             gymnasium.register(
@@ -82,10 +82,10 @@ def register_envs() -> None:
 
 
 def observation_space_of(env: InteractiveNav) -> spaces.Space:
-    """A `Box` for a flat observation, a `Dict` of boxes for one in parts.
+    """Return a `Box` for a flat observation, a `Dict` of boxes for one in parts.
 
     The vector is unbounded float32; images are 0 to 255 as uint8, else 0 (normals: -1) to 1 in
-    their own type.
+    their type.
     """
     key = jax.ShapeDtypeStruct((2,), jnp.uint32)
     obs = jax.eval_shape(env.reset, key).obs
@@ -102,24 +102,24 @@ def observation_space_of(env: InteractiveNav) -> spaces.Space:
 
 
 def action_space_of(env: InteractiveNav) -> spaces.Box:
-    """[-1, 1], one per actuator."""
+    """Return [-1, 1], one per actuator."""
     return spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)
 
 
 def _key(rng: np.random.Generator) -> np.ndarray:
-    """(2,) u32 key drawn from a generator."""
+    """Draw a (2,) u32 key from a generator."""
     return rng.integers(0, 2**32, size=2, dtype=np.uint32)
 
 
-def _check_options(options: dict[str, Any] | None, known: Sequence[str]) -> dict[str, Any]:
-    unknown = [name for name in options or {} if name not in known]
+def _check_options(options: dict[str, Any] | None, allowed: Sequence[str]) -> dict[str, Any]:
+    unknown = [name for name in options or {} if name not in allowed]
     if unknown:
-        raise ConfigError(f"reset option {unknown[0]!r} is unknown; known options: {', '.join(known)}")
+        raise ConfigError(f"reset option {unknown[0]!r} is unknown; known options: {', '.join(allowed)}")
     return options or {}
 
 
 def _to_numpy(tree: Any) -> Any:
-    """Copies that the caller owns: what JAX hands out is read-only."""
+    """Return copies that the caller owns: what JAX hands out is read-only."""
     return jax.tree.map(np.array, tree)
 
 
@@ -145,7 +145,7 @@ class InteractiveNavEnv(gymnasium.Env):
         slot: int | None = None,
         **settings: Any,
     ):
-        """Builds it.
+        """Build it.
 
         Args:
             robot: a name from `robot_names()`, or a file (see `docs/add-a-robot.md`).
@@ -175,7 +175,7 @@ class InteractiveNavEnv(gymnasium.Env):
         self._state: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Draws an episode; with a seed, always the same sequence of episodes from here on."""
+        """Draw an episode; with a seed, always the same sequence of episodes from here on."""
         _refuse_fork()
         super().reset(seed=seed)
         given = _check_options(options, ("start",))
@@ -185,7 +185,7 @@ class InteractiveNavEnv(gymnasium.Env):
         return _to_numpy(self._state.obs), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """One control period."""
+        """Advance by one control period."""
         _refuse_fork()
         if self._state is None:
             raise gymnasium.error.ResetNeeded("step was called before reset")
@@ -199,9 +199,9 @@ class InteractiveNavEnv(gymnasium.Env):
         return _to_numpy(state.obs), float(state.reward), done and not truncated, truncated, info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """(rows, columns, 3) u8 third-person view of the present state; None without a render mode."""
-        seen = self.render_mode is not None and self._state is not None
-        return self._camera.frames(self._state)[0] if seen else None
+        """Return a (rows, columns, 3) u8 third-person view of the present state; None without a render mode."""
+        rendered = self.render_mode is not None and self._state is not None
+        return self._camera.frames(self._state)[0] if rendered else None
 
 
 class InteractiveNavVectorEnv(VectorEnv):
@@ -227,7 +227,7 @@ class InteractiveNavVectorEnv(VectorEnv):
         render_mode: str | None = None,
         **settings: Any,
     ):
-        """Builds it.
+        """Build it.
 
         Args:
             robot: a name from `robot_names()`, or a file (see `docs/add-a-robot.md`).
@@ -268,11 +268,11 @@ class InteractiveNavVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Draws an episode for each environment, or for some of them.
+        """Draw an episode for each environment, or for some of them.
 
         Args:
             seed: s gives environment i the seed s + i; or a list with one (or None) each. None: each goes
-                on with its own sequence.
+                on with its sequence.
             options: `reset_mask` [N] bool: only these; `start`: an `EpisodeStart` with leaves [N, ...] to play.
         """
         _refuse_fork()
@@ -297,7 +297,7 @@ class InteractiveNavVectorEnv(VectorEnv):
         return self._out(self._state.obs), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """One control period; see the class for what follows an episode's end."""
+        """Advance by one control period; see the class for what follows an episode's end."""
         _refuse_fork()
         if self._state is None:
             raise gymnasium.error.ResetNeeded("step was called before reset")
@@ -315,9 +315,9 @@ class InteractiveNavVectorEnv(VectorEnv):
         return (*self._out((now, reward, terminated, truncated)), info)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """A third-person view of each environment; None without a render mode."""
-        seen = self.render_mode is not None and self._state is not None
-        return self._camera.frames(self._state) if seen else None
+        """Return a third-person view of each environment; None without a render mode."""
+        rendered = self.render_mode is not None and self._state is not None
+        return self._camera.frames(self._state) if rendered else None
 
     def _keys(self, seed: int | Sequence[int | None] | None) -> jax.Array:
         n = self.num_envs
@@ -339,7 +339,7 @@ class InteractiveNavVectorEnv(VectorEnv):
         return to_torch(tree) if self.arrays == "torch" else tree
 
     def _info(self, obs: Any, metrics: dict[str, jax.Array], was_over: jax.Array) -> dict[str, Any]:
-        """Values with their masks `_name`, in the places where `SyncVectorEnv` has them."""
+        """Return values with their masks `_name`, in the places where `SyncVectorEnv` has them."""
         same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
         steps = (*self.env.reward_names, NONFINITE_ACTIONS)
         if self.arrays != "numpy":
@@ -365,7 +365,7 @@ class InteractiveNavVectorEnv(VectorEnv):
 
 
 def _masked(values: Mapping[str, jax.Array], mask: np.ndarray) -> dict[str, np.ndarray]:
-    """name -> values, 0 outside the mask, and _name -> mask; nothing where the mask is empty."""
+    """Return name -> values, 0 outside the mask, and _name -> mask; nothing where the mask is empty."""
     if not mask.any():
         return {}
     out = {}
@@ -375,7 +375,7 @@ def _masked(values: Mapping[str, jax.Array], mask: np.ndarray) -> dict[str, np.n
 
 
 def _checked_slot(env: InteractiveNav, slot: int | None) -> jax.Array | None:
-    """The scene that a single environment keeps; None: each episode draws one."""
+    """Return the scene that a single environment keeps; None: each episode draws one."""
     chosen, count = env.config.rules.scene_choice == "slot", len(env.scenes)
     if slot is not None and (not chosen or slot < 0):
         raise ConfigError(
@@ -390,9 +390,9 @@ def _checked_slot(env: InteractiveNav, slot: int | None) -> jax.Array | None:
 
 
 def _checked_render_mode(mode: str | None) -> str | None:
-    known = InteractiveNavEnv.metadata["render_modes"]
-    if mode is not None and mode not in known:
-        raise ConfigError(f"render_mode is {mode!r}, expected one of {', '.join(known)} or none")
+    modes = InteractiveNavEnv.metadata["render_modes"]
+    if mode is not None and mode not in modes:
+        raise ConfigError(f"render_mode is {mode!r}, expected one of {', '.join(modes)} or none")
     return mode
 
 

@@ -1,4 +1,4 @@
-"""A batch of environments and its state in, the next state out, for each way of Gymnasium's to begin new episodes."""
+"""Step a batch of environments for each way in which Gymnasium starts new episodes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _where(mask: jax.Array, new: Any, old: Any) -> Any:
 
 
 def reset_where(env: InteractiveNav, state: Any, keys: jax.Array, mask: jax.Array) -> Any:
-    """New episodes where `mask`."""
+    """Start new episodes where `mask`."""
     info = state.info
     physics, nav, rng = draw_where(env, (state.pipeline_state, info["nav"], _where(mask, keys, info["rng"])), mask)
     of_step = (state.reward, state.done, state.metrics, info["truncation"], info["time_out"])
@@ -36,15 +36,15 @@ def reset_where(env: InteractiveNav, state: Any, keys: jax.Array, mask: jax.Arra
 def step(
     env: InteractiveNav, mode: AutoresetMode, state: Any, actions: jax.Array, ended: jax.Array
 ) -> tuple[Any, jax.Array, tuple[Any, ...]]:
-    """The state after a step and, where the mode has it, a new beginning; which episodes were over before, so that
+    """Return the state after a step and, where the mode has it, a reset; which episodes were over before, so that
     nothing but a reset was done; and observation, reward, terminated, truncated and metrics."""
     stepped = new = jax.vmap(env.step)(state, actions)
     same = mode.name == "SAME_STEP"
     if mode.name != "DISABLED":
         due, keys = (stepped.done > 0, stepped.info["rng"]) if same else (ended, state.info["rng"])
         new = jax.lax.cond(due.any(), lambda s: reset_where(env, s, keys, due), lambda s: s, stepped)
-    told = new if mode.name == "NEXT_STEP" else stepped
-    truncated = told.info["truncation"] > 0
+    reported = new if mode.name == "NEXT_STEP" else stepped
+    truncated = reported.info["truncation"] > 0
     over = ended if mode.name == "NEXT_STEP" else jnp.zeros_like(ended)
-    metrics = {**told.metrics, NONFINITE_ACTIONS: (~jnp.isfinite(actions)).sum(-1).astype(jnp.float32)}
-    return new, over, (told.obs, told.reward, (told.done > 0) & ~truncated, truncated, metrics)
+    metrics = {**reported.metrics, NONFINITE_ACTIONS: (~jnp.isfinite(actions)).sum(-1).astype(jnp.float32)}
+    return new, over, (reported.obs, reported.reward, (reported.done > 0) & ~truncated, truncated, metrics)

@@ -1,4 +1,4 @@
-"""A batch of environments as Stable-Baselines3 wants it: `VecEnv` in place of Gymnasium's vector environment.
+"""Offer a batch of environments as Stable-Baselines3's `VecEnv` in place of Gymnasium's vector environment.
 
 from stable_baselines3 import PPO
 from interactive_nav.interop.sb3_env import SB3VecEnv
@@ -27,7 +27,7 @@ class SB3VecEnv(VecEnv):
     """
 
     def __init__(self, robot: str, scenes: Sequence[str], num_envs: int = 16, **settings: Any):
-        """Builds it.
+        """Build it.
 
         Args:
             robot: a name from `robot_names()`.
@@ -42,18 +42,18 @@ class SB3VecEnv(VecEnv):
         super().__init__(num_envs, self.envs.single_observation_space, self.envs.single_action_space)
 
     def reset(self) -> Any:
-        """Observations of new episodes; of those that `seed` decides, if it was called."""
+        """Return observations of new episodes; of those that `seed` decides, if it was called."""
         seeds = None if all(s is None for s in self._seeds) else list(self._seeds)
         self._reset_seeds()
         self._returns[:] = 0.0
         return self.envs.reset(seed=seeds)[0]
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Takes the actions of the next step."""
+        """Take the actions of the next step."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Observations, rewards, ends, and an info for each environment."""
+        """Return observations, rewards, ends, and an info for each environment."""
         obs, rewards, terminated, truncated, info = self.envs.step(self._actions)
         self._returns += rewards
         infos: list[dict[str, Any]] = [{"TimeLimit.truncated": bool(t)} for t in truncated]
@@ -67,25 +67,25 @@ class SB3VecEnv(VecEnv):
         return obs, rewards, done, infos
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing: there is nothing to release."""
         self.envs.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """A third-person view of each environment, with render_mode="rgb_array"."""
+        """Return a third-person view of each environment, with render_mode="rgb_array"."""
         return self.envs.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """The attribute, which all environments share, once for each index."""
+        """Return the attribute, which all environments share, once for each index."""
         return [getattr(self.envs, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refused: environments have no attributes of their own."""
+        """Refuse it: environments share their attributes."""
         raise NotImplementedError(f"cannot set {attr_name!r}: the environments are one program; make them anew")
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Refused: environments have no methods of their own."""
+        """Refuse it: environments share their methods."""
         raise NotImplementedError(f"cannot call {method_name!r}: the environments are one program")
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """No environment has a wrapper of its own, save that the `Monitor`'s numbers are there."""
+        """Return False for each environment, save that the `Monitor`'s numbers are there."""
         return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]

@@ -1,4 +1,4 @@
-"""JAX arrays and PyTorch tensors into one another through DLPack: the memory is shared, nothing is copied.
+"""Convert JAX arrays and PyTorch tensors into one another through DLPack, which shares the memory.
 
 Both sides then look at the same bytes on the same device. JAX takes its arrays to be constant, so write into
 a tensor that came from JAX only after `clone()`, and into one that was handed to JAX not at all.
@@ -15,7 +15,7 @@ MISSING = "PyTorch is not installed; follow https://pytorch.org/get-started"
 
 
 def to_torch(tree: Any) -> Any:
-    """JAX arrays to PyTorch tensors on the same device, without a copy.
+    """Convert JAX arrays to PyTorch tensors on the same device, without a copy.
 
     Args:
         tree: an array, or any pytree of arrays (dictionaries, tuples, flax structs).
@@ -31,9 +31,9 @@ def to_torch(tree: Any) -> Any:
 
 
 def to_jax(tree: Any) -> Any:
-    """PyTorch tensors to JAX arrays on the same device, without a copy.
+    """Convert PyTorch tensors to JAX arrays on the same device, without a copy.
 
-    Tensors must be contiguous (others are made so, which copies) and carry no gradient: detach them. JAX
+    Tensors must be contiguous (others are copied into it) and carry no gradient: detach them. JAX
     copies a CPU tensor whose memory is not aligned to 64 bytes, such as a slice.
 
     Args:

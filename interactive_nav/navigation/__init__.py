@@ -1,1 +1,1 @@
-"""Where a robot can go: tables built once, looked up inside jit."""
+"""Compute where a robot can go, from tables that are built once and looked up inside jit."""

@@ -1,4 +1,4 @@
-"""Scene tables and a position in, distance to the goal and the path ahead out, inside jit.
+"""Look up the distance to the goal and the path ahead of a position in scene tables, inside jit.
 
 A shortest path is straight but where it bends round a corner (`interactive_nav.geodesic.CornerGraph`). Once
 an episode, `goal_field` solves every corner's distance to the goal; from then on a distance is the least, over
@@ -18,7 +18,7 @@ _LIFT = 1.0 + 1e-4
 
 
 def _cell(tables: SceneTables, scene: jax.Array, xy: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """(row, column), each [...] i32, of the navigation cell that holds each point [..., 2], clamped."""
+    """Return (row, column), each [...] i32, of the navigation cell that holds each point [..., 2], clamped."""
     rows, columns = tables.node_of_cell.shape[1:]
     origin = jnp.broadcast_to(tables.grid_origin_w[scene], xy.shape)
     at = jnp.floor((xy - origin) / tables.cell_m).astype(jnp.int32)
@@ -26,20 +26,20 @@ def _cell(tables: SceneTables, scene: jax.Array, xy: jax.Array) -> tuple[jax.Arr
 
 
 def node_at(tables: SceneTables, scene: jax.Array, xy: jax.Array) -> jax.Array:
-    """[...] i32: the node that stands for the cell that holds each world point [..., 2]."""
+    """Return the node, [...] i32, that stands for the cell that holds each world point [..., 2]."""
     r, c = _cell(tables, scene, xy)
     return tables.node_of_cell[scene, r, c]
 
 
 def cell_centre(tables: SceneTables, scene: jax.Array, xy: jax.Array) -> jax.Array:
-    """[..., 2] m: centre of the navigation cell that holds each world point [..., 2]."""
+    """Return the centre, [..., 2] m, of the navigation cell that holds each world point [..., 2]."""
     r, c = _cell(tables, scene, xy)
     offset = tables.cell_m * (jnp.stack([c, r], -1) + 0.5)
     return jnp.broadcast_to(tables.grid_origin_w[scene], offset.shape) + offset
 
 
 def all_free(tables: SceneTables, scene: jax.Array, points: jax.Array) -> jax.Array:
-    """[] bool: whether world points [p, 2] all lie in free cells."""
+    """Return [] bool: whether world points [p, 2] all lie in free cells."""
     rows, columns = tables.free.shape[1:]
     at = jnp.floor((points - tables.grid_origin_w[scene][None]) / tables.fine_m).astype(jnp.int32)
     r, c = jnp.clip(at[:, 1], 0, rows - 1), jnp.clip(at[:, 0], 0, columns - 1)
@@ -47,20 +47,20 @@ def all_free(tables: SceneTables, scene: jax.Array, points: jax.Array) -> jax.Ar
 
 
 def _in_sight(tables: SceneTables, scene: jax.Array, a: jax.Array, b: jax.Array) -> jax.Array:
-    """[] bool: whether the line between two world points (2,) crosses free cells only."""
+    """Return [] bool: whether the line between two world points (2,) crosses free cells only."""
     share = (jnp.arange(tables.sight_samples) + 0.5) / tables.sight_samples
     return all_free(tables, scene, a[None] + share[:, None] * (b - a)[None])
 
 
 def goal_field(tables: SceneTables, scene: jax.Array, goal_xy_w: jax.Array) -> GoalField:
-    """Every corner's distance to a goal, and the next corner on the way: once an episode.
+    """Return every corner's distance to a goal, and the next corner on the way: once an episode.
 
     Args:
         scene: [] i32.
         goal_xy_w: (2,) m, anywhere on free ground.
     """
     none = tables.corner_xy_w.shape[1] - 1
-    near = tables.seen[scene, node_at(tables, scene, goal_xy_w)].astype(jnp.int32)
+    near = tables.visible[scene, node_at(tables, scene, goal_xy_w)].astype(jnp.int32)
 
     def through(best, corner):
         distance, last = best
@@ -71,17 +71,17 @@ def goal_field(tables: SceneTables, scene: jax.Array, goal_xy_w: jax.Array) -> G
 
     nothing = (jnp.full((none + 1,), jnp.inf), jnp.full((none + 1,), none, jnp.int32))
     (distance, last), _ = jax.lax.scan(through, nothing, near)
-    own = jnp.arange(none + 1)
-    following = jnp.where(last == own, none, tables.next_corner[scene, own, last].astype(jnp.int32))
+    itself = jnp.arange(none + 1)
+    following = jnp.where(last == itself, none, tables.next_corner[scene, itself, last].astype(jnp.int32))
     return GoalField(xy_w=goal_xy_w, corner_m=distance, next_corner=jnp.where(jnp.isinf(distance), none, following))
 
 
 def _from_node(
     tables: SceneTables, scene: jax.Array, goal: GoalField, node: jax.Array, xy: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Distance of a point that sees what its node sees, and where its path first leads: a corner, or the goal."""
+    """Return the distance of a point that sees what its node sees, and where its path leads: a corner or the goal."""
     none = tables.corner_xy_w.shape[1] - 1
-    corners = tables.seen[scene, node].astype(jnp.int32)
+    corners = tables.visible[scene, node].astype(jnp.int32)
     around = jnp.linalg.norm(tables.corner_xy_w[scene, corners] - xy[None], axis=-1) + goal.corner_m[corners]
     best = jnp.argmin(around)
     straight = jnp.linalg.norm(goal.xy_w - xy)
@@ -91,7 +91,7 @@ def _from_node(
 
 
 def geodesic_at(tables: SceneTables, scene: jax.Array, goal: GoalField, xy: jax.Array) -> jax.Array:
-    """Geodesic distance to a goal from a world point, continuous.
+    """Return the geodesic distance to a goal from a world point, continuous.
 
     Args:
         scene: [] i32.
@@ -113,7 +113,7 @@ def geodesic_at(tables: SceneTables, scene: jax.Array, goal: GoalField, xy: jax.
 
 
 def _path(tables: SceneTables, scene: jax.Array, goal: GoalField, xy: jax.Array, hops: int) -> jax.Array:
-    """[hops + 1, 2] m: the point and the bends of its shortest path; the goal repeated at its end."""
+    """Return [hops + 1, 2] m: the point and the bends of its shortest path; the goal repeated at its end."""
     none = tables.corner_xy_w.shape[1] - 1
     _, first = _from_node(tables, scene, goal, node_at(tables, scene, xy), xy)
 
@@ -126,7 +126,7 @@ def _path(tables: SceneTables, scene: jax.Array, goal: GoalField, xy: jax.Array,
 
 
 def _along(points: jax.Array, length: jax.Array, arc: jax.Array) -> jax.Array:
-    """[k, 2]: points of a polyline [p, 2] at given lengths [k], its pieces measured by `length` [p - 1]."""
+    """Return [k, 2]: points of a polyline [p, 2] at given lengths [k], its pieces measured by `length` [p - 1]."""
     before = jnp.cumsum(length) - length
     share = jnp.clip((arc[:, None] - before[None]) / jnp.maximum(length, 1e-6)[None], 0.0, 1.0)
     return points[:1] + share @ (points[1:] - points[:-1])
@@ -139,7 +139,7 @@ def _hops(tables: SceneTables, ahead_m: float) -> int:
 def waypoints_at(
     tables: SceneTables, scene: jax.Array, goal: GoalField, xy: jax.Array, count: int, spacing_m: float
 ) -> jax.Array:
-    """The next waypoints on the shortest path, at equal arc length, the goal repeated at its end.
+    """Return the next waypoints on the shortest path, at equal arc length, the goal repeated at its end.
 
     Args:
         scene: [] i32.
@@ -156,9 +156,9 @@ def waypoints_at(
 def grid_waypoints_at(
     tables: SceneTables, scene: jax.Array, goal: GoalField, xy: jax.Array, count: int, spacing_m: float
 ) -> jax.Array:
-    """Waypoints as the original's code had them (reference benchmark, section 1.2), from cell to cell.
+    """Return waypoints as the original's code had them (reference benchmark, section 1.2), from cell to cell.
 
-    The first is the robot's own cell; from there every second node (spacing / cell) of a path that steps to
+    The first is the robot's cell; from there every second node (spacing / cell) of a path that steps to
     one of eight neighbours, so 0.2 m apart along an axis and 0.283 m on diagonals; then the goal, repeated.
 
     Args and returns: as `waypoints_at`.

@@ -1,8 +1,8 @@
-"""Random keys and scene tables in, an episode's start, goal and clutter out, inside jit.
+"""Draw an episode's start, goal and clutter from random keys and scene tables, inside jit.
 
 Each draw is uniform over tabulated free places and judged from a bounded number of candidates, so nothing
 retries for ever; a small object that finds no place is parked outside, and counted. Where no pair of start and goal is
-drawn at the distances that were asked for, one that is known to be takes its place.
+drawn at the required distances, a fallback pair of the scene takes its place.
 """
 
 import math
@@ -15,11 +15,11 @@ from interactive_nav.navigation.lookup import geodesic_at, goal_field
 from interactive_nav.types import EpisodeStart, SceneTables
 
 PAIR_CANDIDATES = 64
-"""Start-goal pairs tried at first; and in each round that follows, of those in a straight line as far as asked."""
+"""Start-goal pairs tried at first; and in each round that follows, of those far enough apart in a straight line."""
 WIDER_CANDIDATES = 1024
 """Pairs drawn in each round: the straight line is cheap to measure, the way round is not."""
 MAX_ROUNDS = 64
-"""Rounds that follow where no pair qualifies; without one after all, one of the scene's known pairs is taken."""
+"""Rounds that follow where no pair qualifies; without one after all, one of the scene's fallback pairs is taken."""
 DISTANCE_TOLERANCE_M = 1e-3
 """Rounding of distances that are measured again."""
 CLUTTER_CANDIDATES = 16
@@ -29,7 +29,7 @@ CLEARANCE_M = 0.02
 
 
 def _uniform_places(key: jax.Array, shape: tuple[int, ...], cells: jax.Array, count: jax.Array, side_m: float):
-    """[*shape, 2] points, uniform over the first `count` of square cells [p, 2] given by their middles."""
+    """Draw [*shape, 2] points, uniform over the first `count` of square cells [p, 2] given by their middles."""
     key_cell, key_within = jax.random.split(key)
     index = jnp.minimum((jax.random.uniform(key_cell, shape) * count).astype(jnp.int32), count - 1)
     return cells[index] + side_m * jax.random.uniform(key_within, (*shape, 2), minval=-0.5, maxval=0.5)
@@ -38,7 +38,7 @@ def _uniform_places(key: jax.Array, shape: tuple[int, ...], cells: jax.Array, co
 def miss_m(
     tables: SceneTables, scene: jax.Array, start: jax.Array, goal: jax.Array, least_m: float, largest_m: float
 ) -> jax.Array:
-    """[] m by which a start and a goal (2,) miss a least planar and a largest geodesic distance; 0: they do not."""
+    """Return [] m by which a start and a goal (2,) miss a least planar and a largest geodesic distance, or 0."""
     miss = jnp.maximum(least_m - jnp.linalg.norm(start - goal), 0.0)
     if math.isfinite(largest_m):
         way_m = geodesic_at(tables, scene, goal_field(tables, scene, goal), start)
@@ -49,7 +49,7 @@ def miss_m(
 def _draw_pair(
     key_start: jax.Array, key_goal: jax.Array, tables: SceneTables, scene: jax.Array, least_m: float, largest_m: float
 ) -> tuple[jax.Array, jax.Array]:
-    """The first of uniform pairs of start and goal that is as far apart as asked; else one of the known pairs."""
+    """Return the first of uniform pairs of start and goal that is as far apart as required; else a fallback pair."""
 
     start_places = tables.start_xy_w[scene], tables.num_starts[scene], tables.fine_m
     goal_places = tables.goal_xy_w[scene], tables.num_goals[scene], tables.fine_m
@@ -79,8 +79,8 @@ def _draw_pair(
     wider = [jax.random.fold_in(key, zlib.crc32(b"wider")) for key in (key_start, key_goal)]
     first = best(*candidates(key_start, key_goal, PAIR_CANDIDATES))
     _, (start, goal, miss) = jax.lax.while_loop(unmet, again, (jnp.zeros((), jnp.int32), first))
-    known = jax.random.choice(jax.random.fold_in(wider[0], MAX_ROUNDS), tables.known_pairs_xy_w[scene])
-    return jnp.where(miss > 0, known[0], start), jnp.where(miss > 0, known[1], goal)
+    fallback = jax.random.choice(jax.random.fold_in(wider[0], MAX_ROUNDS), tables.fallback_pairs_xy_w[scene])
+    return jnp.where(miss > 0, fallback[0], start), jnp.where(miss > 0, fallback[1], goal)
 
 
 def place_small(
@@ -91,7 +91,7 @@ def place_small(
     kept_free_w: list[jax.Array],
     robot_radius_m: float,
 ) -> tuple[jax.Array, jax.Array]:
-    """Places [k, 2] of objects of radii [k], clear of each other and of a robot at points (2,), and which have one."""
+    """Place objects of radii [k] at [k, 2], clear of each other and of a robot at points (2,); say which fit."""
     count = radius_m.shape[0]
     if not count:
         return jnp.zeros((0, 2)), jnp.zeros(0, bool)
@@ -125,10 +125,10 @@ def draw_episode(
     goal_clear: bool = True,
     random_yaw: bool = True,
 ) -> EpisodeStart:
-    """Draws scene, start, goal and small objects uniformly (paper section IV).
+    """Draw scene, start, goal and small objects uniformly (paper section IV).
 
-    Start and goal are the first of independent uniform pairs that are as far apart as asked, so uniform among
-    such pairs; in `MAX_ROUNDS` without one, it is one of `tables.known_pairs_xy_w`, of the same distances. Each
+    Start and goal are the first of independent uniform pairs that are as far apart as required, so uniform among
+    such pairs; in `MAX_ROUNDS` without one, it is one of `tables.fallback_pairs_xy_w`, of the same distances. Each
     small object lies at the first of `CLUTTER_CANDIDATES` uniform places that is clear of what lies already.
 
     Args:

@@ -120,7 +120,7 @@ def _scene_places(world: World, index: int, rules: TaskRules) -> tuple[CornerGra
     return graph, starts, goals, clutter
 
 
-def _known_pairs(world: World, tables: SceneTables, rules: TaskRules) -> np.ndarray:
+def _fallback_pairs(world: World, tables: SceneTables, rules: TaskRules) -> np.ndarray:
     """Return some starts and goals of each scene [S, PAIRS_KEPT, 2, 2] f32, at middles of cells, at valid distances."""
     least_m, largest_m = rules.min_goal_distance_m, rules.max_goal_distance_m
 
@@ -191,14 +191,14 @@ def navigation_tables(graphs: list[CornerGraph]) -> dict[str, Any]:
         missing = count + 1 - len(table)
         return np.pad(table, [(0, missing), (0, missing)], constant_values=fill)
 
-    seen = [np.where(g.seen < len(g.corner_xy_w), g.seen, count) for g in graphs]
+    visible = [np.where(g.visible < len(g.corner_xy_w), g.visible, count) for g in graphs]
     extent = max(math.hypot(*g.free.shape) * g.fine_m for g in graphs)
     corners = [np.pad(g.corner_xy_w, [(0, count + 1 - len(g.corner_xy_w)), (0, 0)]) for g in graphs]
     arrays = {
         "node_of_cell": np.int32(_pad([g.node_of_cell for g in graphs], 2)),
         "grid_origin_w": np.asarray([g.origin_w for g in graphs], np.float32),
         "node_xy_w": np.float32(_pad([g.node_xy_w for g in graphs], 1)),
-        "seen": _pad(seen, 2, fill=count).astype(index),
+        "visible": _pad(visible, 2, fill=count).astype(index),
         "corner_xy_w": np.stack(corners),
         "corner_distance_m": np.asarray([squared(g.distance_m, np.inf) for g in graphs], np.float32),
         "next_corner": np.stack([squared(g.next_corner, count) for g in graphs]).astype(index),
@@ -234,6 +234,6 @@ def build_tables(world: World, rules: TaskRules) -> SceneTables:
         num_goals=i32([len(p[2]) for p in places]),
         clutter_xy_w=f32(_pad([p[3].reshape(-1, 2) if len(p[3]) else np.zeros((1, 2)) for p in places], 1)),
         num_clutter=i32([len(p[3]) for p in places]),
-        known_pairs_xy_w=f32(np.zeros((len(places), 1, 2, 2))),
+        fallback_pairs_xy_w=f32(np.zeros((len(places), 1, 2, 2))),
     )
-    return tables.replace(known_pairs_xy_w=f32(_known_pairs(world, tables, rules)))
+    return tables.replace(fallback_pairs_xy_w=f32(_fallback_pairs(world, tables, rules)))

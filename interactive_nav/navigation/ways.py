@@ -156,7 +156,7 @@ class Ways:
         weight: 0 takes the shortest way, whatever stands in it; between 0 and 1, a metre through an object of mass m
             and friction mu costs w / (1 - w) * mu m / m_0 metres of detour, its friction's work over the robot's
             weight; 1 goes through something only where no way is free. What the robot cannot push (friction above its
-            own weight) costs as much as at 1. None: nothing is touched.
+            weight) costs as much as at 1. None: nothing is touched.
     """
 
     def __init__(self, env: Any, weight: float | None):

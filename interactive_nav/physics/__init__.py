@@ -1,4 +1,4 @@
-"""Physics backends behind one interface: `warp`, `jax` and `native`; `make_physics` picks one."""
+"""Offer physics backends behind one interface: `warp`, `jax` and `native`; `make_physics` picks one."""
 
 import functools
 import importlib.util
@@ -15,7 +15,7 @@ from interactive_nav_common.files import cache_folder
 
 
 def resolve_backend(name: str) -> str:
-    """`auto` becomes `warp` on an NVIDIA GPU with Warp installed, `native` on a CPU, `jax` elsewhere."""
+    """Resolve `auto` to `warp` on an NVIDIA GPU with Warp installed, `native` on a CPU, `jax` elsewhere."""
     has_warp = importlib.util.find_spec("warp") is not None
     if name == "auto":
         platform = jax.default_backend()
@@ -28,10 +28,10 @@ def resolve_backend(name: str) -> str:
 
 
 def keep_programs() -> None:
-    """Programs that JAX compiles for an accelerator are kept in the cache folder, and found there by later processes.
+    """Keep programs that JAX compiles for an accelerator in the cache folder, from which later processes load them.
 
-    JAX names them by what they were made of, the device and the versions. Those that call Warp name the call alone:
-    what is called each process has from its own tracing. Whoever set JAX_COMPILATION_CACHE_DIR has chosen.
+    JAX names them by their source, the device and the versions. Those that call Warp name the call alone:
+    what is called each process has from its tracing. Whoever set JAX_COMPILATION_CACHE_DIR has chosen.
     """
     chosen = "JAX_COMPILATION_CACHE_DIR" in os.environ or jax.config.jax_compilation_cache_dir
     if not chosen and jax.default_backend() != "cpu":
@@ -40,7 +40,7 @@ def keep_programs() -> None:
 
 @functools.cache
 def compiler_options() -> dict[str, Any] | None:
-    """For programs that step environments with images: on a CPU they leave out XLA's YNNPACK, with which a step takes
+    """Return options for programs that step environments with images: on a CPU without XLA's YNNPACK, whose steps take
     a sixth to a third longer (jax issue 37465; measured by `docs.studies.policies.cpu_programs`).
 
     None elsewhere, or where XLA knows no such option.
@@ -56,7 +56,7 @@ def compiler_options() -> dict[str, Any] | None:
 
 
 def make_physics(world: World, config: NavConfig) -> Physics:
-    """Builds the backend that the configuration names."""
+    """Build the backend that the configuration names."""
     physics = config.physics
     backend = resolve_backend(physics.backend)
     if physics.collision == "hulls" and backend != "native":

@@ -1,4 +1,4 @@
-"""What every physics backend offers: batched states and commands in, stepped states and contact signals out.
+"""Define what every physics backend offers: it steps batched states by commands and returns contact signals.
 
 The state that travels is small and the same on every backend (`qpos`, `qvel`, the solver's warm start),
 so resets are `jnp.where`, checkpoints are portable and nothing engine-specific leaks into the loop.
@@ -64,13 +64,13 @@ class Physics(abc.ABC):
     name: str
     nv: int
     tells_convergence = True
-    """Whether `StepSignals.unconverged` is known."""
+    """Whether `StepSignals.unconverged` is reported."""
 
     @abc.abstractmethod
     def step_batch(
         self, scene: jax.Array, state: PhysicsState, command: jax.Array, time_s: jax.Array
     ) -> tuple[PhysicsState, StepSignals]:
-        """Steps a batch by one control period.
+        """Step a batch by one control period.
 
         Args:
             scene: [N] i32 index of each environment's scene.
@@ -85,12 +85,12 @@ class Physics(abc.ABC):
     def step(
         self, scene: jax.Array, state: PhysicsState, command: jax.Array, time_s: jax.Array | float = 0.0
     ) -> tuple[PhysicsState, StepSignals]:
-        """One environment's `step_batch`; under any number of `vmap`s all environments step in one call."""
+        """Step one environment as `step_batch`; under any number of `vmap`s all environments step in one call."""
         return one_of_batch(self.step_batch, (scene, state, command, jnp.asarray(time_s, jnp.float32)))
 
 
 def uncommitted(tree: Any) -> Any:
-    """The tree with its arrays on no device in particular, as constants of a program on several must be.
+    """Return the tree with its arrays on no device in particular, as constants of a program on several must be.
 
     By `device_put`, which compiles nothing; `jnp.asarray` compiles a program for each shape.
     """
@@ -104,7 +104,7 @@ PAPER_FORCE = TaskRules()
 def summarise_forces(
     force_w: Any, xp: Any = jnp, contacts: Any = None, options: TaskRules = PAPER_FORCE
 ) -> dict[str, Any]:
-    """Contact forces of all substeps to the fields of `StepSignals` that hold forces.
+    """Return the fields of `StepSignals` that hold forces, from the contact forces of all substeps.
 
     Args:
         force_w: [..., substeps, M + 1, 3] net force on each slot, the structure last, N.

@@ -1,4 +1,4 @@
-"""Functions of whole batches, called for one element: any number of `vmap`s becomes one call with all elements."""
+"""Call functions of whole batches for one element: any number of `vmap`s becomes one call with all elements."""
 
 from collections.abc import Callable
 from typing import Any
@@ -33,7 +33,7 @@ def _many(batch: Callable[..., Any], args: tuple) -> Any:
 
 
 def one_of_batch(batch: Callable[..., Any], args: tuple) -> Any:
-    """A batch function's result for one element; vmaps of it call the batch function once, with all elements."""
+    """Return a batch function's result for one element; vmaps of it call the batch function once, with all elements."""
 
     @custom_batching.custom_vmap
     def single(*args):

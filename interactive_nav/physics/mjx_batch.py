@@ -1,4 +1,4 @@
-"""MuJoCo MJX, both of its implementations: `warp` (NVIDIA) and `jax` (any XLA device).
+"""Step with both implementations of MuJoCo MJX: `warp` (NVIDIA) and `jax` (any XLA device).
 
 Environments differ only in model fields: each fills the slots of one small model from its scene's tables
 (`window.py`). The engine's data is rebuilt from a template at every control step, so only `PhysicsState`
@@ -20,7 +20,7 @@ from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces, uncommitted
 from interactive_nav.physics.nearness import Measured
 from interactive_nav.physics.warp_callbacks import keep_collector_out
-from interactive_nav.physics.window import Window
+from interactive_nav.physics.window import PhysicsWindow
 from interactive_nav.robots.spec import RobotState
 from interactive_nav.scenes.contacts import from_sensors, part_of_contacts, rolling_geoms, sensor_addresses
 from interactive_nav.scenes.layout import Layout
@@ -39,8 +39,8 @@ CCD_PER_ENV = 32
 class MjxPhysics(Physics):
     """Steps a batch with `mjx.step` under vmap; what the two implementations do apart is theirs."""
 
-    def __init__(self, world: World, config: NavConfig, window: Window | None = None):
-        self.window = window or Window(world, config)
+    def __init__(self, world: World, config: NavConfig, window: PhysicsWindow | None = None):
+        self.window = window or PhysicsWindow(world, config)
         physics = config.physics
         self._world, self._substeps = world, physics.substeps
         self.nv = world.models[0].nv
@@ -56,15 +56,15 @@ class MjxPhysics(Physics):
 
     @abc.abstractmethod
     def _template(self, n: int) -> mjx.Data:
-        """The engine's data that each of n environments starts a control step from."""
+        """Return the engine's data that each of n environments starts a control step from."""
 
     def _placed(self, data: mjx.Data, scene: jax.Array, walls: jax.Array) -> mjx.Data:
-        """The data of one environment with its walls where they stand."""
+        """Return the data of one environment with its walls where they stand."""
         return data
 
     @abc.abstractmethod
     def _substep_all(self, model: mjx.Model, data: mjx.Data, control: Callable) -> tuple[mjx.Data, Any, jax.Array]:
-        """All substeps of a control step of one environment.
+        """Run all substeps of a control step of one environment.
 
         Returns:
             The last data; the forces [substeps, M + 1, 3] on slots and structure with what `from_sensors` gives of
@@ -107,7 +107,7 @@ class MjxPhysics(Physics):
     def step_measured(
         self, measured: Measured, scene: jax.Array, state: PhysicsState, command: jax.Array, time_s: jax.Array
     ) -> tuple[PhysicsState, StepSignals]:
-        """`step_batch` where what is near is known: leaves [N, ...]."""
+        """Step as `step_batch`, given what is near: leaves [N, ...]."""
         one = functools.partial(self._step_one, self._template(scene.shape[0]))
         new, (forces, contacts), failures, missed = jax.vmap(one)(measured, scene, state, command, time_s)
         finite = jnp.isfinite(new.qpos).all(-1) & jnp.isfinite(new.qvel).all(-1)
@@ -125,7 +125,7 @@ class WarpPhysics(MjxPhysics):
 
     name = "warp"
 
-    def __init__(self, world: World, config: NavConfig, window: Window | None = None):
+    def __init__(self, world: World, config: NavConfig, window: PhysicsWindow | None = None):
         keep_collector_out()
         super().__init__(world, config, window)
         if not (self.contacts_per_env and self.constraints_per_env):
@@ -147,7 +147,7 @@ class WarpPhysics(MjxPhysics):
 
     def _placed(self, data, scene, walls):
         # Warp computes the world poses of static geoms (walls) once, in make_data, from the one model
-        # that it is given: each environment needs its own.
+        # that it is given: each environment needs a separate one.
         xpos, xmat = self.window.static_poses(scene, walls)
         return data.replace(geom_xpos=xpos, geom_xmat=xmat)
 
@@ -170,7 +170,7 @@ class JaxPhysics(MjxPhysics):
     name = "jax"
     tells_convergence = False
 
-    def __init__(self, world: World, config: NavConfig, window: Window | None = None):
+    def __init__(self, world: World, config: NavConfig, window: PhysicsWindow | None = None):
         super().__init__(world, config, window)
         layout = self.window.layout
         self._slot_of_geom = _slot_of_geom(layout, self._host)
@@ -192,7 +192,7 @@ class JaxPhysics(MjxPhysics):
         return data, forces, jnp.asarray(0, jnp.int32)
 
     def _forces_from_contacts(self, data) -> tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array] | None]:
-        """From MJX-JAX's contacts: the net force [M + 1, 3] of the robot on each slot and the structure, world frame;
+        """Return from MJX-JAX's contacts the robot's net force [M + 1, 3] on each slot and the structure, world frame;
         and, where an option asks, what `from_sensors` gives on the other backends."""
         contact, efc = data._impl.contact, data._impl.efc_force
         out = jnp.zeros((len(self._sensors), 3))
@@ -231,7 +231,7 @@ _ROBOT = -2
 
 
 def _slot_of_geom(layout: Layout, model: mujoco.MjModel) -> np.ndarray:
-    """[ngeom] movable slot of each geom; M for the structure, `_ROBOT` for the robot, -1 for the floor."""
+    """Return the [ngeom] movable slot of each geom; M for the structure, `_ROBOT` for the robot, -1 for the floor."""
     slot_of_body = np.full(model.nbody, -1)
     slot_of_body[layout.slot_body] = np.arange(layout.num_slots)
     slot_of_body[layout.structure_body] = layout.num_slots
@@ -251,8 +251,8 @@ def _without_sensors(spec: mujoco.MjSpec) -> mujoco.MjModel:
     return spec.compile()
 
 
-def measure_buffers(world: World, window: Window, head_room: float = 1.6) -> tuple[int, int]:
-    """Contact slots and constraint rows per environment that the window needs, measured at rest.
+def measure_buffers(world: World, window: PhysicsWindow, head_room: float = 1.6) -> tuple[int, int]:
+    """Return contact slots and constraint rows per environment that the window needs, measured at rest.
 
     Everything rests, the small objects laid out on the floor; the window holds the bodies with the most
     contacts. `head_room` leaves place for a robot that pushes objects into each other. What overflows
@@ -269,9 +269,9 @@ def measure_buffers(world: World, window: Window, head_room: float = 1.6) -> tup
         per_body = np.bincount(model.geom_bodyid[data.contact.geom].ravel(), minlength=model.nbody)
         dims = int(data.contact.dim.max(initial=3))
         slots = [np.sort(per_body[world.layout.slot_body[g.slots]])[::-1][: g.width].sum() for g in window.groups]
-        own = int(sum(slots)) + int(per_body[world.layout.robot_bodies].sum())
-        contacts = max(contacts, own)
-        rows = max(rows, own * max(2 * (dims - 1), 1) + (data.nefc - data.ne - (data.efc_type >= _CONTACT).sum()))
+        in_window = int(sum(slots)) + int(per_body[world.layout.robot_bodies].sum())
+        contacts = max(contacts, in_window)
+        rows = max(rows, in_window * max(2 * (dims - 1), 1) + (data.nefc - data.ne - (data.efc_type >= _CONTACT).sum()))
     extra = 24
     contacts, rows = int(contacts * head_room) + extra, int(rows * head_room) + 4 * extra
     return contacts, -(-rows // 16) * 16

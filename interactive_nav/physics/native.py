@@ -1,4 +1,4 @@
-"""C MuJoCo on CPU threads behind `jax.pure_callback`: the default without a GPU.
+"""Step C MuJoCo on CPU threads behind `jax.pure_callback`: the default without a GPU.
 
 With sleep on, objects at rest cost nothing until touched. Which of them sleep is engine state that does
 not travel in `PhysicsState`; it is kept beside the batch as a cache, and dropped for every environment

@@ -1,4 +1,4 @@
-"""Keeps Python's garbage collector out of the calls by which JAX reaches Warp, and Warp's lines off the console.
+"""Keep Python's garbage collector out of the calls by which JAX reaches Warp, and Warp's lines off the console.
 
 Such a call captures a CUDA graph whenever XLA has moved a buffer, and runs Python for up to a second. What the
 collector finds dead meanwhile is destroyed on the device at once, and no capture survives that: a program that JAX has
@@ -34,12 +34,12 @@ mlir.register_lowering(_held, _lower_held)
 
 
 def held(x: jax.Array, owner: object) -> jax.Array:
-    """The array; the program that it is part of keeps `owner` alive, whose memory Warp reads, as long as it lives."""
+    """Return the array; its program keeps `owner` alive, whose memory Warp reads, as long as the program lives."""
     return _held.bind(x, owner=owner)
 
 
 class _Suspended:
-    """Keeps the collector off while anybody is inside, and leaves it as the first found it: devices have threads."""
+    """Keeps the collector off while anybody is inside, and leaves it as it was at first: devices have threads."""
 
     def __init__(self) -> None:
         self._lock, self._inside, self._collects = threading.Lock(), 0, False
@@ -62,7 +62,7 @@ _SUSPENDED = _Suspended()
 
 
 def quieten() -> None:
-    """Instead of Warp's line for each of its hundreds of kernels, one where none is compiled yet. Once is enough."""
+    """Replace Warp's line for each of its hundreds of kernels by one where none is compiled yet. Once is enough."""
     import warp
 
     if warp.config.log_level != warp.LOG_INFO:  # somebody chose, or it was done
@@ -75,7 +75,7 @@ def quieten() -> None:
 
 
 def keep_collector_out() -> None:
-    """Suspends the collector in every callback of Warp's that is made from now on; once is enough."""
+    """Suspend the collector in every callback of Warp's that is created from now on; once is enough."""
     from warp._src.jax.ffi import FfiCallable
 
     quieten()
@@ -86,7 +86,7 @@ def keep_collector_out() -> None:
 
 
 def without_collector(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, not interrupted by the collector, which is found as it was left."""
+    """Return the function, not interrupted by the collector, which stays as it was."""
 
     @functools.wraps(function)
     def quiet(*args: Any, **kwargs: Any) -> Any:

@@ -70,7 +70,7 @@ class _Group:
     """Field -> [m, ...] rows of the world's models."""
 
 
-class Window:
+class PhysicsWindow:
     """A small model, and the way between the world's state and it."""
 
     def __init__(self, world: World, config: NavConfig):
@@ -93,7 +93,7 @@ class Window:
         self._wall_tables = self._walls()
         self._fit({kind: min(width or there[kind], there[kind]) for kind, width in self.widths.items()}, config)
 
-    def narrower(self, widths: Mapping[str, int], config: NavConfig) -> Window:
+    def narrower(self, widths: Mapping[str, int], config: NavConfig) -> PhysicsWindow:
         """Return one with the same tables and at most these numbers of slots and walls, but one wall at least."""
         other = copy.copy(self)
         least = {**widths, "walls": max(1, widths["walls"])}

@@ -1,1 +1,1 @@
-"""What a person sees: pictures and replays of episodes."""
+"""Draw pictures and replays of episodes for people."""

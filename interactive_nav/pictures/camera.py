@@ -1,11 +1,11 @@
-"""Pictures for people: a state of one environment in, RGB, normals, depth and segmentation at any size out.
+"""Draw pictures for people of one environment's state: RGB, normals, depth and segmentation at any size.
 
-    frame = Camera(env).frame(state, 640, 480, streams=("rgb", "normals"), view="follow")
+    frame = PictureCamera(env).frame(state, 640, 480, streams=("rgb", "normals"), view="follow")
 
 Pictures show the scene's visual meshes. Depth, normals and segmentation come from C MuJoCo's rays, which run
-anywhere. RGB comes from MuJoCo's own renderer where a GL is (see `interactive_nav.pictures.gl`), or
+anywhere. RGB comes from MuJoCo's renderer where a GL is (see `interactive_nav.pictures.gl`), or
 from MJX-Warp's, both with textures; where neither is, from rays with a flat colour for each object. MJX-Warp's runs
-on a CPU too, after a compilation of ten seconds a size, so there it is used only when asked for.
+on a CPU too, after a compilation of ten seconds a size, so there it is used only on request.
 """
 
 import functools
@@ -33,14 +33,14 @@ class Painter:
     """RGB with textures of scene models, by the first engine that works here."""
 
     def __init__(self, engine: str = "auto"):
-        """Prepares nothing that is not asked for; `engine` as `Camera` has it; auto until the first picture."""
+        """Prepare nothing before it is needed; `engine` as `PictureCamera` has it; auto until the first picture."""
         if engine not in ENGINES:
             raise ConfigError(f"engine is '{engine}', expected one of {', '.join(ENGINES)}")
         self.engine = engine
         self._painters: dict[tuple, Any] = {}
 
     def draw(self, model: SceneModel, pose: CameraPose, lens: Lens, groups: Sequence[int]) -> np.ndarray | None:
-        """[H, W, 3] u8 of a model's geoms of these groups; None where rays must do."""
+        """Draw [H, W, 3] u8 of a model's geoms of these groups; None where rays must do."""
         one = CameraPose(np.asarray(pose.pos_w)[None], np.asarray(pose.axes_w)[None])
         if self.engine in ("auto", "gl"):
             key = (model, lens.width, lens.height)
@@ -65,7 +65,7 @@ class Painter:
         return None
 
     def depth(self, model: SceneModel, pose: CameraPose, lens: Lens, groups: Sequence[int]) -> np.ndarray:
-        """[H, W] depth along the axis, m, of the picture last drawn: GL looks through ceilings."""
+        """Return [H, W] depth along the axis, m, of the picture last drawn: GL looks through ceilings."""
         if self.engine != "gl":
             return trace(model.model, model.data, pose, lens, groups)[2]
         one = CameraPose(np.asarray(pose.pos_w)[None], np.asarray(pose.axes_w)[None])
@@ -73,24 +73,24 @@ class Painter:
 
 
 def clear_way(model: SceneModel, target_w: np.ndarray, back_w: np.ndarray, groups: Sequence[int] = SCENE) -> float:
-    """Share of the way from a target (3,) along (3,), both m, at which a camera stands in front of what is behind."""
+    """Return the share of the way from a target (3,) along (3,), both m, at which a camera clears what is behind."""
     reach = np.linalg.norm(back_w)
     hit = cast(model.model, model.data, target_w, back_w[None] / reach, groups)[1][0] / reach
     return min(1.0, 0.9 * hit) if hit > 0 else 1.0
 
 
 def straight_down(low_w: np.ndarray, high_w: np.ndarray, aspect: float, fov_deg: float) -> CameraPose:
-    """A camera, x to the right and y up, that sees the floor between two corners (2,), m, and the walls around it."""
+    """Return a camera, x to the right and y up, over the floor between two corners (2,), m, and its walls."""
     size, centre = np.subtract(high_w, low_w), np.add(high_w, low_w) / 2
     above = max(size[1], size[0] / aspect) / 2 / math.tan(math.radians(fov_deg / 2)) + 2.5
     return CameraPose(np.array([*centre, above]), np.array([[0, 1, 0], [0, 0, 1], [-1, 0, 0]], float))
 
 
-class Camera:
+class PictureCamera:
     """Takes pictures of one environment."""
 
     def __init__(self, env: Any, engine: str = "auto", fov_deg: float | None = None):
-        """Prepares nothing that is not asked for.
+        """Prepare nothing before it is needed.
 
         Args:
             fov_deg: vertical field of view of the robot's camera; None: that of its observations.
@@ -103,7 +103,7 @@ class Camera:
 
     @property
     def engine(self) -> str:
-        """Who draws RGB; auto until the first picture."""
+        """Return who draws RGB; auto until the first picture."""
         return self._painter.engine
 
     def frame(
@@ -114,7 +114,7 @@ class Camera:
         streams: tuple[str, ...] = ("rgb",),
         view: str = "robot",
     ) -> dict[str, np.ndarray]:
-        """Pictures of where a state is now.
+        """Draw pictures of where a state is now.
 
         Args:
             width: pixels.
@@ -151,7 +151,7 @@ class Camera:
         return {name: out[name] for name in streams}
 
     def _pose(self, model: SceneModel, qpos: np.ndarray, scene: int, view: str, aspect: float):
-        """Where the camera of a view is, and its field of view in degrees."""
+        """Return where the camera of a view is, and its field of view in degrees."""
         env = self._env
         if view == "robot":
             pose = env.sensors.mount.pose(np.asarray(qpos, np.float32))
@@ -177,7 +177,7 @@ def _by_rays(
     out: dict[str, np.ndarray] = {"depth": np.where(met, depth, 0.0).astype(np.float32)}
     out["segmentation"] = np.where(met, model.class_id[geom], 0).astype(np.uint8)
     if streams & {"normals", "rgb"}:
-        # Meshes may be seen from behind: normals are turned to the viewer.
+        # Meshes may be visible from behind: normals are turned to the viewer.
         faces = np.where(((faces * ray).sum(-1) > 0)[..., None], -faces, faces) * met[..., None]
         forward, right_w, up_w = pose.axes_w.T
         out["normals"] = np.stack([faces @ right_w, faces @ up_w, -(faces @ forward)], -1).astype(np.float32)

@@ -1,7 +1,7 @@
-"""MuJoCo's own renderer, offscreen: camera poses in, pictures out.
+"""Draw pictures from camera poses with MuJoCo's renderer, offscreen.
 
 `mujoco.Renderer` reads MUJOCO_GL when mujoco is imported, and without it and without a display it looks for a window
-system and fails. Here the library is chosen when the first picture is asked for: MUJOCO_GL where it is set, else EGL
+system and fails. Here the library is chosen when the first picture is requested: MUJOCO_GL where it is set, else EGL
 where there is no display.
 """
 
@@ -27,10 +27,10 @@ SKY = tuple(round(255 * c) for c in SKY_COLOUR)
 
 
 class GlPainter:
-    """Draws one model, one camera after the other; it must stay in the thread that made it."""
+    """Draws one model, one camera after the other; it must stay in the thread that created it."""
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int, sky: tuple[int, ...] | None = SKY):
-        """Makes a context.
+        """Create a context.
 
         Args:
             width: of the pictures, pixels.
@@ -64,7 +64,7 @@ class GlPainter:
     def draw(
         self, data: mujoco.MjData, pose: CameraPose, fov_deg: float, groups: Sequence[int], depth: bool = False
     ) -> np.ndarray:
-        """Pictures of cameras.
+        """Draw pictures of cameras.
 
         Args:
             pose: of N cameras without roll, leaves [N, ...].
@@ -109,7 +109,7 @@ def _free_camera(pos_w: np.ndarray, forward: np.ndarray, up: np.ndarray) -> mujo
 
 
 def _context_class() -> Any:
-    asked = os.environ.get("MUJOCO_GL", "").lower().strip()
-    if asked not in LIBRARIES:
-        asked = "glfw" if os.environ.get("DISPLAY") else "egl"
-    return importlib.import_module(f"mujoco.{asked}").GLContext
+    library = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if library not in LIBRARIES:
+        library = "glfw" if os.environ.get("DISPLAY") else "egl"
+    return importlib.import_module(f"mujoco.{library}").GLContext

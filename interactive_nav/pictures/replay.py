@@ -1,4 +1,4 @@
-"""One episode, step by step: an environment and a policy in, a `Replay` of world poses out, and its file.
+"""Play an episode step by step into a `Replay` of world poses, and keep it in a file.
 
 A replay names bodies and holds their poses in the world frame, so that it can be drawn from the scene folder
 alone: without the policy, the physics, or the other scenes of the environment that it was played in.
@@ -84,22 +84,22 @@ class Replay:
     """As in `NavConfig`."""
     success_distance_m: float | None = None
     image_fov_deg: float | None = None
-    """Vertical, of the robot's camera as the episode had it; None: the robot's own."""
-    """Of the goal; None, in older files: not known, taken for the robot's width."""
+    """Vertical, of the robot's camera as the episode had it; None: the robot's."""
+    """Of the goal; None, in older files: unknown, taken for the robot's width."""
 
     @property
     def small(self) -> tuple[SmallObject, ...]:
-        """The small objects."""
+        """Return the small objects."""
         return small_objects(self.num_objects, self.small_objects, self.objects)
 
     @property
     def num_steps(self) -> int:
-        """T."""
+        """Return T."""
         return len(self.action)
 
     @property
     def robot_xy_w(self) -> np.ndarray:
-        """[T + 1, 2] path of the robot's base, m."""
+        """Return the [T + 1, 2] path of the robot's base, m."""
         return self.body_pos_w[:, 0, :2]
 
 
@@ -177,19 +177,19 @@ def _replay_of(player: EpisodePlayer, episode: int, first: Any, values: dict[str
 
 
 def replay_path(run: Path, policy: str, episode: int) -> Path:
-    """Where a run keeps a replay."""
+    """Return where a run keeps a replay."""
     return run / "replays" / f"{policy}-episode{episode}.npz"
 
 
-def save(replay: Replay, path: str | Path) -> None:
-    """Writes a replay as npz, whole or not at all."""
+def save_replay(replay: Replay, path: str | Path) -> None:
+    """Write a replay as npz, whole or not at all."""
     fields = {f.name: getattr(replay, f.name) for f in dataclasses.fields(Replay)}
     header = {name: value for name, value in fields.items() if name not in _ARRAYS} | {"format": FORMAT}
     write_arrays(path, header=np.array(json.dumps(header)), **{name: fields[name] for name in _ARRAYS})
 
 
-def load(path: str | Path) -> Replay:
-    """Reads a replay."""
+def load_replay(path: str | Path) -> Replay:
+    """Read a replay."""
     path = Path(path)
     if not path.is_file():
         raise ReplayError(f"{path}: no such file, expected a replay (npz)")

@@ -55,22 +55,22 @@ def picture_spec(
     small: Sequence[SmallObject] = (),
     classes: MaskClasses | None = None,
 ) -> mujoco.MjSpec:
-    """Return `furnished_spec` in the groups of pictures, lit by its own lamps or one, with a camera named `view`.
+    """Return `furnished_spec` in the groups of pictures, lit by its lamps or one, with a camera named `view`.
 
     Visual meshes are drawn, and the boxes of bodies that have none. `classes` is the setting `segmentation_classes` by
     which boxes are coloured; None leaves their colours as they are stored.
     """
     spec = furnished_spec(scene, robot, small, cut_walls=robot is not None)
-    own = {b.name for b in spec.body(robot.base_body).find_all("body")} | {robot.base_body} if robot else set()
+    robot_bodies = {b.name for b in spec.body(robot.base_body).find_all("body")} | {robot.base_body} if robot else set()
     movable = bodies_by_name(scene, small)
     with_mesh = {g.parent.name for g in spec.geoms if g.group == VISUAL_GROUP}
-    visible_robot = bool(own & with_mesh)
+    visible_robot = bool(robot_bodies & with_mesh)
     for geom in list(spec.geoms):
         name = geom.parent.name
         if name == "cut_walls":
             continue
         plane, box = geom.type == mujoco.mjtGeom.mjGEOM_PLANE, geom.type == mujoco.mjtGeom.mjGEOM_BOX
-        if name in own:
+        if name in robot_bodies:
             geom.group = ROBOT_SOLIDS if visible_robot and geom.group != VISUAL_GROUP else ROBOT
             continue
         bare = box and name not in with_mesh
@@ -113,7 +113,7 @@ class SceneModel:
         mine, rest = ((class_id(kind, classes), kind) for kind in ("robot", "structure"))
         robots = np.isin(self.model.geom_group, (ROBOT, ROBOT_SOLIDS))
         names = [self.model.body(int(body)).name for body in self.model.geom_bodyid]
-        of_geom = [mine if own else rows.get(name, rest) for own, name in zip(robots, names, strict=True)]
+        of_geom = [mine if is_robot else rows.get(name, rest) for is_robot, name in zip(robots, names, strict=True)]
         self.class_id = np.array([number for number, _ in of_geom], np.uint8)
         """[ngeom] segmentation ids."""
         self.category = [category for _, category in of_geom]
@@ -143,8 +143,8 @@ class SceneModel:
             axes = rotation.reshape(3, 3)
             data.xipos[body] = pos + axes @ model.body_ipos[body]
             data.ximat[body] = (axes @ self._inertial_axes_b[body]).ravel()
-            own, geom_pos, geom_axes = carried_geoms(model, body, np.asarray(pos)[None], axes[None])
-            data.geom_xpos[own], data.geom_xmat[own] = geom_pos[0], geom_axes[0].reshape(-1, 9)
+            geoms, geom_pos, geom_axes = carried_geoms(model, body, np.asarray(pos)[None], axes[None])
+            data.geom_xpos[geoms], data.geom_xmat[geoms] = geom_pos[0], geom_axes[0].reshape(-1, 9)
 
 
 def carried_geoms(
@@ -154,10 +154,10 @@ def carried_geoms(
 
     The body is at `pos_w` [N, 3], m, with `axes_w` [N, 3, 3] as columns.
     """
-    own = slice(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
+    geoms = slice(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
     axes_w = axes_w[:, None]
-    pos = pos_w[:, None] + (axes_w @ model.geom_pos[own, :, None])[..., 0]
-    return own, pos, axes_w @ matrix_from_quat(model.geom_quat[own])
+    pos = pos_w[:, None] + (axes_w @ model.geom_pos[geoms, :, None])[..., 0]
+    return geoms, pos, axes_w @ matrix_from_quat(model.geom_quat[geoms])
 
 
 def cast(

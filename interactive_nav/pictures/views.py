@@ -1,4 +1,4 @@
-"""Pictures for people: a scene and body poses in, shaded colour, depth and class images out, without OpenGL.
+"""Draw pictures of a scene for people from body poses: shaded colour, depth and class images, without OpenGL.
 
 Everything is cast with MuJoCo's rays from the scene's visual meshes, so pictures are the same on a laptop, a
 cluster node without a display and in the tests. Walls are cut low where one looks in from outside.
@@ -70,19 +70,19 @@ class SceneView(SceneModel):
     """One scene with a robot and small objects, whose bodies are put where a caller wants them, to be looked at."""
 
     def __init__(self, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject], classes: MaskClasses = 4):
-        """Compiles the model to look at; see `SceneModel`."""
+        """Compile the model to look at; see `SceneModel`."""
         super().__init__(robot, scene, small, classes)
         self._painter = Painter()
         self._floor = self.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         self._colour = np.array([COLOURS[category] for category in self.category])
-        # Things of one kind differ a little, so that two chairs can be told apart.
+        # Objects of one kind differ a little, so that two chairs can be distinguished.
         for g in np.flatnonzero((self.model.geom_group == THINGS) & ~self._floor):
             self._colour[g] = _varied(self._colour[g], int(self.model.geom_bodyid[g]))
 
-    def look(
+    def render(
         self, pose: CameraPose, lens: Lens, groups: tuple[int, ...] = OUTSIDE, paint: FloorPaint | None = None
     ) -> Image:
-        """Renders.
+        """Render an image.
 
         Args:
             pose: of the camera.
@@ -111,10 +111,10 @@ class SceneView(SceneModel):
     def textured(
         self, pose: CameraPose, lens: Lens, groups: Sequence[int], paint: FloorPaint | None = None
     ) -> np.ndarray:
-        """[rows, columns, 3] u8 with textures; words as `look`'s, whose colours it has where no engine draws them."""
+        """Render [rows, columns, 3] u8 with textures, or as `render` colours it where no engine draws them."""
         drawn = self._painter.draw(self, pose, lens, groups)
         if drawn is None:
-            return self.look(pose, lens, tuple(groups), paint).colour
+            return self.render(pose, lens, tuple(groups), paint).colour
         depth_m = self._painter.depth(self, pose, lens, groups)
         points, colour = pose.pos_w + lens.rays(pose) * depth_m[..., None], drawn / 255
         floor = np.abs(points[..., 2]) < ON_FLOOR_M
@@ -122,7 +122,7 @@ class SceneView(SceneModel):
         return (colour * 255 + 0.5).astype(np.uint8)
 
     def _light(self, points: np.ndarray, normal: np.ndarray, groups: tuple[int, ...]) -> np.ndarray:
-        """[n] brightness: light of the sky, and a lamp high above the middle of the view that casts shadows."""
+        """Return [n] brightness: light of the sky, and a lamp high above the middle of the view that casts shadows."""
         lamp = points[:, :2].mean(0) if len(points) else np.zeros(2)
         lamp = np.array([lamp[0] - 2.0, lamp[1] - 3.0, 9.0])
         ray = points - lamp
@@ -136,7 +136,7 @@ class SceneView(SceneModel):
 
 
 def robot_camera(view: SceneView, rows: int, columns: int, fov_deg: float | None = None) -> tuple[CameraPose, Lens]:
-    """The robot's own camera, at the pose that its body has been placed at; `fov_deg` for another field of view."""
+    """Return the robot's camera, at the pose that its body has been placed at; `fov_deg` for another field of view."""
     mount = view.robot.camera
     body = mujoco.mj_name2id(view.model, mujoco.mjtObj.mjOBJ_BODY, mount.body)
     axes = view.data.xmat[body].reshape(3, 3)
@@ -148,7 +148,7 @@ def robot_camera(view: SceneView, rows: int, columns: int, fov_deg: float | None
 def chase_camera(
     robot_pos_w: np.ndarray, yaw_rad: float, rows: int, columns: int, distance_m: float = 3.6
 ) -> tuple[CameraPose, Lens]:
-    """A camera behind and above the robot, 40 degrees down."""
+    """Return a camera behind and above the robot, 40 degrees down."""
     pitch = math.radians(40)
     ahead = np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0])
     forward = math.cos(pitch) * ahead - np.array([0.0, 0.0, math.sin(pitch)])
@@ -167,10 +167,10 @@ class ThirdPerson:
         )
 
     def frames(self, state: Any) -> tuple[np.ndarray, ...]:
-        """[rows, columns, 3] u8 of each environment of a batch, or of one that is alone."""
+        """Draw [rows, columns, 3] u8 of each environment of a batch, or of one that is alone."""
         nav, qpos = state.info["nav"], np.asarray(state.pipeline_state.qpos)
-        told = np.asarray(nav.scene_index).reshape(-1), np.asarray(nav.goal_xy_w).reshape(-1, 2)
-        each = zip(told[0], qpos.reshape(-1, qpos.shape[-1]), told[1], strict=True)
+        which = np.asarray(nav.scene_index).reshape(-1), np.asarray(nav.goal_xy_w).reshape(-1, 2)
+        each = zip(which[0], qpos.reshape(-1, qpos.shape[-1]), which[1], strict=True)
         return tuple(self._frame(int(scene), *row) for scene, *row in each)
 
     def _frame(self, scene: int, qpos: np.ndarray, goal_xy_w: np.ndarray) -> np.ndarray:
@@ -186,13 +186,13 @@ class ThirdPerson:
 
 
 def depth_picture(depth_m: np.ndarray, far_m: float = 5.0) -> np.ndarray:
-    """[rows, columns] depth to [rows, columns, 3] u8: near bright, far and nothing black."""
+    """Convert [rows, columns] depth to [rows, columns, 3] u8: near bright, far and nothing black."""
     near = 1.0 - np.clip(np.nan_to_num(depth_m, posinf=far_m) / far_m, 0.0, 1.0)
     return np.repeat((255 * near**2).astype(np.uint8)[..., None], 3, -1)
 
 
 def mask_picture(mask: np.ndarray, classes: MaskClasses = 4) -> np.ndarray:
-    """[rows, columns] ids to [rows, columns, 3] u8 in the classes' colours; nothing is black."""
+    """Convert [rows, columns] ids to [rows, columns, 3] u8 in the classes' colours; nothing is black."""
     table, colours = np.zeros((256, 3), np.uint8), np.array(SEGMENTATIONS[classes].colours)
     table[: len(colours)] = colours * 255
     return table[mask]

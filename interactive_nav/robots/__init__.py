@@ -1,14 +1,14 @@
-"""Robots by name: each a typed spec (mass, width, action map, camera) and an MJCF builder."""
+"""Get robots by name: each is a typed spec (mass, width, action map, camera) and an MJCF builder."""
 
 from collections.abc import Callable
 
+from interactive_nav.robots.factory import from_file
 from interactive_nav.robots.models.ant import ant
 from interactive_nav.robots.models.humanoid import humanoid
 from interactive_nav.robots.models.minitaur import minitaur
 from interactive_nav.robots.models.quadrotor import quadrotor
 from interactive_nav.robots.models.wheeled import WHEELED
-from interactive_nav.robots.own import from_file
-from interactive_nav.robots.reference import A_FILE, is_reference, load
+from interactive_nav.robots.reference import A_FILE, is_reference, load_reference
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError
@@ -24,7 +24,7 @@ _FACTORIES: dict[str, Callable[[str], RobotSpec]] = {
 
 
 def robot_names() -> tuple[str, ...]:
-    """Names that `get_robot` answers."""
+    """Return the names that `get_robot` accepts."""
     return tuple(sorted(_FACTORIES))
 
 
@@ -36,15 +36,15 @@ def get_robot(name: str, control_mode: str = "native") -> RobotSpec:
         control_mode: one of the robot's `control_modes`; `native` is the original benchmark's action.
 
     Raises:
-        ConfigError: unknown name or mode (the message lists the known ones), or an unusable file.
+        ConfigError: unknown name or mode (the message lists the available ones), or an unusable file.
     """
     factory = _FACTORIES.get(str(name))
     if factory is None and is_reference(str(name)):
-        factory = load(str(name), _FACTORIES)
+        factory = load_reference(str(name), _FACTORIES)
     if factory is None:
         near = nearest(str(name), list(_FACTORIES))
-        known = ", ".join(robot_names())
-        raise ConfigError(f"unknown robot '{name}'{near}; known robots: {known}; or {A_FILE}")
+        names = ", ".join(robot_names())
+        raise ConfigError(f"unknown robot '{name}'{near}; known robots: {names}; or {A_FILE}")
     return factory(control_mode)
 
 
@@ -54,11 +54,11 @@ def robot_name(robot: str) -> str:
 
 
 def register(name: str, factory: Callable[[str], RobotSpec]) -> None:
-    """Make a robot of the user's own known to `make`, for this process.
+    """Register a user's robot for `make`, in this process.
 
     Args:
         name: what `make` and `get_robot` call it; must be new.
-        factory: control mode -> spec; the mode `native` must exist. `from_file` makes one.
+        factory: control mode -> spec; the mode `native` must exist. `from_file` returns one.
 
     Raises:
         ConfigError: a name that is taken, or a factory whose spec has another name.

@@ -1,4 +1,4 @@
-"""`python -m interactive_nav.robots`: the table of robots.
+"""Run `python -m interactive_nav.robots`: print the table of robots.
 
 Exit status: 0; 2 for a question that cannot be answered, with one line that says why.
 """
@@ -20,7 +20,7 @@ def _names(text: str | None) -> tuple[str, ...]:
 
 
 def _unit(label: str) -> str:
-    """The unit at the end of an action's name."""
+    """Return the unit at the end of an action's name."""
     return "N m" if label.endswith(" N m") else label.rsplit(" ", 1)[-1]
 
 
@@ -49,7 +49,7 @@ def _print_table(names: tuple[str, ...], console: Console) -> None:
 
 @reports_errors("interactive_nav.robots")
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; returns its exit status."""
+    """Run the command; return its exit status."""
     args = program(Path(__file__).parents[1] / "words.yaml", "robots").parse_args(argv)
     console = SafeConsole(width=None if sys.stdout.isatty() else 220)
     _print_table((*_names(args.robots or ("" if args.files else "all")), *args.files), console)

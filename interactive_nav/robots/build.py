@@ -1,4 +1,4 @@
-"""A robot's MJCF file and a table of its driven joints in, one `RobotSpec` per control mode out.
+"""Build one `RobotSpec` per control mode from a robot's MJCF file and a table of its driven joints.
 
 Files are written without the robot's name in front of theirs; the loader adds it (`wheel_left` becomes
 `fetch_wheel_left`) and attaches the file to the world. Collision geoms are in group 3. A group-3 geom
@@ -47,7 +47,7 @@ class Joint:
 
     @property
     def label(self) -> str:
-        """Its name in words."""
+        """Return its name in words."""
         return self.name.replace("_", " ")
 
 
@@ -75,11 +75,11 @@ class WheeledBase:
     gripper: tuple[str, ...] = ()
     """Finger joints that mode `whole_body` opens and closes together, by position."""
     path: Path | None = None
-    """MJCF or URDF; none: our own file of the robot's name."""
+    """MJCF or URDF; none: the builtin file of the robot's name."""
 
     @property
     def modes(self) -> tuple[str, ...]:
-        """Control modes, `native` first."""
+        """Return the control modes, `native` first."""
         whole = ("whole_body",) if self.whole_body else ()
         return ("native", *whole, "twist", "velocity", "position", "torque")
 
@@ -102,7 +102,7 @@ class _Limits:
 
 
 def attach(world: mujoco.MjSpec, child: mujoco.MjSpec, prefix: str) -> None:
-    """Attaches a robot to a world, its names prefixed, and pairs its rolling geoms with the floor."""
+    """Attach a robot to a world, its names prefixed, and pairs its rolling geoms with the floor."""
     rolling = [
         (g.name, list(g.friction), int(g.condim))
         for g in child.geoms
@@ -123,7 +123,7 @@ def attach(world: mujoco.MjSpec, child: mujoco.MjSpec, prefix: str) -> None:
 
 
 def stand(robot: RobotSpec, world: mujoco.MjSpec) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """The robot alone in a world, on the floor in its home pose; its frames are computed."""
+    """Return the robot alone in a world, on the floor in its home pose, with its frames computed."""
     world.compiler.degree = False
     robot.add_to(world)
     model = world.compile()
@@ -137,21 +137,21 @@ def stand(robot: RobotSpec, world: mujoco.MjSpec) -> tuple[mujoco.MjModel, mujoc
 
 
 def half_extents(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """(3,) half sizes of a box about the geom's origin that holds it, in its own frame, m."""
+    """Return (3,) half sizes of a box about the geom's origin that holds it, in its frame, m."""
     return np.abs(model.geom_aabb[geom, :3]) + model.geom_aabb[geom, 3:]
 
 
 def _limits(child: mujoco.MjSpec, joint: Joint) -> _Limits:
-    own = child.joint(joint.name)
-    low, high = (float(v) for v in own.range)
-    effort = float(own.actfrcrange[1])
+    driven = child.joint(joint.name)
+    low, high = (float(v) for v in driven.range)
+    effort = float(driven.actfrcrange[1])
     if not effort > 0:
         raise ConfigError(f"joint '{joint.name}' has no torque limit (actuatorfrcrange), expected a positive one")
     return _Limits((low, high) if low < high else None, effort)
 
 
 def _set_mode(actuator: Any, mode: str, joint: Joint, limits: _Limits, low_high: tuple[float, float] | None) -> None:
-    """Makes an actuator a position servo, velocity servo or motor; the file has its native one."""
+    """Turn an actuator into a position servo, velocity servo or motor; the file has its native one."""
     stiff, damp = float(actuator.gainprm[0]), -float(actuator.biasprm[2])
     if joint.side:
         stiff = _WHEEL_STIFFNESS * damp
@@ -164,7 +164,7 @@ def _set_mode(actuator: Any, mode: str, joint: Joint, limits: _Limits, low_high:
 def _affine_law(
     matrix: np.ndarray, offset: np.ndarray, relative: np.ndarray, address: np.ndarray, yaw_gain: float
 ) -> ControlLaw:
-    """controls = matrix @ command + offset, plus the joint's position where the command is an advance.
+    """Return the law controls = matrix @ command + offset, plus the joint's position where the command is an advance.
 
     With a yaw gain the command is a twist, whose turn is raised by the gain times its error.
     """
@@ -272,7 +272,7 @@ class _Mode:
         return _affine_law(matrix, offset, relative, self.qpos_address, gain)
 
     qpos_address: np.ndarray = np.zeros(0, np.int64)
-    """[joints] addresses among the robot's own qpos."""
+    """[joints] addresses among the robot's qpos."""
 
     def set_servos(self, child: mujoco.MjSpec) -> None:
         bounds: dict[int, tuple[float, float]] = {}
@@ -288,7 +288,7 @@ class _Mode:
 
 
 def _load(base: WheeledBase, base_body: str, prepare: Callable[[mujoco.MjSpec], None] | None) -> mujoco.MjSpec:
-    """The robot's file, parsed and prepared; it has a joint and an actuator of each driven joint's name."""
+    """Return the robot's file, parsed and prepared; it has a joint and an actuator of each driven joint's name."""
     path = base.path or FOLDER / f"{base.name}.xml"
     child = read_file(path, base_body)
     if prepare is not None:
@@ -317,7 +317,7 @@ def wheeled_robot(
     rolling: tuple[str, ...] = (),
     **figures: Any,
 ) -> RobotSpec:
-    """The spec of a wheeled robot in a control mode.
+    """Return the spec of a wheeled robot in a control mode.
 
     Args:
         base_body: the file's body with the free joint.
@@ -331,9 +331,9 @@ def wheeled_robot(
     free = next(j.name for j in child.body(base_body).joints)
 
     def add_to(world: mujoco.MjSpec) -> None:
-        own = _load(base, base_body, prepare)
-        mode.set_servos(own)
-        attach(world, own, prefix)
+        robot = _load(base, base_body, prepare)
+        mode.set_servos(robot)
+        attach(world, robot, prefix)
 
     wheels = rolling or tuple(child.joint(j.name).parent.name for j in base.joints if j.side)
     return RobotSpec(

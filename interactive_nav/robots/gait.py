@@ -1,4 +1,4 @@
-"""A row of `models/legged.yaml` and a gait in, one `RobotSpec` per control mode out; bodies: `mjcf/<robot>.xml`.
+"""Build one `RobotSpec` per control mode from a row of `models/legged.yaml`, a gait and `mjcf/<robot>.xml`.
 
 A gait is a pure function of the twist command, the robot's state and the clock, run at every physics step: its
 targets are `home + reference(phase, command, base)`, a scripted stepping motion.
@@ -55,7 +55,7 @@ class BaseMotion(NamedTuple):
 
 
 def base_motion(state: RobotState, xp: Any) -> BaseMotion:
-    """The base's lean and velocity in its heading frame."""
+    """Return the base's lean and velocity in its heading frame."""
     quat = state.qpos[..., 3:7]
     w, x, y, z = (quat[..., k] for k in range(4))
     up_x, up_y, up_z = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
@@ -97,7 +97,7 @@ class Legged:
     """(phase [...], command [..., 2], base, numpy or jax.numpy) -> target offsets from home [..., J], rad."""
 
     def body(self) -> mujoco.MjSpec:
-        """The robot's file, parsed."""
+        """Return the robot's file, parsed."""
         return read_file(FOLDER / f"{self.name}.xml")
 
     @functools.cached_property
@@ -107,12 +107,12 @@ class Legged:
 
     @property
     def ranges(self) -> tuple[tuple[float, float], ...]:
-        """[J] least and largest target, rad."""
+        """Return [J] least and largest target, rad."""
         return tuple((float(joint.range[0]), float(joint.range[1])) for joint in self._joints_of_file)
 
     @property
     def torque_nm(self) -> tuple[float, ...]:
-        """[J]"""
+        """Return [J] torque limits."""
         return tuple(float(joint.actfrcrange[1]) for joint in self._joints_of_file)
 
 
@@ -124,18 +124,18 @@ class Row(Figures):
     spawn_height_m: float
     contact_time_constant_s: float | None = None
     gait: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
-    """Figures of its gait when it is told to go, and when told to stand; the other robots' stand with their gaits."""
+    """Figures of its gait when it is commanded to go, and to stand; the other robots' stand with their gaits."""
 
 
 @functools.cache
 def legged_row(name: str) -> Row:
-    """A legged robot's row."""
+    """Return a legged robot's row."""
     rows = read_packaged(FOLDER.parent / "models" / "legged.yaml", tuple[Row, ...])
     return next(row for row in rows if row.legs.name == name)
 
 
 def gait_law(legs: Legged) -> ControlLaw:
-    """Twist to joint targets [..., J], rad, within the joints' ranges."""
+    """Return the law from a twist to joint targets [..., J], rad, within the joints' ranges."""
 
     def law(command, state, xp):
         assert legs.reference is not None
@@ -149,7 +149,7 @@ def gait_law(legs: Legged) -> ControlLaw:
 
 
 def _command_range(legs: Legged, mode: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Commands at action -1 and +1: positions of the joints, or what is symmetric: action 0 stands."""
+    """Return commands at action -1 and +1: positions of the joints, or what is symmetric: action 0 stands."""
     if mode == "position":
         return tuple(low for low, _ in legs.ranges), tuple(high for _, high in legs.ranges)
     most = legs.torque_nm
@@ -161,7 +161,7 @@ def _command_range(legs: Legged, mode: str) -> tuple[tuple[float, ...], tuple[fl
 
 
 def _action_names(legs: Legged, mode: str) -> tuple[str, ...]:
-    """With units."""
+    """Return the actions' names with their units."""
     if mode == "twist":
         return ("forward m/s", "turn rad/s")
     unit = {"position": "rad", "velocity": "rad/s"}.get(mode, "N m")
@@ -169,7 +169,7 @@ def _action_names(legs: Legged, mode: str) -> tuple[str, ...]:
 
 
 def _add_to(legs: Legged, mode: str, world: mujoco.MjSpec) -> None:
-    """Attaches the robot to a world, with one actuator per joint: torque, velocity, or position otherwise."""
+    """Attach the robot to a world, with one actuator per joint: torque, velocity, or position otherwise."""
     world.worldbody.add_frame().attach_body(legs.body().worldbody.first_body(), f"{legs.name}_", "")
     servo = legs.servo
     for joint, torque, limits in zip(legs.joints, legs.torque_nm, legs.ranges, strict=True):
@@ -179,7 +179,7 @@ def _add_to(legs: Legged, mode: str, world: mujoco.MjSpec) -> None:
 
 
 def legged_robot(legs: Legged, control_mode: str = "native", **figures: Any) -> RobotSpec:
-    """The spec of a legged robot in a control mode.
+    """Return the spec of a legged robot in a control mode.
 
     Args:
         control_mode: one of `legs.modes`; `native` is `legs.native` of each joint, `twist` the base's linear and

@@ -1,4 +1,4 @@
-"""Settings of `from_file` for a bare URDF or MJCF file: those in the YAML file beside it, and what the file shows."""
+"""Infer settings of `from_file` for a bare URDF or MJCF file from the YAML file beside it and from the file itself."""
 
 import dataclasses
 import re
@@ -11,9 +11,9 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
+from interactive_nav.robots.factory import from_file
 from interactive_nav.robots.files import compiled, read_file, warn
 from interactive_nav.robots.joints import FLOOR_M
-from interactive_nav.robots.own import from_file
 from interactive_nav.robots.repair import slip_torque_n_m, strip
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav_common.errors import ConfigError
@@ -116,7 +116,7 @@ def _on_floor(spec: mujoco.MjSpec, model: mujoco.MjModel, base: str) -> list[_Ro
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     kinds = [int(k) for k in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CYLINDER)]
-    found: list[tuple[float, _Round]] = []
+    links: list[tuple[float, _Round]] = []
     for body in range(1, model.nbody):
         geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body and model.geom_group[g] == 3]
         if len(geoms) != 1 or model.geom_type[geoms[0]] not in kinds or model.body(body).name == base:
@@ -129,6 +129,6 @@ def _on_floor(spec: mujoco.MjSpec, model: mujoco.MjModel, base: str) -> list[_Ro
             if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE and abs(data.xaxis[j, 1]) > 0.95:
                 joint, effort = model.joint(j).name, float(spec.joint(model.joint(j).name).actfrcrange[1])
         sphere = model.geom_type[geoms[0]] == kinds[0]
-        found.append((z - radius, _Round(model.body(body).name, joint, x, y, radius, sphere, effort)))
-    floor = min((low for low, link in found if link.joint), default=-np.inf)
-    return [link for low, link in found if abs(low - floor) < FLOOR_M]
+        links.append((z - radius, _Round(model.body(body).name, joint, x, y, radius, sphere, effort)))
+    floor = min((low for low, link in links if link.joint), default=-np.inf)
+    return [link for low, link in links if abs(low - floor) < FLOOR_M]

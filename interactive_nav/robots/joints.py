@@ -1,4 +1,4 @@
-"""The joints of a user's robot: wheels turn without limits, driven joints get servos, the others are held."""
+"""Prepare the joints of a user's robot: wheels turn without limits, driven joints get servos, the others are held."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -56,11 +56,11 @@ def hold(
     hinge, free = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
     loose = [j for j in child.joints if j.type != free and j.name not in driven]
     for joint in loose:
-        own = model.joint(joint.name)
+        loose_joint = model.joint(joint.name)
         if joint.name in home:
-            data.qpos[own.qposadr[0]] = home[joint.name]
-        elif model.jnt_limited[own.id]:
-            data.qpos[own.qposadr[0]] = np.clip(data.qpos[own.qposadr[0]], *own.range)
+            data.qpos[loose_joint.qposadr[0]] = home[joint.name]
+        elif model.jnt_limited[loose_joint.id]:
+            data.qpos[loose_joint.qposadr[0]] = np.clip(data.qpos[loose_joint.qposadr[0]], *loose_joint.range)
     mujoco.mj_kinematics(model, data)
     parents = model.body_parentid
     held, swinging = [], []
@@ -91,14 +91,14 @@ def hold(
 
 def add_servo(child: mujoco.MjSpec, path: Path, joint: Joint) -> None:
     """Add the joint's native actuator; gains from its torque limit and speed."""
-    own = child.joint(joint.name)
-    effort = float(own.actfrcrange[1])
+    driven = child.joint(joint.name)
+    effort = float(driven.actfrcrange[1])
     if not effort > 0:
         raise FileError(
             f"robot file {path}: joint '{joint.name}' has no torque limit; give one (URDF: <limit effort>, "
             f"MJCF: actuatorfrcrange, or torque_limits={{'{joint.name}': ...}})"
         )
-    own.actfrclimited = True
+    driven.actfrclimited = True
     if joint.side:
         stiff, damp = 0.0, 5.0 * effort / joint.max_speed
         # Wheels much lighter than their servo is stiff chatter at the environment's timestep of 0.02 s.
@@ -107,7 +107,7 @@ def add_servo(child: mujoco.MjSpec, path: Path, joint: Joint) -> None:
         stiff = _STIFFNESS_PER_EFFORT * effort
         damp = 0.12 * stiff
         least = 2e-4 * stiff
-    if own.armature < least:
-        own.armature = least
+    if driven.armature < least:
+        driven.armature = least
     actuator = child.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     set_servo(actuator, (stiff, damp), None)

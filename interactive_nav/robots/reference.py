@@ -1,4 +1,4 @@
-"""Robots that a file describes: `porter.urdf`, `porter.xml` or `path.py:function`; run folders keep them."""
+"""Load robots that a file describes, `porter.urdf`, `porter.xml` or `path.py:function`; keep them in run folders."""
 
 import dataclasses
 import hashlib
@@ -61,7 +61,7 @@ def identity(robot: str) -> str:
     return f"{path.name}{function}, sha256 {hashlib.sha256(contents).hexdigest()[:16]}"
 
 
-def load(reference: str, registry: Mapping[str, Factory]) -> Factory:
+def load_reference(reference: str, registry: Mapping[str, Factory]) -> Factory:
     """Return the control mode -> spec of a file's robot; each content is read, and warned of, once."""
     path, function = _split(reference)
     key = f"{path.parent}/{identity(reference)}"
@@ -76,28 +76,28 @@ def load(reference: str, registry: Mapping[str, Factory]) -> Factory:
 
 def _of_python(path: Path, function: str, registry: Mapping[str, Factory]) -> Factory:
     """Return the factory that a Python function is, returns or registers."""
-    known = set(registry)
-    found = import_function(f"{path}{function or ':'}", "robot", f"expected {A_FILE}", ConfigError)
+    registered = set(registry)
+    factory = import_function(f"{path}{function or ':'}", "robot", f"expected {A_FILE}", ConfigError)
     try:
-        needed = [p for p in inspect.signature(found).parameters.values() if p.default is p.empty]
-        made: Any = found if needed else found()
-        new = set(registry) - known
-        made = found if isinstance(made, RobotSpec) else registry[new.pop()] if made is None and len(new) == 1 else made
-        spec = made("native") if callable(made) else made
+        needed = [p for p in inspect.signature(factory).parameters.values() if p.default is p.empty]
+        out: Any = factory if needed else factory()
+        new = set(registry) - registered
+        out = factory if isinstance(out, RobotSpec) else registry[new.pop()] if out is None and len(new) == 1 else out
+        spec = out("native") if callable(out) else out
     except UserError:
         raise
     except Exception as error:
-        told = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-        raise ConfigError(f"robot {path}{function}: raised {told}") from error
-    if not (callable(made) and isinstance(spec, RobotSpec)):
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        raise ConfigError(f"robot {path}{function}: raised {reason}") from error
+    if not (callable(out) and isinstance(spec, RobotSpec)):
         raise ConfigError(
             f"robot {path}{function}: gave type {type(spec).__name__}, expected a RobotSpec for a control mode, or "
             "what from_file returns"
         )
-    return cast(Factory, made)
+    return cast(Factory, out)
 
 
-def keep(robot: str, folder: Path) -> None:
+def record_robot(robot: str, folder: Path) -> None:
     """Record a robot in a run's folder: a file that names no others is copied there."""
     if not is_reference(robot) or folder.exists():
         return
@@ -111,7 +111,7 @@ def keep(robot: str, folder: Path) -> None:
     write_text(folder / "reference.json", json.dumps(dataclasses.asdict(record), indent=1) + "\n")
 
 
-def kept(folder: Path) -> tuple[str, str] | None:
+def recorded_robot(folder: Path) -> tuple[str, str] | None:
     """Return the reference and the identity of a run's robot, and warn of a change; None for one that has a name."""
     path = folder / "reference.json"
     if not path.is_file():

@@ -1,4 +1,4 @@
-"""A user's parsed robot file in, the same made fit for the task's physics out; every change is warned of.
+"""Make a user's parsed robot file fit for the task's physics; every change is warned of.
 
 What is needed and may lack is put right: wheels become spheres that roll on the floor only, with a box in front of
 furniture; cylinders become boxes; links without inertia take their shapes'; driven joints get a servo. Actuators,
@@ -52,16 +52,16 @@ def _solid(geom) -> bool:
 
 
 def find(child: mujoco.MjSpec, path: Path, kind: str, name: str):
-    """The body or joint of a name."""
-    found = child.body(name) if kind == "body" else child.joint(name)
-    if found is None:
-        known = [x.name for x in (child.bodies if kind == "body" else child.joints) if x.name not in ("world", "")]
-        raise FileError(f"robot file {path} has no {kind} named '{name}'; it has {', '.join(known)}")
-    return found
+    """Return the body or joint of a name."""
+    element = child.body(name) if kind == "body" else child.joint(name)
+    if element is None:
+        available = [x.name for x in (child.bodies if kind == "body" else child.joints) if x.name not in ("world", "")]
+        raise FileError(f"robot file {path} has no {kind} named '{name}'; it has {', '.join(available)}")
+    return element
 
 
 def strip(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
-    """Leaves bodies, joints, geoms, sites and cameras; gives the base its free joint, geoms their groups."""
+    """Leave bodies, joints, geoms, sites and cameras; gives the base its free joint, geoms their groups."""
     child.compiler.fusestatic = False
     child.compiler.balanceinertia = True
     child.compiler.boundmass, child.compiler.boundinertia = 1e-4, 1e-7
@@ -122,7 +122,7 @@ def _replace_wheel(child: mujoco.MjSpec, wheel: Wheel, base_body: str) -> None:
 
 
 def _replace_cylinder(child: mujoco.MjSpec, geom) -> None:
-    """A regular octagon of four boxes instead."""
+    """Replace a cylinder by a regular octagon of four boxes."""
     radius, half, name = float(geom.size[0]), float(geom.size[1]), geom.name
     body, pos, quat = geom.parent, np.array(geom.pos), np.array(geom.quat)
     quat = quat / np.linalg.norm(quat)
@@ -137,7 +137,7 @@ def _replace_cylinder(child: mujoco.MjSpec, geom) -> None:
 
 
 def _fix_masses(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
-    """Every body's inertia made explicit, so that what is put in for collision weighs nothing."""
+    """Make every body's inertia explicit, so that what is put in for collision weighs nothing."""
     for body in child.bodies:
         shapes = [g for g in body.geoms if g.group == 3]
         if body.name == "world":
@@ -162,9 +162,9 @@ def _fix_masses(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
     for body in child.bodies:
         if body.name == "world":
             continue
-        own = model.body(body.name)
+        has = model.body(body.name)
         body.explicitinertial = True
-        body.mass, body.ipos, body.iquat, body.inertia = own.mass[0], own.ipos, own.iquat, own.inertia
+        body.mass, body.ipos, body.iquat, body.inertia = has.mass[0], has.ipos, has.iquat, has.inertia
         body.fullinertia = [math.nan] * 6
 
 
@@ -178,7 +178,7 @@ def complete(
     home: Mapping[str, float],
     child: mujoco.MjSpec,
 ) -> None:
-    """Every change to the file, in order; warns of each."""
+    """Apply every change to the file, in order; warn of each."""
     for name, limit in torque_limits.items():
         child.joint(name).actfrcrange = [-limit, limit]
     strip(child, path, base_body)

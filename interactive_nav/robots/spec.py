@@ -1,4 +1,4 @@
-"""What the environment must know of a robot, in one frozen record."""
+"""Define what the environment needs of a robot in one frozen record."""
 
 from __future__ import annotations
 
@@ -51,20 +51,20 @@ class TwistMap:
 
 
 def wheel_twist(wheel_radius_m: float, track_m: float, sides: tuple[int, ...]) -> tuple[tuple[float, float], ...]:
-    """Rows of a `TwistMap.matrix` for wheels on the left (-1) and right (+1) of a differential or skid-steer drive."""
+    """Return rows of a `TwistMap.matrix` for wheels on the left (-1) and right (+1) of a differential or skid steer."""
     return tuple((1.0 / wheel_radius_m, side * track_m / (2.0 * wheel_radius_m)) for side in sides)
 
 
-def check_mode(robot: str, mode: str, known: tuple[str, ...]) -> None:
-    """Raises ConfigError for a control mode that the robot does not have."""
-    if mode not in known:
-        raise ConfigError(f"robot '{robot}' has no control mode '{mode}'; it has {', '.join(known)}")
+def check_mode(robot: str, mode: str, modes: tuple[str, ...]) -> None:
+    """Raise ConfigError for a control mode that the robot does not have."""
+    if mode not in modes:
+        raise ConfigError(f"robot '{robot}' has no control mode '{mode}'; it has {', '.join(modes)}")
 
 
 def set_servo(
     actuator: mujoco.MjsActuator, gains: tuple[float, float] | None, control_range: tuple[float, float] | None
 ) -> None:
-    """Makes an actuator a servo of its joint, or a motor.
+    """Turn an actuator a servo of its joint, or a motor.
 
     Args:
         gains: stiffness and damping; without stiffness the control is a velocity, else a position; None: a force.
@@ -121,7 +121,7 @@ class RobotSpec:
     control_every_substep: bool = False
     """The control law runs at every physics step, not once a control period."""
     contact_time_constant_s: float | None = None
-    """Of the robot's own contacts, where its gait needs a certain one; None: the environment's."""
+    """Of the robot's contacts, where its gait needs a certain one; None: the environment's."""
     twist: TwistMap | None = None
     """None: scripted drivers cannot drive this mode."""
     kind: str = "wheeled"
@@ -139,34 +139,34 @@ class RobotSpec:
 
     @property
     def action_size(self) -> int:
-        """Number of actions."""
+        """Return the number of actions."""
         return len(self.action_low)
 
     def symmetric(self) -> RobotSpec:
-        """The robot with action 0 meaning no command: each range widened to plus and minus its larger end."""
+        """Return the robot with action 0 meaning no command: each range widened to plus and minus its larger end."""
         largest = tuple(max(abs(a), abs(b)) for a, b in zip(self.action_low, self.action_high, strict=True))
         return dataclasses.replace(self, action_low=tuple(-x for x in largest), action_high=largest)
 
     def command(self, action, xp=np):
-        """Maps actions [..., A] in [-1, 1] (clipped) affinely to commands [..., A]."""
+        """Map actions [..., A] in [-1, 1] (clipped) affinely to commands [..., A]."""
         low, high = self._command_range(action, xp)
         return low + 0.5 * (xp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
 
     def action(self, command, xp=np):
-        """The inverse of `command`: actions [..., A], clipped to [-1, 1]."""
+        """Return the inverse of `command`: actions [..., A], clipped to [-1, 1]."""
         low, high = self._command_range(command, xp)
         return xp.clip(2.0 * (xp.asarray(command) - low) / (high - low) - 1.0, -1.0, 1.0)
 
     def _command_range(self, values, xp):
-        """`action_low` and `action_high`, each in the shape of actions or commands [..., A]."""
+        """Return `action_low` and `action_high`, each in the shape of actions or commands [..., A]."""
         return (xp.broadcast_to(xp.asarray(end), xp.shape(values)) for end in (self.action_low, self.action_high))
 
     def controls(self, command, state: RobotState, xp=np):
-        """Actuator controls [..., nu] for commands [..., A]."""
+        """Return actuator controls [..., nu] for commands [..., A]."""
         return command if self.control is None else self.control(command, state, xp)
 
     def drive(self, linear_m_s, angular_rad_s, xp=np):
-        """Actions [..., A] that ask the base for a velocity."""
+        """Return actions [..., A] that request a velocity of the base."""
         if self.twist is None:
             raise ConfigError(
                 f"robot '{self.name}' in control mode '{self.control_mode}' takes no base velocity; "
@@ -189,5 +189,5 @@ class Figures:
     source: str
 
     def figures(self, *others: str) -> dict[str, Any]:
-        """By name, without the row's other columns."""
+        """Return the figures by name, without the row's other columns."""
         return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in others}

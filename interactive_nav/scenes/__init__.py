@@ -1,1 +1,1 @@
-"""Scene folders in, MuJoCo models of equal layout out."""
+"""Build MuJoCo models of equal layout from scene folders."""

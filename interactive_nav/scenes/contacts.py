@@ -1,4 +1,4 @@
-"""Single contacts of the robot, for the options that each body's net force does not answer.
+"""Read single contacts of the robot, for the options that each body's net force does not answer.
 
 The original's code leaves out friction and wheels, and could sum the contacts' norms instead of their vectors
 (reference benchmark, section 11, rows 4, 6 and 7). MuJoCo's contact sensors list contacts of a whole robot, so wheels
@@ -18,7 +18,7 @@ from interactive_nav.robots import RobotSpec
 SLOTS = 32
 """Contacts listed between the robot, or one of its wheels, and one body; more than a robot's few boxes make."""
 _FIELDS = 7
-"""found (1), force in the contact's frame (3), normal in the world frame (3)."""
+"""whether there is one (1), force in the contact's frame (3), normal in the world frame (3)."""
 _DATA = sum(
     1 << int(bit)
     for bit in (
@@ -34,7 +34,7 @@ _ROLLING = "contacts_of_rolling"
 def add_sensor(
     spec: mujoco.MjSpec, name: str, objtype: mujoco.mjtObj, objname: str, body: str, numbers: tuple[int, int, int]
 ) -> None:
-    """A contact sensor of a part of the robot against a body; `numbers` are its data, reduction and slots."""
+    """Add a contact sensor of a part of the robot against a body; `numbers` are its data, reduction and slots."""
     spec.add_sensor(
         name=name,
         type=mujoco.mjtSensor.mjSENS_CONTACT,
@@ -47,7 +47,7 @@ def add_sensor(
 
 
 def add_contact_sensors(spec: mujoco.MjSpec, robot: RobotSpec, bodies: list[str]) -> None:
-    """Lists the robot's and its rolling parts' contacts with each of the bodies."""
+    """List the robot's and its rolling parts' contacts with each of the bodies."""
 
     casters = [
         geom.name
@@ -67,14 +67,14 @@ def add_contact_sensors(spec: mujoco.MjSpec, robot: RobotSpec, bodies: list[str]
 
 
 def rolling_geoms(model: mujoco.MjModel, robot: RobotSpec, robot_bodies: np.ndarray) -> np.ndarray:
-    """[ngeom] bool: parts of the robot that roll, as the sensors know them."""
+    """Return [ngeom] bool: parts of the robot that roll, as the sensors take them."""
     wheels = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in robot.rolling_bodies]
-    own = np.isin(model.geom_bodyid, robot_bodies)
-    return own & (np.isin(model.geom_bodyid, wheels) | (model.geom_condim == 1))
+    of_robot = np.isin(model.geom_bodyid, robot_bodies)
+    return of_robot & (np.isin(model.geom_bodyid, wheels) | (model.geom_condim == 1))
 
 
 def sensor_addresses(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Addresses in sensordata of the whole robot's lists and of its rolling parts': [a, SLOTS, 7], [b, SLOTS, 7]."""
+    """Return addresses in sensordata of the robot's lists [a, SLOTS, 7] and of its rolling parts' [b, SLOTS, 7]."""
     names = [(model.sensor(i).name, int(model.sensor_adr[i])) for i in range(model.nsensor)]
 
     def of(prefix: str) -> np.ndarray:
@@ -85,7 +85,7 @@ def sensor_addresses(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def part_of_contacts(force_c: Any, normal_w: Any, part: str, xp: Any) -> tuple[Any, Any, Any]:
-    """Sums over contacts.
+    """Return sums over contacts.
 
     Args:
         force_c: [..., c, 3] in the contacts' frames, normal first, N; 0 where there is no contact.
@@ -101,13 +101,13 @@ def part_of_contacts(force_c: Any, normal_w: Any, part: str, xp: Any) -> tuple[A
 
 
 def from_sensors(data: Any, addresses: tuple[np.ndarray, np.ndarray], part: str, xp: Any) -> tuple[Any, Any, Any]:
-    """`part_of_contacts` of a record of sensordata [..., nsensordata]: over all listed contacts, without the rolling
-    parts' in the first and third, and in the second too where `part` is `normal`."""
+    """Return `part_of_contacts` of a record of sensordata [..., nsensordata]: over all listed contacts, without the
+    rolling parts' in the first and third, and in the second too where `part` is `normal`."""
     sums = []
     for where in addresses:
         listed = data[..., where.reshape(-1, _FIELDS)]
-        found = listed[..., :1] > 0
-        sums.append(part_of_contacts(xp.where(found, listed[..., 1:4], 0.0), listed[..., 4:7], part, xp))
+        is_contact = listed[..., :1] > 0
+        sums.append(part_of_contacts(xp.where(is_contact, listed[..., 1:4], 0.0), listed[..., 4:7], part, xp))
     (vector, norm, touch), (rolling_vector, rolling_norm, rolling_touch) = sums
     norm = norm - rolling_norm if part == "normal" else norm
     # Differences of equal sums leave rounding behind.
@@ -117,7 +117,7 @@ def from_sensors(data: Any, addresses: tuple[np.ndarray, np.ndarray], part: str,
 def combine(
     net_w: Any, contacts: tuple[Any, Any, Any] | None, force_part: str, force_sum: str, xp: Any
 ) -> tuple[Any, Any]:
-    """The options' F_t and the force of what touches.
+    """Return the options' F_t and the force of what touches.
 
     Args:
         net_w: [..., substeps, 3] the robot's full contact force on all but the floor, N.

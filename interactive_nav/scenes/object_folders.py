@@ -1,4 +1,4 @@
-"""Folders made by `python -m converters object` in, small objects out: what `NavConfig.objects` names."""
+"""Read the folders of `python -m converters object` that `NavConfig.objects` names as small objects."""
 
 import dataclasses
 import hashlib
@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from interactive_nav.scenes.objects import Box, SmallObject, pick
-from interactive_nav.scenes.scene import Movable, hull_sources, read_movable, task_parts
+from interactive_nav.scenes.scene import Movable, body_task_parts, hull_sources, read_movable
 from interactive_nav_common.config import Positive
 from interactive_nav_common.files import check_name
 from interactive_nav_common.records import Reader
@@ -21,7 +21,7 @@ RGBA = (0.6, 0.6, 0.6, 1.0)
 
 @dataclasses.dataclass(frozen=True)
 class _About:
-    """What is asked of object.json."""
+    """What is required of object.json."""
 
     name: str
     category: str
@@ -40,15 +40,15 @@ class ConvertedObject(SmallObject):
     movable: Movable = dataclasses.field(repr=False, compare=False)
     """Its body in the same frame: mass properties and hulls as converted."""
     hull_sources: list = dataclasses.field(repr=False, compare=False)
-    """What its hulls are made from."""
+    """What its hulls come from."""
 
     @property
     def task_parts(self) -> tuple:
-        return *super().task_parts, task_parts(self.movable, self.hull_sources)
+        return *super().task_parts, body_task_parts(self.movable, self.hull_sources)
 
 
 def small_objects(num_objects: int, split: str, folders: Sequence[str]) -> tuple[SmallObject, ...]:
-    """The small objects of an environment: the folders in turn where there are some, else the built-in ones."""
+    """Return the small objects of an environment: the folders in turn where there are some, else the builtin ones."""
     if not folders:
         return pick(num_objects, split)
     models = [load_object(folder) for folder in folders]
@@ -56,7 +56,7 @@ def small_objects(num_objects: int, split: str, folders: Sequence[str]) -> tuple
 
 
 def load_object(folder: str | Path) -> ConvertedObject:
-    """Reads and checks a folder with `object.xml`, `object.json` and `assets/`."""
+    """Read and check a folder with `object.xml`, `object.json` and `assets/`."""
     from scenes_mjcf.categories import class_id  # which imports the world that small objects are part of
 
     folder = Path(folder)
@@ -90,7 +90,7 @@ def _numbers(values: np.ndarray) -> tuple[float, ...]:
 
 
 def _standing(movable: Movable) -> Movable:
-    """The body as it stands at rest over the origin: its frame level, its boxes' lowest corner at z = 0."""
+    """Return the body as it stands at rest over the origin: its frame level, its boxes' lowest corner at z = 0."""
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, movable.quat_w)
     turn = turn.reshape(3, 3)

@@ -1,4 +1,4 @@
-"""The small objects strewn about each episode: parametric boxes out, with real-world masses (kg) and sizes (m).
+"""Build the small objects strewn about each episode of parametric boxes with real-world masses (kg) and sizes (m).
 
 Four kinds as in the paper (section IV): baskets, shoes, pots, toys. The original's meshes are not public
 with textures, so these are ours: unions of boxes, which every physics backend collides alike, and primitives
@@ -43,14 +43,14 @@ class Box:
 
     @property
     def corners_m(self) -> list[tuple[float, float, float]]:
-        """Its eight corners, in the object's frame."""
-        corner, found = np.zeros(3), []
+        """Return its eight corners, in the object's frame."""
+        corner, corners = np.zeros(3), []
         for signs in itertools.product((-1, 1), repeat=3):
-            own = [s * h for s, h in zip(signs, self.half_m, strict=True)]
-            mujoco.mju_rotVecQuat(corner, np.array(own), np.array(self.quat))
+            corner_m = [s * h for s, h in zip(signs, self.half_m, strict=True)]
+            mujoco.mju_rotVecQuat(corner, np.array(corner_m), np.array(self.quat))
             x, y, z = (c + float(v) for c, v in zip(self.centre_m, corner, strict=True))
-            found.append((x, y, z))
-        return found
+            corners.append((x, y, z))
+        return corners
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,28 +83,28 @@ class SmallObject:
     shapes: tuple[Shape, ...]
 
     def mask_id(self, classes: MaskClasses) -> int:
-        """Its class where the setting `segmentation_classes` is this: its own model's, or its category's."""
+        """Return its class where the setting `segmentation_classes` is this: its model's, or its category's."""
         return class_id(self.category, classes) if classes == "all" else self.segmentation_id
 
     @property
     def task_parts(self) -> tuple:
-        """What of it decides a task, to be hashed: its looks are not in it."""
+        """Return what of it decides a task, to be hashed: its looks are not in it."""
         boxes = [dataclasses.astuple(box) for box in self.boxes]
         return self.category, self.segmentation_id, self.mass_kg, self.friction, boxes
 
     @property
     def radius_m(self) -> float:
-        """Radius of the disc about the origin that holds the object's footprint."""
+        """Return the radius of the disc about the origin that holds the object's footprint."""
         return max(math.hypot(x, y) for b in self.boxes for x, y, _ in b.corners_m)
 
     @property
     def height_m(self) -> float:
-        """Top of the boxes above the floor."""
+        """Return the top of the boxes above the floor."""
         return max(z for b in self.boxes for _, _, z in b.corners_m)
 
     @property
     def rows(self) -> np.ndarray:
-        """[n, 10] of its boxes: centre (3), quaternion (4), half sizes (3)."""
+        """Return [n, 10] of its boxes: centre (3), quaternion (4), half sizes (3)."""
         return np.asarray([[*b.centre_m, *b.quat, *b.half_m] for b in self.boxes], float)
 
 
@@ -190,7 +190,7 @@ def _pot(name: str, width: float, height: float, mass: float, colour: Rgba, plan
 
 def _toy(name: str, length: float, width: float, mass: float, colour: Rgba, cab: tuple[float, float, float] = (
          0.05, 0.20, 0.035), accent: Rgba = (0.75, 0.85, 0.92, 1.0)) -> SmallObject:  # fmt: skip
-    """A vehicle; `cab` is the cab's centre and half length as shares of the length, and its half height in m."""
+    """Build a vehicle; `cab` is the cab's centre and half length as shares of the length, and its half height in m."""
     boxes = (
         Box((0, 0, 0.04), (length / 2, width / 2, 0.04)),
         Box((cab[0] * length, 0, round(0.08 + cab[2], 4)), (cab[1] * length, 0.4 * width, cab[2])),
@@ -213,7 +213,7 @@ def _toy(name: str, length: float, width: float, mass: float, colour: Rgba, cab:
 
 
 def _model(kind: str, about: dict[str, Any]) -> SmallObject:
-    """A model of the file."""
+    """Build a model of the file."""
     colours = {name: _rgba(*about[name]) for name in ("colour", "sole", "accent") if name in about}
     return {"basket": _basket, "shoe": _shoe, "pot": _pot, "toy": _toy}[kind](**{**about, **colours})
 
@@ -227,7 +227,7 @@ MODELS: dict[str, dict[str, tuple[SmallObject, ...]]] = {
 
 
 def pick(num_objects: int, split: str = "train", variant: int = 0) -> tuple[SmallObject, ...]:
-    """A set of small objects: two models of each kind, as many copies as it takes.
+    """Return a set of small objects: two models of each kind, as many copies as it takes.
 
     Slot i holds the same kind, with the same number of boxes, whatever the split and the variant: which two models of
     each kind, 0 the default set; they come round again. Ten objects are 3 baskets, 3 shoes, 2 pots, 2 toys.
@@ -258,12 +258,12 @@ _TURN = {"z": (1.0, 0.0, 0.0, 0.0), "x": (_HALF, 0.0, _HALF, 0.0), "y": (_HALF, 
 
 
 def body_names(objects: Sequence[SmallObject]) -> tuple[str, ...]:
-    """Names of the bodies of small objects, wherever these stand in a model."""
+    """Return the names of the bodies of small objects, wherever these stand in a model."""
     return tuple(f"{o.category}_small_{i}" for i, o in enumerate(objects))
 
 
 def add_boxes(body: mujoco.MjsBody, obj: SmallObject, name: str) -> None:
-    """Adds an object's boxes to its body, origin on the floor: they collide, and share its mass by volume."""
+    """Add an object's boxes to its body, origin on the floor: they collide, and share its mass by volume."""
     volume = sum(8 * b.half_m[0] * b.half_m[1] * b.half_m[2] for b in obj.boxes)
     for i, box in enumerate(obj.boxes):
         body.add_geom(
@@ -279,7 +279,7 @@ def add_boxes(body: mujoco.MjsBody, obj: SmallObject, name: str) -> None:
 
 
 def add_shapes(body: mujoco.MjsBody, obj: SmallObject, name: str) -> None:
-    """Adds an object's shapes to its body, origin on the floor: visuals, massless and without collision."""
+    """Add an object's shapes to its body, origin on the floor: visuals, massless and without collision."""
     for i, shape in enumerate(obj.shapes):
         body.add_geom(
             name=f"{name}_visual_{i}",

@@ -92,7 +92,7 @@ class Scene:
         parts += [_rounded([maps.resolution_m, *maps.origin_w]), _rounded(_six_digits(self.walls))]
         hulls = hull_sources(self.path / "scene.xml") if any(m.hulls for m in self.movables) else {}
         for movable in self.movables:
-            parts += task_parts(movable, hulls.get(movable.name, []))
+            parts += body_task_parts(movable, hulls.get(movable.name, []))
         return TASK_DIGEST + hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
@@ -109,7 +109,7 @@ def _six_digits(rows: np.ndarray) -> np.ndarray:
     return rows
 
 
-def task_parts(movable: Movable, hulls: list) -> list:
+def body_task_parts(movable: Movable, hulls: list) -> list:
     """Return what of a body decides a task, to be hashed: all but its name; its hulls as `hull_sources` has them."""
     numbers = {f.name: getattr(movable, f.name) for f in dataclasses.fields(Movable)}
     for name in ("name", "hulls", "hinge", "category"):

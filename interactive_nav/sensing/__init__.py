@@ -1,4 +1,4 @@
-"""Cameras and scanners: poses in, depth, class ids and distances out; `make_renderer` picks who draws."""
+"""Render depth, class ids and distances for cameras and scanners; `make_renderer` picks the renderer."""
 
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing.base import CameraPose, Lens, Renderer, look_along
@@ -6,7 +6,7 @@ from interactive_nav.sensing.boxes import BoxTables, build_boxes
 
 
 def make_renderer(tables: BoxTables, lens: Lens, name: str, backend: str, meshes: World | None = None) -> Renderer:
-    """Builds a renderer.
+    """Build a renderer.
 
     Args:
         lens: the camera's.

@@ -1,4 +1,4 @@
-"""What every renderer offers: scenes, `qpos` and camera poses in, images out, for a batch at once."""
+"""Define what every renderer offers: images of scenes, `qpos` and camera poses, for a batch at once."""
 
 from __future__ import annotations
 
@@ -44,32 +44,32 @@ class Lens:
 
     @property
     def half_height(self) -> float:
-        """Half of the image's height at depth 1."""
+        """Return half of the image's height at depth 1."""
         return math.tan(math.radians(self.fov_deg) / 2)
 
     @property
     def pixel(self) -> float:
-        """Side of a pixel at depth 1."""
+        """Return the side of a pixel at depth 1."""
         return 2 * self.half_height / self.height
 
     @property
     def columns(self) -> np.ndarray:
-        """[width] f32: rightward offset of the pixels' centres at depth 1, left to right."""
+        """Return [width] f32: rightward offset of the pixels' centres at depth 1, left to right."""
         return ((np.arange(self.width) + 0.5 - self.width / 2) * self.pixel).astype(np.float32)
 
     @property
     def rows(self) -> np.ndarray:
-        """[height] f32: upward offset at depth 1, top to bottom."""
+        """Return [height] f32: upward offset at depth 1, top to bottom."""
         return ((self.height / 2 - np.arange(self.height) - 0.5) * self.pixel).astype(np.float32)
 
     def rays(self, pose: CameraPose) -> np.ndarray:
-        """[height, width, 3] of the pixels of one camera, world frame; along its axis their length is 1."""
+        """Return the rays [height, width, 3] of one camera's pixels, world frame; along its axis their length is 1."""
         right, up = np.meshgrid(self.columns.astype(float), self.rows.astype(float))
         return np.stack([np.ones_like(right), right, up], -1) @ np.asarray(pose.axes_w, float).T
 
 
 def look_along(pos_w: Any, forward_w: Any) -> CameraPose:
-    """A camera without roll: its right is horizontal, as if the world's z were up.
+    """Return a camera without roll: its right is horizontal, as if the world's z were up.
 
     NumPy's arrays stay NumPy's: JAX would compile each operation anew for every number of cameras.
 
@@ -95,13 +95,13 @@ class Renderer(abc.ABC):
     tables: BoxTables
 
     def through(self, lens: Lens) -> Renderer:
-        """What draws the same through another lens; what does not depend on that is shared."""
+        """Return a renderer of the same through another lens; what does not depend on that is shared."""
         other = copy.copy(self)
         other.lens = lens
         return other
 
     def render_batch(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
-        """Draws a batch.
+        """Draw a batch.
 
         Args:
             scene: [N] i32 index of each environment's scene.
@@ -112,20 +112,20 @@ class Renderer(abc.ABC):
             Depth [N, H, W] f32, the distance along the optical axis, m, 0 where nothing is met, and class ids
             [N, H, W] u8.
         """
-        seen = self.images_batch(("depth", "segmentation"), scene, qpos, camera)
-        return seen["depth"], seen["segmentation"]
+        images = self.images_batch(("depth", "segmentation"), scene, qpos, camera)
+        return images["depth"], images["segmentation"]
 
     @abc.abstractmethod
     def images_batch(
         self, names: tuple[str, ...], scene: jax.Array, qpos: jax.Array, camera: CameraPose, look: Look | None = None
     ) -> dict[str, jax.Array]:
-        """Draws a batch in several ways.
+        """Draw a batch in several ways.
 
         Args:
             scene: [N] i32.
             qpos: [N, nq] f32.
             camera: leaves [N, ...].
-            look: leaves [N, ...]; None: things have their own colours.
+            look: leaves [N, ...]; None: objects keep their colours.
 
         Returns:
             depth and segmentation as `render_batch` gives them; rgb [N, H, W, 3] f32 in [0, 1]; normals
@@ -135,10 +135,10 @@ class Renderer(abc.ABC):
     def images(
         self, names: tuple[str, ...], scene: jax.Array, qpos: jax.Array, camera: CameraPose, look: Look | None = None
     ) -> dict[str, jax.Array]:
-        """One environment's `images_batch`; under any number of `vmap`s all environments are drawn in one call."""
+        """Draw one environment's `images_batch`; under any number of `vmap`s all are drawn in one call."""
         drawn = (scene, qpos, camera) if look is None else (scene, qpos, camera, look)
         return one_of_batch(functools.partial(self.images_batch, names), drawn)
 
     def render(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
-        """One environment's `render_batch`; under any number of `vmap`s all environments are drawn in one call."""
+        """Draw one environment's `render_batch`; under any number of `vmap`s all are drawn in one call."""
         return one_of_batch(self.render_batch, (scene, qpos, camera))

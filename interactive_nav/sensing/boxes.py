@@ -54,14 +54,14 @@ class Links:
         frames = [(qpos[..., at : at + 3], matrix_from_quat(qpos[..., at + 3 : at + 7]))]
         for link in self.rest:
             pos, axes = frames[link.parent]
-            pos, axes = pos + rotate(axes, constant(link.pos)), compose(axes, constant(link.axes))
+            pos, axes = pos + apply_axes(axes, constant(link.pos)), compose(axes, constant(link.axes))
             for slides, address, zero, axis, anchor in link.joints:
                 value, axis = qpos[..., address] - zero, constant(axis)
                 if slides:
-                    pos = pos + rotate(axes, axis) * value[..., None]
+                    pos = pos + apply_axes(axes, axis) * value[..., None]
                     continue
                 arm, turn = swing(axis, constant(anchor), value)
-                pos = pos + rotate(axes, arm)
+                pos = pos + apply_axes(axes, arm)
                 axes = compose(axes, turn)
             frames.append((pos, axes))
         return frames
@@ -171,7 +171,7 @@ def build_boxes(world: World, classes: MaskClasses = 4, colours: bool = False, r
     )
 
 
-def rotate(axes: jax.Array, vector: jax.Array) -> jax.Array:
+def apply_axes(axes: jax.Array, vector: jax.Array) -> jax.Array:
     """Return [..., 3, 3] times [..., 3]; a sum of products, because GPUs may round a matmul's factors to TF32."""
     return (axes * vector[..., None, :]).sum(-1)
 
@@ -188,7 +188,7 @@ def swing(axis: Array, anchor_m: Array, angle_rad: jax.Array) -> tuple[jax.Array
     """
     half = 0.5 * angle_rad[..., None]
     turned = matrix_from_quat(jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], -1))
-    return anchor_m - rotate(turned, anchor_m), turned
+    return anchor_m - apply_axes(turned, anchor_m), turned
 
 
 def body_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -203,7 +203,7 @@ def body_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[ja
     at_rest = slots.pos_w_m, slots.axes_w, slots.hinge_axis_b, slots.hinge_anchor_b_m
     pos, rest, axis, anchor = (jnp.asarray(table[:, hinged], jnp.float32)[scene] for table in at_rest)
     arm, turned = swing(axis, anchor, qpos[..., address[hinged]])
-    swung = pos + rotate(rest, arm)
+    swung = pos + apply_axes(rest, arm)
     standing = jnp.broadcast_to(jnp.eye(3, dtype=qpos.dtype), (*lead, 1, 3, 3))
     pos = jnp.concatenate([pose[..., :3], swung, jnp.zeros((*lead, 1, 3), qpos.dtype)], -2)
     axes = jnp.concatenate([matrix_from_quat(pose[..., 3:]), compose(rest, turned), standing], -3)
@@ -218,7 +218,7 @@ def box_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[jax
     """Return world frames of the boxes: centres [..., B, 3], m, and axes as columns [..., B, 3, 3]."""
     pos, axes = body_poses(tables, scene, qpos)
     pos, axes = pos[..., tables.body, :], axes[..., tables.body, :, :]
-    return pos + rotate(axes, tables.pos_b[scene]), compose(axes, tables.axes_b[scene])
+    return pos + apply_axes(axes, tables.pos_b[scene]), compose(axes, tables.axes_b[scene])
 
 
 def slab(eye: jax.Array, half: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -21,7 +21,7 @@ from scipy.spatial import ConvexHull
 from interactive_nav.physics.warp_callbacks import held, keep_collector_out
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing.base import FAR_M, NEAR_M, Lens, Renderer
-from interactive_nav.sensing.boxes import BoxTables, body_poses, geom_box, robot_geoms, rotate
+from interactive_nav.sensing.boxes import BoxTables, apply_axes, body_poses, geom_box, robot_geoms
 from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, SKY_COLOUR, geom_colour, visual_geoms
 from interactive_nav.sensing.surfaces import lit_images
 from interactive_nav_common.rotations import matrix_from_quat
@@ -36,7 +36,7 @@ _SIDES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5,
 
 
 @dataclasses.dataclass
-class _Part:
+class _Surface:
     """One body's surface of one material, in the body's frame."""
 
     slot: int
@@ -54,20 +54,20 @@ class _Part:
     """In the image itself: it is drawn without shading."""
 
 
-def _box_part(slot: int, boxes: np.ndarray, colour: np.ndarray) -> _Part:
+def _box_surface(slot: int, boxes: np.ndarray, colour: np.ndarray) -> _Surface:
     corners = boxes[:, None, 7:10] * _CORNERS
     points = boxes[:, None, :3] + np.einsum("nij,nvj->nvi", matrix_from_quat(boxes[:, 3:7]), corners)
     faces = _SIDES + 8 * np.arange(len(boxes))[:, None, None]
     faces = faces.reshape(-1, 3)
-    return _Part(slot, points.reshape(-1, 3), faces, np.zeros((len(faces), 3, 2)), None, colour)
+    return _Surface(slot, points.reshape(-1, 3), faces, np.zeros((len(faces), 3, 2)), None, colour)
 
 
-def _geom_part(model: mujoco.MjModel, geom: int, slot: int) -> _Part:
+def _geom_surface(model: mujoco.MjModel, geom: int, slot: int) -> _Surface:
     """Return the surface of a geom of the robot's: a mesh, a box, or what is round as its hull."""
     kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        return _mesh_part(model, geom, slot, False)
-    part = _box_part(slot, geom_box(model, geom)[None], geom_colour(model, geom))
+        return _mesh_surface(model, geom, slot, False)
+    part = _box_surface(slot, geom_box(model, geom)[None], geom_colour(model, geom))
     turn, rise = np.meshgrid(np.arange(24) * np.pi / 12, np.linspace(-np.pi / 2, np.pi / 2, 13))
     ball = np.stack([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)], -1).reshape(-1, 3)
     ends = np.array([[[0.0, 0.0, -1.0]], [[0.0, 0.0, 1.0]]])
@@ -84,7 +84,7 @@ def _geom_part(model: mujoco.MjModel, geom: int, slot: int) -> _Part:
     return dataclasses.replace(part, points=points, faces=hull.simplices, uv=np.zeros((len(hull.simplices), 3, 2)))
 
 
-def _mesh_part(model: mujoco.MjModel, geom: int, slot: int, standing: bool) -> _Part:
+def _mesh_surface(model: mujoco.MjModel, geom: int, slot: int, standing: bool) -> _Surface:
     mesh, texture = model.geom_dataid[geom], -1
     vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
     rows = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
@@ -99,21 +99,21 @@ def _mesh_part(model: mujoco.MjModel, geom: int, slot: int, standing: bool) -> _
         shape = model.tex_height[texture], model.tex_width[texture], model.tex_nchannel[texture]
         image = model.tex_data[model.tex_adr[texture] :][: np.prod(shape)].reshape(shape)[..., :3]
     lit = standing and is_lit(model)
-    return _Part(slot, points, model.mesh_face[rows], uv, image, geom_colour(model, geom), lit)
+    return _Surface(slot, points, model.mesh_face[rows], uv, image, geom_colour(model, geom), lit)
 
 
-def _parts(world: World, s: int, tables: BoxTables) -> tuple[list[_Part], list[int]]:
+def _surfaces(world: World, s: int, tables: BoxTables) -> tuple[list[_Surface], list[int]]:
     """Return the surfaces of a scene, boxes where a body has no visual mesh, and the class of each slot."""
     model, visual = visual_geoms(world.scenes[s])
     slots, ids = world.slots, world.slots.class_ids(tables.classes)[s]
     parts = []
     for slot, name in enumerate((*slots.names[s], "structure")):
         if meshes := [g for g in visual.get(name, []) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH]:
-            parts += [_mesh_part(model, geom, slot, name == "structure") for geom in meshes]
+            parts += [_mesh_surface(model, geom, slot, name == "structure") for geom in meshes]
         elif len(boxes := slots.rows(s, slot)):
-            parts.append(_box_part(slot, boxes, PALETTES[tables.classes][ids[slot]]))
+            parts.append(_box_surface(slot, boxes, PALETTES[tables.classes][ids[slot]]))
     links = robot_geoms(world) if tables.robot else []
-    parts += [_geom_part(world.models[0], g, len(ids) + i) for i, geoms in enumerate(links) for g in geoms]
+    parts += [_geom_surface(world.models[0], g, len(ids) + i) for i, geoms in enumerate(links) for g in geoms]
     return parts, [*ids, *[class_id("robot", tables.classes)] * len(links)]
 
 
@@ -145,7 +145,7 @@ class MeshTables:
 
 def build_meshes(world: World, tables: BoxTables) -> MeshTables:
     """Read the visual meshes of every scene; bodies without any are drawn as their boxes."""
-    scenes = [_parts(world, s, tables) for s in range(len(world.scenes))]
+    scenes = [_surfaces(world, s, tables) for s in range(len(world.scenes))]
     shape = len(scenes), max(len(parts) for parts, _ in scenes)
     surface, slot = np.full(shape, -1, np.int32), np.zeros(shape, np.int32)
     sphere, look, colour = np.full((*shape, 4), -1.0, np.float32), np.zeros((*shape, 5), np.int32), np.ones((*shape, 3))
@@ -234,14 +234,14 @@ def _meet(
             if along + half > NEAR and along - half < nearest:
                 axes = wp.transpose(axes_w[n, k])
                 start = axes * (eye + NEAR * ray - pos_w[n, k])
-                found = wp.mesh_query_ray(mesh, start, axes * ray, nearest - NEAR, root[s, k])
-                if found.result:
-                    nearest = found.t + NEAR
+                query = wp.mesh_query_ray(mesh, start, axes * ray, nearest - NEAR, root[s, k])
+                if query.result:
+                    nearest = query.t + NEAR
                     hit = k
-                    face = found.face
-                    u = found.u
-                    v = found.v
-                    normal = wp.transpose(axes) * found.normal
+                    face = query.face
+                    u = query.u
+                    v = query.v
+                    normal = wp.transpose(axes) * query.normal
     return nearest, hit, face, u, v, normal
 
 
@@ -341,7 +341,7 @@ class MeshRenderer(Renderer):
         pos = jnp.take_along_axis(pos, slot[..., None], -2)
         axes = jnp.take_along_axis(axes, slot[..., None, None], -3)
         sphere = self._sphere_b[scene]
-        sphere = jnp.concatenate([pos + rotate(axes, sphere[..., :3]), sphere[..., 3:]], -1)
+        sphere = jnp.concatenate([pos + apply_axes(axes, sphere[..., :3]), sphere[..., 3:]], -1)
         columns, rows = jnp.asarray(self.lens.columns), jnp.asarray(self.lens.rows)
         size = (len(scene), self.lens.height, self.lens.width)
         handle = held(self._handle, self._mesh)

@@ -1,4 +1,4 @@
-"""Errors of real cameras: a camera's images and a key in, its disturbed images out; every model is off by default.
+"""Disturb a camera's images by the errors of real cameras; every model is off by default.
 
 Formulas and sources stand in `docs/sensors.md`.
 """
@@ -15,11 +15,11 @@ from interactive_nav.camera_config import CameraNoise
 from interactive_nav.sensing.base import Lens
 
 KeyOf = Callable[[str], jax.Array]
-"""An error's name to its PRNG key: each has a stream of its own, so that switching one on leaves the others alone."""
+"""An error's name to its PRNG key: each has a separate stream, so that switching one on leaves the others alone."""
 
 
 def disturbed(noise: CameraNoise, lens: Lens, images: dict[str, jax.Array], key_of: KeyOf) -> dict[str, jax.Array]:
-    """The images of one camera with its errors.
+    """Return the images of one camera with its errors.
 
     Args:
         images: as `Renderer.images` gives them: depth in m, rgb in [0, 1]; normals are needed for `depth_grazing_deg`.
@@ -35,7 +35,7 @@ def disturbed(noise: CameraNoise, lens: Lens, images: dict[str, jax.Array], key_
 
 
 def noisy_rgb(noise: CameraNoise, rgb: jax.Array, key_of: KeyOf) -> jax.Array:
-    """[H, W, 3] in [0, 1]: lens, then exposure, then sensor."""
+    """Return [H, W, 3] in [0, 1] with the errors of the lens, then the exposure, then the sensor."""
     if noise.rgb_blur_px:
         rgb = blurred(rgb, noise.rgb_blur_px)
     if noise.rgb_exposure:
@@ -50,7 +50,7 @@ def noisy_rgb(noise: CameraNoise, rgb: jax.Array, key_of: KeyOf) -> jax.Array:
 
 
 def blurred(image: jax.Array, deviation_px: float) -> jax.Array:
-    """[H, W, C] convolved with a Gaussian cut at three deviations, its edges continued outwards."""
+    """Return [H, W, C] convolved with a Gaussian cut at three deviations, its edges continued outwards."""
     reach = math.ceil(3 * deviation_px)
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / deviation_px) ** 2)
     weights = (weights / weights.sum()).astype(np.float32)
@@ -65,7 +65,7 @@ def blurred(image: jax.Array, deviation_px: float) -> jax.Array:
 def noisy_depth(
     noise: CameraNoise, lens: Lens, depth: jax.Array, normals: jax.Array | None, key_of: KeyOf
 ) -> jax.Array:
-    """[H, W] m: as a sensor of structured light reads it; 0 where it reads nothing.
+    """Return [H, W] m as a sensor of structured light reads it; 0 where it reads nothing.
 
     It measures disparity, the reciprocal of depth times a constant: an even error of disparity is one of depth that
     grows with its square.

@@ -1,4 +1,4 @@
-"""Pose, velocity, path and other signals in, the flat observation out, in the original benchmark's order.
+"""Compute the flat observation from pose, velocity, path and other signals, in the original benchmark's order.
 
 Layout by default (reference benchmark, section 1.1), robot frame, full roll-pitch-yaw inverse, no clipping:
 
@@ -9,7 +9,7 @@ Layout by default (reference benchmark, section 1.1), robot frame, full roll-pit
 | 23-25 | base linear velocity | m/s |
 | 26-28 | base angular velocity | rad/s |
 
-Then, where asked for: localisation, odometry, collision, joints, lidar, trail. Images stand beside the
+Then, where requested: localisation, odometry, collision, joints, lidar, trail. Images stand beside the
 vector, not in it: `interactive_nav.sensing.sensors`.
 """
 
@@ -18,12 +18,12 @@ import jax.numpy as jnp
 
 
 def waypoints_in_body(waypoints_w: jax.Array, pos_w: jax.Array, rotation: jax.Array) -> jax.Array:
-    """World waypoints (W, 2), lifted to the robot's own height, in the robot's frame (W, 2)."""
+    """Return world waypoints (W, 2), lifted to the robot's height, in the robot's frame (W, 2)."""
     offset = jnp.concatenate([waypoints_w - pos_w[None, :2], jnp.zeros((waypoints_w.shape[0], 1))], -1)
     return (offset @ rotation)[:, :2]
 
 
-def task_parts(
+def task_observation(
     pos_w: jax.Array,
     rotation: jax.Array,
     linear_velocity_w: jax.Array,
@@ -31,7 +31,7 @@ def task_parts(
     goal_xy_w: jax.Array,
     waypoints_b: jax.Array,
 ) -> dict[str, jax.Array]:
-    """The task's parts of the observation of one environment, in the vector's order.
+    """Return the task's parts of the observation of one environment, in the vector's order.
 
     Args:
         pos_w: (3,) base position, m.
@@ -55,7 +55,7 @@ def task_parts(
 def advance_odometry(
     pose: jax.Array, moved_w: jax.Array, yaw_rad: jax.Array, turned_rad: jax.Array, noise: jax.Array
 ) -> jax.Array:
-    """Dead reckoning over one control step, in the frame of the episode's start.
+    """Advance dead reckoning by one control step, in the frame of the episode's start.
 
     Args:
         pose: (3,) x, y (m), yaw (rad) reckoned so far.

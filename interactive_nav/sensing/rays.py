@@ -1,4 +1,4 @@
-"""Rays against boxes in plain JAX: `BoxTables`, poses and a lens in, depth and class images out, on any device.
+"""Cast rays against boxes in plain JAX, on any device: depth and class images of `BoxTables` through a lens.
 
 A ray meets a box where it has entered the box's three slabs and left none. A pixel keeps one integer, the bits
 of its nearest distance with the class id in the lowest (four cost 2^-19 of the distance, six 2^-17), so that a minimum
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.sensing.base import FAR_M, NEAR_M, CameraPose, Lens
-from interactive_nav.sensing.boxes import BoxTables, box_poses, compose, rotate, slab
+from interactive_nav.sensing.boxes import BoxTables, apply_axes, box_poses, compose, slab
 from interactive_nav.sensing.surfaces import BoxRenderer
 from scenes_mjcf.categories import SEGMENTATIONS
 
@@ -27,26 +27,26 @@ class RayRenderer(BoxRenderer):
     """Draws by casting a ray through the middle of each pixel."""
 
     def __init__(self, tables: BoxTables, lens: Lens, tiled: bool | None = None):
-        """`tiled` chooses the order of work; None: tiles on CPUs."""
+        """Choose the order of work by `tiled`; None: tiles on CPUs."""
         self.lens, self.tables = lens, tables
         self._tiled = jax.default_backend() == "cpu" if tiled is None else tiled
         self.name = "rays (tiles)" if self._tiled else "rays (scan)"
 
     def render_batch(self, scene, qpos, camera):
-        boxes = boxes_seen(self.tables, scene, qpos, camera)
+        boxes = camera_boxes(self.tables, scene, qpos, camera)
         depth, ids = self._cast(boxes, camera, _low_bits(len(SEGMENTATIONS[self.tables.classes].names) - 1))
         return depth, ids.astype(jnp.uint8)
 
     def trace_batch(self, scene, qpos, camera):
         count = self.tables.num_boxes
-        boxes = boxes_seen(self.tables, scene, qpos, camera)
+        boxes = camera_boxes(self.tables, scene, qpos, camera)
         boxes["id"] = jnp.broadcast_to(jnp.arange(1, count + 1, dtype=jnp.int32), boxes["id"].shape)
         depth, ids = self._cast(boxes, camera, _low_bits(count))
         index = jnp.where(ids > 0, ids - 1, count)
         return depth, jnp.where(depth > 0, index, -1)
 
     def _cast(self, boxes: dict[str, jax.Array], camera: CameraPose, mask: int) -> tuple[jax.Array, jax.Array]:
-        """Depth f32, m, and the boxes' numbers i32; both 0 where nothing is met before the far plane."""
+        """Return depth f32, m, and the boxes' numbers i32; both 0 where nothing is met before the far plane."""
         cast = _tiles if self._tiled and self.tables.num_boxes else _scan
         keys = cast(boxes, camera, self.lens, mask)
         distance = jax.lax.bitcast_convert_type(keys & ~mask, jnp.float32)
@@ -55,12 +55,12 @@ class RayRenderer(BoxRenderer):
 
 
 def _low_bits(number: int) -> int:
-    """The mask of the bits of a key that hold numbers up to this one."""
+    """Return the mask of the bits of a key that hold numbers up to this one."""
     return (1 << number.bit_length()) - 1
 
 
-def boxes_seen(tables: BoxTables, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> dict[str, jax.Array]:
-    """What a slab test needs of each box; leading axes [N].
+def camera_boxes(tables: BoxTables, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> dict[str, jax.Array]:
+    """Return what a slab test needs of each box; leading axes [N].
 
     Returns:
         axes [N, B, 3, 3], the camera's forward, right and up (columns) in the box's frame; eye [N, B, 3], its
@@ -70,7 +70,7 @@ def boxes_seen(tables: BoxTables, scene: jax.Array, qpos: jax.Array, camera: Cam
     inverse = jnp.swapaxes(axes, -1, -2)
     return {
         "axes": compose(inverse, camera.axes_w[..., None, :, :]),
-        "eye": rotate(inverse, camera.pos_w[..., None, :] - centre),
+        "eye": apply_axes(inverse, camera.pos_w[..., None, :] - centre),
         "half": tables.half_m[scene],
         "id": tables.class_id[scene].astype(jnp.int32),
     }
@@ -86,7 +86,7 @@ def _greater(a, b):
 
 
 def enter_and_leave(eye, half, directions) -> tuple[jax.Array, jax.Array]:
-    """Distances (entry, exit) at which rays enter and leave a box, in units of the direction; met: entry < exit.
+    """Return distances (entry, exit) at which rays enter and leave a box, in units of the direction; met: entry < exit.
 
     `eye`, the rays' origin in the box's frame, `half` and `directions` are three arrays each, broadcast.
     """
@@ -105,7 +105,7 @@ def _key(entry, leave, half, number, mask: int) -> jax.Array:
 
 
 def _floor_key(height, down, mask: int) -> jax.Array:
-    """The floor's key for a camera `height` above it and rays that fall by `down` per unit of depth; its id is 0."""
+    """Return the floor's key for a camera `height` above it and rays that fall by `down` per depth; its id is 0."""
     met = down > 1e-6
     distance = jnp.where(met, height / jnp.where(met, down, 1.0), -1.0)
     return jnp.where(distance > NEAR_M, jax.lax.bitcast_convert_type(distance, jnp.int32) & ~mask, _EMPTY)
@@ -115,7 +115,7 @@ def _scan(boxes: dict[str, jax.Array], camera: CameraPose, lens: Lens, mask: int
     right, up = jnp.asarray(lens.columns)[None, None], jnp.asarray(lens.rows)[None, :, None]
 
     def direction(axes):
-        """Component of the pixels' rays along one axis: axes [N, 3] -> [N, H, W]."""
+        """Return the component of the pixels' rays along one axis: axes [N, 3] -> [N, H, W]."""
         f, r, u = (axes[:, i, None, None] for i in range(3))
         return (f + r * right) + u * up
 
@@ -134,12 +134,12 @@ def _scan(boxes: dict[str, jax.Array], camera: CameraPose, lens: Lens, mask: int
 
 
 def _tile_side(size: int) -> int:
-    """Side of a tile, pixels: 16, or what divides the image and is near."""
+    """Return the side of a tile, pixels: 16, or what divides the image and is near."""
     return min((s for s in range(12, 21) if size % s == 0), key=lambda s: abs(s - 16), default=min(16, size))
 
 
 def _shows(boxes: dict[str, jax.Array], edges: np.ndarray, axis: int) -> jax.Array:
-    """Which boxes may show between neighbouring planes through the eye: [N, B, k], false if all of it is on one side.
+    """Return which boxes may show between neighbouring planes through the eye, [N, B, k]: not all on one side.
 
     `edges` are [k + 1] rising offsets at depth 1, along the camera's right (axis 1) or up (axis 2).
     """
@@ -153,7 +153,7 @@ def _shows(boxes: dict[str, jax.Array], edges: np.ndarray, axis: int) -> jax.Arr
 
 
 def in_view(boxes: dict[str, jax.Array], lens: Lens) -> jax.Array:
-    """Which boxes of `boxes_seen` may show in the image: [N, B]; false for padding."""
+    """Return which boxes of `camera_boxes` may show in the image: [N, B]; false for padding."""
     wide, high = lens.half_height * lens.width / lens.height, lens.half_height
     across = _shows(boxes, np.array([-wide, wide], np.float32), 1)
     along = _shows(boxes, np.array([-high, high], np.float32), 2)
@@ -161,14 +161,14 @@ def in_view(boxes: dict[str, jax.Array], lens: Lens) -> jax.Array:
 
 
 def _in_front(boxes: dict[str, jax.Array]) -> jax.Array:
-    """Which boxes are not padding and reach before the near plane: [N, B]."""
+    """Return which boxes are not padding and reach before the near plane: [N, B]."""
     ahead = -(boxes["eye"] * boxes["axes"][..., 0]).sum(-1)
     ahead += (boxes["half"] * jnp.abs(boxes["axes"][..., 0])).sum(-1)
     return (boxes["half"][..., 0] >= 0) & (ahead > NEAR_M)
 
 
 def _lists(shows: jax.Array, env: np.ndarray, n: int) -> tuple[jax.Array, jax.Array]:
-    """Each tile's list of the boxes that it shows, and how many: of `shows` [T, B] and the tiles' environments [T].
+    """Return each tile's list of the boxes that it shows, and how many, from `shows` [T, B] and its environment [T].
 
     Returns:
         [T, B + 1] i32 rows of boxes, the free places pointing at the row of padding behind all of them; [T] i32.
@@ -210,14 +210,14 @@ def _tiles(boxes: dict[str, jax.Array], camera: CameraPose, lens: Lens, mask: in
 
     def work(tiles):
         x, y = jnp.asarray(corner_x)[tiles], jnp.asarray(corner_y)[tiles]
-        own, todo = lists[tiles], lengths[tiles].max()
+        in_tile, todo = lists[tiles], lengths[tiles].max()
 
         def direction(f, r, u):
             return (f + r * x + u * y)[:, None] + r[:, None] * dx + u[:, None] * dy
 
         def body(carry):
             k, keys = carry
-            row = rows[jax.lax.dynamic_index_in_dim(own, k, 1, keepdims=False)]
+            row = rows[jax.lax.dynamic_index_in_dim(in_tile, k, 1, keepdims=False)]
             column = [row[:, i] for i in range(15)]
             directions = [direction(*column[3 * i : 3 * i + 3]) for i in range(3)]
             wide = [c[:, None] for c in column]
@@ -242,13 +242,13 @@ def _tiles(boxes: dict[str, jax.Array], camera: CameraPose, lens: Lens, mask: in
 def cast_fan(
     tables: BoxTables, scene: jax.Array, qpos: jax.Array, origin_w: jax.Array, directions_w: jax.Array
 ) -> jax.Array:
-    """Distances along a few rays of one environment, in units of their length: a lidar's beams.
+    """Return distances along a few rays of one environment, in units of their length: a lidar's beams.
 
     From `origin_w` (3,), m, along `directions_w` [R, 3]: [R] f32, infinite where nothing is met; the floor is met too.
     """
     centre, axes = box_poses(tables, scene, qpos)
     inverse = jnp.swapaxes(axes, -1, -2)
-    eye, half = rotate(inverse, origin_w[None] - centre), tables.half_m[scene]
+    eye, half = apply_axes(inverse, origin_w[None] - centre), tables.half_m[scene]
 
     def body(nearest, box):
         inverse, eye, half = box

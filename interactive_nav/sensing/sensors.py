@@ -1,11 +1,11 @@
-"""Physics state and task memory in, what the robot observes out: a vector, and images where asked for.
+"""Compute what the robot observes from the physics' state and the task's memory: a vector, and images on request.
 
 Without images the observation is the flat f32 vector of `interactive_nav.sensing.observation`. With them it is a dict,
 its keys named as Brax's networks for pixels want them:
 
 | key | content |
 |---|---|
-| `state` | the vector (left out if no part of it is asked for) |
+| `state` | the vector (left out if no part of it is requested) |
 | `pixels/depth` | (H, W, 1): distance along the optical axis over `depth_range_m`, cut at 1; 0 where nothing is met |
 | `pixels/segmentation` | (H, W, 1): class id over 11, or over their number (`scenes_mjcf.categories.SEGMENTATIONS`) |
 | `pixels/rgb` | (H, W, 3): colour in [0, 1] |
@@ -33,10 +33,10 @@ from interactive_nav.config import IMAGES, NavConfig, SensorConfig
 from interactive_nav.physics.base import PhysicsState
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing import Lens, Renderer, build_boxes, make_renderer
-from interactive_nav.sensing.boxes import rotate
+from interactive_nav.sensing.boxes import apply_axes
 from interactive_nav.sensing.mount import Mount, make_mount
 from interactive_nav.sensing.noise import disturbed
-from interactive_nav.sensing.observation import task_parts
+from interactive_nav.sensing.observation import task_observation
 from interactive_nav.sensing.rays import cast_fan
 from interactive_nav.sensing.shading import draw_look
 from interactive_nav.types import NavInfo
@@ -52,9 +52,9 @@ LIDAR_NEAR_M = 0.05
 
 
 def stream(rng: jax.Array, name: str, step_count: jax.Array) -> jax.Array:
-    """A sensor's key of one control step.
+    """Return a sensor's key of one control step.
 
-    Its name is folded into the episode's key, so that each sensor has a stream of its own. A small number would not
+    Its name is folded into the episode's key, so that each sensor has a separate stream. A small number would not
     do: `fold_in(key, 1)` is `split(key)[1]`, which the next episode is drawn from.
     """
     return jax.random.fold_in(jax.random.fold_in(rng, zlib.crc32(name.encode())), step_count)
@@ -65,7 +65,7 @@ class SensorCamera:
     """A camera of the robot's, and what draws for it."""
 
     prefix: str
-    """Of its images' names: empty for the robot's own, else its name and a slash."""
+    """Of its images' names: empty for the robot's camera, else its name and a slash."""
     mount: Mount
     lens: Lens
     renderer: Renderer
@@ -86,16 +86,16 @@ class Sensors:
         rules, config = settings.rules, settings.sensors
         self._layout, self._config = world.layout, config
         model = world.models[0]
-        self._joints = _own_joints(model, world)
+        self._joints = _robot_joints(model, world)
         self._images = tuple(name for name in IMAGES if name in config.observations)
         meshes = config.image_geometry == "meshes"
         self._drawn = (*self._images, *(["normals"] if config.camera_noise.depth_grazing_deg else []))
         coloured = not meshes and bool({"rgb", "normals"} & set(self._drawn))
         self.boxes = build_boxes(world, config.segmentation_classes, coloured)
-        seen = build_boxes(world, config.segmentation_classes, coloured, True) if config.robot_visible else self.boxes
+        shown = build_boxes(world, config.segmentation_classes, coloured, True) if config.robot_visible else self.boxes
         self.mount = make_mount(model, world.robot.base_body, world.robot.camera)
         self.lens = Lens(config.image_size, config.image_size, config.image_fov_deg or world.robot.camera.fov_deg)
-        drawn = seen, self.lens, config.renderer, backend, world if meshes else None
+        drawn = shown, self.lens, config.renderer, backend, world if meshes else None
         self.renderer = make_renderer(*drawn) if self._images else None
         self.cameras: tuple[SensorCamera, ...] = _cameras(world, config, self.renderer) if self.renderer else ()
         angles = -0.5 * config.lidar_fov_deg + np.arange(config.lidar_rays) * config.lidar_fov_deg / config.lidar_rays
@@ -117,15 +117,15 @@ class Sensors:
 
     @property
     def observation_size(self) -> int | dict[str, tuple[int, ...]]:
-        """Length of the vector, or with images the shape under each key."""
+        """Return the length of the vector, or with images the shape under each key."""
         length = sum(self.sizes.values())
         if not self._images:
             return length
         shapes: dict[str, tuple[int, ...]] = {"state": (length,)} if length else {}
         for camera in self.cameras:
             side = camera.lens.height, camera.lens.width
-            own = {name: (*side, 3 if name in ("rgb", "normals") else 1) for name in self._images}
-            shapes |= {f"pixels/{camera.prefix}{name}": shape for name, shape in own.items()}
+            image_shapes = {name: (*side, 3 if name in ("rgb", "normals") else 1) for name in self._images}
+            shapes |= {f"pixels/{camera.prefix}{name}": shape for name, shape in image_shapes.items()}
         return shapes
 
     def observe(
@@ -146,17 +146,17 @@ class Sensors:
         return out
 
     def _pixels(self, camera: SensorCamera, physics: PhysicsState, nav: NavInfo, rng: jax.Array):
-        """What one camera adds to the observation."""
+        """Return what one camera adds to the observation."""
         config, out = self._config, {}
 
         def key_of(name: str) -> jax.Array:
             return stream(rng, f"{camera.prefix}{name}", nav.step_count)
 
-        seen = disturbed(config.camera_noise, camera.lens, self.render(physics, nav, camera, rng), key_of)
-        depth = jnp.clip(seen["depth"] / config.depth_range_m, 0.0, 1.0)
+        noisy = disturbed(config.camera_noise, camera.lens, self.render(physics, nav, camera, rng), key_of)
+        depth = jnp.clip(noisy["depth"] / config.depth_range_m, 0.0, 1.0)
         depth = _noisy(depth, config.depth_noise, config.depth_dropout, 0.0, key_of("depth"))
-        ids = seen["segmentation"].astype(jnp.float32) / SEGMENTATIONS[self.boxes.classes].divisor
-        images = {**seen, "depth": depth[..., None], "segmentation": ids[..., None]}
+        ids = noisy["segmentation"].astype(jnp.float32) / SEGMENTATIONS[self.boxes.classes].divisor
+        images = {**noisy, "depth": depth[..., None], "segmentation": ids[..., None]}
         dtype = jnp.dtype(config.image_dtype)
         whole = dtype == jnp.uint8
         for name in self._images:
@@ -168,7 +168,7 @@ class Sensors:
         return out
 
     def render(self, physics: PhysicsState, nav: NavInfo, camera: SensorCamera, rng: jax.Array) -> dict[str, jax.Array]:
-        """What a camera sees, without noise: the images that are observed or needed for it, as
+        """Return what a camera sees, without noise: the images that are observed or needed for it, as
         `Renderer.images_batch` has them, without its leading axis; depth and segmentation always."""
         # A broken world's numbers must not reach the renderer's search tree.
         qpos = jnp.where(jnp.isfinite(physics.qpos), physics.qpos, 0.0)
@@ -183,7 +183,7 @@ class Sensors:
     ) -> jax.Array:
         v, q = self._layout.robot_qvel, self._layout.robot_qpos
         rotation = matrix_from_quat(physics.qpos[q + 3 : q + 7])
-        values = task_parts(
+        values = task_observation(
             nav.robot_pos_w,
             rotation,
             physics.qvel[v : v + 3],
@@ -206,8 +206,8 @@ class Sensors:
 
     def _scan(self, physics: PhysicsState, nav: NavInfo, rotation: jax.Array, rng: jax.Array) -> jax.Array:
         config = self._config
-        origin = nav.robot_pos_w + rotate(rotation, jnp.asarray(config.lidar_pos_m, jnp.float32))
-        beams = rotate(rotation[None], jnp.asarray(self._beams_b))
+        origin = nav.robot_pos_w + apply_axes(rotation, jnp.asarray(config.lidar_pos_m, jnp.float32))
+        beams = apply_axes(rotation[None], jnp.asarray(self._beams_b))
         distance = cast_fan(self.boxes, nav.scene_index, physics.qpos, origin, beams)
         scan = jnp.clip(distance / config.lidar_range_m, LIDAR_NEAR_M / config.lidar_range_m, 1.0)
         key = stream(rng, "lidar", nav.step_count)
@@ -215,23 +215,23 @@ class Sensors:
 
 
 def _cameras(world: World, config: SensorConfig, renderer: Renderer) -> tuple[SensorCamera, ...]:
-    """The cameras that are asked for; those of one lens share a renderer."""
-    own, drawn = world.robot.camera, {renderer.lens: renderer}
+    """Return the requested cameras; those of one lens share a renderer."""
+    robot_camera, drawn = world.robot.camera, {renderer.lens: renderer}
     out = []
     for view in config.views:
         side = view.size or config.image_size
-        lens = Lens(side, side, view.fov_deg or config.image_fov_deg or own.fov_deg)
+        lens = Lens(side, side, view.fov_deg or config.image_fov_deg or robot_camera.fov_deg)
         if lens not in drawn:
             drawn[lens] = renderer.through(lens)
-        pitch = own.pitch_rad if view.pitch_deg is None else math.radians(view.pitch_deg)
-        seat = dataclasses.replace(own, pos_m=view.pos_m or own.pos_m, pitch_rad=pitch)
+        pitch = robot_camera.pitch_rad if view.pitch_deg is None else math.radians(view.pitch_deg)
+        seat = dataclasses.replace(robot_camera, pos_m=view.pos_m or robot_camera.pos_m, pitch_rad=pitch)
         mount = make_mount(world.models[0], world.robot.base_body, seat, math.radians(view.yaw_deg))
         out.append(SensorCamera(f"{view.name}/" if view.name else "", mount, lens, drawn[lens]))
     return tuple(out)
 
 
 def _noisy(reading: jax.Array, noise: float, dropout: float, lost: float, key: jax.Array) -> jax.Array:
-    """Readings in [0, 1] with a Gaussian error in proportion, some replaced by `lost`."""
+    """Return readings in [0, 1] with a Gaussian error in proportion, some replaced by `lost`."""
     key_noise, key_dropout = jax.random.split(key)
     if noise:
         reading = jnp.clip(reading * (1 + noise * jax.random.normal(key_noise, reading.shape)), 0.0, 1.0)
@@ -240,13 +240,13 @@ def _noisy(reading: jax.Array, noise: float, dropout: float, lost: float, key: j
     return reading
 
 
-def _own_joints(model: mujoco.MjModel, world: World) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The robot's joints but its free one: addresses in qpos and in qvel, and whether they turn without limit."""
-    own = [
+def _robot_joints(model: mujoco.MjModel, world: World) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the robot's joints but its free one: addresses in qpos and qvel, and whether they turn without limit."""
+    joints = [
         j
         for j in range(model.njnt)
         if model.jnt_bodyid[j] in world.layout.robot_bodies
         and int(model.jnt_type[j]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     ]
-    turns = (model.jnt_type[own] == mujoco.mjtJoint.mjJNT_HINGE) & ~model.jnt_limited[own].astype(bool)
-    return model.jnt_qposadr[own], model.jnt_dofadr[own], turns
+    turns = (model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE) & ~model.jnt_limited[joints].astype(bool)
+    return model.jnt_qposadr[joints], model.jnt_dofadr[joints], turns

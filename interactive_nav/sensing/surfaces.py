@@ -1,4 +1,4 @@
-"""Which box each pixel shows in, what there is to see of it out: depth, class, normal and colour, for all renderers."""
+"""Compute depth, class, normal and colour from the box that each pixel shows, for all renderers."""
 
 import abc
 
@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from interactive_nav.sensing.base import CameraPose, Lens, Renderer
-from interactive_nav.sensing.boxes import BoxTables, box_poses, rotate, slab
+from interactive_nav.sensing.boxes import BoxTables, apply_axes, box_poses, slab
 from interactive_nav.sensing.shading import SKY_COLOUR, Look, lit
 
 _FLOOR_HALF_M = (1e4, 1e4, 1.0)
@@ -18,7 +18,7 @@ class BoxRenderer(Renderer):
 
     @abc.abstractmethod
     def trace_batch(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
-        """Which box each pixel shows: what colours and normals are made from.
+        """Return which box each pixel shows, from which colours and normals follow.
 
         Returns:
             Depth as `render_batch` gives it, and indices [N, H, W] i32 into the tables' boxes; B is the floor and
@@ -41,9 +41,9 @@ def paint(
     index: jax.Array,
     look: Look | None = None,
 ) -> dict[str, jax.Array]:
-    """Images, as `Renderer.images_batch` has them, from the boxes that a renderer has met.
+    """Return images, as `Renderer.images_batch` has them, from the boxes that a renderer has met.
 
-    Each ray meets its own box once more, so that depth and face are exact and the same whoever found the box. Leading
+    Each ray meets its box once more, so that depth and face are exact and the same with every renderer. Leading
     axes are [N]; `index` [N, H, W] is of `BoxRenderer.trace_batch`; a `look` of None leaves things as they are.
     """
     n, shape = len(scene), index.shape
@@ -57,7 +57,7 @@ def paint(
     met = index >= 0
 
     def of_pixel(table: jax.Array) -> jax.Array:
-        """[N, B + 1, k] to [N, H, W, k]."""
+        """Return a table [N, B + 1, k] by pixel, [N, H, W, k]."""
         return jnp.take_along_axis(table, place[..., None], 1).reshape(*shape, table.shape[-1])
 
     row = of_pixel(boxes)
@@ -65,17 +65,17 @@ def paint(
     inverse = jnp.swapaxes(axes, -1, -2)
     forward, right, up = (camera.axes_w[:, None, None, :, i] for i in range(3))
     across, along = jnp.asarray(lens.columns)[None, None, :, None], jnp.asarray(lens.rows)[None, :, None, None]
-    direction = rotate(inverse, forward + right * across + up * along)
-    low, _ = slab(rotate(inverse, camera.pos_w[:, None, None] - centre), half, direction)
+    direction = apply_axes(inverse, forward + right * across + up * along)
+    low, _ = slab(apply_axes(inverse, camera.pos_w[:, None, None] - centre), half, direction)
     outward = -jnp.sign(direction) * jax.nn.one_hot(jnp.argmax(low, -1), 3)
-    normal = rotate(axes, outward) * met[..., None]
+    normal = apply_axes(axes, outward) * met[..., None]
     sky = jnp.broadcast_to(jnp.asarray(SKY_COLOUR), (*shape, 3))
     base = jnp.where(met[..., None], of_pixel(tables.colour[scene]), sky)
-    seen = jnp.where(met, of_pixel(ids[..., None])[..., 0], 0)
+    classes = jnp.where(met, of_pixel(ids[..., None])[..., 0], 0)
     return {
         "depth": jnp.where(met, low.max(-1), 0.0),
-        "segmentation": seen,
-        **lit_images(base, normal, camera, met, seen, look),
+        "segmentation": classes,
+        **lit_images(base, normal, camera, met, classes, look),
     }
 
 
@@ -87,7 +87,7 @@ def lit_images(
     ids: jax.Array,
     look: Look | None = None,
 ) -> dict[str, jax.Array]:
-    """The images `rgb` and `normals`, of `base` colours in [0, 1] and `normal_w`, both [N, H, W, 3], 0 where none.
+    """Return images `rgb` and `normals` of `base` colours in [0, 1] and `normal_w`, both [N, H, W, 3], 0 where none.
 
     Light falls where `shaded`, [N, H, W] bool; else the colours stay. A `look` of None leaves things as they are.
     """

@@ -1,8 +1,8 @@
-"""MJX-Warp's batched renderer (NVIDIA): the same boxes as everywhere, in a model of its own that holds nothing else.
+"""Draw with MJX-Warp's batched renderer (NVIDIA): the same boxes as everywhere, in a model that holds nothing else.
 
 The engine's kinematics are not run: poses of boxes and camera are computed here and written into the data, so
 that all backends draw the same numbers. MJX allocates a context for a number of environments, outside JAX;
-one is made for each batch size and kept.
+one is created for each batch size and kept.
 """
 
 import copy
@@ -17,7 +17,7 @@ from interactive_nav.physics.base import uncommitted
 from interactive_nav.physics.warp_callbacks import held, keep_collector_out
 from interactive_nav.sensing.base import FAR_M, NEAR_M, CameraPose, Lens
 from interactive_nav.sensing.boxes import BoxTables, box_poses
-from interactive_nav.sensing.rays import boxes_seen, in_view
+from interactive_nav.sensing.rays import camera_boxes, in_view
 from interactive_nav.sensing.shading import SKY_COLOUR
 from interactive_nav.sensing.surfaces import BoxRenderer
 
@@ -71,7 +71,7 @@ class WarpRenderer(BoxRenderer):
         centre, axes = box_poses(self.tables, scene, qpos)
         half = self.tables.half_m[scene]
         # What the camera does not see lies aside with the padding: the tree of the rest is smaller.
-        hidden = ~in_view(boxes_seen(self.tables, scene, qpos, camera), self.lens)[..., None]
+        hidden = ~in_view(camera_boxes(self.tables, scene, qpos, camera), self.lens)[..., None]
         centre = jnp.where(hidden, jnp.asarray(_HIDDEN_W), centre)
         half = jnp.where(hidden, _HIDDEN_HALF_M, half)
         order = jnp.argsort(morton_codes(centre[..., :2], hidden[..., 0]), axis=1)
@@ -82,7 +82,7 @@ class WarpRenderer(BoxRenderer):
         fields = {
             "geom_xpos": jnp.concatenate([centre, floor], 1),
             "geom_xmat": jnp.concatenate([axes, upright], 1),
-            **_seen_from(camera, self._host),
+            **_data_of_camera(camera, self._host),
         }
         size = jnp.concatenate([half, jnp.broadcast_to(jnp.asarray([0.0, 0.0, 0.1]), (n, 1, 3))], 1)
         template = mjx.make_data(self._host, impl="warp", naconmax=1, njmax=1)
@@ -105,7 +105,7 @@ class WarpRenderer(BoxRenderer):
 
 
 def morton_codes(xy_m: jax.Array, hidden: jax.Array) -> jax.Array:
-    """Places [N, B] i32 on a Z-order curve: neighbours in its order are neighbours in the plane; hidden ones come last.
+    """Return places [N, B] i32 on a Z-order curve: neighbours on it are neighbours in the plane; hidden ones come last.
 
     The renderer's tree of boxes keeps its shape, halves of halves of their order, and only its bounds follow
     the boxes: it is as good as that order. Hidden boxes, [N, B] bool, have no part in the curve's extent.
@@ -122,7 +122,7 @@ class WarpColour:
     """RGB of one scene's visual meshes, with textures, for a batch of poses of it."""
 
     def __init__(self, model: mujoco.MjModel, lens: Lens, n: int, groups: list[int]):
-        """Makes a context; the first picture compiles.
+        """Create a context; the first picture compiles.
 
         The model has visual meshes and one camera; `n` is pictures a call, `groups` are the geom groups that are drawn.
         """
@@ -145,13 +145,13 @@ class WarpColour:
         self.draw = jax.jit(self._draw)
 
     def _draw(self, geom_xpos, geom_xmat, camera: CameraPose) -> jax.Array:
-        """Geoms' poses [N, ngeom, 3] and [N, ngeom, 3, 3], cameras [N, ...] to [N, H, W, 3] u8."""
+        """Draw geoms' poses [N, ngeom, 3] and [N, ngeom, 3, 3], cameras [N, ...] to [N, H, W, 3] u8."""
         n = geom_xpos.shape[0]
         context, template = self._context.pytree(), mjx.make_data(self._host, impl="warp", naconmax=1, njmax=1)
         fields = {
             "geom_xpos": jnp.asarray(geom_xpos, jnp.float32),
             "geom_xmat": jnp.asarray(geom_xmat, jnp.float32),
-            **_seen_from(camera, self._host),
+            **_data_of_camera(camera, self._host),
         }
 
         def one(fields):
@@ -162,8 +162,8 @@ class WarpColour:
         return jnp.stack([(packed >> shift) & 255 for shift in (16, 8, 0)], -1).astype(jnp.uint8)
 
 
-def _seen_from(camera: CameraPose, model: mujoco.MjModel) -> dict[str, jax.Array]:
-    """Fields of MJX's data, leading axis [N]: the model's only camera, and a `qpos` that nobody reads."""
+def _data_of_camera(camera: CameraPose, model: mujoco.MjModel) -> dict[str, jax.Array]:
+    """Return fields of MJX's data, leading axis [N]: the model's only camera, and a `qpos` that nobody reads."""
     pos_w, axes_w = jnp.asarray(camera.pos_w, jnp.float32), jnp.asarray(camera.axes_w, jnp.float32)
     # MuJoCo's cameras look along -z with x to the right.
     forward, right, up = (axes_w[..., i] for i in range(3))
@@ -175,7 +175,7 @@ def _seen_from(camera: CameraPose, model: mujoco.MjModel) -> dict[str, jax.Array
 
 
 def _box_model(num_boxes: int, lens: Lens) -> mujoco.MjModel:
-    """A model of `num_boxes` boxes, the floor after them, and one camera; poses and sizes are placeholders."""
+    """Build a model of `num_boxes` boxes, the floor after them, and one camera; poses and sizes are placeholders."""
     spec = mujoco.MjSpec()
     spec.stat.extent = 1.0
     spec.visual.map.znear, spec.visual.map.zfar = NEAR_M, FAR_M

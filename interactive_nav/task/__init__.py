@@ -1,1 +1,1 @@
-"""The environment, its batches and its devices."""
+"""Define the environment, its batches and its devices."""

@@ -1,6 +1,6 @@
-"""InteractiveNav, a Brax environment: keys and actions in, states out; wiring only.
+"""Define InteractiveNav, a Brax environment from keys and actions to states; it only wires parts together.
 
-`reset` and `step` are pure, jit-able and vmap-able; every constant is made in `__init__`. Episodes follow
+`reset` and `step` are pure, jit-able and vmap-able; every constant is built in `__init__`. Episodes follow
 section IV of Interactive Gibson (Xia et al. 2020); where paper and code differ, `docs/design.md` says which
 is meant.
 """
@@ -33,7 +33,7 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.slots import parking_spot
 from interactive_nav.scenes.world import build_world
-from interactive_nav.sensing.boxes import body_poses, rotate
+from interactive_nav.sensing.boxes import apply_axes, body_poses
 from interactive_nav.sensing.observation import waypoints_in_body
 from interactive_nav.sensing.sensors import Sensors
 from interactive_nav.task.terms import TERMS, Moment, Step, Term
@@ -80,7 +80,7 @@ class InteractiveNav(Env):
         self.terms = (*(t for t in TERMS if t.kind != "observation" or t.name in observed), *terms)
         keys = [t.key for t in self.terms]
         if repeated := [key for key in keys if keys.count(key) > 1]:
-            raise ConfigError(f"terms: two are called '{repeated[0]}', expected names of their own; rename one")
+            raise ConfigError(f"terms: two are called '{repeated[0]}', expected different names; rename one")
         self.metric_names = tuple(t.key for t in self.terms if t.kind == "metric")
         self.reward_names = tuple(t.key for t in self.terms if t.kind == "reward")
         extra = {t.name: t.size for t in terms if t.kind == "observation"}
@@ -94,46 +94,46 @@ class InteractiveNav(Env):
 
     @property
     def backend(self) -> str:
-        """Physics backend in use: warp, jax or native."""
+        """Return the physics backend in use: warp, jax or native."""
         return self.physics.name
 
     @property
     def observation_size(self) -> int | dict[str, tuple[int, ...]]:  # type: ignore[override]
-        """Length of the observation; with images, the shape under each key."""
+        """Return the length of the observation; with images, the shape under each key."""
         return self.sensors.observation_size
 
     @property
     def action_size(self) -> int:
-        """Number of actions."""
+        """Return the number of actions."""
         return self.robot.action_size
 
     @property
     def dt(self) -> float:
-        """Control period, s."""
+        """Return the control period, s."""
         return self.config.physics.control_dt_s
 
     def furniture_map(self, scene: int) -> np.ndarray:
-        """[rows, columns] bool on a scene's map: where furniture stands at rest, below the robot's height."""
+        """Return [rows, columns] bool on a scene's map: where furniture stands at rest, below the robot's height."""
         return furniture_map(self.scenes[scene], rest_poses(self.world, scene), self.robot.height_m)
 
     def reset(self, rng: jax.Array, scene: jax.Array | None = None) -> State:
-        """The first state of a new episode; `rng`, one key, is consumed, and `scene`, [] i32, is drawn where None."""
+        """Return the first state of a new episode; `rng`, one key, is consumed; `scene`, [] i32, is drawn if None."""
         return self.observe(self.draw(rng, scene))
 
     def draw(self, rng: jax.Array, scene: jax.Array | None = None) -> State:
-        """`reset` without an observation: `obs` is empty until `observe`."""
+        """Do `reset` without an observation: `obs` is empty until `observe`."""
         rng, key = jax.random.split(rng)
         return self._begin(self.draw_start(key, scene), rng)
 
     def draw_start(self, key: jax.Array, scene: jax.Array | None = None) -> EpisodeStart:
-        """What an episode starts from, as `reset` draws it: `key` is consumed, `scene` is [] i32, None: drawn."""
+        """Return what an episode starts from, as `reset` draws it: `key` is consumed, `scene` [] i32, drawn if None."""
         rules = self.config.rules
         distances_m = rules.min_goal_distance_m, rules.max_goal_distance_m
         about = self.tables, self._small_radius_m, self.robot.footprint_radius_m, *distances_m, scene
         return draw_episode(key, *about, rules.goal_clear, rules.random_object_yaw)
 
     def strew(self, key: jax.Array, start: EpisodeStart) -> EpisodeStart:
-        """One environment's given episode with its small objects drawn: clear of start, goal and each other."""
+        """Return one environment's given episode with its small objects drawn: clear of start, goal and each other."""
         key_place, key_turn = jax.random.split(key)
         free, scene = [start.start_xy_w, start.goal_xy_w], start.scene_index
         xy, ok = place_small(key_place, self.tables, scene, self._small_radius_m, free, self.robot.footprint_radius_m)
@@ -141,7 +141,7 @@ class InteractiveNav(Env):
         return start.replace(small_xy_w=xy, small_yaw_rad=turn, small_placed=ok)
 
     def reset_to(self, start: EpisodeStart, rng: jax.Array) -> State:
-        """The first state of a given episode (fixed evaluation episodes, tests); it carries `rng` for its next one."""
+        """Return the first state of a given episode (fixed evaluation episodes, tests), with `rng` for the next one."""
         return self.observe(self._begin(start, rng))
 
     def _begin(self, start: EpisodeStart, rng: jax.Array) -> State:
@@ -191,7 +191,7 @@ class InteractiveNav(Env):
         return jax.tree.map(lambda new, old: old if new is old else jnp.where(again, new, old), first, nav)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advances one environment by one control period.
+        """Advance one environment by one control period.
 
         `action` is (A,) in [-1, 1]; it is clipped, and non-finite entries count as 0.
         """
@@ -199,7 +199,7 @@ class InteractiveNav(Env):
         return self.observe(state, blank=state.metrics["nonfinite"] > 0)
 
     def observe(self, state: State, blank: jax.Array | bool = False) -> State:
-        """The state with the observation of where it is now; zeros where `blank`, as after a broken step."""
+        """Return the state with the observation of where it is now; zeros where `blank`, as after a broken step."""
         nav: NavInfo = state.info["nav"]
         physics: PhysicsState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
         moment = Moment(*self._constants, nav, physics, self._robot_pose(physics)[1])
@@ -209,7 +209,7 @@ class InteractiveNav(Env):
         return state.replace(obs=jax.tree.map(lambda x: jnp.where(blank, jnp.zeros_like(x), x), obs))
 
     def advance(self, state: State, action: jax.Array) -> State:
-        """`step` without an observation: `obs` stays what it was until `observe`."""
+        """Do `step` without an observation: `obs` stays what it was until `observe`."""
         rules, nav = self.config.rules, state.info["nav"]
         action = jnp.where(jnp.isfinite(action), action, 0.0)
         command = jnp.asarray(self.robot.command(action, jnp), jnp.float32)
@@ -223,7 +223,7 @@ class InteractiveNav(Env):
         nav = step.nav
         physics = physics.replace(control_steps=nav.step_count)  # pyright: ignore[reportAttributeAccessIssue]
 
-        # Contacts were dropped: what the robot did is no longer known, and the episode ends here.
+        # Contacts were dropped: what the robot did is no longer certain, and the episode ends here.
         lost = ~step.broken & (signals.overflow > 0)
         lifted = ~step.broken & ~lost & ~step.success & step.lifted & rules.fail_when_lifted
         timed_out = ~step.success & ~step.broken & ~lost & ~lifted & (nav.step_count >= rules.episode_steps)
@@ -277,7 +277,7 @@ class InteractiveNav(Env):
         )  # fmt: skip
 
     def initial_physics(self, start: EpisodeStart) -> PhysicsState:
-        """The physics' state that a given episode begins with."""
+        """Return the physics' state that a given episode starts with."""
         layout = self.world.layout
         qpos = self.tables.rest_qpos[start.scene_index]
         yaw, at = start.start_yaw_rad, layout.robot_qpos
@@ -297,9 +297,9 @@ class InteractiveNav(Env):
         return physics.qpos[at : at + 3], matrix_from_quat(physics.qpos[at + 3 : at + 7])
 
     def _object_positions(self, scene: jax.Array, physics: PhysicsState) -> jax.Array:
-        """(M, 3) centres of mass in the world frame."""
+        """Return (M, 3) centres of mass in the world frame."""
         pos_w, axes_w = body_poses(self.sensors.boxes, scene, physics.qpos)
-        return pos_w[:-1] + rotate(axes_w[:-1], self.tables.com_m[scene])
+        return pos_w[:-1] + apply_axes(axes_w[:-1], self.tables.com_m[scene])
 
     def _score_mass_kg(self) -> float:
         """Return m_0 as the scores take it, kg."""
@@ -310,7 +310,7 @@ class InteractiveNav(Env):
     def _geodesic(
         self, scene: jax.Array, goal: GoalField, detour: tuple[GoalField, jax.Array] | None, pos_w: jax.Array
     ) -> jax.Array:
-        """[] m: the distance that the potential is made of."""
+        """Return [] m: the distance from which the potential follows."""
         xy = pos_w[:2]
         if self.config.rules.potential == "quantised":
             xy = cell_centre(self.tables, scene, xy)

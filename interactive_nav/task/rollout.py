@@ -105,7 +105,7 @@ class Player:
         """Play every episode to its end.
 
         Args:
-            keys: [N, 2]; an episode is drawn, and its policy's randomness is, from its own key alone.
+            keys: [N, 2]; an episode is drawn, and its policy's randomness is, from its key alone.
             starts: `EpisodeStart`s, leaves [N, ...]: these episodes instead of drawn ones.
             scene_index: [N] i32, the scene of each drawn episode; None: drawn as well.
             record: E of the recorders at each step; None: all.

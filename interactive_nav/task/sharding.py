@@ -1,4 +1,4 @@
-"""A natively batched environment in, the same spread over several devices out: one program, equal shares.
+"""Spread a natively batched environment over several devices: one program, equal shares.
 
     env = ShardedEnv(AutoResetEnv(interactive_nav.make(...)))       # all devices, of all processes
     state = jax.jit(env.reset)(jax.random.split(key, num_envs))     # leaves are sharded along their first axis
@@ -21,14 +21,14 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from interactive_nav_common.errors import ConfigError
 
 AXIS = "i"
-"""Name of the mesh's axis; Brax's own."""
+"""Name of the mesh's axis, as in Brax."""
 
 
 class ShardedEnv(Wrapper):
     """Steps equal shares of a batch on each device."""
 
     def __init__(self, env: Env, devices: Sequence[Any] | None = None):
-        """Wraps an environment."""
+        """Wrap an environment."""
         super().__init__(env)
         self.mesh = Mesh(np.asarray(devices if devices is not None else jax.devices()), (AXIS,))
         self.sharding = NamedSharding(self.mesh, PartitionSpec(AXIS))
@@ -38,29 +38,29 @@ class ShardedEnv(Wrapper):
 
     @property
     def num_devices(self) -> int:
-        """Devices that share the batch."""
+        """Return the number of devices that share the batch."""
         return self.mesh.size
 
     def reset(self, rng: jax.Array) -> State:
-        """[N, 2] keys to N states."""
+        """Return N states for [N, 2] keys."""
         if rng.shape[0] % self.num_devices:
             raise ConfigError(
                 f"{rng.shape[0]} environments over {self.num_devices} devices, expected a multiple: "
                 f"take {self.num_devices * max(1, rng.shape[0] // self.num_devices)}"
             )
-        # Each device sees its share alone: which environments these are, it must be told.
+        # Each device sees its share alone: it must be given which environments these are.
         whole = rng, jnp.arange(rng.shape[0])
         return self._reset(*(jax.lax.with_sharding_constraint(x, self.sharding) for x in whole))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """N states and [N, A] actions to N states."""
+        """Return the states that follow N states and [N, A] actions."""
         return self._step(state, jax.lax.with_sharding_constraint(action, self.sharding))
 
 
 def start_distributed(coordinator: str, num_processes: int, process_id: int) -> None:
-    """Joins processes, on one machine or several, into one JAX program.
+    """Join processes, on one machine or several, into one JAX program.
 
-    Every process runs the same script with its own `process_id`; afterwards `jax.devices()` are the devices
+    Every process runs the same script with another `process_id`; afterwards `jax.devices()` are the devices
     of all of them and `ShardedEnv` spreads over all.
     """
     if not 0 <= process_id < num_processes:

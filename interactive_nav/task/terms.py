@@ -227,6 +227,6 @@ TERMS = (
              trail_w[jnp.array(TRAIL)], at.nav.robot_pos_w, at.rotation).reshape(-1),
          lambda nav: jnp.tile(nav.robot_pos_w[:2], (max(TRAIL) + 1, 1)), _trail, 2 * len(TRAIL)),
 )  # fmt: skip
-"""The benchmark's own, metrics in the order of the columns of rows."""
+"""The benchmark's terms, metrics in the order of the columns of rows."""
 EPISODE_METRICS = tuple(term.key for term in TERMS if term.kind == "metric")
 REWARD_TERMS = tuple(term.key for term in TERMS if term.kind == "reward")

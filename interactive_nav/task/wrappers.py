@@ -1,6 +1,6 @@
-"""The seam to learners: a batched environment whose finished episodes are followed by newly drawn ones.
+"""Connect learners: batch an environment whose finished episodes are followed by newly drawn ones.
 
-Brax's own auto-reset returns each environment's first state again, so an environment would repeat one
+Brax's auto-reset returns each environment's first state again, so an environment would repeat one
 episode for ever, and what the task keeps in `info` would leak into it.
 """
 
@@ -20,12 +20,12 @@ DRAW_SHARE = 16
 
 
 def scene_of_slot(env: InteractiveNav, slot: jax.Array) -> jax.Array | None:
-    """[...] scenes that environments with these numbers in their batch keep; None where each episode draws one."""
+    """Return the scenes [...] that environments of these numbers keep; None where each episode draws one."""
     return slot % len(env.scenes) if env.config.rules.scene_choice == "slot" else None
 
 
 def reset_all(env: InteractiveNav, keys: jax.Array, slot: jax.Array | None = None) -> State:
-    """[N, 2] keys, consumed, to N new episodes, each in the scene that its environment keeps, if it keeps one.
+    """Return N new episodes of [N, 2] keys, consumed, each in the scene that its environment keeps, if it keeps one.
 
     `slot` is [N] i32, numbers of the environments where these are a part of a larger batch; None: 0 to N - 1.
     """
@@ -34,7 +34,7 @@ def reset_all(env: InteractiveNav, keys: jax.Array, slot: jax.Array | None = Non
 
 
 def draw_where(env: InteractiveNav, current: tuple, over: jax.Array) -> tuple:
-    """New episodes where `over`, drawn for a part of the batch at a time: few end in one step.
+    """Draw new episodes where `over`, drawn for a part of the batch at a time: few end in one step.
 
     Args:
         current: physics, `nav` and `rng` of N environments; where an episode is over, its `rng` is consumed.
@@ -62,11 +62,11 @@ def draw_where(env: InteractiveNav, current: tuple, over: jax.Array) -> tuple:
 def wrap_for_brax_training(
     env: Any, episode_length: int | None = None, action_repeat: int = 1, randomization_fn: Any = None
 ) -> AutoResetEnv:
-    """What Brax's learners take as `wrap_env_fn`, as MuJoCo Playground has it: every episode is newly drawn.
+    """Wrap an environment as Brax's learners' `wrap_env_fn`, as MuJoCo Playground has it: every episode is newly drawn.
 
     Args:
         env: what `interactive_nav.make` returns, or a wrapper of it: see `AutoResetEnv`.
-        episode_length: at least the environment's own `episode_steps`, which ends its episodes; None: that.
+        episode_length: at least the environment's `episode_steps`, which ends its episodes; None: that.
         action_repeat: control steps that an action is held for.
         randomization_fn: none: scenes and episodes are drawn by the environment.
 
@@ -85,11 +85,11 @@ def wrap_for_brax_training(
 
 
 def _refuse_passed_over(env: Any) -> None:
-    """Refuses wrappers whose `step` or `reset` is never called: a batch calls their finer parts."""
+    """Refuse wrappers whose `step` or `reset` is never called: a batch calls their finer parts."""
     while isinstance(env, Wrapper):
-        own = {name for name in ("reset", "step", "draw", "advance", "observe") if name in _overridden(type(env))}
+        changed = {name for name in ("reset", "step", "draw", "advance", "observe") if name in _overridden(type(env))}
         for name, part in (("step", "advance"), ("reset", "draw")):
-            if name in own and not own & {part, "observe"}:
+            if name in changed and not changed & {part, "observe"}:
                 raise ConfigError(
                     f"{type(env).__name__} overrides `{name}`, which a batch that resets itself never calls; expected "
                     f"`{part}` (the {name} without its observation) or `observe`: override that too"
@@ -104,7 +104,7 @@ def _overridden(kind: type) -> set[str]:
 class AutoResetEnv(Wrapper):
     """N environments as one natively batched Brax environment (`wrap_env=False` for Brax's learners).
 
-    `reward`, `done`, `info["truncation"]`, `info["time_out"]` and `metrics` belong to the step just made;
+    `reward`, `done`, `info["truncation"]`, `info["time_out"]` and `metrics` belong to the last step;
     where an episode ended, `obs`, `pipeline_state` and `info["nav"]` are those of a new one. `info` also has
     `steps` [N] (of the episode that the step belongs to), `episode_done` [N] and `episode_metrics`: name ->
     [N], the scores of the last finished episode, with `length` and `sum_reward`.
@@ -113,22 +113,22 @@ class AutoResetEnv(Wrapper):
     env: InteractiveNav
 
     def __init__(self, env: Any, action_repeat: int = 1):
-        """Wraps an environment.
+        """Wrap an environment.
 
         Args:
             env: of one episode; wrappers of it override `draw`, `advance` and `observe`, of which `reset` and `step`
-                are made.
+                consist.
             action_repeat: control steps that an action is held for; rewards are summed.
 
         Raises:
-            ConfigError: a wrapper that overrides `step` or `reset` alone, and so would never be asked.
+            ConfigError: a wrapper that overrides `step` or `reset` alone, and so would never be called.
         """
         super().__init__(env)
         _refuse_passed_over(env)
         self.action_repeat = action_repeat
 
     def reset(self, rng: jax.Array, slot: jax.Array | None = None) -> State:
-        """[N, 2] keys to N states; `slot` as in `reset_all`."""
+        """Return N states for [N, 2] keys; `slot` as in `reset_all`."""
         state = reset_all(self.env, rng, slot)
         zero = jnp.zeros(rng.shape[0])
         info = {
@@ -141,7 +141,7 @@ class AutoResetEnv(Wrapper):
         return state.replace(info=info)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """N states and [N, A] actions to N states."""
+        """Return the states that follow N states and [N, A] actions."""
         # What ended in the last step has begun anew.
         stepped = jax.vmap(self.env.advance)(state.replace(done=jnp.zeros_like(state.done)), action)
         for _ in range(self.action_repeat - 1):

@@ -28,15 +28,15 @@ def env(room, two_rooms):
 
 @pytest.fixture(scope="module")
 def made(env):
-    return episodes.draw(env, 6, seed=4)
+    return episodes.draw_episode_file(env, 6, seed=4)
 
 
 def test_round_trip_and_the_same_episodes_as_reset(env, made, tmp_path):
     path = tmp_path / "deep" / "episodes.json"
-    episodes.save(made, path)
-    assert episodes.load(path) == made
+    episodes.save_episode_file(made, path)
+    assert episodes.load_episode_file(path) == made
     assert len(path.read_text().splitlines()) < 60  # one line an episode
-    starts = episodes.starts_of(episodes.load(path), env)
+    starts = episodes.starts_of(episodes.load_episode_file(path), env)
     keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.PRNGKey(4), i))(np.arange(6))
     want = jax.jit(jax.vmap(env.reset))(keys)
     got = jax.jit(jax.vmap(env.reset_to))(starts, keys)
@@ -46,12 +46,12 @@ def test_round_trip_and_the_same_episodes_as_reset(env, made, tmp_path):
     np.testing.assert_allclose(got.info["nav"].shortest_path_m, lengths, atol=1e-5)
     assert {0, 1} == {row["scene"] for row in made.episodes}
     # A longer file begins with the same episodes.
-    assert episodes.draw(env, 2, seed=4).episodes == made.episodes[:2]
+    assert episodes.draw_episode_file(env, 2, seed=4).episodes == made.episodes[:2]
 
 
 def test_episodes_without_small_objects(room):
     bare = interactive_nav.make("turtlebot", [room], backend="native", num_objects=0)
-    made = episodes.draw(bare, 2, seed=1)
+    made = episodes.draw_episode_file(bare, 2, seed=1)
     starts = episodes.starts_of(made, bare)
     assert starts.small_placed.shape == (2, 0) and starts.small_placed.dtype == bool
     np.testing.assert_allclose(starts.goal_xy_w, [row["goal_xy_w"] for row in made.episodes], atol=1e-6)
@@ -158,7 +158,7 @@ def test_files_that_do_not_fit_are_refused(env, made, room):
     longer = ({**made.episodes[0], "shortest_path_m": 9.0}, *made.episodes[1:])
     refused("episode 0: shortest_path_m is 9.000 m", dataclasses.replace(made, episodes=longer))
     with pytest.raises(UserError, match="episodes is 0, expected at least 1"):
-        episodes.draw(env, 0, 0)
+        episodes.draw_episode_file(env, 0, 0)
 
 
 @pytest.mark.parametrize(
@@ -186,47 +186,47 @@ def test_files_that_do_not_fit_are_refused(env, made, room):
 )
 def test_damaged_files_are_named(made, tmp_path, change, message):
     path = tmp_path / "episodes.json"
-    episodes.save(made, path)
+    episodes.save_episode_file(made, path)
     data = json.loads(path.read_text())
     change(data)
     path.write_text(json.dumps(data))
     with pytest.raises(EpisodeFileError, match=message):
-        episodes.load(path)
+        episodes.load_episode_file(path)
 
 
 def test_several_files_are_one(env, made, room, tmp_path):
     """Scenes of both, once each; every row keeps its scene."""
     alone = interactive_nav.make("turtlebot", [room], backend="native", num_objects=3)
-    second = episodes.draw(alone, 2, seed=9)
+    second = episodes.draw_episode_file(alone, 2, seed=9)
     for name, file in (("a", made), ("b", second)):
-        episodes.save(file, tmp_path / f"{name}.json")
-    both, digest = episodes.load_all([tmp_path / "b.json", tmp_path / "a.json"])
+        episodes.save_episode_file(file, tmp_path / f"{name}.json")
+    both, digest = episodes.load_episode_files([tmp_path / "b.json", tmp_path / "a.json"])
     assert [name for name, _ in both.scenes] == ["room", "two_rooms"] and len(both.episodes) == 8
     starts = episodes.starts_of(both, env)
     for part, rows in ((second, slice(0, 2)), (made, slice(2, 8))):
         expected = episodes.starts_of(part, env)
         np.testing.assert_array_equal(starts.scene_index[rows], expected.scene_index)
         np.testing.assert_array_equal(starts.small_xy_w[rows], expected.small_xy_w)
-    one, of_one = episodes.load_all([tmp_path / "a.json"])
+    one, of_one = episodes.load_episode_files([tmp_path / "a.json"])
     assert one == made and of_one == hashlib.sha256((tmp_path / "a.json").read_bytes()).hexdigest()[:16] != digest
-    episodes.save(dataclasses.replace(second, robot="fetch"), tmp_path / "c.json")
+    episodes.save_episode_file(dataclasses.replace(second, robot="fetch"), tmp_path / "c.json")
     with pytest.raises(EpisodeFileError, match=r"c.json: made for robot .fetch. with 3 small objects, "):
-        episodes.load_all([tmp_path / "a.json", tmp_path / "c.json"])
+        episodes.load_episode_files([tmp_path / "a.json", tmp_path / "c.json"])
 
 
 def test_packed_files(made, tmp_path):
     plain, packed = tmp_path / "episodes.json", tmp_path / "episodes.json.gz"
-    episodes.save(made, plain)
-    episodes.save(made, packed)
-    assert episodes.load(packed) == made and packed.stat().st_size < 0.7 * plain.stat().st_size
+    episodes.save_episode_file(made, plain)
+    episodes.save_episode_file(made, packed)
+    assert episodes.load_episode_file(packed) == made and packed.stat().st_size < 0.7 * plain.stat().st_size
     assert gzip.decompress(packed.read_bytes()) == plain.read_bytes()
     again = tmp_path / "again.json.gz"
-    episodes.save(made, again)
+    episodes.save_episode_file(made, again)
     assert again.read_bytes() == packed.read_bytes()  # no time of day in it
     for damage in (packed.read_bytes()[:60], plain.read_bytes()):
         packed.write_bytes(damage)
         with pytest.raises(EpisodeFileError, match="not readable as packed with gzip"):
-            episodes.load(packed)
+            episodes.load_episode_file(packed)
 
 
 def test_the_command_line(room, tmp_path, capsys):
@@ -234,13 +234,13 @@ def test_the_command_line(room, tmp_path, capsys):
     words = ["make", "--scenes", str(room), "--episodes", "3", "--seed", "1", "--num-objects", "2", "-o", str(out)]
     assert episodes.main(words) == 0
     assert "3 episodes in 1 scenes" in capsys.readouterr().out
-    file = episodes.load(out)
+    file = episodes.load_episode_file(out)
     assert (file.seed, len(file.episodes), file.objects) == (1, 3, ("basket", "shoe"))
     assert episodes.main(["make", "--scenes", str(tmp_path / "nowhere"), "-o", str(out)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("interactive_nav.episodes: ") and "no such file" in line
     with pytest.raises(EpisodeFileError, match="cannot read"):
-        episodes.load(tmp_path / "absent.json")
+        episodes.load_episode_file(tmp_path / "absent.json")
     (tmp_path / "bad.json").write_text("{")
     with pytest.raises(EpisodeFileError, match="not readable as JSON"):
-        episodes.load(tmp_path / "bad.json")
+        episodes.load_episode_file(tmp_path / "bad.json")

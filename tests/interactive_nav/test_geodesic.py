@@ -126,11 +126,11 @@ def tables_of(graph: geodesic.CornerGraph) -> SceneTables:
         node_of_cell=np.zeros(CELLS, int),
         node_xy_w=np.zeros((count, 2), np.float32),
         corner_xy_w=np.zeros((MOST_CORNERS, 2), np.float32),
-        seen=np.zeros((count, MOST_SEEN), int),
+        visible=np.zeros((count, MOST_SEEN), int),
         distance_m=np.zeros((MOST_CORNERS,) * 2, np.float32),
         next_corner=np.zeros((MOST_CORNERS,) * 2, int),
     )
-    assert len(graph.corner_xy_w) <= MOST_CORNERS and graph.seen.shape[1] <= MOST_SEEN
+    assert len(graph.corner_xy_w) <= MOST_CORNERS and graph.visible.shape[1] <= MOST_SEEN
     values = navigation_tables([graph, filler])
     return scene_tables(values)
 

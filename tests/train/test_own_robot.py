@@ -78,6 +78,6 @@ def test_a_moved_run_is_evaluated_replayed_and_drawn(tmp_path, monkeypatch):
     assert evaluate.main([".", "--episodes", "2", "--policies", "learned,random"]) == 0
     rows = pq.read_table("evaluation/episodes.parquet").to_pydict()
     assert set(rows["robot"]) == {"porter"} and len(rows["success"]) == 4
-    played = replay.load(tmp_path / "moved" / "replays" / "random-episode0.npz")
+    played = replay.load_replay(tmp_path / "moved" / "replays" / "random-episode0.npz")
     assert get_robot(played.robot).name == "porter"
     assert RunFolder(tmp_path / "moved").read_config().env.robot == str(tmp_path / "moved" / "robot" / "porter.urdf")

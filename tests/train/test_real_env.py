@@ -83,7 +83,7 @@ def test_train_resume_and_evaluate(trained, tmp_path, capsys):
 
     # An episode played once more starts as the row that was scored.
     assert replay_program.main([str(folder.path), "--episodes", "3", "env.episode_steps=30"]) == 0
-    again = replay.load(replay.replay_path(folder.path, "learned", 3))
+    again = replay.load_replay(replay.replay_path(folder.path, "learned", 3))
     assert again.label == f"toy, {best_steps(folder)} steps"
     assert again.metrics["shortest_path_m"] == pytest.approx(rows["shortest_path_m"][3])
     assert again.metrics["robot_path_m"] == pytest.approx(rows["robot_path_m"][3], rel=0.05)

@@ -41,7 +41,7 @@ def test_one_command_makes_a_video_of_a_run(run, tmp_path, capsys):
     assert record.main([*asked, *pictures]) == 0
     size = out.stat().st_size
     assert size > 1000
-    kept = replay.load(replay.replay_path(run, "random", 2))
+    kept = replay.load_replay(replay.replay_path(run, "random", 2))
     assert (kept.policy, kept.episode, kept.num_steps) == ("random", 2, 15)
     printed = "".join(capsys.readouterr().out.split())  # the console breaks lines where it is narrow
     assert f"{out}:4framesofrandom,episode2" in printed
@@ -91,13 +91,13 @@ def test_a_run_of_a_gpu_is_played_without_one(run, tmp_path, monkeypatch, capsys
     else:
         assert ended == 0
         assert f"{copy.path}: trained with backend warp, which is not here; played with native" in said.out
-        assert replay.load(replay.replay_path(copy.path, "random", 0)).num_steps == 15
+        assert replay.load_replay(replay.replay_path(copy.path, "random", 0)).num_steps == 15
 
 
 def test_an_episode_starts_as_its_number_says_whoever_plays_it(run):
     assert program.main([str(run), "--episodes", "1,3", "--policies", "random,follower"]) == 0
     first, other, third = (
-        replay.load(replay.replay_path(run, *which)) for which in (("random", 1), ("follower", 1), ("random", 3))
+        replay.load_replay(replay.replay_path(run, *which)) for which in (("random", 1), ("follower", 1), ("random", 3))
     )
     np.testing.assert_array_equal(first.body_pos_w[0], other.body_pos_w[0])
     np.testing.assert_array_equal(first.goal_xy_w, other.goal_xy_w)
@@ -108,11 +108,11 @@ def test_an_episode_starts_as_its_number_says_whoever_plays_it(run):
 def test_an_episode_of_a_file_starts_as_the_file_says(run, room, tmp_path, capsys):
     path = tmp_path / "two.json"
     env = interactive_nav.make("turtlebot", [room], backend="native", num_objects=1)
-    made = dataclasses.replace(episodes.draw(env, 2, seed=4), seed=5)  # keys alone would draw others
-    episodes.save(made, path)
+    made = dataclasses.replace(episodes.draw_episode_file(env, 2, seed=4), seed=5)  # keys alone would draw others
+    episodes.save_episode_file(made, path)
     asked = [str(run), "--policies", "random", "--episode-file", str(path)]
     assert program.main([*asked, "--episodes", "1"]) == 0
-    played, told = replay.load(replay.replay_path(run, "random", 1)), made.episodes[1]
+    played, told = replay.load_replay(replay.replay_path(run, "random", 1)), made.episodes[1]
     np.testing.assert_allclose(played.start_xy_w, told["start_xy_w"], atol=1e-6)
     np.testing.assert_allclose(played.goal_xy_w, told["goal_xy_w"], atol=1e-6)
     small = played.body_pos_w[0, played.bodies.index(body_names(played.small)[0]), :2]

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import interactive_nav
-from interactive_nav.pictures.camera import Camera
+from interactive_nav.pictures.camera import PictureCamera
 from interactive_nav.sensing.base import Lens
 from interactive_nav.sensing.sensors import LIDAR_NEAR_M
 from interactive_nav_common.errors import UserError
@@ -83,7 +83,7 @@ class RosSimulator:
         self.max_linear_mps, self.max_angular_radps = twist.max_linear_m_s, twist.max_angular_rad_s
         self.dt_s = self._env.dt
         self.lens = Lens(config.width, config.height, config.fov_deg)
-        self._camera = Camera(self._env, config.engine, config.fov_deg)
+        self._camera = PictureCamera(self._env, config.engine, config.fov_deg)
         self._step = jax.jit(self._env.step)
         key = jax.random.PRNGKey(config.seed)
         start = self._env.draw_start(key)

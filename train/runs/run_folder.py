@@ -84,9 +84,9 @@ class RunFolder:
         """Return the reference and identity of a robot of the user's own."""
         if not self.robot.is_dir():
             return None
-        from interactive_nav.robots.reference import kept  # heavy, and most runs need none
+        from interactive_nav.robots.reference import recorded_robot  # heavy, and most runs need none
 
-        return kept(self.robot)
+        return recorded_robot(self.robot)
 
     def open(self, config: TrainConfig) -> bool:
         """Writes config and versions of a new run, or checks that an existing one is continued as it began.
@@ -94,7 +94,7 @@ class RunFolder:
         Returns:
             True where the run exists already.
         """
-        from interactive_nav.robots.reference import identity, keep
+        from interactive_nav.robots.reference import identity, record_robot
 
         exists = self.config.is_file()
         if exists:
@@ -108,7 +108,7 @@ class RunFolder:
                         "set run.name to begin another run, or remove the folder"
                     )
         write_text(self.config, to_yaml(config))
-        keep(config.env.robot, self.robot)
+        record_robot(config.env.robot, self.robot)
         write_text(self.path / VERSIONS, json.dumps(versions(), indent=1) + "\n")
         return exists
 

@@ -168,9 +168,9 @@ class SweepFolder:
 
 @functools.cache
 def _read(files: tuple[str, ...]) -> tuple[Any, str]:
-    from interactive_nav.episodes import load_all  # Brax and MJX: seconds, which a sweep of drawn episodes saves
+    from interactive_nav.episodes import load_episode_files  # imports Brax and MJX, for seconds
 
-    return load_all(files)
+    return load_episode_files(files)
 
 
 def _tail(path: Path) -> list[str]:

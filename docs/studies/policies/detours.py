@@ -12,7 +12,7 @@ import numpy as np
 import pandas
 
 import interactive_nav
-from interactive_nav.episodes import load_all, starts_of
+from interactive_nav.episodes import load_episode_files, starts_of
 from interactive_nav_common.errors import reports_errors
 from interactive_nav_common.rows import read_rows
 
@@ -21,7 +21,7 @@ EDGES_M = (0.05, 0.3, 1.0)
 
 def detours_m(robot: str, scenes: Sequence[str], episode_file: str, share: float) -> np.ndarray:
     """[N] m of each episode's detour; infinite where start or goal is shut in by what is heavy."""
-    file, _ = load_all([episode_file])
+    file, _ = load_episode_files([episode_file])
     env = interactive_nav.make(
         robot, list(scenes), backend="native", num_objects=len(file.episodes[0]["objects"]), potential_round=share
     )

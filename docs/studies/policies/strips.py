@@ -14,7 +14,7 @@ import shapely
 from matplotlib.axes import Axes
 
 from interactive_nav.pictures.camera import straight_down
-from interactive_nav.pictures.replay import Replay, load
+from interactive_nav.pictures.replay import Replay, load_replay
 from interactive_nav.pictures.scene_model import ROBOT, SCENE
 from interactive_nav.pictures.views import SceneView
 from interactive_nav.robots import get_robot
@@ -92,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     figure = style.plt.figure(figsize=(9.6, 2.12 * len(given.strip) + 0.3), layout="constrained")
     parts = figure.subfigures(len(given.strip), 1, squeeze=False)[:, 0]
     for part, (path, caption) in zip(parts, given.strip, strict=True):
-        replay = load(path)
+        replay = load_replay(path)
         told = f"{caption} ({Path(replay.scene).name}, episode {replay.episode})"
         part.suptitle(told, x=0.005, ha="left", fontsize=11.5)
         thing = draw(part.subplots(1, len(given.at), squeeze=False)[0], replay, given.at)

@@ -1,1 +1,1 @@
-"""One module a robot."""
+"""Define the builtin robots, one module per kind."""

@@ -1,4 +1,4 @@
-"""Ant: nothing in, its `RobotSpec` out.
+"""Build Ant's `RobotSpec`.
 
 Shape and joints are those of the MuJoCo and GibsonEnv Ant (`ant.xml`) at GibsonEnv's default scale of 0.25:
 at full size it is 1.39 m wide and passes no door. Two readings of that file's mass exist, 0.911 kg (MuJoCo,
@@ -28,7 +28,7 @@ _REACH_M = 0.104
 
 
 def _reference(phase, command, base, xp):
-    """Trot: diagonal pairs swing half a cycle apart; a leg in swing lifts its ankle. Offsets from home, [..., 8]."""
+    """Trot, offsets from home [..., 8]: diagonal pairs swing half a cycle apart; a leg in swing lifts its ankle."""
     del base
     forward, turn = command[..., 0], command[..., 1]
     effort = xp.clip(8.0 * xp.abs(forward) + 2.0 * xp.abs(turn), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Humanoid: nothing in, its `RobotSpec` out.
+"""Build Humanoid's `RobotSpec`.
 
 Shape, masses (42.1 kg), joints and their springs are those of the MuJoCo and GibsonEnv `humanoid.xml`; torque
 limits are iGibson's gains times 0.41. Two things are ours. The feet: the original's are spheres, on which no
@@ -62,17 +62,17 @@ class Stepping(NamedTuple):
     """Untold, it steps in so far as step_speed * speed + step_lean * (|pitch| + |roll|) exceeds the threshold."""
 
 
-WALK, STAND = (Stepping(**dict(zip(_ROW.gait, own, strict=True))) for own in zip(*_ROW.gait.values(), strict=True))
+WALK, STAND = (Stepping(**dict(zip(_ROW.gait, row, strict=True))) for row in zip(*_ROW.gait.values(), strict=True))
 
 
 def _reference(phase, command, base, xp):
-    """The walk of `Stepping` p as offsets from home, [..., 17]; it stands when neither told nor forced to step."""
+    """Return the walk of `Stepping` p as offsets from home, [..., 17]; without command or force to step it stands."""
     forward, turn = command[..., 0], command[..., 1]
-    told = xp.clip(10.0 * xp.abs(forward) + 5.0 * xp.abs(turn), 0.0, 1.0)
-    p = Stepping(*(told * a + (1.0 - told) * b for a, b in zip(WALK, STAND, strict=True)))
+    commanded = xp.clip(10.0 * xp.abs(forward) + 5.0 * xp.abs(turn), 0.0, 1.0)
+    p = Stepping(*(commanded * a + (1.0 - commanded) * b for a, b in zip(WALK, STAND, strict=True)))
     speed = xp.sqrt(base.forward**2 + base.left**2 + 1e-6)
     forced = p.step_speed * speed + p.step_lean * (xp.abs(base.pitch) + xp.abs(base.roll)) - p.step_threshold
-    going = xp.clip(xp.maximum(told, forced), 0.0, 1.0)
+    going = xp.clip(xp.maximum(commanded, forced), 0.0, 1.0)
     forward = forward + p.slip * going
     sway = going * xp.cos(phase - p.sway_phase)
     out = {name: 0.0 * forward for name in _JOINTS}

@@ -1,4 +1,4 @@
-"""Minitaur: nothing in, its `RobotSpec` out.
+"""Build Minitaur's `RobotSpec`.
 
 Masses (6.0 kg), motor positions and link lengths are those of GibsonEnv's `minitaur.urdf`, whose inertias are
 placeholders; here they follow from the shapes. A leg is a closed chain: two upper links on a motor each, one
@@ -33,7 +33,7 @@ _STRIDE_GAIN, _TURN_GAIN = 0.615, 4.63
 
 
 def _reference(phase, command, base, xp):
-    """Trot: diagonal legs together; strides of left and right differ in a turn. Offsets from home, [..., 8]."""
+    """Trot, with offsets from home [..., 8]: diagonal legs together; strides of left and right differ in a turn."""
     del base
     forward, turn = command[..., 0], command[..., 1]
     effort = xp.clip(8.0 * xp.abs(forward) + 3.0 * xp.abs(turn), 0.0, 1.0)
@@ -52,7 +52,7 @@ LEGS = dataclasses.replace(_ROW, reference=_reference)
 
 
 def _leg_angles(command, state, xp):
-    """Swing then extension of each leg, [..., 8] in [-1, 1], to motor angles: the original's leg coordinates."""
+    """Convert swing, then extension of each leg, [..., 8] in [-1, 1], to motor angles: the original's coordinates."""
     del state
     swing, extension = command[..., :4], command[..., 4:]
     middle = math.pi - 0.25 * math.pi * (extension + 1.5)
@@ -61,7 +61,7 @@ def _leg_angles(command, state, xp):
 
 
 def minitaur(control_mode: str = "native") -> RobotSpec:
-    """Minitaur's spec."""
+    """Return Minitaur's spec."""
     parts = (("motor", LEGS.home[0]), ("knee", _KNEE_HOME_RAD))
     home = tuple((joint.replace("motor", part), value) for joint in LEGS.joints for part, value in parts)
     figures: dict[str, Any] = {"home_qpos": home}

@@ -1,4 +1,4 @@
-"""Quadrotor: nothing in, its `RobotSpec` out.
+"""Build Quadrotor's `RobotSpec`.
 
 Mass (0.5 kg), inertia, rotor arms (0.175 m along +x, +y, -x, -y), thrust (0 to 10 N a rotor) and rotor torque
 (+/- 0.0245 N m per N, + on the x rotors) are those of GibsonEnv's `quadrotor.urdf`; rotors follow their command at
@@ -81,7 +81,7 @@ def _add_to(spec: mujoco.MjSpec, mode: str) -> None:
 
 
 def _thrusts(acceleration_up, angular_acceleration, xp):
-    """Body-frame specific thrust [...] and angular acceleration [..., 3] to four thrusts [..., 4] in 0 .. 10 N."""
+    """Convert body-frame specific thrust [...] and angular acceleration [..., 3] to thrusts [..., 4] in 0 .. 10 N."""
     torque = angular_acceleration * xp.broadcast_to(xp.asarray(INERTIA), angular_acceleration.shape)
     wrench = xp.concatenate([MASS_KG * acceleration_up[..., None], torque], -1)
     return xp.clip(wrench @ xp.asarray(_MIXER).T, 0.0, MAX_THRUST_N)
@@ -92,12 +92,12 @@ def _fly_rates(rates, thrust_n, state, xp):
 
 
 def _rate_law(command, state, xp):
-    """(roll, pitch, yaw rate rad/s, total thrust N) to thrusts."""
+    """Convert (roll, pitch, yaw rate rad/s, total thrust N) to thrusts."""
     return _fly_rates(command[..., :3], command[..., 3], state, xp)
 
 
 def _velocity_law(command, state, xp):
-    """(vx, vy, vz m/s along the heading, yaw rate rad/s) to thrusts."""
+    """Convert (vx, vy, vz m/s along the heading, yaw rate rad/s) to thrusts."""
     quat, velocity_w = state.qpos[..., 3:7], state.qvel[..., :3]
     heading = yaw_from_quat(quat)
     cos, sin = xp.cos(heading), xp.sin(heading)
@@ -124,7 +124,7 @@ def _velocity_law(command, state, xp):
 
 
 def _twist_law(command, state, xp):
-    """(forward m/s, yaw rate rad/s) to thrusts, at the hover height."""
+    """Convert (forward m/s, yaw rate rad/s) to thrusts, at the hover height."""
     climb = xp.clip(_ALTITUDE_GAIN * (HOVER_HEIGHT_M - state.qpos[..., 2]), -MAX_CLIMB_M_S, MAX_CLIMB_M_S)
     zero = xp.zeros_like(climb)
     return _velocity_law(xp.stack([command[..., 0], zero, climb, command[..., 1]], -1), state, xp)
@@ -139,7 +139,7 @@ _LAWS = {"native": _velocity_law, "velocity": _velocity_law, "rate": _rate_law, 
 
 
 def quadrotor(control_mode: str = "native") -> RobotSpec:
-    """The Quadrotor's spec.
+    """Return the Quadrotor's spec.
 
     Args:
         control_mode: `velocity`, also called `native`: velocity along the heading and yaw rate, flown physically;

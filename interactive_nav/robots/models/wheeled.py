@@ -1,4 +1,4 @@
-"""The seven wheeled robots: `wheeled.yaml` in, one factory (control mode -> `RobotSpec`) a robot out.
+"""Build the factories (control mode -> `RobotSpec`) of the seven wheeled robots of `wheeled.yaml`.
 
 Bodies and shapes: `mjcf/<robot>.xml`. Control modes: `native`, velocities of the wheels, left then right, front
 before rear (Husky: their torques), an arm folded; `whole_body`, of a robot with an arm, its velocities too, and a

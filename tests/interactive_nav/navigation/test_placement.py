@@ -211,7 +211,7 @@ def test_distances_that_next_to_no_pair_has_are_met(two_rooms, largest_m):
     starts, goals, miss = draw_pairs(tables, 40, 5.5, largest_m)
     assert miss.max() < 1e-5 and len(np.unique(starts, axis=0)) > 8
     assert np.linalg.norm(starts - goals, axis=-1).min() > 5.5 - 1e-5
-    known = np.asarray(tables.known_pairs_xy_w[0]).reshape(-1, 4)
+    known = np.asarray(tables.fallback_pairs_xy_w[0]).reshape(-1, 4)
     drawn = np.concatenate([starts, goals], -1)
     assert (np.abs(drawn[:, None] - known[None]).max(-1).min(1) < 1e-6).sum() > 8  # a fifth
 

@@ -88,7 +88,7 @@ def test_ways_and_whether_there_is_one(env):
 
 def test_episodes_say_whether_a_push_is_needed(env):
     """In the corridor where start and goal lie on either side of the cubes; in the room nowhere."""
-    file = episodes.draw(env, 24, seed=1)
+    file = episodes.draw_episode_file(env, 24, seed=1)
     for row in file.episodes:
         sides = {row["start_xy_w"][0] > 0, row["goal_xy_w"][0] > 0}
         assert row["push_needed"] is (row["scene"] == 0 and len(sides) == 2)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from interactive_nav.config import NavConfig, Tier, parse_tiers
+from interactive_nav.config import NavConfig, WindowTier, parse_window_tiers
 from interactive_nav.physics import PhysicsState, make_physics, tiers
 from interactive_nav.physics.tiers import TieredPhysics, assign, propose_tiers, tier_sizes
 from interactive_nav.robots import get_robot
@@ -77,8 +77,8 @@ def test_tiers_hold_what_was_counted():
         "walls": np.repeat([2, 3, 4], [50, 33, 17]),
     }
     # With twice as many in need as counted, 0.8 must fit the first tier of 0.6, and 0.5 one without share.
-    assert propose_tiers(counts, (0.6,)) == (Tier(0.6, 2, 0, 0, 3),)
-    assert propose_tiers(counts, (0.6, 0.3)) == (Tier(0.6, 2, 0, 0, 3), Tier(0.3, 3, 0, 1, 4))
+    assert propose_tiers(counts, (0.6,)) == (WindowTier(0.6, 2, 0, 0, 3),)
+    assert propose_tiers(counts, (0.6, 0.3)) == (WindowTier(0.6, 2, 0, 0, 3), WindowTier(0.3, 3, 0, 1, 4))
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_tiers_hold_what_was_counted():
 def test_tiers_that_cannot_be_are_refused(words):
     with pytest.raises(ConfigError, match="expected such as"):
         NavConfig.of(windows=words)
-    assert parse_tiers(["0.7 2 1 1 12"]) == (Tier(0.7, 2, 1, 1, 12),)
+    assert parse_window_tiers(["0.7 2 1 1 12"]) == (WindowTier(0.7, 2, 1, 1, 12),)
 
 
 @pytest.fixture(scope="module")

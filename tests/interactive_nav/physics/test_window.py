@@ -11,7 +11,7 @@ import pytest
 
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, make_physics, mjx_batch
-from interactive_nav.physics.window import FIELDS, Window
+from interactive_nav.physics.window import FIELDS, PhysicsWindow
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.spec import FEET
@@ -49,7 +49,7 @@ def _select(window):
 
 @pytest.mark.parametrize("scene", [0, 1])
 def test_complete_window_has_the_fields_of_the_scenes_own_model(world, scene):
-    window = Window(world, NavConfig.of(num_objects=2, **ALL))
+    window = PhysicsWindow(world, NavConfig.of(num_objects=2, **ALL))
     assert sum(group.width for group in window.groups) == world.layout.num_slots
     chosen, walls, missed = _select(window)(jnp.asarray(scene), _state(world, scene))
     fields = jax.jit(window.fields)(jnp.asarray(scene), chosen, walls)
@@ -79,7 +79,7 @@ def test_complete_window_has_the_fields_of_the_scenes_own_model(world, scene):
 
 
 def test_the_nearest_are_chosen_and_what_is_left_out_within_reach_is_told(world):
-    two = Window(world, NavConfig.of(num_objects=2, active_furniture=2))
+    two = PhysicsWindow(world, NavConfig.of(num_objects=2, active_furniture=2))
     kinds = {tuple(g.slots): i for i, g in enumerate(two.groups)}
     free = next(i for slots, i in kinds.items() if len(slots) == 4)
     group, select = two.groups[free], _select(two)
@@ -90,21 +90,21 @@ def test_the_nearest_are_chosen_and_what_is_left_out_within_reach_is_told(world)
 
     assert names((0.0, 0.0)) == ({"chair_0", "chair_1"}, 0)
     assert names((-2.0, 0.0))[0] >= {"table_1"}
-    one = Window(world, NavConfig.of(num_objects=2, active_furniture=1))
+    one = PhysicsWindow(world, NavConfig.of(num_objects=2, active_furniture=1))
     # Between the chairs both are within 0.18 + 0.6 m; only one is simulated.
     assert int(_select(one)(jnp.asarray(0), _state(world, 0, (1.05, 0.0)))[2]) == 1
 
 
 def test_sizes_are_measured_where_none_are_set(world):
-    auto = Window(world, NavConfig.of(num_objects=2, active_small=1))
+    auto = PhysicsWindow(world, NavConfig.of(num_objects=2, active_small=1))
     assert auto.widths == {"small": 1, "free": 2, "hinge": 1, "walls": 2}, "two chairs or the table; a corner"
     kinds = [world.layout.slot_kind[group.slots[0]] for group in auto.groups]
     assert dict(zip(kinds, (g.width for g in auto.groups), strict=True)) == {"small": 1, "free": 2}
-    assert auto.n_walls == 2 < Window(world, NavConfig.of(num_objects=2, **ALL)).n_walls
+    assert auto.n_walls == 2 < PhysicsWindow(world, NavConfig.of(num_objects=2, **ALL)).n_walls
 
 
 def test_a_moving_object_outranks_one_at_rest(world):
-    one = Window(world, NavConfig.of(num_objects=2, active_furniture=1))
+    one = PhysicsWindow(world, NavConfig.of(num_objects=2, active_furniture=1))
     state = _state(world, 0)
     slot = world.slots.names[0].index("chair_1")
     moving = state.replace(qvel=state.qvel.at[world.layout.slot_qvel[slot]].set(0.5))
@@ -115,7 +115,7 @@ def test_a_moving_object_outranks_one_at_rest(world):
 
 
 def test_enter_and_leave_are_inverse(world):
-    window = Window(world, NavConfig.of(num_objects=2, active_furniture=2))
+    window = PhysicsWindow(world, NavConfig.of(num_objects=2, active_furniture=2))
     state = _state(world, 0)
     key = jax.random.PRNGKey(0)
     state = state.replace(qpos=state.qpos + 0.01 * jax.random.normal(key, state.qpos.shape))
@@ -172,7 +172,7 @@ def narrow(tmp_path_factory):
 
 def test_a_pushed_sofa_does_not_enter_a_wall_in_a_window(narrow):
     """For 2 s, the window's own model in C MuJoCo against everything: the wall is 1.9 m away from the robot."""
-    world, window = narrow, Window(narrow, NavConfig.of(num_objects=0, active_walls=1))
+    world, window = narrow, PhysicsWindow(narrow, NavConfig.of(num_objects=0, active_walls=1))
     physics = make_physics(world, NavConfig.of(num_objects=0, backend="native", sleep=False))
     model, data = window.model, mujoco.MjData(window.model)
     # C MuJoCo's trees of boxes are those of the model as compiled: without them geoms may be resized.
@@ -202,7 +202,7 @@ def test_a_pushed_sofa_does_not_enter_a_wall_in_a_window(narrow):
 
 
 def test_walls_left_out_behind_what_may_be_pushed_are_told(narrow):
-    one, two = (Window(narrow, NavConfig.of(num_objects=0, active_walls=n)) for n in (1, 2))
+    one, two = (PhysicsWindow(narrow, NavConfig.of(num_objects=0, active_walls=n)) for n in (1, 2))
     beside = _state(narrow, 0, (0.6, 0.4))  # 0.4 m from a side wall, 1.9 m from the wall behind the sofa
     far = _state(narrow, 0, (-0.5, 0.4))  # out of the sofa's reach
     selects = {1: _select(one), 2: _select(two)}

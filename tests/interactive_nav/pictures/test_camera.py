@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from interactive_nav.config import NavConfig
-from interactive_nav.pictures.camera import STREAMS, Camera
+from interactive_nav.pictures.camera import STREAMS, PictureCamera
 from interactive_nav.pictures.views import SceneView
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import pick
@@ -38,7 +38,7 @@ def scene_and_state(world):
 
 def test_the_whole_scene_from_above(scene_and_state):
     env, state = scene_and_state
-    frame = Camera(env, "rays").frame(state, 120, 100, STREAMS, view="top")
+    frame = PictureCamera(env, "rays").frame(state, 120, 100, STREAMS, view="top")
     assert frame["rgb"].shape == (100, 120, 3) and frame["rgb"].dtype == np.uint8
     ids = frame["segmentation"]
     # x to the right, y up: the chair (1.2, 0) right of the middle, the table (-1.2, 1) left and above, the robot.
@@ -57,7 +57,7 @@ def test_the_whole_scene_from_above(scene_and_state):
 
 def test_the_robots_own_view_is_the_sensors_view(scene_and_state):
     env, state = scene_and_state
-    frame = Camera(env, "rays").frame(state, 68, 68, ("rgb", "normals", "depth", "segmentation"))
+    frame = PictureCamera(env, "rays").frame(state, 68, 68, ("rgb", "normals", "depth", "segmentation"))
     assert set(frame) == {"rgb", "normals", "depth", "segmentation"} and not (frame["segmentation"] == 1).any()
     qpos = jnp.asarray(state.pipeline_state.qpos, jnp.float32)[None]
     camera = env.sensors.mount.pose(qpos)
@@ -86,7 +86,9 @@ def test_pictures_have_the_masks_ids_of_each_model(tmp_path, classes, own):
     state = types.SimpleNamespace(
         pipeline_state=types.SimpleNamespace(qpos=qpos), info={"nav": types.SimpleNamespace(scene_index=0)}
     )
-    seen = set(np.unique(Camera(env, "rays").frame(state, 160, 120, ("segmentation",), view="top")["segmentation"]))
+    seen = set(
+        np.unique(PictureCamera(env, "rays").frame(state, 160, 120, ("segmentation",), view="top")["segmentation"])
+    )
     observed = set(np.unique(env.sensors.boxes.class_id[0]))
     assert seen == observed | {1} and own <= seen
     view = SceneView(get_robot("turtlebot"), world.scenes[0], pick(6), classes)
@@ -98,15 +100,15 @@ def test_pictures_have_the_masks_ids_of_each_model(tmp_path, classes, own):
 
 def test_the_follower_sees_the_robot(scene_and_state):
     env, state = scene_and_state
-    frame = Camera(env, "rays").frame(state, 60, 60, ("segmentation",), view="follow")
+    frame = PictureCamera(env, "rays").frame(state, 60, 60, ("segmentation",), view="follow")
     assert 1 in frame["segmentation"][20:40, 20:40]
 
 
 def test_what_cannot_be_drawn_is_refused(scene_and_state):
     env, state = scene_and_state
-    camera = Camera(env, "rays")
+    camera = PictureCamera(env, "rays")
     with pytest.raises(UserError, match="engine is 'opengl', expected one of auto, gl, warp, rays"):
-        Camera(env, "opengl")
+        PictureCamera(env, "opengl")
     with pytest.raises(UserError, match="streams is .*, expected a choice from rgb, normals, depth, segmentation"):
         camera.frame(state, streams=("colour",))
     with pytest.raises(UserError, match="view is 'side', expected one of robot, top, follow"):
@@ -121,8 +123,8 @@ def test_what_cannot_be_drawn_is_refused(scene_and_state):
 def test_mjx_warp_draws_the_same_colours(scene_and_state):
     """Lamps and the floor differ between the two; what is where, and in which colour, does not."""
     env, state = scene_and_state
-    drawn = Camera(env, "warp").frame(state, 32, 24, ("rgb",), view="top")["rgb"]
-    rays = Camera(env, "rays").frame(state, 32, 24, ("rgb", "segmentation"), view="top")
+    drawn = PictureCamera(env, "warp").frame(state, 32, 24, ("rgb",), view="top")["rgb"]
+    rays = PictureCamera(env, "rays").frame(state, 32, 24, ("rgb", "segmentation"), view="top")
     assert drawn.shape == (24, 32, 3) and drawn.dtype == np.uint8
     chair, table = rays["segmentation"] == 2, rays["segmentation"] == 4
     got, want = (picture[chair].mean(0) - picture[table].mean(0) for picture in (drawn.astype(float), rays["rgb"]))

@@ -89,8 +89,8 @@ def test_a_replay_is_what_the_environment_kept_account_of(env, played):
 
 def test_a_replay_survives_its_file(played, tmp_path):
     path = tmp_path / "deep" / "a.npz"
-    replay.save(played, path)
-    back = replay.load(path)
+    replay.save_replay(played, path)
+    back = replay.load_replay(path)
     for field in dataclasses.fields(played):
         np.testing.assert_array_equal(getattr(back, field.name), getattr(played, field.name))
     assert list(path.parent.iterdir()) == [path]
@@ -98,14 +98,14 @@ def test_a_replay_survives_its_file(played, tmp_path):
 
 def test_files_that_are_no_replays_are_refused(played, tmp_path):
     with pytest.raises(ReplayError, match="no such file"):
-        replay.load(tmp_path / "absent.npz")
+        replay.load_replay(tmp_path / "absent.npz")
     np.savez(tmp_path / "other.npz", x=1)
     (tmp_path / "text.npz").write_text("hello")
-    replay.save(played, tmp_path / "cut.npz")
+    replay.save_replay(played, tmp_path / "cut.npz")
     (tmp_path / "cut.npz").write_bytes((tmp_path / "cut.npz").read_bytes()[:-3000])
     for name in ("other", "text", "cut"):
         with pytest.raises(ReplayError, match=rf"{name}\.npz: not readable .*; record the episode again"):
-            replay.load(tmp_path / f"{name}.npz")
+            replay.load_replay(tmp_path / f"{name}.npz")
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +120,7 @@ def test_depth_and_classes_by_hand(view):
     """A room of 4 x 3 m with a cube of 0.4 m on the floor at (0.7, 0); the eye is at 0.3 m."""
     view.place(("chair_0",), np.array([[0.7, 0.0, 0.2]]), np.array([IDENTITY]))
     eye = look_along(np.array([-1.0, 0.0, 0.3]), np.array([1.0, 0, 0])), Lens(101, 101, 90.0)
-    seen = view.look(*eye, INSIDE)
+    seen = view.render(*eye, INSIDE)
     assert CLASSES[seen.classes[50, 50]] == "chair" and seen.depth_m[50, 50] == pytest.approx(1.5, abs=1e-5)
     # Beside the cube the wall, 3 m ahead of the eye: depth is along the axis, so equal over the wall.
     wall = seen.depth_m[50, 75], seen.depth_m[40, 30]
@@ -130,11 +130,11 @@ def test_depth_and_classes_by_hand(view):
     assert seen.depth_m[80, 50] == pytest.approx(0.3 * 50.5 / 30, rel=1e-5)
     # Away with the cube: the wall behind it, 0.3 m above the floor.
     view.place(("chair_0",), np.array([[0.7, 9.0, 0.2]]), np.array([IDENTITY]))
-    assert view.look(*eye, INSIDE).depth_m[50, 50] == pytest.approx(3.0, abs=1e-5)
+    assert view.render(*eye, INSIDE).depth_m[50, 50] == pytest.approx(3.0, abs=1e-5)
     # Turned by 45 degrees it shows an edge: half a diagonal in front of its middle.
     turned = [math.cos(math.pi / 8), 0, 0, math.sin(math.pi / 8)]
     view.place(("chair_0",), np.array([[0.7, 0.0, 0.2]]), np.array([turned]))
-    assert view.look(*eye, INSIDE).depth_m[50, 50] == pytest.approx(1.7 - 0.2 * math.sqrt(2), abs=1e-3)
+    assert view.render(*eye, INSIDE).depth_m[50, 50] == pytest.approx(1.7 - 0.2 * math.sqrt(2), abs=1e-3)
 
 
 def test_the_robot_is_seen_from_outside_only(view):
@@ -146,15 +146,15 @@ def test_the_robot_is_seen_from_outside_only(view):
     np.testing.assert_allclose(camera.pos_w, np.array([-0.5, 0.3, 0.0]) + robot.camera.pos_m, atol=1e-9)
     np.testing.assert_allclose(camera.axes_w[:, 0], [1, 0, 0], atol=1e-9)
     index = CLASSES.index("robot")
-    assert not (view.look(camera, lens, INSIDE).classes == index).any()
+    assert not (view.render(camera, lens, INSIDE).classes == index).any()
     above = look_along(np.array([-1.5, 0.3, 2.0]), np.array([1.0, 0, -1.0])), Lens(60, 60, math.degrees(1.0))
-    assert (view.look(*above, OUTSIDE).classes == index).sum() > 20
+    assert (view.render(*above, OUTSIDE).classes == index).sum() > 20
 
 
 def test_goal_and_path_are_painted_on_the_floor(view):
     down = look_along(np.array([-1.2, 0.0, 3.0]), np.array([1e-3, 0, -1.0])), Lens(41, 41, math.degrees(0.3))
     paint = FloorPaint(np.array([-1.2, 0.0]), 0.2, np.array([[-1.2, 0.3]]))
-    plain, painted = view.look(*down, OUTSIDE).colour, view.look(*down, OUTSIDE, paint).colour
+    plain, painted = view.render(*down, OUTSIDE).colour, view.render(*down, OUTSIDE, paint).colour
     changed = (plain != painted).any(-1)
     # A disc of 0.2 m and a dot of 0.04 m, in a view of 2 * 3 m * tan(0.15).
     share = (math.pi * 0.2**2 + math.pi * 0.04**2) / (2 * 3.0 * math.tan(0.15)) ** 2
@@ -165,8 +165,8 @@ def test_goal_and_path_are_painted_on_the_floor(view):
 
 def test_pictures_show_the_episodes_own_models_and_goal(room, played, tmp_path, monkeypatch):
     told = dataclasses.replace(played, small_objects="test", segmentation_classes=5, success_distance_m=0.7)
-    replay.save(told, tmp_path / "a.npz")
-    told = replay.load(tmp_path / "a.npz")
+    replay.save_replay(told, tmp_path / "a.npz")
+    told = replay.load_replay(tmp_path / "a.npz")
     assert (told.small_objects, told.segmentation_classes, told.success_distance_m) == ("test", 5, 0.7)
     names = [f"{o.category}_small_{i}" for i, o in enumerate(pick(3, "test"))]
     shown = bodies_by_name(load_scene(room), told.small)
@@ -208,7 +208,7 @@ def test_a_replay_of_before_can_be_read(played, tmp_path):
     header = {n: v for n, v in fields.items() if n not in (*replay._ARRAYS, *later)} | {"format": 1}
     arrays = {name: fields[name] for name in replay._ARRAYS}
     np.savez(tmp_path / "old.npz", header=np.array(json.dumps(header)), **arrays)
-    old = replay.load(tmp_path / "old.npz")
+    old = replay.load_replay(tmp_path / "old.npz")
     assert (old.small_objects, old.segmentation_classes, old.success_distance_m) == ("train", 4, None)
 
 
@@ -291,9 +291,9 @@ import sys, weakref, numpy as np
 early = weakref.finalize(sys.modules["numpy"], print)  # programs that JAX compiles make some before there is a GL
 from interactive_nav import record
 from interactive_nav.pictures.camera import Painter
-from interactive_nav.pictures.replay import load
+from interactive_nav.pictures.replay import load_replay
 from interactive_nav.scenes.scene import load_scene
-replay = load(sys.argv[2])
+replay = load_replay(sys.argv[2])
 film = record.Compositor(replay, load_scene(replay.scene), height=120, views=("eye", "above"))
 film._view._painter = Painter(sys.argv[3])
 eye, _ = film._camera("eye", 0)
@@ -306,7 +306,7 @@ np.savez(sys.argv[1], frame=film.frame(replay.num_steps), eye=eye.pos_w, above=a
 def test_a_film_from_eye_height_and_from_above(played, tmp_path, engine):
     if engine == "gl":
         need_gl()
-    replay.save(played, tmp_path / "a.npz")
+    replay.save_replay(played, tmp_path / "a.npz")
     made = drawn(FILM, tmp_path, tmp_path / "a.npz", engine)
     frame, above = made["frame"], made["above"]
     assert frame.shape == (140, 320, 3)
@@ -324,7 +324,7 @@ def test_a_film_from_eye_height_and_from_above(played, tmp_path, engine):
 
 def test_a_gif_and_refusals(played, room, two_rooms, tmp_path, capsys):
     path = tmp_path / "a.npz"
-    replay.save(played, path)
+    replay.save_replay(played, path)
     arguments = [str(path), "--height", "120", "--every", "30"]
     assert record.main([*arguments, "-o", str(tmp_path / "a.gif")]) == 0
     with Image.open(tmp_path / "a.gif") as gif:
@@ -339,7 +339,7 @@ def test_a_gif_and_refusals(played, room, two_rooms, tmp_path, capsys):
     assert record.main([str(path), "--height", "125"]) == 2
     assert "height is 125, expected a multiple of 12" in capsys.readouterr().err
     other = dataclasses.replace(played, scene=str(two_rooms))
-    replay.save(other, tmp_path / "b.npz")
+    replay.save_replay(other, tmp_path / "b.npz")
     for program in (record, topdown):
         assert program.main([str(tmp_path / "b.npz"), "-o", str(tmp_path / "b.gif")]) == 2
         assert "has changed since the replay was recorded" in capsys.readouterr().err
@@ -370,12 +370,12 @@ def test_a_map_shows_what_was_moved(played, room, tmp_path):
         np.testing.assert_allclose([*arrow.xyann, *arrow.xy], [0.2, 0, 0.7, 0], atol=1e-6)
         [path] = axis.collections
         assert len(path.get_segments()) == played.num_steps
-    replay.save(played, tmp_path / "replays" / "x-episode4.npz")
+    replay.save_replay(played, tmp_path / "replays" / "x-episode4.npz")
     assert topdown.main([str(tmp_path), "-o", str(tmp_path / "map.png")]) == 0
     with Image.open(tmp_path / "map.png") as picture:
         assert picture.size[0] > 500
     with pytest.raises(UserError, match="colour_by is 'speed', expected one of time, contact"):
-        topdown.draw(axis, played, scene, "speed")
+        topdown.draw_topdown(axis, played, scene, "speed")
 
 
 def test_gymnasium_renders_the_view_from_behind(room):

@@ -175,15 +175,15 @@ def test_make_the_viewer_and_the_table_take_a_file(tmp_path, monkeypatch, capsys
 def test_a_run_keeps_the_files_of_its_robot(tmp_path):
     path = write(tmp_path, cart())
     write(tmp_path, "max_wheel_speed_rad_s: 4\n", "porter.yaml")
-    reference.keep(path, tmp_path / "run" / "robot")
+    reference.record_robot(path, tmp_path / "run" / "robot")
     shutil.move(tmp_path / "run", tmp_path / "moved")
     (tmp_path / "porter.urdf").unlink()
-    kept, identity = reference.kept(tmp_path / "moved" / "robot") or ("", "")
+    kept, identity = reference.recorded_robot(tmp_path / "moved" / "robot") or ("", "")
     assert get(kept)[0].action_high == (4.0, 4.0) and get(kept)[0].name == "porter"
     assert identity.startswith("porter.urdf, sha256 ") and reference.identity(kept) == identity
     (tmp_path / "moved" / "robot" / "porter.yaml").write_text("max_wheel_speed_rad_s: 5\n")
     with pytest.warns(UserWarning, match="porter.urdf changed since the run began"):
-        reference.kept(tmp_path / "moved" / "robot")
+        reference.recorded_robot(tmp_path / "moved" / "robot")
 
 
 def test_a_run_refers_to_a_python_function_and_to_files_with_includes(tmp_path):
@@ -192,21 +192,21 @@ def test_a_run_refers_to_a_python_function_and_to_files_with_includes(tmp_path):
         write(tmp_path, '<mujoco><include file="x"/></mujoco>', "a.xml"),
     )
     for k, place in enumerate(places):
-        reference.keep(place, tmp_path / f"robot{k}")
-        assert reference.kept(tmp_path / f"robot{k}") == (place, reference.identity(place))
+        reference.record_robot(place, tmp_path / f"robot{k}")
+        assert reference.recorded_robot(tmp_path / f"robot{k}") == (place, reference.identity(place))
         assert [p.name for p in (tmp_path / f"robot{k}").iterdir()] == ["reference.json"]
     (tmp_path / "mine.py").write_text(MODULE + "#")
     with pytest.warns(UserWarning, match="mine.py:made changed since the run began"):
-        reference.kept(tmp_path / "robot0")
+        reference.recorded_robot(tmp_path / "robot0")
     (tmp_path / "mine.py").unlink()
-    lost, _ = reference.kept(tmp_path / "robot0") or ("", "")
+    lost, _ = reference.recorded_robot(tmp_path / "robot0") or ("", "")
     with pytest.raises(ConfigError, match="mine.py does not exist.*to play a run, give env.robot=PATH"):
         get(lost)
 
 
 def test_robots_with_a_name_leave_nothing_in_a_run(tmp_path):
-    reference.keep("fetch", tmp_path / "robot")
-    assert not (tmp_path / "robot").exists() and reference.kept(tmp_path / "robot") is None
+    reference.record_robot("fetch", tmp_path / "robot")
+    assert not (tmp_path / "robot").exists() and reference.recorded_robot(tmp_path / "robot") is None
     assert reference.identity("fetch") == robots.robot_name("fetch") == "fetch"
 
 

@@ -16,7 +16,7 @@ import interactive_nav
 from converters.single_object import ObjectConfig, convert_object
 from interactive_nav import episodes
 from interactive_nav.config import make_config
-from interactive_nav.pictures.replay import EpisodePlayer, load, save
+from interactive_nav.pictures.replay import EpisodePlayer, load_replay, save_replay
 from interactive_nav.scenes.object_folders import load_object, small_objects
 from interactive_nav.scenes.objects import Box, pick
 from interactive_nav.scenes.slots import bodies_by_name
@@ -89,7 +89,7 @@ def test_they_rest_where_an_episode_puts_them(env):
 
 
 def test_episodes_know_the_objects(env, room, folders):
-    file = episodes.draw(env, 2, 0)
+    file = episodes.draw_episode_file(env, 2, 0)
     assert file.objects == ("toy", "other", "toy")
     starts = episodes.starts_of(file, env)
     assert starts.small_xy_w.shape == (2, 3, 2)
@@ -111,7 +111,7 @@ def test_episodes_know_the_objects(env, room, folders):
 def test_episodes_know_how_an_object_moves_and_not_how_it_looks(room, folders, tmp_path, name, before, after, same):
     def digest(folder):
         env = interactive_nav.make("turtlebot", [room], backend="native", objects=[str(folder)], num_objects=1)
-        return episodes.draw(env, 1, 0).objects_digest
+        return episodes.draw_episode_file(env, 1, 0).objects_digest
 
     shutil.copytree(folders[0], tmp_path / "toy_crate")
     text = (tmp_path / "toy_crate" / name).read_text()
@@ -123,8 +123,8 @@ def test_episodes_know_how_an_object_moves_and_not_how_it_looks(room, folders, t
 
 def test_replays_draw_the_objects(env, tmp_path):
     replay = EpisodePlayer(env, lambda obs, key: jax.numpy.zeros(2)).play(jax.random.PRNGKey(1), 0)
-    save(replay, tmp_path / "r.npz")
-    again = load(tmp_path / "r.npz")
+    save_replay(replay, tmp_path / "r.npz")
+    again = load_replay(tmp_path / "r.npz")
     assert again.objects == replay.objects and again.small == env.world.small_objects
     thing = bodies_by_name(env.scenes[0], again.small)["other_small_1"]
     assert thing.category == "other"

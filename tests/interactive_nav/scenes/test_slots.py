@@ -12,7 +12,7 @@ from interactive_nav.config import NavConfig
 from interactive_nav.navigation.tables import friction_share, rest_poses
 from interactive_nav.physics import PhysicsState
 from interactive_nav.physics.nearness import Nearness
-from interactive_nav.physics.window import Window
+from interactive_nav.physics.window import PhysicsWindow
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
@@ -86,7 +86,7 @@ def test_a_window_finds_geoms_by_name_in_any_order(world):
     other = dataclasses.replace(world, models=(spec.compile(), *world.models[1:]))
     assert _geoms(other.models[0], world.layout.slot_body[5], "foot")[0] < _geoms(
         other.models[0], world.layout.slot_body[5], "box")[0]  # fmt: skip
-    plain, changed = Window(world, config), Window(other, config)
+    plain, changed = PhysicsWindow(world, config), PhysicsWindow(other, config)
     for a, b in zip(plain.groups, changed.groups, strict=True):
         for field in a.tables:
             np.testing.assert_array_equal(a.tables[field], b.tables[field], err_msg=field)

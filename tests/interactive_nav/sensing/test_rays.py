@@ -17,7 +17,7 @@ from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing.base import CameraPose, Lens, look_along
 from interactive_nav.sensing.boxes import box_poses, build_boxes
-from interactive_nav.sensing.rays import RayRenderer, boxes_seen, cast_fan, in_view
+from interactive_nav.sensing.rays import RayRenderer, camera_boxes, cast_fan, in_view
 from scenes_mjcf.categories import SEGMENTATIONS, MaskClasses, class_id
 from tests.toys import write_room
 
@@ -104,7 +104,7 @@ def test_sizes_that_tiles_do_not_divide(boxes, jumble, size):
 def test_in_view_is_what_no_side_of_the_picture_cuts_off(boxes, jumble, size):
     scene, qpos, eye, forward = jumble
     lens, pose = Lens(size[0], size[1], 80.0), look_along(eye, forward)
-    seen = np.asarray(in_view(boxes_seen(boxes, scene, qpos, pose), lens))
+    seen = np.asarray(in_view(camera_boxes(boxes, scene, qpos, pose), lens))
     # By corners: [N, B, 8, 3] ahead, to the right and up.
     centre, axes = box_poses(boxes, scene, qpos)
     half, signs = np.asarray(boxes.half_m)[scene], np.array(list(itertools.product((-1, 1), repeat=3)))

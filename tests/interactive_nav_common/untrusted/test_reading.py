@@ -76,7 +76,7 @@ def test_bombs_in_the_files_of_runs_are_refused(tmp_path, monkeypatch):
     for name in ("e.json.gz", "metrics.jsonl.gz"):
         (tmp_path / name).write_bytes(bomb)
     with pytest.raises(UserError, match="e.json.gz: it unpacks to more than 1 MiB; make it again"):
-        episodes.load(tmp_path / "e.json.gz")
+        episodes.load_episode_file(tmp_path / "e.json.gz")
     with pytest.raises(FileError, match="unpacks to more than 1 MiB"):
         read_metrics(tmp_path / "metrics.jsonl.gz")
     codes = np.frombuffer(zlib.compress(bytes(2**20 + 1)), np.uint8)
@@ -95,7 +95,7 @@ def test_what_is_no_regular_file_is_not_opened(tmp_path, special):
         lambda: Reader(FileError, "make it again").json(path),
         lambda: config_io.load(str(path)),
         lambda: read_rows([tmp_path / "b.parquet"]),
-        lambda: episodes.load(tmp_path / "c.json.gz"),
+        lambda: episodes.load_episode_file(tmp_path / "c.json.gz"),
         lambda: read_metrics(path),
         lambda: is_locked(path),
     ]

@@ -12,13 +12,13 @@ from tests.toys import write_room
 def test_scores_stand_by_what_the_way_round_heavy_furniture_costs(tmp_path, capsys):
     room = write_room(tmp_path / "homes" / "room", (4.0, 3.0), (("basket", 0.0, 0.0, 40.0, 0.5),), split="test")
     env = interactive_nav.make("turtlebot", [room], backend="native", num_objects=0)
-    file = episodes.draw(env, 2, 0)
+    file = episodes.draw_episode_file(env, 2, 0)
     ways = [((-0.7, y), (1.6, y)) for y in (0.0, 1.0)]  # through the block's middle, and past it
     chosen = [
         {**row, "start_xy_w": list(start), "goal_xy_w": list(goal), "shortest_path_m": 2.3}
         for row, (start, goal) in zip(file.episodes, ways, strict=True)
     ]
-    episodes.save(dataclasses.replace(file, episodes=chosen), tmp_path / "two.json")
+    episodes.save_episode_file(dataclasses.replace(file, episodes=chosen), tmp_path / "two.json")
     found = detours_m("turtlebot", [str(room)], str(tmp_path / "two.json"), 1.0)
     # By hand, round the two corners of a square of 0.4 m as a disc of the robot's radius: tests of options.
     assert found == pytest.approx([0.21, 0.0], abs=0.03)

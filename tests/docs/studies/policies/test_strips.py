@@ -9,7 +9,7 @@ from PIL import Image
 import interactive_nav
 from docs.studies.policies.strips import LENS, floor_seen, main, touched_longest
 from interactive_nav.pictures.camera import straight_down
-from interactive_nav.pictures.replay import EpisodePlayer, Replay, save
+from interactive_nav.pictures.replay import EpisodePlayer, Replay, save_replay
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def test_the_floor_seen_is_where_the_rays_of_the_corners_end():
 
 def test_a_strip_is_drawn_and_said(played, tmp_path, capsys):
     replay = _touching(played[1], [played[1].bodies[-1]] * 4)
-    save(replay, tmp_path / "a.npz")
+    save_replay(replay, tmp_path / "a.npz")
     main(["--strip", str(tmp_path / "a.npz"), "stands", "--at", "0", "9", "-o", str(tmp_path / "a.webp")])
     assert f"touched {replay.bodies[-1]} longest, success 0" in capsys.readouterr().out
     with Image.open(tmp_path / "a.webp") as picture:

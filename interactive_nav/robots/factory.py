@@ -1,4 +1,4 @@
-"""A user's MJCF or URDF and a few facts in, a robot that `make` accepts out (see `docs/add-a-robot.md`).
+"""Build a robot that `make` accepts from a user's MJCF or URDF and a few facts (see `docs/add-a-robot.md`).
 
 What the task's physics needs and a file may lack is put right, each with a warning that says what was done (see
 `repair.py`); meshes that collide, links without inertia or shape and joints without torque limits are refused.
@@ -31,7 +31,7 @@ def _read_facts(child: mujoco.MjSpec, path: Path, base_body: str, wheels: Mappin
     model = compiled(child, path)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    found = []
+    read = []
     for name, side in wheels.items():
         joint = model.joint(name)
         body = model.jnt_bodyid[joint.id]
@@ -57,12 +57,12 @@ def _read_facts(child: mujoco.MjSpec, path: Path, base_body: str, wheels: Mappin
         thin = kind == _GEOM.mjGEOM_CYLINDER
         half_width = float(model.geom_size[geom, 1]) if thin else _SPHERE_WIDTH * radius
         pos = data.geom_xpos[geom] - data.xpos[model.body(base_body).id]
-        found.append(Wheel(name, side, model.body(body).name, pos, radius, half_width, bool(axis[1] < 0)))
-    return Facts(tuple(found), min(float(w.pos_m[2] - w.radius_m) for w in found))
+        read.append(Wheel(name, side, model.body(body).name, pos, radius, half_width, bool(axis[1] < 0)))
+    return Facts(tuple(read), min(float(w.pos_m[2] - w.radius_m) for w in read))
 
 
 def _outline(robot: RobotSpec) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Lower and upper corner above the floor, radius about the base frame and mass, at home."""
+    """Return the lower and upper corner above the floor, radius about the base frame and mass, at home."""
     world = mujoco.MjSpec()
     world.worldbody.add_geom(name=FLOOR, type=_GEOM.mjGEOM_PLANE, size=[0, 0, 0.1])
     model, data = stand(robot, world)
@@ -77,7 +77,7 @@ def _outline(robot: RobotSpec) -> tuple[np.ndarray, np.ndarray, float, float]:
 
 
 def _sides(left_wheels: tuple[str, ...], right_wheels: tuple[str, ...]) -> dict[str, int]:
-    """Wheel joint -> -1 on the left, 1 on the right."""
+    """Return wheel joint -> -1 on the left, 1 on the right."""
     for side, names in (("left_wheels", left_wheels), ("right_wheels", right_wheels)):
         if isinstance(names, str):
             raise ConfigError(f"{side} is the text '{names}', expected a tuple: ('{names}',)")
@@ -109,7 +109,7 @@ def _base(
     max_linear_m_s: float | None,
     max_angular_rad_s: float | None,
 ) -> WheeledBase:
-    """Driven joints and commands; what is None follows from the wheels."""
+    """Return the driven joints and commands; what is None follows from the wheels."""
     radii = [w.radius_m for w in facts.wheels]
     if max(radii) - min(radii) > 1e-3:
         raise ConfigError(f"robot file {path}: its driven wheels differ in radius, expected one radius")
@@ -152,7 +152,7 @@ def _factory(
     camera: RobotCamera | None,
     body_width_m: float | None,
 ) -> Callable[[str], RobotSpec]:
-    """Control mode -> spec, with the figures that its outline gives; `change` warns here, and then no more."""
+    """Return control mode -> spec, with the figures that its outline gives; `change` warns here, and then no more."""
 
     def quietly(parsed: mujoco.MjSpec) -> None:
         with warnings.catch_warnings():
@@ -199,7 +199,7 @@ def _check(name: str, wheel_rad_s: float, optional: Mapping[str, float | None]) 
         raise ConfigError(f"max_wheel_speed_rad_s is {wheel_rad_s}, expected a number above 0, in rad/s")
     for setting, value in optional.items():
         if value is not None and not 0 < value < np.inf:
-            raise ConfigError(f"{setting} is {value}, expected a number above 0; leave it out to take the file's own")
+            raise ConfigError(f"{setting} is {value}, expected a number above 0; leave it out to take the file's value")
 
 
 def from_file(
@@ -220,7 +220,7 @@ def from_file(
     max_linear_m_s: float | None = None,
     max_angular_rad_s: float | None = None,
 ) -> Callable[[str], RobotSpec]:
-    """A factory for `register` from a wheeled robot's own MJCF or URDF. Frame: x forward, y left, z up.
+    """Return a factory for `register` from a wheeled robot's MJCF or URDF. Frame: x forward, y left, z up.
 
     Args:
         max_wheel_speed_rad_s: of every driven wheel; the native action's range.
