@@ -259,8 +259,7 @@ class SensorConfig(Settings):
     depth_range_m: Positive = 5.0
     """Depth is cut off here and divided by it."""
     segmentation_classes: MaskClasses = 4
-    """Furniture classes: 4 as in the original's code (desk and table are one), the paper's 5, or all: every category
-    has a separate id."""
+    """Furniture classes: 4 as in the original's code (desk and table are one), the paper's 5, or all categories."""
     depth_dropout: Share = 0.0
     """Share of depth pixels that read 0, drawn anew each step."""
     depth_noise: NotNegative = 0.0

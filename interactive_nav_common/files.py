@@ -58,8 +58,7 @@ def writing(place: object, remedy: str, what: str = "cannot be written") -> Iter
 def whole_file(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path` of the same ending, which replaces it once the block has written it.
 
-    Each writer has a temporary file, locked while it writes: of two that write one path at the same time, the
-    last one stands.
+    Each writer has a temporary file, locked while it writes: the last of two at the same time stands.
     """
     path = Path(path)
     partial, lock = path.with_name(f"{PARTIAL}{secrets.token_hex(4)}-{path.name[-40:]}"), None

@@ -84,8 +84,7 @@ def register_envs() -> None:
 def observation_space_of(env: InteractiveNav) -> spaces.Space:
     """Return a `Box` for a flat observation, a `Dict` of boxes for one in parts.
 
-    The vector is unbounded float32; images are 0 to 255 as uint8, else 0 (normals: -1) to 1 in
-    their type.
+    The vector is unbounded float32; images are 0 to 255 as uint8, else 0 (normals: -1) to 1 in their dtype.
     """
     key = jax.ShapeDtypeStruct((2,), jnp.uint32)
     obs = jax.eval_shape(env.reset, key).obs
@@ -271,8 +270,7 @@ class InteractiveNavVectorEnv(VectorEnv):
         """Draw an episode for each environment, or for some of them.
 
         Args:
-            seed: s gives environment i the seed s + i; or a list with one (or None) each. None: each goes
-                on with its sequence.
+            seed: s gives environment i the seed s + i; or a list with one (or None) each. None: each goes on.
             options: `reset_mask` [N] bool: only these; `start`: an `EpisodeStart` with leaves [N, ...] to play.
         """
         _refuse_fork()

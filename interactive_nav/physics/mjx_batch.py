@@ -1,8 +1,7 @@
 """Step with both implementations of MuJoCo MJX: `warp` (NVIDIA) and `jax` (any XLA device).
 
 Environments differ only in model fields: each fills the slots of one small model from its scene's tables
-(`window.py`). The engine's data is rebuilt from a template at every control step, so only `PhysicsState`
-is carried.
+(`window.py`). The engine's data is rebuilt from a template at every control step, so only `PhysicsState` is carried.
 """
 
 import abc

@@ -3,8 +3,7 @@
 Objects at rest far from the robot stay where they are, so only the nearest ones need to be simulated. C
 MuJoCo leaves the others out by letting them sleep; MJX steps every body of its model, and its cost grows
 with the number of bodies, contacts and pairs of boxes. Here the model has a few empty slots and walls, and at
-every control step each environment fills them with what is nearest to its robot. All slots at once give the
-whole building.
+every control step each environment fills them with what is nearest to its robot. All slots give the whole building.
 """
 
 from __future__ import annotations

@@ -109,8 +109,7 @@ class Renderer(abc.ABC):
             camera: leaves [N, ...].
 
         Returns:
-            Depth [N, H, W] f32, the distance along the optical axis, m, 0 where nothing is met, and class ids
-            [N, H, W] u8.
+            Depth [N, H, W] f32, the distance along the optical axis, m, 0 where nothing is met; class ids [N, H, W] u8.
         """
         images = self.images_batch(("depth", "segmentation"), scene, qpos, camera)
         return images["depth"], images["segmentation"]

@@ -21,8 +21,7 @@ class BoxRenderer(Renderer):
         """Return which box each pixel shows, from which colours and normals follow.
 
         Returns:
-            Depth as `render_batch` gives it, and indices [N, H, W] i32 into the tables' boxes; B is the floor and
-            -1 nothing.
+            Depth as `render_batch` gives it, and indices [N, H, W] i32 into the tables' boxes, B the floor, -1 nothing.
         """
 
     def images_batch(self, names, scene, qpos, camera, look=None):

@@ -1,8 +1,7 @@
 """Define InteractiveNav, a Brax environment from keys and actions to states; it only wires parts together.
 
 `reset` and `step` are pure, jit-able and vmap-able; every constant is built in `__init__`. Episodes follow
-section IV of Interactive Gibson (Xia et al. 2020); where paper and code differ, `docs/design.md` says which
-is meant.
+section IV of Interactive Gibson (Xia et al. 2020); where paper and code differ, `docs/design.md` says which.
 """
 
 import dataclasses

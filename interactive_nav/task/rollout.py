@@ -109,8 +109,7 @@ class Player:
             starts: `EpisodeStart`s, leaves [N, ...]: these episodes instead of drawn ones.
             scene_index: [N] i32, the scene of each drawn episode; None: drawn as well.
             record: E of the recorders at each step; None: all.
-            batch: episodes played at a time; None: all. Where the device's memory does not hold so many, half as
-                many are tried.
+            batch: episodes played at a time; None: all. Where the device's memory lacks room, half as many are tried.
             on_progress: called with the numbers of finished episodes and of steps.
         """
         count = len(keys)

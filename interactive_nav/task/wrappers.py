@@ -116,8 +116,7 @@ class AutoResetEnv(Wrapper):
         """Wrap an environment.
 
         Args:
-            env: of one episode; wrappers of it override `draw`, `advance` and `observe`, of which `reset` and `step`
-                consist.
+            env: of one episode; wrappers of it override `draw`, `advance` and `observe`, parts of `reset` and `step`.
             action_repeat: control steps that an action is held for; rewards are summed.
 
         Raises:
