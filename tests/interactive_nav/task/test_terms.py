@@ -98,5 +98,5 @@ def test_gymnasium_replays_and_rollouts_report_them(env):
 
 def test_two_terms_of_one_name_are_refused(env):
     twice = Term("success", "Twice.", "reward", lambda _, step: jnp.zeros(()))
-    with pytest.raises(ConfigError, match="two are called 'reward/success', expected names of their own; rename one"):
+    with pytest.raises(ConfigError, match="two are called 'reward/success', expected different names; rename one"):
         env.__class__(env.robot, env.scenes, env.config, (twice,))
