@@ -230,7 +230,7 @@ def training(
     learner: list[str],
 ) -> dict[str, Any]:
     """Rate of `python -m train` with a preset and `learner` words laid over it: median over its log lines."""
-    algorithm = config_io.load(preset).algorithm
+    algorithm = config_io.load_config(preset).algorithm
     with tempfile.TemporaryDirectory() as folder:
         overrides = [
             f"env.scenes=[{','.join(scenes)}]",
@@ -245,7 +245,7 @@ def training(
             *(f"env.{k}={json.dumps(v)}" for k, v in settings.items()),
             *learner,
         ]
-        _, run_folder, _ = train_run(config_io.load(preset, overrides), Console(quiet=True))
+        _, run_folder, _ = train_run(config_io.load_config(preset, overrides), Console(quiet=True))
         lines = [json.loads(line) for line in run_folder.metrics.read_text(encoding="utf-8").splitlines()]
     rates = [line["env_steps_per_s"] for line in lines[1:]] or [lines[0]["env_steps_per_s"]]
     last = lines[-1]

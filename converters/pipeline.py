@@ -47,7 +47,7 @@ from scenes_mjcf.schema import SceneManifest, SceneMaps, save_manifest, save_map
 MODELLED = 10**6, 4096
 """Faces, and pixels a side, up to which a structure without furniture is drawn as it is: somebody modelled it."""
 TURNED_M = 0.1
-"""`bake_structure`'s word for homes that are made of parts."""
+"""`bake_structure`'s word for homes that consist of parts."""
 PARALLEL_OBJECTS = 8
 """From so many objects on, starting processes for their textures pays."""
 
@@ -62,7 +62,7 @@ class ConvertConfig:
     unit: str = dataclasses.field(default="auto", metadata=NOT_HASHED)
     mirror: bool = dataclasses.field(default=False, metadata=NOT_HASHED)
     root: Path | None = dataclasses.field(default=None, metadata=NOT_HASHED)
-    """Of an MJCF or Gazebo home: the folder that may be read; None: its own."""
+    """Of an MJCF or Gazebo home: the folder that may be read; None: the home's."""
     split: str = dataclasses.field(default="train", metadata=NOT_HASHED)
     jobs: int = dataclasses.field(default=2, metadata=NOT_HASHED)
     seed: int = 0
@@ -84,7 +84,7 @@ class ConvertConfig:
 
     @property
     def search(self) -> DecomposeConfig:
-        """The parameters of the decomposition."""
+        """Return the parameters of the decomposition."""
         return DecomposeConfig(seed=self.seed, timeout_s=self.timeout_s)
 
 
@@ -240,7 +240,7 @@ def _place(raw: RawScene, config: ConvertConfig, clock: Clock, stages: StageCach
 
 
 def _write(placed: Placed, structure: VisualMesh, drawn: list[Drawn], folder: Path) -> SceneParts:
-    """Write the model and the maps of a floor; return what the model is made of."""
+    """Write the model and the maps of a floor; return what the model consists of."""
     down = np.array([0.0, 0.0, placed.floor_m])
     parts = dataclasses.replace(
         placed.settled.parts,
@@ -259,7 +259,7 @@ def _object_rows(placed: Placed, drawn: list[Drawn]) -> list[dict[str, Any]]:
     moves = zip(placed.settled.displacement_m, placed.settled.drop_m, strict=True)
     rows = []
     for row, (shift_m, drop_m), one, placed_object in zip(placed.rows, moves, drawn, placed.annotated, strict=True):
-        settled = {"settle_shift_m": shift_m, "settle_drop_m": drop_m, "texture_seen_share": round(one.seen_share, 3)}
+        settled = {"settle_shift_m": shift_m, "settle_drop_m": drop_m, "texture_seen_share": round(one.shown_share, 3)}
         shown = {"drawn_area_share": round(one.kept_share, 3), "drawn_off_m": round(one.off_m, 4)}
         hinge = placed_object.hinge
         rows.append(row | settled | shown | ({} if hinge is None else {"hinge_assumed": hinge.assumed}))
@@ -344,7 +344,7 @@ def convert_building(
         cache: folder of hulls and stage results by content; default `cache_folder()`.
         warn: called with what is wrong with the source as soon as it is read; all warnings stand in the result too.
         floors: that it must have; None: any number.
-        annotations: Scan2CAD's file, in place of the source's own; its models are those of `config.library`.
+        annotations: Scan2CAD's file, in place of the source's; its models are those of `config.library`.
     """
     clock = Clock(report or (lambda stage, share: None))
     if config.library is None and (source / "cad").is_dir():

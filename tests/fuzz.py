@@ -214,7 +214,7 @@ def runs() -> dict[str, Target]:
         folder.read_metrics()
 
     def sweep(root: Path) -> None:
-        folder = SweepFolder(spec.load(str(write_sweep(root))))
+        folder = SweepFolder(spec.load_sweep(str(write_sweep(root))))
         folder.prepare()
         for k, each in enumerate(folder.sweep.runs):
             (folder.runs / each.name).mkdir()
@@ -223,7 +223,7 @@ def runs() -> dict[str, Target]:
                 folder.give_up(each.name, "train: ended with exit code 1", 3)
 
     def read_sweep(root: Path) -> None:
-        folder = SweepFolder(spec.load(str(root / "small.yaml")))
+        folder = SweepFolder(spec.load_sweep(str(root / "small.yaml")))
         told = [folder.state(each) for each in folder.sweep.runs]
         assert all("\n" not in state.reason for state in told), "a reason of several lines"
 
@@ -231,7 +231,7 @@ def runs() -> dict[str, Target]:
         state = {"x": np.zeros(3, np.float32)}
         snapshot = type("Snapshot", (), {"learner": weights, "env_state": state})()
         meta = checkpoint.CheckpointMeta(5, 1.0, 0.5, "ppo", "turtlebot", ("lidar",), 3, 2)
-        path = checkpoint.save(root, snapshot, meta, 2, 10.0)
+        path = checkpoint.save_snapshot(root, snapshot, meta, 2, 10.0)
         (root / "exported").mkdir()
         flat = {"params/kernel": np.ones((3, 2), np.float32), "params/bias": np.zeros(2, np.float32)}
         np.savez(root / "exported" / policy_file.POLICY, **policy_file.packed(flat))  # type: ignore[arg-type]
@@ -327,8 +327,8 @@ def given() -> dict[str, Target]:
         shutil.copy(ROOT / "train" / "configs" / "sweeps" / "kint.yaml", root / "sweep.yaml")
 
     def read_settings(root: Path) -> None:
-        config_io.load(str(root / "config.yaml"))
-        spec.load(str(root / "sweep.yaml"))
+        config_io.load_config(str(root / "config.yaml"))
+        spec.load_sweep(str(root / "sweep.yaml"))
 
     return {
         "rows": Target(rows, read_rows),

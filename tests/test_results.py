@@ -40,7 +40,7 @@ def test_every_run_is_whole_and_says_where_it_comes_from():
         max(train_env_steps), any_value(train_device), any_value(train_commit)
         from '{SWEPT}/rows/*.parquet' group by run"""
     ).fetchall()
-    sweep = spec.load("kint")
+    sweep = spec.load_sweep("kint")
     known = {run.name: run for run in sweep.runs}
     assert {name for name, *_ in found} == set(known) and len(known) == 54
     for name, count, scenes, shortest_m, least, most, device, commit in found:

@@ -1,4 +1,4 @@
-"""`python -m train`: words on the command line in, a trained run folder and an exit code out."""
+"""Run `python -m train`: train as the command line says, write a run folder and return an exit code."""
 
 import argparse
 import dataclasses
@@ -15,29 +15,29 @@ from train.runs.run_folder import RunFolder
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
-    made = Parser(
+    """Return the parser of the command line."""
+    command = Parser(
         prog="python -m train",
         description="Trains a policy. The same command continues a run that was stopped or killed.",
         epilog=f"settings (key=default):\n{config_io.help_text()}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    known = ", ".join(config_io.known_in())
-    source = made.add_mutually_exclusive_group(required=True)
-    source.add_argument("--config", metavar="NAME|PATH", help=f"a preset ({known}) or a YAML file")
-    source.add_argument("--resume", metavar="RUN_DIR", help="continue this run folder with its own config")
-    made.add_argument("--robot", metavar="NAME|FILE", help="as env.robot=...: a name, a file, or path.py:function")
-    made.add_argument(
+    presets = ", ".join(config_io.preset_names())
+    source = command.add_mutually_exclusive_group(required=True)
+    source.add_argument("--config", metavar="NAME|PATH", help=f"a preset ({presets}) or a YAML file")
+    source.add_argument("--resume", metavar="RUN_DIR", help="continue this run folder with its config")
+    command.add_argument("--robot", metavar="NAME|FILE", help="as env.robot=...: a name, a file, or path.py:function")
+    command.add_argument(
         "--checkpoint", default="last", metavar="best|last|STEPS", help="continue from it (default: last)"
     )
-    made.add_argument("overrides", nargs="*", metavar="key=value", help="settings to change, see below")
-    return made
+    command.add_argument("overrides", nargs="*", metavar="key=value", help="settings to change, see below")
+    return command
 
 
 def read_config(arguments: argparse.Namespace) -> TrainConfig:
-    """The config that the command line means."""
+    """Return the config that the command line describes."""
     if arguments.config:
-        return config_io.load(arguments.config, arguments.overrides)
+        return config_io.load_config(arguments.config, arguments.overrides)
     path = Path(arguments.resume)
     config = RunFolder(path).read_config()
     run = dataclasses.replace(config.run, out_dir=str(path.parent), name=path.resolve().name)
@@ -46,11 +46,11 @@ def read_config(arguments: argparse.Namespace) -> TrainConfig:
 
 @reports_errors("train")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs; 0 when done, 2 on a user's error, 128 + signal when asked to stop (after saving)."""
+    """Train; return 0 when done, 2 on a user's error, 128 + signal when stopped by one (after saving)."""
     arguments = parser().parse_intermixed_args(argv)
     arguments.overrides = config_io.with_robot(arguments.overrides, arguments.robot)
     config = read_config(arguments)
-    # Heavy: after the config is known to be right.
+    # Heavy: after the config has been checked.
     from train.runs.run import train_run
 
     _, _, stopped_by = train_run(config, SafeConsole(), resume_from=arguments.checkpoint)

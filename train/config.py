@@ -1,4 +1,4 @@
-"""Every setting of a training run: frozen dataclasses, checked on construction; docstrings are the help."""
+"""Define every setting of a training run: frozen dataclasses, checked on construction; docstrings are the help."""
 
 import dataclasses
 from pathlib import Path
@@ -127,9 +127,9 @@ class OffPolicyConfig(Settings):
     replay_limit_gb: Positive = 16.0
     """A replay that would take more device memory (1e9 bytes) is refused."""
     replay_dtype: Literal["float32", "float16"] = "float32"
-    """How vectors are stored; images keep their own type (env.image_dtype)."""
+    """How vectors are stored; images keep their type (env.image_dtype)."""
     n_steps: AtLeastOne = 1
-    """Rewards summed before the critic's own estimate takes over."""
+    """Rewards summed before the critic's estimate takes over."""
     discounting: Share = 0.99
     """Discount of one control step."""
     reward_scaling: Positive = 1.0
@@ -262,7 +262,7 @@ def resolve(config: TrainConfig, backend: str) -> TrainConfig:
     sections: dict[str, Any] = {}
     for name, auto in AUTO.items():
         if backend not in auto:
-            raise ConfigError(f"env.backend: no automatic sizes for {backend!r}; known: {', '.join(auto)}")
+            raise ConfigError(f"env.backend: no automatic sizes for {backend!r}; available: {', '.join(auto)}")
         section = getattr(config, name)
         filled = {key: value for key, value in auto[backend].items() if getattr(section, key) is None}
         sections[name] = dataclasses.replace(section, **filled)

@@ -1,4 +1,4 @@
-"""YAML text and `key=value` words -> a `TrainConfig`, and back; every mistake named in one line."""
+"""Read a `TrainConfig` from YAML text and `key=value` words, and write it; every mistake is named in one line."""
 
 import dataclasses
 import json
@@ -19,21 +19,20 @@ PRESET_DIR = Path(__file__).parent / "configs"
 
 
 def to_yaml(config: TrainConfig) -> str:
-    """YAML text that `from_yaml` reads back to an equal config."""
+    """Return YAML text that `from_yaml` reads back to an equal config."""
     return yaml.safe_dump(to_dict(config), sort_keys=False)
 
 
 def from_dict(plain: Any, base: TrainConfig | None = None, where: str = "config") -> TrainConfig:
-    """`base` with nested plain values laid over it.
+    """Return `base` with nested plain values laid over it.
 
-    Args:
-        base: what `plain` does not name; the defaults where None.
+    `base`: what `plain` does not name; the defaults where None.
     """
     return overlay(base or TrainConfig(), plain, where, elsewhere=list(flatten(TrainConfig())))
 
 
 def from_yaml(text: str, where: str = "config") -> TrainConfig:
-    """As `from_dict`, from YAML text."""
+    """Return the config of YAML text, as `from_dict`."""
     return from_dict(_parsed(text, where), where=where)
 
 
@@ -41,31 +40,31 @@ def _parsed(text: str, where: str) -> Any:
     return Reader(ConfigError, "expected settings, see --help", finite=False).decoded(text, "YAML", where)
 
 
-def known_in(folder: Path = PRESET_DIR) -> list[str]:
-    """Names of a folder's YAML files: those that `--config` knows, or of `SWEEP_DIR` those of sweeps."""
+def preset_names(folder: Path = PRESET_DIR) -> list[str]:
+    """Return the names of a folder's YAML files: the presets of `--config`, or in `SWEEP_DIR` those of sweeps."""
     return sorted(path.stem for path in folder.glob("*.yaml"))
 
 
-def read_file(name_or_path: str, folder: Path, what: str, told: str = "") -> tuple[Path, Any]:
-    """The nested plain values of a YAML file: a path that ends in .yaml or .yml, or a name among a folder's."""
+def read_file(name_or_path: str, folder: Path, what: str, prefix: str = "") -> tuple[Path, Any]:
+    """Return the nested plain values of a YAML file: a path ending in .yaml or .yml, or a name among a folder's."""
     path = Path(name_or_path)
     if path.suffix not in (".yaml", ".yml"):
         path = folder / f"{name_or_path}.yaml"
         if not path.is_file():
-            known = known_in(folder)
+            names = preset_names(folder)
             raise ConfigError(
-                f"{told}no {what} {name_or_path!r}{nearest(name_or_path, known)}; "
-                f"expected one of {', '.join(known)}, or the path of a .yaml file"
+                f"{prefix}no {what} {name_or_path!r}{nearest(name_or_path, names)}; "
+                f"expected one of {', '.join(names)}, or the path of a .yaml file"
             )
     try:
         return path, _parsed(regular(path).read_text(encoding="utf-8"), path.name)
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise ConfigError(f"{told}cannot read {path} ({reason}); expected a YAML file") from None
+        raise ConfigError(f"{prefix}cannot read {path} ({reason}); expected a YAML file") from None
 
 
-def load(name_or_path: str, overrides: Sequence[str] = ()) -> TrainConfig:
-    """Reads a preset (by name) or a YAML file (by path) and applies `key=value` words to it."""
+def load_config(name_or_path: str, overrides: Sequence[str] = ()) -> TrainConfig:
+    """Read a preset (by name) or a YAML file (by path) and apply `key=value` words to it."""
     path, plain = read_file(name_or_path, PRESET_DIR, "preset", "--config: ")
     if isinstance(plain, dict) and {"preset", "grid"} & plain.keys():
         raise ConfigError(
@@ -81,7 +80,7 @@ def load(name_or_path: str, overrides: Sequence[str] = ()) -> TrainConfig:
 
 
 def with_scenes(config: TrainConfig) -> TrainConfig:
-    """The config with the scene folders of the sets that `env.scenes` names (`cluttered/train`)."""
+    """Return the config with the scene folders of the sets that `env.scenes` names (`cluttered/train`)."""
     return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=scene_folders(config.env.scenes)))
 
 
@@ -91,12 +90,12 @@ def with_robot(words: Sequence[str], robot: str | None) -> list[str]:
 
 
 def apply_overrides(config: TrainConfig, words: Sequence[str]) -> TrainConfig:
-    """The config with `dotted.name=value` words laid over it; values are read as YAML."""
+    """Return the config with `dotted.name=value` words laid over it; values are read as YAML."""
     return overlay(config, read_words(words), "override", elsewhere=list(flatten(TrainConfig())))
 
 
 def help_text() -> str:
-    """One line a setting: dotted name, default, meaning."""
+    """Return one line for each setting: dotted name, default, meaning."""
     sizes: dict[str, list[str]] = {}
     for section, backends in AUTO_SIZES.items():
         for backend, auto in backends.items():

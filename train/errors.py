@@ -1,4 +1,4 @@
-"""What can go wrong for a user of `train` beside settings and files: each error is one clear line."""
+"""Define what can go wrong for a user of `train` beside settings and files: each error is one clear line."""
 
 from interactive_nav_common.errors import UserError
 

@@ -1,4 +1,4 @@
-"""`python -m train.evaluate`: run folders in; Parquet rows, recorded paths and tables of scores out."""
+"""Run `python -m train.evaluate`: evaluate run folders; write Parquet rows, recorded paths and tables of scores."""
 
 import argparse
 import dataclasses
@@ -23,23 +23,23 @@ from interactive_nav_common.words import program
 from scenes_mjcf.sets import installed, scene_folders
 from train import config_io
 from train.config import EnvConfig, TrainConfig
-from train.runs.run import config_to_play, make_env
+from train.runs.run import build_env, config_to_play
 from train.runs.run_folder import RunFolder, claim
 from train.scoring.brought import named
 from train.scoring.evaluation import AUTO_BATCH, LEARNED, POLICIES, SEED, evaluate, write_paths
 from train.scoring.evaluation import load_policy as load_policy
 from train.scoring.policies import PLANNERS
 from train.scoring.rollout import BatchPlayer
-from train.scoring.row_files import EvaluationAsked, paths_beside
+from train.scoring.row_files import EvaluationRequest, paths_beside
 from train.scoring.rows import score_table
 
 EPISODES = 200
 ROWS = "evaluation/episodes.parquet"
-"""Of a run folder's own evaluation."""
+"""Of a run folder's default evaluation."""
 
 
 def _read_episodes(paths: Sequence[str], most: int | None) -> tuple[EpisodeFile, str]:
-    """The first episodes of files, or all, and the files' digest."""
+    """Return the first episodes of files, or all, and the files' digest."""
     try:
         file, digest = load_episode_files([str(installed(path)) for path in paths])
     except EpisodeFileError as error:
@@ -50,7 +50,7 @@ def _read_episodes(paths: Sequence[str], most: int | None) -> tuple[EpisodeFile,
 
 
 def _config_of_baselines(policies: Sequence[str], arguments: argparse.Namespace) -> TrainConfig:
-    """The default config, for policies that need no run folder."""
+    """Return the default config, for policies that need no run folder."""
     if LEARNED in policies or not arguments.scenes:
         raise ConfigError(
             "RUN_DIR is missing; without one, expected --scenes and --policies without learned, "
@@ -60,7 +60,7 @@ def _config_of_baselines(policies: Sequence[str], arguments: argparse.Namespace)
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     return program(
         Path(__file__).with_name("words.yaml"), "evaluate", episodes=EPISODES, policies=",".join(POLICIES),
         planners=",".join(PLANNERS), seed=SEED, rows=ROWS,
@@ -69,7 +69,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _policies(arguments: argparse.Namespace) -> tuple[str, ...]:
-    """What --policies names, then `name=module:factory` of each --policy."""
+    """Return what --policies names, then `name=module:factory` of each --policy."""
     brought = [named(word) for word in arguments.policy]
     given = arguments.policies
     if given is None:
@@ -80,16 +80,16 @@ def _policies(arguments: argparse.Namespace) -> tuple[str, ...]:
     names = [word.partition("=")[0] for word in (*policies, *brought)]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
-        raise ConfigError(f"--policy: name {twice[0]!r} is taken, expected one of its own, as in mine=module:factory")
+        raise ConfigError(f"--policy: name {twice[0]!r} is taken, expected another one, as in mine=module:factory")
     return (*policies, *brought)
 
 
 def _place(
-    arguments: argparse.Namespace, folder: RunFolder | None, config: TrainConfig, asked: EvaluationAsked
+    arguments: argparse.Namespace, folder: RunFolder | None, config: TrainConfig, request: EvaluationRequest
 ) -> Path:
-    """Where rows go; those without a run go where those of a run of their name would."""
+    """Return where rows go; those without a run go where those of a run of their name would."""
     if arguments.dataset:
-        return Path(arguments.dataset) / asked.file_name(config.run.name)
+        return Path(arguments.dataset) / request.file_name(config.run.name)
     home = folder.path if folder else Path(config.run.out_dir) / config.run.name
     return Path(arguments.out or home / ROWS)
 
@@ -97,7 +97,7 @@ def _place(
 def _wanted(
     folder: RunFolder | None, policies: Sequence[str], arguments: argparse.Namespace, console: Console
 ) -> TrainConfig:
-    """A run's config with the environment that the command line asks for."""
+    """Return a run's config with the environment that the command line requests."""
     words = [word for word in arguments.words if "=" in word]
     if folder:
         return config_to_play(folder, words, arguments.scenes, console)
@@ -106,7 +106,7 @@ def _wanted(
 
 
 def _checked_seed(arguments: argparse.Namespace) -> int:
-    """The seed of drawn episodes, once numbers are in range and no word is without effect."""
+    """Return the seed of drawn episodes, once numbers are in range and no word is without effect."""
     for name, value in (("--episodes", arguments.episodes), ("--batch", arguments.batch)):
         if value is not None and value < 1:
             raise ConfigError(f"{name} is {value}, expected at least 1")
@@ -121,66 +121,66 @@ def _checked_seed(arguments: argparse.Namespace) -> int:
 
 
 @reports_errors("train.evaluate")
-def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = make_env) -> int:
-    """Evaluates; 0 when done, 2 on a user's error, 128 + signal when stopped, which keeps what has been played."""
+def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = build_env) -> int:
+    """Evaluate; return 0 when done, 2 on a user's error, 128 + signal when stopped, which keeps what is played."""
     kept: dict[Path, str] = {}
     try:
         with interrupts_heard(*STOPS):
             return _run(parser().parse_intermixed_args(argv), build_env, kept)
     except KeyboardInterrupt as stop:
-        told = "; ".join(kept.values()) or "nothing, no policy had played all"
+        saved = "; ".join(kept.values()) or "nothing, no policy had played all"
         number = number_of(stop)
-        print(f"train.evaluate: stopped by {signal.Signals(number).name}; kept: {told}", file=sys.stderr)
+        print(f"train.evaluate: stopped by {signal.Signals(number).name}; kept: {saved}", file=sys.stderr)
         return 128 + number
 
 
 def _run(arguments: argparse.Namespace, build_env: Callable[[EnvConfig], Any], kept: dict[Path, str]) -> int:
-    """Fills `kept` with what has been written: a run's file of rows -> how to say it."""
+    """Fill `kept` with what has been written: a run's file of rows -> how to say it."""
     console = SafeConsole()
     arguments.words = config_io.with_robot(arguments.words, arguments.robot)
     seed = _checked_seed(arguments)
     policies = _policies(arguments)
     for word in arguments.words:
         if "=" in word and not word.startswith("env."):
-            raise ConfigError(f"override {word!r}: expected env.<setting>=value: the rest is the run's own")
+            raise ConfigError(f"override {word!r}: expected env.<setting>=value: the run decides the rest")
     runs = [RunFolder(Path(word)) for word in arguments.words if "=" not in word]
     if len(runs) > 1 and arguments.out:
         raise ConfigError("--out is for one run; several write into a folder: --dataset DIR")
     folders = runs or [None]
     configs = [_wanted(folder, policies, arguments, console) for folder in folders]
     if arguments.policies is None and not all("waypoints" in c.env.sensors.observations for c in configs):
-        policies = tuple(name for name in policies if name != "follower")  # nobody asked for it
+        policies = tuple(name for name in policies if name != "follower")  # nobody requested it
     given = arguments.episode_file
-    fixed, digest = _read_episodes(given, arguments.episodes) if given else (None, "")
+    file, digest = _read_episodes(given, arguments.episodes) if given else (None, "")
     # Runs of one environment one after the other: it is built and compiled once. k_int is in no score.
     kinds = [replace(config.env, k_int=0.0) for config in configs]
     order = sorted(range(len(folders)), key=lambda i: kinds.index(kinds[i]))
     player, built = None, None
     for i in order:
         folder, config = folders[i], configs[i]
-        asked = EvaluationAsked(
+        request = EvaluationRequest(
             scenes=tuple(Path(scene).name for scene in config.env.scenes),
             policies=policies,
-            episodes=len(fixed.episodes) if fixed else arguments.episodes or EPISODES,
-            seed=fixed.seed if fixed else seed,
-            balanced=arguments.balanced and fixed is None,
+            episodes=len(file.episodes) if file else arguments.episodes or EPISODES,
+            seed=file.seed if file else seed,
+            balanced=arguments.balanced and file is None,
             checkpoint=arguments.checkpoint,
             deterministic=not arguments.stochastic,
             settings=tuple(sorted(word for word in arguments.words if "=" in word)),
             episode_file=digest,
         )
-        out = _place(arguments, folder, config, asked)
+        out = _place(arguments, folder, config, request)
         claim(out.parent)
-        told = f"{asked.episodes} episodes by each of {', '.join(policies)} in {', '.join(asked.scenes)}"
-        console.print(f"{config.run.name}: {told}; loading and compiling first", highlight=False, soft_wrap=True)
+        summary = f"{request.episodes} episodes by each of {', '.join(policies)} in {', '.join(request.scenes)}"
+        console.print(f"{config.run.name}: {summary}; loading and compiling first", highlight=False, soft_wrap=True)
         if player is None or kinds[i] != built:
             player = None  # the old one's memory goes before the new one's comes
             player, built = BatchPlayer(build_env(config.env)), kinds[i]
         trained_steps = folder.origin().get("env_steps") if folder else None
-        notes = {"asked": json.dumps(asked.plain()), "trained_steps": json.dumps(trained_steps)}
+        notes = {"asked": json.dumps(request.plain()), "trained_steps": json.dumps(trained_steps)}
         rows, stood = pa.table({}), out.exists()
         unfinished = out.with_name(f".unfinished-{out.name}")  # which figures and sweeps pass over
-        for rows, played in evaluate(folder, config, player, asked, arguments.record, console, fixed, arguments.batch):
+        for rows, played in evaluate(folder, config, player, request, arguments.record, console, file, arguments.batch):
             # What is stopped keeps what has been played; whole rows that stood there give way to whole ones only.
             place = out if len(played) == len(policies) or not stood else unfinished
             write_paths(paths_beside(place), played, player.env)  # first: rows are never without paths as new as they
@@ -195,7 +195,7 @@ def _run(arguments: argparse.Namespace, build_env: Callable[[EnvConfig], Any], k
 
 
 def _tell(console: Console, rows: pa.Table, config: TrainConfig, env: Any, out: Path) -> None:
-    """The table of scores, and whether they are in doubt."""
+    """Print the table of scores, and whether they are in doubt."""
     console.print(score_table(rows, f"{config.run.name}: {', '.join(scene.name for scene in env.scenes)}"))
     # A solve that met its iteration limit is inexact, not lost.
     for name in FAILURES[:3]:

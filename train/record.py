@@ -1,6 +1,6 @@
-"""`python -m train.record RUN_DIR --episode K -o out.mp4`: an episode of a run played once more, and a video of it.
+"""Run `python -m train.record RUN_DIR --episode K -o out.mp4`: replay an episode of a run and draw a video of it.
 
-`python -m train.replay`, then `python -m interactive_nav.record` of the replay.
+This is `python -m train.replay`, then `python -m interactive_nav.record` of the replay.
 """
 
 import inspect
@@ -16,15 +16,15 @@ from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.words import program
 from train import replay
 from train.config import EnvConfig
-from train.runs.run import make_env
+from train.runs.run import build_env
 
 
 @reports_errors("train.record")
-def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = make_env) -> int:
-    """Plays and draws; 0 when done, 2 on a user's error, 130 when interrupted."""
-    made = program(Path(__file__).with_name("words.yaml"), "record")
-    add_picture_words(made)
-    arguments = made.parse_intermixed_args(argv)
+def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = build_env) -> int:
+    """Play and draw; return 0 when done, 2 on a user's error, 130 when interrupted."""
+    command = program(Path(__file__).with_name("words.yaml"), "record")
+    add_picture_words(command)
+    arguments = command.parse_intermixed_args(argv)
     played = ["--episodes", str(arguments.episode), "--policies", arguments.policy]
     played += ["--episode-file", arguments.episode_file] if arguments.episode_file else []
     try:

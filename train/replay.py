@@ -1,8 +1,8 @@
-"""`python -m train.replay RUN_DIR --episodes 0,1 --policies learned,follower`: episodes played once more, step by step.
+"""Run `python -m train.replay RUN_DIR --episodes 0,1 --policies learned,follower`: record episodes step by step.
 
 Episode K starts as row K of `python -m train.evaluate` with the same seed or file: same place, goal and objects. The
 numbers that a network computes may differ in their last bits with the size of the batch, so a close call may
-end otherwise; a replay carries its own scores. Videos and maps are drawn from its files:
+end otherwise; a replay carries its scores. Videos and maps are drawn from its files:
 `python -m train.record`, `python -m interactive_nav.topdown`.
 """
 
@@ -23,19 +23,19 @@ from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.words import program
 from scenes_mjcf.sets import installed
 from train.config import EnvConfig
-from train.runs.run import config_to_play, make_env
+from train.runs.run import build_env, config_to_play
 from train.runs.run_folder import RunFolder, claim
 from train.scoring.evaluation import POLICIES, SEED, make_policies
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     return program(Path(__file__).with_name("words.yaml"), "replay", policies=",".join(POLICIES), seed=SEED)
 
 
 @reports_errors("train.replay")
-def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = make_env) -> int:
-    """Records; 0 when done, 2 on a user's error."""
+def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = build_env) -> int:
+    """Record; return 0 when done, 2 on a user's error."""
     arguments = parser().parse_intermixed_args(argv)
     console = SafeConsole()
     if not all(word.isdecimal() for word in arguments.episodes.split(",")):
@@ -56,10 +56,10 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
     names = list(dict.fromkeys(arguments.policies.split(",")))
     for name in names:
         if name not in POLICIES:
-            known = ", ".join(POLICIES)
-            raise ConfigError(f"--policies: got {name!r}, expected a choice from {known}")
-    made = make_policies(names, folder, config, env, arguments.checkpoint, not arguments.stochastic)
-    for name, (policy, meta) in made.items():
+            choices = ", ".join(POLICIES)
+            raise ConfigError(f"--policies: got {name!r}, expected a choice from {choices}")
+    policies = make_policies(names, folder, config, env, arguments.checkpoint, not arguments.stochastic)
+    for name, (policy, meta) in policies.items():
         label = f"{config.run.name}, {meta.env_steps:,} steps" if meta else ""
         player = replay.EpisodePlayer(env, policy, name, label)
         for episode in episodes:

@@ -1,1 +1,1 @@
-"""Does a scene hold: settling, gates, a picture of the conversion."""
+"""Check scenes: settle objects, judge gates, draw the conversion."""

@@ -1,4 +1,4 @@
-"""Whether a scene's files agree: map with walls, `scene.json` with `scene.xml`, masses with what is usual."""
+"""Check that a scene's files agree: map with walls, `scene.json` with `scene.xml`, masses with what is usual."""
 
 import math
 from collections.abc import Sequence
@@ -16,10 +16,10 @@ GRAVITY = (0.0, 0.0, -9.81)
 
 
 def wall_values(model: mujoco.MjModel, maps: SceneMaps) -> dict[str, float]:
-    """Share of the free floor's rim that no wall box bounds, and of the free floor that lies within one.
+    """Return the shares of the free floor's rim that no wall box bounds, and of the free floor within one.
 
     A cell is bounded where a box comes within a cell's diagonal of its middle; it lies within a box one cell deep,
-    for the map's cells are turned against the boxes'. The rim within reach of a hinge is not asked for: where a door's
+    for the map's cells are turned against the boxes'. The rim within reach of a hinge is not required: where a door's
     leaf turns no wall stands.
     """
     side, pad = maps.resolution_m, 2
@@ -56,10 +56,9 @@ def wall_values(model: mujoco.MjModel, maps: SceneMaps) -> dict[str, float]:
 def manifest_values(
     model: mujoco.MjModel, objects: Sequence[SceneObject]
 ) -> tuple[dict[str, float], dict[str, tuple[str, ...]]]:
-    """Values of the gates on masses, friction and physics, and by gate the lines that name what is off.
+    """Return values of the gates on masses, friction and physics, and by gate the lines that name what is off.
 
-    Args:
-        objects: as `scene.json` lists them; one that the model lacks is another gate's matter.
+    `objects`: as `scene.json` lists them; one that the model lacks is another gate's matter.
     """
     ratios, friction, differs = [1.0], [1.0], differences(model, objects)
     for item in objects:
@@ -81,7 +80,7 @@ def manifest_values(
 
 
 def _physics(model: mujoco.MjModel) -> list[tuple[str, object, object]]:
-    """Name, value and expected value of what every scene has alike."""
+    """Return name, value and expected value of what every scene has alike."""
     floor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "floor")
     solid = floor >= 0 and bool(model.geom_contype[floor]) and model.geom_pos[floor, 2] == 0
     return [

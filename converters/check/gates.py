@@ -1,4 +1,4 @@
-"""A scene's model, manifest and maps in; acceptance values against one table of limits out."""
+"""Judge a scene's model, manifest and maps by acceptance values against one table of limits."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ OFF_MAP_M = 1.0
 """An object with no free floor this near lies outside of what was mapped."""
 DRIFT_S = 5.0
 TIMESTEP_S = 0.02
-"""The environments' own physics timestep (`sim_dt_s`), for hulls and for boxes."""
+"""The environments' physics timestep (`sim_dt_s`), for hulls and for boxes."""
 
 
 LIMITS: dict[str, Limit] = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, Limit])
@@ -33,7 +33,7 @@ LIMITS: dict[str, Limit] = read_packaged(Path(__file__).with_suffix(".yaml"), di
 
 
 def judge(name: str, value: float, warnings: tuple[str, ...] = ()) -> Gate:
-    """Holds a value against the table; a non-finite value fails."""
+    """Judge a value by the table; a non-finite value fails."""
     limit = LIMITS[name]
     passed = math.isfinite(value)
     passed = passed and (limit.least is None or value >= limit.least) and (limit.most is None or value <= limit.most)
@@ -41,7 +41,7 @@ def judge(name: str, value: float, warnings: tuple[str, ...] = ()) -> Gate:
 
 
 def collide_with(spec: mujoco.MjSpec, shape: str) -> mujoco.MjModel:
-    """Compiles a scene with the movables colliding by their hulls or by their boxes.
+    """Compile a scene with the movables colliding by their hulls or by their boxes.
 
     The switch is thrown in the spec: a compiled model's bounding-volume trees hold colliding geoms only, so
     that setting `geom_contype` afterwards leaves contacts out.
@@ -54,13 +54,13 @@ def collide_with(spec: mujoco.MjSpec, shape: str) -> mujoco.MjModel:
 
 
 def run(model: mujoco.MjModel, data: mujoco.MjData, seconds: float) -> None:
-    """Steps for so long at the model's own timestep."""
+    """Step for so long at the model's timestep."""
     for _ in range(round(seconds / model.opt.timestep)):
         mujoco.mj_step(model, data)
 
 
 def started_over(data: mujoco.MjData) -> bool:
-    """Whether MuJoCo met a bad position, velocity or acceleration.
+    """Return whether MuJoCo met a bad position, velocity or acceleration.
 
     It then starts the simulation over and only counts a warning: the state alone would look sound.
     """
@@ -69,12 +69,12 @@ def started_over(data: mujoco.MjData) -> bool:
 
 
 def movable_bodies(model: mujoco.MjModel) -> list[int]:
-    """Ids of the bodies that have a joint of their own."""
+    """Return ids of the bodies that have a joint."""
     return [b for b in range(1, model.nbody) if model.body_jntnum[b] > 0]
 
 
 def deepest_contact(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, str]:
-    """Largest penetration among the present contacts, m, and the two bodies; 0 without any."""
+    """Return the largest penetration among the present contacts, m, and the two bodies; 0 without any."""
     if not data.ncon:
         return 0.0, ""
     contact = min(data.contact[: data.ncon], key=lambda c: c.dist)
@@ -83,7 +83,7 @@ def deepest_contact(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, 
 
 
 def physical_values(model: mujoco.MjModel, named: dict[str, str] | None = None) -> dict[str, float]:
-    """Drift (m), turn (deg), deepest penetration (m) and finiteness over `DRIFT_S` without a robot."""
+    """Return drift (m), turn (deg), deepest penetration (m) and finiteness over `DRIFT_S` without a robot."""
     named = {} if named is None else named
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -109,19 +109,19 @@ def physical_values(model: mujoco.MjModel, named: dict[str, str] | None = None) 
 
 
 def eroded(traversable: np.ndarray, resolution_m: float, radius_m: float) -> np.ndarray:
-    """Cells whose middle is at least the radius from all that is not traversable, map edge included."""
+    """Return cells whose middle is at least the radius from all that is not traversable, map edge included."""
     return clearance(traversable, resolution_m) >= radius_m
 
 
 def _largest_piece(maps: SceneMaps) -> tuple[np.ndarray, np.ndarray]:
-    """Cells where the disc's middle may be, all of them hanging together; and every cell's distance to them, m."""
+    """Return connected cells where the disc's middle may be, and every cell's distance to them, m."""
     piece = largest_component(eroded(maps.traversable, maps.resolution_m, ROBOT_RADIUS_M))
     distance = ndimage.distance_transform_edt(~piece, sampling=maps.resolution_m)
     return piece, np.asarray(distance) if piece.any() else np.full(piece.shape, np.inf)
 
 
 def free_space_values(maps: SceneMaps) -> dict[str, float]:
-    """Traversable area (m2), share of it that the disc covers in one piece, and that piece's farthest pair (m)."""
+    """Return traversable area (m2), its share that the disc covers in one piece, and the piece's farthest pair (m)."""
     piece, distance = _largest_piece(maps)
     cells = np.argwhere(piece).astype(float)
     farthest = 0.0
@@ -141,9 +141,9 @@ def free_space_values(maps: SceneMaps) -> dict[str, float]:
 
 
 def free_space_warnings(maps: SceneMaps) -> tuple[str, ...]:
-    """Names the free floor that the robot cannot reach, when it is more than corners and rims.
+    """Name the free floor that the robot cannot reach, when it is more than corners and rims.
 
-    Those are within two radii of where its middle may be; of the rest, less than the disc's own area is no matter.
+    Those are within two radii of where its middle may be; of the rest, less than the disc's area is no matter.
     """
     _, distance = _largest_piece(maps)
     cell_m2 = maps.resolution_m**2
@@ -210,8 +210,8 @@ def evaluate(
     agreed, warnings = manifest_values(model, objects)
     surface, worst = surface_values(model, kept or {})
     values |= free_space_values(maps) | wall_values(model, maps) | agreed | surface
-    told = {f"{what}_{shape}": (body,) for shape, of in who.items() for what, body in of.items()} | worst
-    warnings |= {name: words for name, words in told.items() if not judge(name, (values | surface)[name]).passed}
+    blamed = {f"{what}_{shape}": (body,) for shape, of in who.items() for what, body in of.items()} | worst
+    warnings |= {name: words for name, words in blamed.items() if not judge(name, (values | surface)[name]).passed}
     warnings["connected_share"] = free_space_warnings(maps)
     if 2 * len(apart) > len(bodies):
         warnings["furniture_apart"] = (
@@ -224,12 +224,12 @@ def evaluate(
 
 
 def drawn_shares(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Object -> share of its model's area that is drawn, from a scene's rows of alignment."""
+    """Return object -> share of its model's area that is drawn, from a scene's rows of alignment."""
     return {str(row["name"]): float(row["drawn_area_share"]) for row in rows if "drawn_area_share" in row}
 
 
 def check_folder(folder: Path) -> tuple[SceneManifest, tuple[Gate, ...]]:
-    """Runs the gates on a written scene folder."""
+    """Run the gates on a written scene folder."""
     manifest, maps = load_manifest(folder), load_maps(folder)
     path = folder / "scene.xml"
     if not path.is_file():

@@ -1,4 +1,4 @@
-"""Names of CAD models in, one picture of them out: each from the front, the right and above, with name and size."""
+"""Draw CAD models in one picture: each from the front, the right and above, with name and size."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,7 +24,7 @@ AZIMUTH_RAD, ELEVATION_RAD = 0.6, 0.42
 
 
 def camera_axes() -> np.ndarray:
-    """Rows: what runs to the right, what runs up, what looks at the reader; the model faces +z, y is up."""
+    """Return rows that point right, up and at the reader; the model faces +z, y is up."""
     (sin_a, cos_a), (sin_e, cos_e) = [(np.sin(a), np.cos(a)) for a in (AZIMUTH_RAD, ELEVATION_RAD)]
     toward = np.array([sin_a * cos_e, sin_e, cos_a * cos_e])
     right = np.array([cos_a, 0.0, -sin_a])
@@ -32,10 +32,10 @@ def camera_axes() -> np.ndarray:
 
 
 def model_picture(name: str, pixels: int = PIXELS) -> np.ndarray:
-    """(pixels, pixels, 3) uint8 picture of a model, in the colours of its materials or texture, on white."""
+    """Draw a (pixels, pixels, 3) uint8 picture of a model, in the colours of its materials or texture, on white."""
     model = cad_model(name)
-    if (own := model.surface) is not None:
-        mesh = TexturedMesh(own.vertices, own.faces, own.uv[own.uv_faces], own.image)
+    if (surface := model.surface) is not None:
+        mesh = TexturedMesh(surface.vertices, surface.faces, surface.uv[surface.uv_faces], surface.image)
     else:
         colours = [np.tile(np.rint(255 * np.array(MATERIALS[p.material])), (len(p.faces), 1)) for p in model.parts]
         parts = zip(model.parts, colours, strict=True)
@@ -44,24 +44,24 @@ def model_picture(name: str, pixels: int = PIXELS) -> np.ndarray:
 
 
 def mesh_picture(mesh: TexturedMesh, axes: np.ndarray, pixels: int, one_sided: bool = False) -> np.ndarray:
-    """(pixels, pixels, 3) uint8 picture of a whole mesh on white, along axes such as those of `camera_axes`."""
-    seen = mesh.vertices @ axes.T
-    half, middle = np.ptp(seen, axis=0)[:2].max() / 2 / 0.94, (seen.min(axis=0) + seen.max(axis=0)) / 2
+    """Draw a (pixels, pixels, 3) uint8 picture of a whole mesh on white, along axes such as `camera_axes`'."""
+    turned = mesh.vertices @ axes.T
+    half, middle = np.ptp(turned, axis=0)[:2].max() / 2 / 0.94, (turned.min(axis=0) + turned.max(axis=0)) / 2
     picture = Picture(over(axes, middle - half, middle + half - 1e-9, 2 * half / pixels))
     picture.draw(mesh, one_sided)
     return picture.image
 
 
 def model_sheet(target: Path, names: Sequence[str] = ()) -> int:
-    """Draws models into a PNG, whole or not at all.
+    """Draw models into a PNG, whole or not at all.
 
     Returns:
         How many models there are on it.
     """
     unknown = [n for n in names if n not in LIBRARY and n not in {d.category for d in LIBRARY.values()}]
     if unknown:
-        known = ", ".join(sorted({d.category for d in LIBRARY.values()}))
-        raise UserError(f"no model or category named {', '.join(unknown)}; categories: {known}")
+        categories = ", ".join(sorted({d.category for d in LIBRARY.values()}))
+        raise UserError(f"no model or category named {', '.join(unknown)}; categories: {categories}")
     wanted = [n for n, d in LIBRARY.items() if not names or n in names or d.category in names]
     wanted.sort(key=lambda name: LIBRARY[name].category)
     rows = -(-len(wanted) // COLUMNS)

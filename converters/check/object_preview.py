@@ -1,4 +1,4 @@
-"""A single object's folder in, a figure of it from above, from the front and from the side out."""
+"""Draw a single object's folder as a figure from above, from the front and from the side."""
 
 import dataclasses
 from pathlib import Path
@@ -27,7 +27,7 @@ PIXELS = 260
 
 @dataclasses.dataclass(frozen=True)
 class _About:
-    """What is asked of object.json."""
+    """What is read of object.json."""
 
     name: str
     category: str
@@ -35,7 +35,7 @@ class _About:
 
 
 def draw_object(folder: Path) -> Figure:
-    """Draws the textured surface, and the hulls and boxes that collide, as the object stands at rest."""
+    """Draw the textured surface, and the hulls and boxes that collide, as the object stands at rest."""
     described = folder / "object.json"
     about = SCENES.record(SCENES.json(described), _About, str(described), others=True)
     name = check_name(about.name, f"{described}: name", SceneError)
@@ -80,7 +80,7 @@ def draw_object(folder: Path) -> Figure:
 
 
 def geom_outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int, axes_w: np.ndarray) -> np.ndarray:
-    """(k, 2) m: outline of a mesh or box geom, seen along the third of the axes."""
+    """Return (k, 2) m: outline of a mesh or box geom, viewed along the third of the axes."""
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
         corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T * model.geom_size[geom]
     else:
@@ -92,7 +92,7 @@ def geom_outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int, axes_w: 
 
 
 def _draw_solids(axes: Axes, model: mujoco.MjModel, data: mujoco.MjData, body: int, axes_w: np.ndarray) -> None:
-    """Outlines of hulls, filled, and boxes, as lines."""
+    """Draw outlines of hulls, filled, and boxes, as lines."""
     for geom in np.flatnonzero(model.geom_bodyid == body):
         box = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX
         if not box and not model.geom_contype[geom]:

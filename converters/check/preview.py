@@ -1,4 +1,4 @@
-"""A scene folder in, and the raw folder it came from; one PNG of the conversion's stages from above out.
+"""Draw the stages of a conversion from above in one PNG, from a scene folder and the raw folder it came from.
 
 Drawn by matplotlib's Agg, which needs neither display nor GPU.
 """
@@ -51,13 +51,13 @@ WALL = (0.75, 0.75, 0.75)
 
 
 def _geoms(model: mujoco.MjModel) -> list[tuple[str, str, int]]:
-    """(geom name, body name, geom id) of every named geom."""
-    found = []
+    """Return (geom name, body name, geom id) of every named geom."""
+    geoms = []
     for geom in range(model.ngeom):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or ""
         body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.geom_bodyid[geom])) or ""
-        found.append((name, body, geom))
-    return found
+        geoms.append((name, body, geom))
+    return geoms
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +82,7 @@ def _frame(axes: Axes, scene: _Scene, title: str) -> None:
 
 
 def _draw_surface(axes: Axes, scene: _Scene, surface: TexturedMesh, title: str) -> None:
-    """What looks up of a surface, from above."""
+    """Draw what looks up of a surface, from above."""
     left, right, bottom, top = scene.maps.extent_w
     low, high = np.array([left, bottom]) - MARGIN_M, np.array([right, top]) + MARGIN_M
     pixel_m = float((high - low).max()) / SURFACE_PIXELS
@@ -93,7 +93,7 @@ def _draw_surface(axes: Axes, scene: _Scene, surface: TexturedMesh, title: str) 
 
 
 def _scan_surface(scan: ScanMesh, vertices_w: np.ndarray, chosen: np.ndarray) -> TexturedMesh:
-    """Some faces of a scan, in its own colours."""
+    """Return some faces of a scan, in its colours."""
     faces = scan.faces[chosen]
     if scan.texture is not None and scan.corner_uv is not None:
         return TexturedMesh(vertices_w, faces, scan.corner_uv[chosen], scan.texture)
@@ -102,7 +102,7 @@ def _scan_surface(scan: ScanMesh, vertices_w: np.ndarray, chosen: np.ndarray) ->
 
 
 def _draw_views(slantwise: Axes, standing: Axes, scene: _Scene, width_in: float) -> None:
-    """Everything at rest, seen from the south and by somebody who stands there."""
+    """Draw everything at rest, viewed from the south and by somebody who stands there."""
     left, right, bottom, top = scene.maps.extent_w
     low, high = np.array([left, bottom]) - MARGIN_M, np.array([right, top]) + MARGIN_M
     wide = int(SLANTWISE * width_in * DPI)
@@ -117,7 +117,7 @@ def _draw_views(slantwise: Axes, standing: Axes, scene: _Scene, width_in: float)
 
 
 def _draw_ground(axes: Axes, scene: _Scene) -> None:
-    """Traversable area and wall boxes."""
+    """Draw traversable area and wall boxes."""
     shade = np.where(scene.maps.traversable[..., None], TRAVERSABLE, 1.0)
     axes.imshow(shade, origin="lower", extent=scene.maps.extent_w, interpolation="nearest")
     for name, _, geom in _geoms(scene.model):
@@ -127,7 +127,7 @@ def _draw_ground(axes: Axes, scene: _Scene) -> None:
 
 
 def apart(centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Centres of labels, moved up or down as little as it takes for none to lie on an earlier one.
+    """Return centres of labels, moved up or down as little as it takes for none to lie on an earlier one.
 
     Args:
         centres: [N, 2], in any unit.
@@ -144,7 +144,7 @@ def apart(centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:
 
 
 def _draw_objects(axes: Axes, scene: _Scene) -> None:
-    """Each movable object's CAD surface in its category's colour, lit from above, with its name."""
+    """Draw each movable object's CAD surface in its category's colour, lit from above, with its name."""
     _draw_ground(axes, scene)
     for item in scene.manifest.objects:
         surface = scene.surfaces[item.name]
@@ -168,7 +168,7 @@ def _draw_objects(axes: Axes, scene: _Scene) -> None:
 
 
 def _draw_collision(axes: Axes, scene: _Scene, kind: str) -> None:
-    """Outlines of one kind of collision shape, 'hull' or 'box', in the category's colour."""
+    """Draw outlines of one kind of collision shape, 'hull' or 'box', in the category's colour."""
     _draw_ground(axes, scene)
     category = {o.name: o.category for o in scene.manifest.objects}
     count = 0
@@ -184,14 +184,14 @@ def _draw_collision(axes: Axes, scene: _Scene, kind: str) -> None:
 
 
 def _placed(scene: _Scene) -> tuple[PlacedObject, ...]:
-    """The scene's objects as the cut takes them."""
-    found = []
+    """Return the scene's objects as the cut takes them."""
+    placed = []
     for item in scene.manifest.objects:
         vertices, faces = geom_mesh(scene.model, scene.model.geom(f"{item.name}_visual").id)
         names = [f"{item.name}_hull_{i}" for i in range(item.n_hulls)]
         hulls = [geom_mesh(scene.model, scene.model.geom(name).id)[0] for name in names]
         body = scene.model.body(item.name).id
-        found.append(
+        placed.append(
             PlacedObject(
                 name=item.name,
                 category=item.category,
@@ -206,14 +206,13 @@ def _placed(scene: _Scene) -> tuple[PlacedObject, ...]:
                 hinge=None,
             )
         )
-    return tuple(found)
+    return tuple(placed)
 
 
 def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) -> RawScene:
-    """Reads the raw folder that a scene was made from.
+    """Read the raw folder that a scene was converted from.
 
-    Args:
-        floor_height_m: of the scene's floor in the scan's frame: which one is drawn of several.
+    `floor_height_m`: of the scene's floor in the scan's frame: which one is drawn of several.
     """
     from converters.read import source as sources
     from converters.read.storeys import split_storeys
@@ -223,13 +222,13 @@ def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) ->
     strange = sorted(k for k in raw.sources if k in expected and raw.sources[k] != expected[k])
     if strange or not set(raw.sources) & set(expected):
         what = f"{strange[0]} differs" if strange else "no file is the same"
-        raise SceneError(f"{source}: is not what {manifest.name} was made from ({what}); give its own --source")
+        raise SceneError(f"{source}: is not what {manifest.name} was converted from ({what}); give its --source")
     floors = split_storeys(raw)
     return min(floors, key=lambda f: abs((f.floor_height_m or floor_height_m) - floor_height_m))
 
 
 def draw(scene: _Scene, raw: RawScene | None) -> Figure:
-    """Draws two views, and panels: scan, cut and filled where the raw scene is given; objects, hulls and boxes."""
+    """Draw two views, and panels: scan, cut and filled where the raw scene is given; objects, hulls and boxes."""
     left, right, bottom, top = scene.maps.extent_w
     ratio = (right - left + 2 * MARGIN_M) / (top - bottom + 0.5 + MARGIN_M)
     rows = 2 if raw is not None else 1
@@ -270,10 +269,9 @@ def draw(scene: _Scene, raw: RawScene | None) -> Figure:
 
 
 def preview(folder: Path, target: Path, source: Path | None = None) -> None:
-    """Draws a scene or object folder into a PNG of few colours, whole or not at all.
+    """Draw a scene or object folder into a PNG of few colours, whole or not at all.
 
-    Args:
-        folder: of the scene, or of an object made by `python -m converters object`.
+    `folder`: of the scene, or of an object written by `python -m converters object`.
     """
     if (folder / "object.json").is_file():
         if source is not None:

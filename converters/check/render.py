@@ -1,4 +1,4 @@
-"""Textured meshes and a camera in, a picture out; in NumPy: neither display nor GPU is needed."""
+"""Draw textured meshes as a camera shows them; in NumPy: neither display nor GPU is needed."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ class Camera:
     """Where a picture is taken from."""
 
     eye_w: np.ndarray
-    """(3,) m; of parallel rays any point that nothing to be seen lies behind."""
+    """(3,) m; of parallel rays any point that nothing visible lies behind."""
     axes_w: np.ndarray
     """(3, 3) rows: what runs to the right, what runs up, what looks at the reader."""
     shape: tuple[int, int]
@@ -36,17 +36,17 @@ class Camera:
     parallel: bool = False
 
     def project(self, points_w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Homogeneous pixels (..., 3), columns first, rows downwards, and metres in front of the eye (...)."""
-        seen = (points_w - self.eye_w) @ self.axes_w.T
-        depth = -seen[..., 2]
+        """Return homogeneous pixels (..., 3), columns first, rows downwards, and metres in front of the eye (...)."""
+        turned = (points_w - self.eye_w) @ self.axes_w.T
+        depth = -turned[..., 2]
         weight = np.ones_like(depth) if self.parallel else depth
         rows, columns = self.shape
-        x, y = self.focal * seen[..., 0] + columns / 2 * weight, rows / 2 * weight - self.focal * seen[..., 1]
+        x, y = self.focal * turned[..., 0] + columns / 2 * weight, rows / 2 * weight - self.focal * turned[..., 1]
         return np.stack([x, y, weight], axis=-1), depth
 
 
 def looking_at(eye_w: np.ndarray, at_w: np.ndarray, shape: tuple[int, int], view_rad: float) -> Camera:
-    """A camera with an upright picture that is `view_rad` wide; it does not look straight up or down."""
+    """Return a camera with an upright picture that is `view_rad` wide; it does not look straight up or down."""
     toward = (eye_w - at_w) / np.linalg.norm(eye_w - at_w)
     right = np.cross([0.0, 0.0, 1.0], toward)
     right /= np.linalg.norm(right)
@@ -54,7 +54,7 @@ def looking_at(eye_w: np.ndarray, at_w: np.ndarray, shape: tuple[int, int], view
 
 
 def over(axes_w: np.ndarray, low: np.ndarray, high: np.ndarray, pixel_m: float) -> Camera:
-    """A camera of parallel rays over a rectangle.
+    """Return a camera of parallel rays over a rectangle.
 
     Args:
         axes_w: (3, 3) as a `Camera` has them.
@@ -70,18 +70,18 @@ class Picture:
     """A picture that meshes are drawn into, near before far; white where nothing is."""
 
     def __init__(self, camera: Camera) -> None:
-        """Empty."""
+        """Start an empty picture."""
         self._camera = camera
         self._depth = np.full(camera.shape[0] * camera.shape[1], np.inf)
         self._colours = np.full((len(self._depth), 3), 255, np.uint8)
 
     @property
     def image(self) -> np.ndarray:
-        """(rows, columns, 3) uint8."""
+        """Return (rows, columns, 3) uint8."""
         return self._colours.reshape(*self._camera.shape, 3)
 
     def draw(self, mesh: TexturedMesh, one_sided: bool = False, below_m: float = np.inf) -> None:
-        """Draws a mesh."""
+        """Draw a mesh."""
         assert mesh.corner_uv is not None and mesh.texture is not None
         corners = mesh.vertices[mesh.faces]
         normal = face_vectors(mesh.vertices, mesh.faces)
@@ -118,7 +118,7 @@ class Picture:
 
 
 def _looked_up(texture: np.ndarray, uv: np.ndarray, between: bool) -> np.ndarray:
-    """(n, 3) colours at texture coordinates (n, 2): the nearest texel's, or `between` four."""
+    """Return (n, 3) colours at texture coordinates (n, 2): the nearest texel's, or `between` four."""
     size = np.array(texture.shape[1::-1])
     at = np.stack([uv[:, 0] % 1.0, 1.0 - uv[:, 1] % 1.0], axis=1) * size - 0.5 * between
     first = np.floor(at).astype(int)
@@ -131,7 +131,7 @@ def _looked_up(texture: np.ndarray, uv: np.ndarray, between: bool) -> np.ndarray
 
 
 def _boxes(pixels: np.ndarray, depth: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """(m, 2) first pixel and the one after the last of boxes about triangles, of what lies before the eye."""
+    """Return (m, 2) first pixel and the one after the last of boxes about triangles, of what lies before the eye."""
     after, after_depth = np.roll(pixels, -1, axis=1), np.roll(depth, -1, axis=1)
     with np.errstate(all="ignore"):
         share = ((NEAR_M - depth) / (after_depth - depth))[..., None]
@@ -146,7 +146,7 @@ def _boxes(pixels: np.ndarray, depth: np.ndarray, shape: tuple[int, int]) -> tup
 
 
 def _fragments(low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Blocks of boxes: which boxes (p,), and of every pixel in them which of these (n,) and where it lies (n, 2)."""
+    """Yield blocks of boxes: which boxes (p,), and of every pixel in them which of these (n,) and where (n, 2)."""
     count = (high - low).prod(axis=1)
     some = np.flatnonzero(count)
     for part in np.split(some, np.flatnonzero(np.diff(np.cumsum(count[some]) // FRAGMENTS)) + 1):
@@ -157,7 +157,7 @@ def _fragments(low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, 
 
 
 def _fitted(texture: np.ndarray, uv: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, bool]:
-    """The texture with no more texels than it has pixels in the picture, and whether one is seen as a square."""
+    """Return the texture with no more texels than it has pixels in the picture, and whether one shows as a square."""
 
     def area(corners: np.ndarray) -> float:
         a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]

@@ -1,4 +1,4 @@
-"""Objects at their annotated poses and wall boxes in, objects at rest out."""
+"""Settle objects at their annotated poses among wall boxes until they rest."""
 
 import dataclasses
 from collections.abc import Collection, Mapping
@@ -54,7 +54,7 @@ def _on_floor(parts: SceneParts) -> SceneParts:
 def _overlaps(
     model: mujoco.MjModel, data: mujoco.MjData, among: Collection[int]
 ) -> dict[tuple[int, int], tuple[float, np.ndarray]]:
-    """Pairs of bodies with one `among` them: their deepest overlap, m, and the (2,) way out of it for the second."""
+    """Return pairs of bodies, one `among` them: their deepest overlap, m, and the (2,) way out for the second."""
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     mujoco.mj_collision(model, data)
@@ -73,7 +73,7 @@ def _overlaps(
 
 
 def _push(model: mujoco.MjModel, data: mujoco.MjData, free: dict[int, int], most_m: float) -> None:
-    """Slides the free bodies (id -> address in qpos) by up to `most_m`."""
+    """Slide the free bodies (id -> address in qpos) by up to `most_m`."""
     mujoco.mj_resetData(model, data)
     start = {body: data.qpos[at : at + 2].copy() for body, at in free.items()}
     for _ in range(PUSH_STEPS):
@@ -96,7 +96,7 @@ def _push(model: mujoco.MjModel, data: mujoco.MjData, free: dict[int, int], most
 def push_apart(
     parts: SceneParts, most_m: float = MAX_PUSH_M, hold: Collection[int] = ()
 ) -> tuple[SceneParts, dict[int, str]]:
-    """Slides free objects horizontally until neither hulls nor boxes cut walls or each other.
+    """Slide free objects horizontally until neither hulls nor boxes cut walls or each other.
 
     Without dynamics, so that nothing flies.
 
@@ -141,7 +141,7 @@ def _with_poses(parts: SceneParts, model: mujoco.MjModel, data: mujoco.MjData) -
 
 
 def _simulate(parts: SceneParts, shape: str, seconds: float) -> SceneParts:
-    """Damped simulation; doors are held."""
+    """Simulate with damping; doors are held."""
     model = collide_with(build_spec(parts), shape)
     model.opt.timestep = 0.002
     for placed in parts.objects:
@@ -163,7 +163,7 @@ def _simulate(parts: SceneParts, shape: str, seconds: float) -> SceneParts:
 
 
 def settle(parts: SceneParts, drawn: bool = False, fitted: Collection[int] = ()) -> Settled:
-    """Sets objects on the floor, pushes them apart, then lets boxes and after them hulls come to rest."""
+    """Set objects on the floor, push them apart, then let boxes and after them hulls come to rest."""
     hold = range(len(parts.objects)) if drawn else fitted
     result, held = push_apart(_on_floor(parts), DRAWN_PUSH_M if drawn else MAX_PUSH_M, hold)
     if not held:

@@ -1,4 +1,4 @@
-"""Whether what is drawn of an object is what a robot hits, and what its model shows."""
+"""Check whether what is drawn of an object is what a robot hits, and what its model shows."""
 
 from collections.abc import Mapping
 
@@ -22,7 +22,7 @@ SIDE = 0.7
 
 
 def geom_mesh(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) m in the body's frame and faces (m, 3) of a mesh geom."""
+    """Return vertices (n, 3) m in the body's frame and faces (m, 3) of a mesh geom."""
     mesh, turn = model.geom_dataid[geom], np.zeros(9)
     first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
     vertices = model.mesh_vert[first : first + count].astype(float)
@@ -32,7 +32,7 @@ def geom_mesh(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def geom_surface(model: mujoco.MjModel, geom: int) -> TexturedMesh:
-    """A textured mesh geom as MuJoCo draws it, in the body's frame."""
+    """Return a textured mesh geom as MuJoCo draws it, in the body's frame."""
     vertices, faces = geom_mesh(model, geom)
     mesh, image = model.geom_dataid[geom], model.mat_texid[model.geom_matid[geom]][mujoco.mjtTextureRole.mjTEXROLE_RGB]
     corners = model.mesh_facetexcoord[model.mesh_faceadr[mesh] :][: len(faces)]
@@ -61,7 +61,7 @@ def kept_share(vertices: np.ndarray, faces: np.ndarray, drawn: tuple[np.ndarray,
 
 
 def body_shares(drawn: tuple[np.ndarray, np.ndarray], hulls: list[np.ndarray]) -> tuple[float, float]:
-    """Of the hulls' outer sides what lies off the drawn mesh, and of the drawn mesh what lies outside of the hulls."""
+    """Return the shares of the hulls' outer sides off the drawn mesh, and of the drawn mesh outside of the hulls."""
     solids = [ConvexHull(hull) for hull in hulls]
 
     def outside(points: np.ndarray, of: list[ConvexHull], by_m: float) -> np.ndarray:
@@ -76,28 +76,27 @@ def body_shares(drawn: tuple[np.ndarray, np.ndarray], hulls: list[np.ndarray]) -
         points, face = sample_faces(hulls[k], solid.simplices.astype(np.int64), SPACING_M)
         points = points[np.abs(solid.equations[face, 2]) < SIDE]
         sides.append(points[outside(points, solids[:k] + solids[k + 1 :], 1e-3)])
-    seen = sample_faces(*drawn, SPACING_M)[0]
-    off = KDTree(seen).query(np.vstack(sides), distance_upper_bound=HIDDEN_M)[0] > HIDDEN_M
-    bare = outside(seen, solids, BARE_M)
+    visible = sample_faces(*drawn, SPACING_M)[0]
+    off = KDTree(visible).query(np.vstack(sides), distance_upper_bound=HIDDEN_M)[0] > HIDDEN_M
+    bare = outside(visible, solids, BARE_M)
     return float(off.mean()) if len(off) else 0.0, float(bare.mean())
 
 
 def surface_values(
     model: mujoco.MjModel, kept: Mapping[str, float]
 ) -> tuple[dict[str, float], dict[str, tuple[str, ...]]]:
-    """Worst object's values of the gates on surfaces, and by gate the line that names it.
+    """Return the worst object's values of the gates on surfaces, and by gate the line that names it.
 
-    Args:
-        kept: object -> share of its model's area that is drawn, where it is known.
+    `kept`: object -> share of its model's area that is drawn, where it is given.
     """
     worst: dict[str, tuple[float, str]] = {"unseen_hulls": (0.0, ""), "unsolid_surface": (0.0, "")}
     worst["surface_kept"] = min(((share, name) for name, share in kept.items()), default=(1.0, ""))
     shares: dict[bytes, tuple[float, float]] = {}
     names = [model.geom(g).name for g in range(model.ngeom)]
     for body in np.flatnonzero(model.body_jntnum[1:] > 0) + 1:
-        own = np.flatnonzero(model.geom_bodyid == body).tolist()
-        drawn = [geom_mesh(model, g) for g in own if names[g].endswith("_visual")]
-        hulls = [geom_mesh(model, g)[0] for g in own if "_hull_" in names[g]]
+        geoms = np.flatnonzero(model.geom_bodyid == body).tolist()
+        drawn = [geom_mesh(model, g) for g in geoms if names[g].endswith("_visual")]
+        hulls = [geom_mesh(model, g)[0] for g in geoms if "_hull_" in names[g]]
         if drawn and hulls:
             key = b"".join(np.round(points, 4).tobytes() for points in (drawn[0][0], *hulls))
             if key not in shares:

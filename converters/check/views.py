@@ -1,4 +1,4 @@
-"""A compiled scene in, pictures of what is drawn of it out: slantwise from the south, from above, and at eye height."""
+"""Draw pictures of a compiled scene: slantwise from the south, from above, and at eye height."""
 
 import dataclasses
 import math
@@ -22,26 +22,26 @@ CUT_M = 1.3
 EYE_M, EYE_VIEW_RAD, DOWN = 1.5, math.radians(75.0), 0.2
 """Height and width of the view of somebody who stands there, and how far down they look in a metre."""
 FREE_M, NEAR_M, FAR_M = 0.5, 1.2, 7.0
-"""Around somebody who stands there; and how far off is what counts as seen."""
+"""Around somebody who stands there; and how far off is what counts as visible."""
 HEADINGS, PLACES = 24, 200
 SHARP = 2
 """Pixels a side that become one, at eye height: from farther off that is noise, which makes files large."""
 
 
 def world_surfaces(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, TexturedMesh]:
-    """Body -> what is drawn of it, in the world."""
-    found = {}
+    """Return body -> what is drawn of it, in the world."""
+    surfaces = {}
     for geom in range(model.ngeom):
         name = model.geom(geom).name
         if name.endswith("_visual"):
             body, surface = model.geom_bodyid[geom], geom_surface(model, geom)
             points = surface.vertices @ data.xmat[body].reshape(3, 3).T + data.xpos[body]
-            found[model.body(body).name] = dataclasses.replace(surface, vertices=points)
-    return found
+            surfaces[model.body(body).name] = dataclasses.replace(surface, vertices=points)
+    return surfaces
 
 
 def _taken(camera: Camera, surfaces: dict[str, TexturedMesh], cut_m: float = np.inf) -> np.ndarray:
-    """The picture (rows, columns, 3) of bodies."""
+    """Draw the picture (rows, columns, 3) of bodies."""
     picture = Picture(camera)
     for body, surface in surfaces.items():
         structure = body == "structure"
@@ -52,7 +52,7 @@ def _taken(camera: Camera, surfaces: dict[str, TexturedMesh], cut_m: float = np.
 def from_the_south(
     surfaces: dict[str, TexturedMesh], maps: SceneMaps, low: np.ndarray, high: np.ndarray, pixels: int
 ) -> np.ndarray:
-    """Everything, slantwise, `pixels` wide: walls are cut at `CUT_M`, and neither ceilings nor near walls hide a room.
+    """Draw everything, slantwise, `pixels` wide: walls are cut at `CUT_M`; no ceiling or near wall hides a room.
 
     Args:
         low: (2,) least x and y, m.
@@ -68,7 +68,7 @@ def from_the_south(
 
 
 def _without_near_side(structure: TexturedMesh, maps: SceneMaps) -> TexturedMesh:
-    """The structure less upright faces that look south where no floor lies south of them."""
+    """Return the structure less upright faces that look south where no floor lies south of them."""
     assert structure.corner_uv is not None
     normal, centre = face_vectors(structure.vertices, structure.faces), structure.vertices[structure.faces].mean(axis=1)
     first = np.where(maps.traversable.any(axis=0), maps.traversable.argmax(axis=0), len(maps.traversable))
@@ -79,7 +79,7 @@ def _without_near_side(structure: TexturedMesh, maps: SceneMaps) -> TexturedMesh
 
 
 def from_above(surface: TexturedMesh, low: np.ndarray, high: np.ndarray, pixel_m: float) -> np.ndarray:
-    """What looks up, between corners (2,) m; the last row is the southernmost."""
+    """Draw what looks up, between corners (2,) m; the last row is the southernmost."""
     return _taken(over(np.eye(3), low, high, pixel_m), {"structure": surface})
 
 
@@ -87,7 +87,7 @@ def at_eye_height(
     model: mujoco.MjModel, data: mujoco.MjData, surfaces: dict[str, TexturedMesh], maps: SceneMaps,
     shape: tuple[int, int],
 ) -> np.ndarray:  # fmt: skip
-    """What somebody sees from where most is seen."""
+    """Draw what somebody sees from where most is visible."""
     eye, heading = _vantage(model, data, surfaces, maps)
     eye_w = np.array([*eye, EYE_M])
     fine = SHARP * shape[0], SHARP * shape[1]
@@ -98,7 +98,7 @@ def at_eye_height(
 def _vantage(
     model: mujoco.MjModel, data: mujoco.MjData, surfaces: dict[str, TexturedMesh], maps: SceneMaps
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Place (2,) and heading (2,) with most objects, the larger and nearer the better, before no wall."""
+    """Return place (2,) and heading (2,) with most objects, the larger and nearer the better, before no wall."""
     clear = clearance(maps.traversable, maps.resolution_m)
     rows, columns = np.nonzero(clear >= min(FREE_M, 0.8 * float(clear.max())))
     some = np.unique(np.linspace(0, len(rows) - 1, PLACES).astype(int))
@@ -114,17 +114,17 @@ def _vantage(
     way = (low + high) / 2 - places[:, None]
     distance = np.linalg.norm(way, axis=2)
     weight = np.linalg.norm(high - low, axis=1) / np.maximum(distance, NEAR_M)
-    seen = (distance > NEAR_M) & (distance < FAR_M) & ~_hidden(model, data, places, way)
+    visible = (distance > NEAR_M) & (distance < FAR_M) & ~_hidden(model, data, places, way)
     turns = np.arange(HEADINGS) * 2 * math.pi / HEADINGS
     headings = np.stack([np.cos(turns), np.sin(turns)], axis=1)
     ahead = way @ headings.T > math.cos(0.8 * EYE_VIEW_RAD / 2) * distance[..., None]
-    score = np.einsum("pk,pkh->ph", np.where(seen, weight, 0.0), ahead)
+    score = np.einsum("pk,pkh->ph", np.where(visible, weight, 0.0), ahead)
     place, heading = np.unravel_index(score.argmax(), score.shape)
     return places[place], headings[heading]
 
 
 def _hidden(model: mujoco.MjModel, data: mujoco.MjData, places: np.ndarray, way: np.ndarray) -> np.ndarray:
-    """(p, k) whether a wall stands in the way (p, k, 2) from a place (p, 2)."""
+    """Return (p, k) whether a wall stands in the way (p, k, 2) from a place (p, 2)."""
     walls = [g for g in range(model.ngeom) if model.geom(g).name.startswith("wall_")]
     outlines = [shapely.Polygon(geom_outline(model, data, g, np.eye(3))) for g in walls]
     start = np.broadcast_to(places[:, None], way.shape)

@@ -1,1 +1,1 @@
-"""Scan in; levelled floor, scan without furniture, maps and wall boxes out."""
+"""Level a scan's floor, cut its furniture out, and compute maps and wall boxes."""

@@ -1,4 +1,4 @@
-"""Scan mesh and placed objects in; which faces go, and which object each removed vertex showed, out."""
+"""Decide which faces of a scan placed objects replace, and which object each removed vertex showed."""
 
 import dataclasses
 
@@ -12,8 +12,8 @@ from converters.geometry.faces import face_areas, face_labels, loose_parts
 from converters.records.raw import CATEGORY_LABELS, FLOOR, SMALL_LABELS, STRUCTURE_LABELS
 from interactive_nav_common.rotations import matrix_from_quat
 
-NEAR_OWN_M = 0.15
-"""Own-label faces this close to the model are the object's: alignments are off by several centimetres."""
+NEAR_LABEL_M = 0.15
+"""Faces of an object's label this close to the model are the object's: alignments are off by several centimetres."""
 NEAR_OTHER_M = 0.04
 """Any furniture face this close is the object's, whatever its label."""
 LYING_ABOVE_M = 0.30
@@ -37,7 +37,7 @@ class CutResult:
 
 
 def depth_in_hulls(points: np.ndarray, hulls: tuple[Hull, ...]) -> np.ndarray:
-    """(n,) signed distance-like value: negative inside a hull (largest plane value, least over hulls), m."""
+    """Return (n,) signed distance-like values: negative inside a hull (largest plane value, least over hulls), m."""
     best = np.full(len(points), np.inf)
     for hull in hulls:
         a, b, c = (hull.vertices[hull.faces[:, k]] for k in range(3))
@@ -49,10 +49,10 @@ def depth_in_hulls(points: np.ndarray, hulls: tuple[Hull, ...]) -> np.ndarray:
 
 
 def _faces_of(centres: np.ndarray, labels: np.ndarray, placed: PlacedObject) -> np.ndarray:
-    """(m,) bool: faces that show this object, by place and label."""
+    """Return (m,) bool: faces that show this object, by place and label."""
     local = (centres - placed.position_w) @ matrix_from_quat(placed.quaternion_w)
     low, high = placed.vertices_b.min(axis=0), placed.vertices_b.max(axis=0)
-    around = ((local > low - NEAR_OWN_M) & (local < high + [NEAR_OWN_M, NEAR_OWN_M, LYING_ABOVE_M])).all(axis=1)
+    around = ((local > low - NEAR_LABEL_M) & (local < high + [NEAR_LABEL_M, NEAR_LABEL_M, LYING_ABOVE_M])).all(axis=1)
     index = np.flatnonzero(around)
     points, label = local[index], labels[index]
     mesh = trimesh.Trimesh(placed.vertices_b, placed.faces, process=False)
@@ -60,9 +60,9 @@ def _faces_of(centres: np.ndarray, labels: np.ndarray, placed: PlacedObject) -> 
     inside = depth_in_hulls(points, placed.hulls_b)
     near = (distance < NEAR_OTHER_M) | (inside < 0.02)
     over = ((points > low - 0.03) & (points < high + [0.03, 0.03, LYING_ABOVE_M])).all(axis=1)
-    own = np.isin(label, CATEGORY_LABELS.get(placed.category, ()))
-    structure = np.isin(label, STRUCTURE_LABELS) & ~own
-    gone = (own & ((distance < NEAR_OWN_M) | (inside < NEAR_OWN_M / 2))) | (~structure & near)
+    labelled = np.isin(label, CATEGORY_LABELS.get(placed.category, ()))
+    structure = np.isin(label, STRUCTURE_LABELS) & ~labelled
+    gone = (labelled & ((distance < NEAR_LABEL_M) | (inside < NEAR_LABEL_M / 2))) | (~structure & near)
     gone |= np.isin(label, SMALL_LABELS) & over
     # Legs that the labeller took for floor.
     gone |= (label == FLOOR) & (centres[index, 2] > FLOOR_CLEARANCE_M) & near
@@ -82,7 +82,7 @@ def cut_furniture(
 ) -> CutResult:
     """Decide which scan faces are annotated furniture.
 
-    Floor and walls stay, whatever stands against them: only faces with the object's own label, with no
+    Floor and walls stay, whatever stands against them: only faces with the object's label, with no
     label or of small things lying on it, and other furniture faces that touch the model, go. Of a part that loses
     faces, pieces smaller than `DEBRIS_AREA_M2` go too; a part that loses none stays whole, however small it is.
 
@@ -120,7 +120,7 @@ def _take_rest_of_instances(
     objects: tuple[PlacedObject, ...],
     category: str,
 ) -> None:
-    """Extends `owner` in place: a connected piece of a category's label that is mostly cut goes entirely."""
+    """Extend `owner` in place: a connected piece of a category's label that is mostly cut goes entirely."""
     index = np.flatnonzero(np.isin(label, CATEGORY_LABELS.get(category, ())))
     if len(index) == 0:
         return

@@ -1,6 +1,6 @@
-"""Cleaned scan and floor plan in; plane patches behind the holes that furniture left in floor and walls, out.
+"""Patch the holes that furniture left in floor and walls of a cleaned scan, by plane pieces behind them.
 
-Wall planes are found by RANSAC, as the floor's is (`converters.structure.floor`), whose waves are taken out by now. On
+Wall planes are fitted by RANSAC, as the floor's is (`converters.structure.floor`), whose waves are taken out by now. On
 a raster of each plane a cell is patched that ought to be surface and that the scan does not show. A patch
 lies behind the scan and reaches under its border on all sides, so that no crack shows from within the room.
 The picture's mesh never collides: nothing needs to be joined.
@@ -43,7 +43,7 @@ BESIDE_M = 0.10
 LONG_STEPS = 100
 """Steps of sampling along a drawn face beyond which it counts as long: simplified walls are slivers."""
 OVERLAP, FREE = 5, 2
-"""Cells that a patch reaches under the scan around it, and beyond where nothing was seen (past a corner)."""
+"""Cells that a patch reaches under the scan around it, and beyond where nothing is visible (past a corner)."""
 BEHIND_M = 0.002
 """Of a patch from the rearmost scan around it: enough for depth buffers, and above the collision floor."""
 SPACING_M = 0.03
@@ -52,18 +52,18 @@ REACH_M = 0.6
 """Furniture this near a wall hides it."""
 SHADOW_M = 0.15
 """So much farther than its outline it hides floor and wall."""
-COLUMN_SEEN_M = 0.15
-"""Height of wall seen in a column from which there is wall at all: the plane may run on past its end."""
+COLUMN_VISIBLE_M = 0.15
+"""Height of wall visible in a column from which there is wall at all: the plane may extend past its end."""
 FRONT_M = 0.15
 OPENING, CORNER = 12, 6
 """Columns: wider stretches without wall are openings; so many may be hidden in a corner."""
-SEEN_BORDER_SHARE = 0.35
-"""Least share of a wall patch's border (its foot apart) that runs along seen wall: else it may be an opening."""
+VISIBLE_BORDER_SHARE = 0.35
+"""Least share of a wall patch's border (its foot apart) that runs along visible wall: else it may be an opening."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Plane:
-    """A plane with its own two axes."""
+    """A plane with two axes."""
 
     origin: np.ndarray
     """(3,) m."""
@@ -74,30 +74,30 @@ class Plane:
 
     @property
     def normal(self) -> np.ndarray:
-        """(3,) unit, u x v."""
+        """Return (3,) unit, u x v."""
         return np.cross(self.u, self.v)
 
     def flatten(self, points: np.ndarray) -> np.ndarray:
-        """(n, 2) coordinates in the plane of (n, 3) points."""
+        """Return (n, 2) coordinates in the plane of (n, 3) points."""
         return (points - self.origin) @ np.stack([self.u, self.v], axis=1)
 
     def lift(self, flat: np.ndarray) -> np.ndarray:
-        """(n, 3) points of the plane from (n, 2) coordinates."""
+        """Return (n, 3) points of the plane from (n, 2) coordinates."""
         return self.origin + flat[:, :1] * self.u + flat[:, 1:] * self.v
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """(n,) signed distances, m."""
+        """Return (n,) signed distances, m."""
         return (points - self.origin) @ self.normal
 
 
 def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> list[Plane]:
-    """Vertical planes of the walls by sequential RANSAC (Fischler and Bolles 1981), the largest first.
+    """Fit vertical planes of the walls by sequential RANSAC (Fischler and Bolles 1981), the largest first.
 
     A draw is one upright face: its middle and the horizontal direction of its normal are a hypothesis; its
     support is the area of the faces within `WALL_TOLERANCE_M` whose normals agree within 25 degrees. The best
     of `RANSAC_DRAWS` is refined by least squares over its support, and over the support of that while it grows (Chum,
     Matas and Kittler 2003, Locally optimized RANSAC), which is then taken out. A plane's normal looks
-    to the side that its faces look to: the room, as scans are made from inside.
+    to the side that its faces look to: the room, as scans are taken from inside.
 
     Args:
         vertices: (n, 3) m, z up.
@@ -142,8 +142,8 @@ def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> 
     return planes
 
 
-def seen_in_plane(vertices: np.ndarray, faces: np.ndarray, plane: Plane) -> np.ndarray:
-    """Indices of the faces that show the plane: within `BESIDE_M` of it, and look as it does.
+def faces_in_plane(vertices: np.ndarray, faces: np.ndarray, plane: Plane) -> np.ndarray:
+    """Return indices of the faces that show the plane: within `BESIDE_M` of it, and look as it does.
 
     Panels and pillars that stand out of a wall are among them: a patch over them would be a second layer.
     """
@@ -165,14 +165,14 @@ class Shown:
     low: np.ndarray
     """(2,) m in the plane, corner of cell [0, 0]."""
     cell_m: float
-    seen: np.ndarray
+    visible: np.ndarray
     """bool."""
     depth_m: np.ndarray
     """Of the rearmost, along the plane's normal; infinite where there is none."""
 
     @classmethod
     def of(cls, plane: Plane, points: np.ndarray, low: np.ndarray, shape: tuple[int, int], cell_m: float) -> Shown:
-        """Of (n, 3) points, half a cell apart."""
+        """Rasterise (n, 3) points, half a cell apart."""
         column, row = np.floor((plane.flatten(points) - low) / cell_m).astype(int).T
         inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
         depth_m = np.full(shape, np.inf)
@@ -180,10 +180,10 @@ class Shown:
         return cls(plane, low, cell_m, np.isfinite(depth_m), depth_m)
 
     def patches(self, hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (k, 3) m and faces (j, 3) that cover hidden cells; they look along the normal."""
+        """Return vertices (k, 3) m and faces (j, 3) that cover hidden cells; they look along the normal."""
         rearmost = ndimage.minimum_filter(self.depth_m, OVERLAP)
         rearmost = np.where(np.isfinite(rearmost), rearmost, 0.0) - BEHIND_M
-        pieces, count = label((_grown(hidden, OVERLAP) & self.seen) | _grown(hidden, FREE))
+        pieces, count = label((_grown(hidden, OVERLAP) & self.visible) | _grown(hidden, FREE))
         done = [(np.zeros((0, 3)), np.zeros((0, 3), np.int64))]
         for k in range(1, count + 1):
             cells = np.argwhere(pieces == k)[:, ::-1] * self.cell_m + self.low
@@ -199,7 +199,7 @@ class Shown:
 
 
 def whole_floor(plan: FloorPlan, objects: tuple[PlacedObject, ...]) -> np.ndarray:
-    """(rows, columns) bool: floor of the plan, and around what stands on it, which may not be seen."""
+    """Return (rows, columns) bool: floor of the plan, and around what stands on it, which may be hidden."""
     shadow = np.zeros(plan.grid.shape, bool)
     for placed in objects:
         plan.grid.add_below(shadow, to_world(placed, placed.vertices_b), SHADOW_M)
@@ -208,41 +208,41 @@ def whole_floor(plan: FloorPlan, objects: tuple[PlacedObject, ...]) -> np.ndarra
 
 
 def _beside(mask: np.ndarray, plan: FloorPlan, shown: Shown, above_m: float) -> np.ndarray:
-    """(columns,) bool: a (rows, columns) mask of the plan, so far before the plane."""
-    along = shown.low[0] + (np.arange(shown.seen.shape[1]) + 0.5) * shown.cell_m
+    """Return (columns,) bool: a (rows, columns) mask of the plan, so far before the plane."""
+    along = shown.low[0] + (np.arange(shown.visible.shape[1]) + 0.5) * shown.cell_m
     points = shown.plane.lift(np.column_stack([along, 0 * along])) + above_m * shown.plane.normal
     return plan.grid.values(mask, points)
 
 
 def _extent(plan: FloorPlan, shown: Shown) -> np.ndarray:
-    """(rows, columns) bool: from the floor up to the seen wall's top, where wall is seen or hides in a corner.
+    """Return (rows, columns) bool: from the floor to the visible wall's top, where wall is visible or in a corner.
 
-    A column in which too little is seen is as high as the lower of the seen ones beside it.
+    A column in which too little is visible is as high as the lower of the visible ones beside it.
     """
-    rows, columns = shown.seen.shape
-    known = np.flatnonzero(shown.seen.sum(axis=0) * shown.cell_m > COLUMN_SEEN_M)
-    if not len(known):
+    rows, columns = shown.visible.shape
+    walled = np.flatnonzero(shown.visible.sum(axis=0) * shown.cell_m > COLUMN_VISIBLE_M)
+    if not len(walled):
         return np.zeros((rows, columns), bool)
-    wall = np.isin(np.arange(columns), known)
+    wall = np.isin(np.arange(columns), walled)
     wall = np.asarray(ndimage.binary_closing(np.pad(wall, OPENING), np.ones(2 * OPENING + 1)), bool)[OPENING:-OPENING]
     wall |= _grown(wall, CORNER) & _beside(plan.floor, plan, shown, FRONT_M)
     # Where one may stand on both sides there is an opening.
     wall &= ~np.all([_beside(plan.traversable, plan, shown, d * FRONT_M) for d in (-2, -1, 0, 1, 2)], axis=0)
-    top = rows - shown.seen[::-1].argmax(axis=0)
-    before = known[np.clip(np.searchsorted(known, np.arange(columns), side="right") - 1, 0, len(known) - 1)]
-    after = known[np.clip(np.searchsorted(known, np.arange(columns)), 0, len(known) - 1)]
+    top = rows - shown.visible[::-1].argmax(axis=0)
+    before = walled[np.clip(np.searchsorted(walled, np.arange(columns), side="right") - 1, 0, len(walled) - 1)]
+    after = walled[np.clip(np.searchsorted(walled, np.arange(columns)), 0, len(walled) - 1)]
     row = np.arange(rows)[:, None]
-    # The scan's own upper edge is ragged: nothing is built there.
+    # The scan's upper edge is ragged: nothing is built there.
     return wall & (row >= OVERLAP) & (row < np.minimum(top[before], top[after]) - 2)
 
 
 def hidden_wall(plan: FloorPlan, shown: Shown, objects: tuple[PlacedObject, ...]) -> np.ndarray:
-    """(rows, columns) bool: what furniture hid of a wall; doors hide nothing.
+    """Return (rows, columns) bool: what furniture hid of a wall; doors hide nothing.
 
     The shadow of each near object on the wall, down to the floor, where there is wall; pieces that touch too little
-    seen wall are left open.
+    visible wall are left open.
     """
-    shadow, doors = np.zeros((2, *shown.seen.shape), bool)
+    shadow, doors = np.zeros((2, *shown.visible.shape), bool)
     for placed in objects:
         points = to_world(placed, placed.vertices_b)
         distance = shown.plane.distance(points)
@@ -253,12 +253,12 @@ def hidden_wall(plan: FloorPlan, shown: Shown, objects: tuple[PlacedObject, ...]
         left, right = int(max(index[:, 0].min() - margin, 0)), int(max(index[:, 0].max() + margin, 0))
         mask = doors if placed.hinge is not None else shadow
         mask[: int(max(index[:, 1].max() + margin, 0)) + 1, left : right + 1] = True
-    hidden = shadow & ~doors & _extent(plan, shown) & ~shown.seen
+    hidden = shadow & ~doors & _extent(plan, shown) & ~shown.visible
     pieces, count = label(hidden)
     for k in range(1, count + 1):
         border = _grown(pieces == k, 1) & (pieces == 0)
         border[:OVERLAP] = False
-        if shown.seen[border].mean() < SEEN_BORDER_SHARE:
+        if shown.visible[border].mean() < VISIBLE_BORDER_SHARE:
             hidden &= pieces != k
     return hidden
 
@@ -267,7 +267,7 @@ def fill_holes(
     planes: list[Plane], plan: FloorPlan, objects: tuple[PlacedObject, ...], cloud: ColourCloud,
     scan: tuple[np.ndarray, np.ndarray],
 ) -> tuple[tuple[np.ndarray, np.ndarray], list[ColourCloud]]:  # fmt: skip
-    """What furniture hid of floor and walls, and coloured points on it.
+    """Patch what furniture hid of floor and walls, with coloured points on it.
 
     Args:
         scan: vertices (n, 3) m and faces (m, 3) that are drawn.
@@ -280,7 +280,7 @@ def fill_holes(
     done, clouds = [], []
     for plane in (ground, *planes):
         tolerance_m = FLOOR_TOLERANCE_M if plane is ground else WALL_TOLERANCE_M
-        faces = scan[1][seen_in_plane(*scan, plane)]
+        faces = scan[1][faces_in_plane(*scan, plane)]
         fine = count_samples(scan[0], faces, cell_m / 2, LONG_STEPS) < CLOUD
         points, _ = sample_faces(scan[0], faces, cell_m / 2 if fine else cell_m, LONG_STEPS)
         if plane is ground:
@@ -288,7 +288,7 @@ def fill_holes(
             points = points[plane.distance(points) > -1e-6]
             floor = whole_floor(plan, objects).repeat(2, axis=0).repeat(2, axis=1)
             shown = Shown.of(plane, points, np.zeros(2), floor.shape, cell_m)
-            patch = shown.patches(floor & ~shown.seen)
+            patch = shown.patches(floor & ~shown.visible)
         elif len(points):
             flat = plane.flatten(points)
             low = np.array([flat[:, 0].min() - (CORNER + OVERLAP) * cell_m, LIFT_M - OVERLAP * cell_m])
@@ -298,18 +298,20 @@ def fill_holes(
         else:
             continue
         near = np.abs(plane.distance(cloud.points)) < tolerance_m
-        seen = np.flatnonzero(near & (np.abs(cloud.normals @ plane.normal) > 0.7))
+        shows = np.flatnonzero(near & (np.abs(cloud.normals @ plane.normal) > 0.7))
         done.append(patch)
-        if len(patch[1]) and len(seen):
-            clouds.append(_coloured(patch, plane, ColourCloud(cloud.points[seen], cloud.normals, cloud.colours[seen])))
+        if len(patch[1]) and len(shows):
+            clouds.append(
+                _coloured(patch, plane, ColourCloud(cloud.points[shows], cloud.normals, cloud.colours[shows]))
+            )
     return stacked(done), clouds
 
 
-def _coloured(patch: tuple[np.ndarray, np.ndarray], plane: Plane, seen: ColourCloud) -> ColourCloud:
-    """Points on a patch, coloured as what is seen of its plane around them."""
+def _coloured(patch: tuple[np.ndarray, np.ndarray], plane: Plane, visible: ColourCloud) -> ColourCloud:
+    """Return points on a patch, coloured as what is visible of its plane around them."""
     spots, _ = sample_faces(*patch, SPACING_M)
-    count = min(48, len(seen.points))
-    distance, index = KDTree(seen.points).query(spots, k=count)
+    count = min(48, len(visible.points))
+    distance, index = KDTree(visible.points).query(spots, k=count)
     weight = 1.0 / (distance.reshape(-1, count) + 0.05)
-    shade = (seen.colours[index.reshape(-1, count)] * weight[..., None]).sum(axis=1)
+    shade = (visible.colours[index.reshape(-1, count)] * weight[..., None]).sum(axis=1)
     return ColourCloud(spots, np.tile(plane.normal, (len(spots), 1)), shade / weight.sum(axis=1, keepdims=True))

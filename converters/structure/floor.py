@@ -1,4 +1,4 @@
-"""Labelled scan in; the floor's plane by RANSAC, and the scan with its floor level, out."""
+"""Fit the floor's plane of a labelled scan by RANSAC, and level the scan's floor."""
 
 import dataclasses
 import math
@@ -20,7 +20,7 @@ DRAWS = 300
 MAX_TILT_DEG = 5.0
 MIN_LABELS = 50
 GIVEN_NEAR_M = 0.3
-"""A height from the source's own files is this near to the floor."""
+"""A height from the source's files is this near to the floor."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,16 +38,16 @@ class FloorFit:
 
     @property
     def tilt_deg(self) -> float:
-        """Angle to the level."""
+        """Return the angle to the level."""
         return math.degrees(math.atan(float(np.hypot(*self.slope))))
 
     def height_at(self, points: np.ndarray) -> np.ndarray:
-        """(n,) z of the plane under (n, 2+) points."""
+        """Return (n,) z of the plane under (n, 2+) points."""
         return self.height_m + (points[:, :2] - self.centre) @ self.slope
 
 
 def _least_squares(points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
-    """Centre, height and slope of the plane with the least weighted vertical residual."""
+    """Return centre, height and slope of the plane with the least weighted vertical residual."""
     centre = weight @ points[:, :2] / weight.sum()
     root = np.sqrt(weight)[:, None]
     terms = np.column_stack([np.ones(len(points)), points[:, :2] - centre])
@@ -56,7 +56,7 @@ def _least_squares(points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, 
 
 
 def fit_floor(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, near_m: float | None = None) -> FloorFit:
-    """The floor's plane by RANSAC (Fischler and Bolles 1981) over the faces labelled floor.
+    """Fit the floor's plane by RANSAC (Fischler and Bolles 1981) over the faces labelled floor.
 
     A draw is three such faces' middles, drawn by area; its support is the area within `TOLERANCE_M` of the plane
     through them. Planes steeper than `MAX_TILT_DEG` are no floors. The best is refined by least squares over its
@@ -105,7 +105,7 @@ def fit_floor(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, near_
 
 
 def level_floor(vertices_w: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """(n, 3) vertices with tilt and waves of the reconstructed floor taken out: the collision floor is level.
+    """Return (n, 3) vertices with tilt and waves of the reconstructed floor removed: the collision floor is level.
 
     Args:
         vertices_w: (n, 3) world, m: the floor is near z = 0.

@@ -1,4 +1,4 @@
-"""Cleaned scan and object footprints in, grid of floor, obstacles and traversable cells out.
+"""Compute a grid of floor, obstacles and traversable cells from a cleaned scan and objects' footprints.
 
 The working grid is turned by the building's main direction, so that its walls run along rows and columns
 (fewer and flatter wall boxes); `resample` brings the result to the axis-aligned map that the scene folder
@@ -30,9 +30,9 @@ BAND_M = (0.02, 1.2)
 NOISE_M = 0.08
 """Reconstructed floors wave by a few centimetres: what is lower than this is floor, not obstacle."""
 CLOSE_CELLS = 2
-"""Gaps of up to twice this many cells in seen floor are floor."""
+"""Gaps of up to twice this many cells in visible floor are floor."""
 MAX_HOLE_M2 = 4.0
-"""Larger holes inside seen floor are not taken for floor."""
+"""Larger holes inside visible floor are not taken for floor."""
 BRIDGE_M = 1.2
 """Unseen floor so wide between two pieces of it is floor."""
 MAX_CORNER_M2 = 0.5
@@ -63,7 +63,7 @@ class Grid:
     resolution_m: float
 
     def cells(self, points_w: np.ndarray, push: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Row, column and inside flag of (n, 2+) world points, pushed by so many cells."""
+        """Return row, column and inside flag of (n, 2+) world points, pushed by so many cells."""
         turned = points_w[:, :2] @ yaw_matrix(self.yaw)[:2, :2]
         index = np.floor((turned - self.origin) / self.resolution_m + push).astype(np.int64)
         row, column = index[:, 1], index[:, 0]
@@ -71,13 +71,13 @@ class Grid:
         return row, column, inside
 
     def values(self, mask: np.ndarray, points_w: np.ndarray) -> np.ndarray:
-        """(n,) of a (rows, columns) mask at (n, 2+) world points; False outside."""
+        """Return (n,) of a (rows, columns) mask at (n, 2+) world points; False outside."""
         row, column, inside = self.cells(points_w)
         inside[inside] = mask[row[inside], column[inside]]
         return inside
 
     def centres_w(self, rows: slice = slice(None), columns: slice = slice(None)) -> np.ndarray:
-        """(rows, columns, 2) middles of the cells in the world, m."""
+        """Return (rows, columns, 2) middles of the cells in the world, m."""
         row, column = np.meshgrid(
             *(np.arange(n)[at] for n, at in zip(self.shape, (rows, columns), strict=True)), indexing="ij"
         )
@@ -85,7 +85,7 @@ class Grid:
         return turned @ yaw_matrix(self.yaw)[:2, :2].T
 
     def add_below(self, mask: np.ndarray, points_w: np.ndarray, margin_m: float) -> None:
-        """Sets the cells of a (rows, columns) mask whose middles lie in the hull of (n, 2+) points, with a margin."""
+        """Set the cells of a (rows, columns) mask whose middles lie in the hull of (n, 2+) points, with a margin."""
         shadow = MultiPoint(points_w[:, :2]).convex_hull.buffer(margin_m)
         row, column, _ = self.cells(shapely.get_coordinates(shadow))
         at = tuple(slice(max(int(k.min()), 0), max(int(k.max()) + 1, 0)) for k in (row, column))
@@ -99,7 +99,7 @@ class FloorPlan:
 
     grid: Grid
     floor: np.ndarray
-    """(rows, columns) bool: floor seen, or taken to be there."""
+    """(rows, columns) bool: floor that is visible, or assumed."""
     occupied: np.ndarray
     """(rows, columns) bool: static structure in the robot's height band."""
     traversable: np.ndarray
@@ -109,7 +109,7 @@ class FloorPlan:
     """(rows, columns) bool: wall that a door's leaf touches as it turns, at the hinge mostly, cells being coarser than
     leaves. Not traversable, but no box may stand there. None: no such cell."""
     height_m: np.ndarray | None = None
-    """(rows, columns) m: how high what stands in a cell is; the wall's height where walls stand or nothing is known.
+    """(rows, columns) m: how high what stands in a cell is; the wall's height where walls stand or nothing was scanned.
     None: the wall's height everywhere."""
     unseen_m2: float = 0.0
     """Traversable floor that the scan does not show."""
@@ -118,7 +118,7 @@ class FloorPlan:
 
 
 def main_direction(vertices_w: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> float:
-    """Direction of the walls modulo 90 degrees, rad in [-pi/4, pi/4): mode of wall normals, by area.
+    """Return the direction of the walls modulo 90 degrees, rad in [-pi/4, pi/4): mode of wall normals, by area.
 
     Less than 1 degree counts as 0: the map then needs no turning."""
     wall = np.isin(face_labels(labels, faces), [v for v in STRUCTURE_LABELS if v not in (FLOOR, CEILING)])
@@ -141,7 +141,7 @@ def main_direction(vertices_w: np.ndarray, faces: np.ndarray, labels: np.ndarray
 
 
 def _footprint(grid: Grid, placed: PlacedObject) -> np.ndarray:
-    """(rows, columns) bool: cells under the object's hulls."""
+    """Return (rows, columns) bool: cells under the object's hulls."""
     mask = np.zeros(grid.shape, bool)
     for hull in placed.hulls_b:
         grid.add_below(mask, to_world(placed, hull.vertices), grid.resolution_m / 2)
@@ -149,7 +149,7 @@ def _footprint(grid: Grid, placed: PlacedObject) -> np.ndarray:
 
 
 def swept_by_door(grid: Grid, placed: PlacedObject, margin_m: float = LEAF_MARGIN_M) -> np.ndarray:
-    """(rows, columns) bool: cells that the leaf passes over its whole range, with a margin."""
+    """Return (rows, columns) bool: cells that the leaf passes over its whole range, with a margin."""
     assert placed.hinge is not None
     mask = np.zeros(grid.shape, bool)
     flat = np.vstack([h.vertices for h in placed.hulls_b])
@@ -168,12 +168,12 @@ def _drop_small(mask: np.ndarray, least_cells: int) -> np.ndarray:
 
 
 def _fill_holes(floor: np.ndarray, occupied: np.ndarray, resolution_m: float) -> np.ndarray:
-    """Adds unseen regions enclosed by floor, where nothing stands, and small ones between floor and wall.
+    """Add hidden regions enclosed by floor, where nothing stands, and small ones between floor and wall.
 
     The small ones are corners that furniture hid; the inside of a wall touches no floor and stays out.
     """
-    known = floor | occupied
-    enclosed = np.asarray(ndimage.binary_fill_holes(known), bool) & ~known
+    covered = floor | occupied
+    enclosed = np.asarray(ndimage.binary_fill_holes(covered), bool) & ~covered
     holes, count = label(enclosed)
     result = floor.copy()
     for k in range(1, count + 1):
@@ -186,7 +186,7 @@ def _fill_holes(floor: np.ndarray, occupied: np.ndarray, resolution_m: float) ->
 
 
 def _bridge(floor: np.ndarray, occupied: np.ndarray, resolution_m: float) -> np.ndarray:
-    """Adds unseen regions, up to `BRIDGE_M` wide, in which nothing stands and which part two pieces of floor."""
+    """Add hidden regions, up to `BRIDGE_M` wide, in which nothing stands and which part two pieces of floor."""
     line = np.ones((1, round(BRIDGE_M / resolution_m) + 1))
     between = np.logical_or(ndimage.binary_closing(floor, line), ndimage.binary_closing(floor, line.T))
     pieces, _ = label(_drop_small(floor, math.ceil(MIN_FREE_M2 / resolution_m**2)))
@@ -199,7 +199,7 @@ def _bridge(floor: np.ndarray, occupied: np.ndarray, resolution_m: float) -> np.
 
 
 def _without_insides(free: np.ndarray, shown: _Shown, resolution_m: float) -> np.ndarray:
-    """The pieces of floor that one may stand on: the largest, and others that are no insides of closed solids.
+    """Return the pieces of floor that one may stand on: the largest, and others that are no insides of closed solids.
 
     What stands around a room faces it; the sides of a solid face away from its inside.
     """
@@ -217,7 +217,7 @@ def _without_insides(free: np.ndarray, shown: _Shown, resolution_m: float) -> np
 
 
 def _grid_around(points_w: np.ndarray, yaw: float, resolution_m: float) -> Grid:
-    """The grid of whole cells over (n, 3) points, with a margin."""
+    """Return the grid of whole cells over (n, 3) points, with a margin."""
     used = points_w @ yaw_matrix(yaw)
     low, high = used[:, :2].min(axis=0) - PAD_M, used[:, :2].max(axis=0) + PAD_M
     low = np.floor(low / resolution_m) * resolution_m
@@ -235,18 +235,18 @@ def make_floor_plan(
     exact: bool = False,
     resolution_m: float = RESOLUTION_M,
 ) -> FloorPlan:
-    """Reads floor and obstacles off the cleaned scan.
+    """Read floor and obstacles off the cleaned scan.
 
     Args:
         vertices_w: (n, 3) m, floor at z = 0, after the cut.
         faces: (m, 3) that stay.
         labels: (n,) NYU40.
-        given: the source's own traversable map, or None.
+        given: the source's traversable map, or None.
         yaw: of the grid: the building's `main_direction`, rad.
     """
     grid = _grid_around(vertices_w[np.unique(faces)], yaw, resolution_m)
     shown = _shown(grid, vertices_w, faces, face_labels(labels, faces))
-    floor_seen = shown.floor >= 2
+    floor_visible = shown.floor >= 2
     occupied = _drop_small(shown.solid >= 3, MIN_OBSTACLE_CELLS)
     # Reconstruction holes in walls: join along rows and columns only, so that doorways stay open.
     for line in (np.ones((1, 4)), np.ones((4, 1))):
@@ -259,12 +259,12 @@ def make_floor_plan(
             swept |= swept_by_door(grid, placed, LEAF_MARGIN_M + BOXED_M * exact)
     # What is left of the door's scan in its sweep goes, walls stay.
     occupied &= ~swept | (shown.solid_wall >= 3)
-    closed = ndimage.binary_closing(floor_seen, iterations=CLOSE_CELLS) | under | floor_seen
+    closed = ndimage.binary_closing(floor_visible, iterations=CLOSE_CELLS) | under | floor_visible
     if given is not None:
         closed |= _given_floor(grid, given)
     # What lies behind a line of obstacles (the inside of a wall, the far side of one that a chair's annotated
-    # pose cuts) is no floor: it must connect to floor that was seen.
-    floor = np.asarray(ndimage.binary_propagation(floor_seen & ~occupied, mask=closed & ~occupied), bool)
+    # pose cuts) is no floor: it must connect to visible floor.
+    floor = np.asarray(ndimage.binary_propagation(floor_visible & ~occupied, mask=closed & ~occupied), bool)
     floor = _fill_holes(floor, occupied, resolution_m)
     if given is None and not exact:
         floor = _bridge(floor, occupied, resolution_m)
@@ -278,7 +278,7 @@ def make_floor_plan(
             "check the floor's labels and height"
         )
     height, leaf = _heights(shown, occupied, 1 if exact else 5), swept & (~traversable if exact else occupied)
-    unseen_m2 = float((traversable & ~floor_seen).sum()) * resolution_m**2
+    unseen_m2 = float((traversable & ~floor_visible).sum()) * resolution_m**2
     open_share = float(beyond_obstacles(occupied, resolution_m)[traversable].mean())
     return FloorPlan(grid, floor, occupied, traversable, shown.wall_height_m, leaf, height, unseen_m2, open_share)
 
@@ -337,7 +337,7 @@ def _shown(grid: Grid, vertices_w: np.ndarray, faces: np.ndarray, of_face: np.nd
 
 
 def _heights(shown: _Shown, occupied: np.ndarray, around: int) -> np.ndarray:
-    """(rows, columns) m: height of what stands in each cell, see `FloorPlan.height_m`.
+    """Return (rows, columns) m: height of what stands in each cell, see `FloorPlan.height_m`.
 
     A cell is low where no wall, window or the like is labelled in the robot's band and the highest point lies
     within it; the highest of so many cells around counts, so that a scan's ragged edge does not lower a cabinet.
@@ -351,7 +351,7 @@ def _heights(shown: _Shown, occupied: np.ndarray, around: int) -> np.ndarray:
 
 
 def _given_floor(grid: Grid, given: GivenMap) -> np.ndarray:
-    """(rows, columns) bool: cells whose middle is traversable in the source's own map."""
+    """Return (rows, columns) bool: cells whose middle is traversable in the source's map."""
     centres = grid.centres_w()
     index = np.floor((centres - given.origin) / given.resolution_m).astype(int)
     row, column = index[..., 1], index[..., 0]
@@ -362,7 +362,7 @@ def _given_floor(grid: Grid, given: GivenMap) -> np.ndarray:
 
 
 def resample(grid: Grid, mask: np.ndarray, resolution_m: float) -> tuple[np.ndarray, tuple[float, float]]:
-    """Brings a mask to an axis-aligned grid, conservatively: a cell is true where its middle and corners are.
+    """Resample a mask to an axis-aligned grid, conservatively: a cell is true where its middle and corners are.
 
     Returns:
         mask [rows along y, columns along x], and the x, y of the outer corner of cell [0, 0], m.

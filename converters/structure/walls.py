@@ -1,4 +1,4 @@
-"""Traversable cells in, few boxes that bound them out."""
+"""Bound traversable cells by few boxes."""
 
 import heapq
 from collections.abc import Iterator
@@ -18,12 +18,12 @@ _Run = tuple[int, int, int, int, int, int, int, int]
 
 
 def border_cells(traversable: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool: cells that are not traversable but touch one that is, corners included."""
+    """Return (rows, columns) bool: cells that are not traversable but touch one that is, corners included."""
     return ndimage.binary_dilation(traversable, np.ones((3, 3))) & ~traversable
 
 
 def cover_rectangles(needed: np.ndarray, allowed: np.ndarray) -> Iterator[tuple[int, int, int, int]]:
-    """Covers the needed cells with rectangles of allowed cells, the most useful first.
+    """Cover the needed cells with rectangles of allowed cells, the most useful first.
 
     Args:
         needed: (rows, columns) bool, every one of these ends up covered.
@@ -40,7 +40,7 @@ def cover_rectangles(needed: np.ndarray, allowed: np.ndarray) -> Iterator[tuple[
     heap: list[tuple[int, int, _Run]] = []
 
     def offer(run: _Run) -> None:
-        """By most gain, then by first cell, rows before columns; one without gain is dropped."""
+        """Queue a run by most gain, then by first cell, rows before columns; drop one without gain."""
         upright, line, start, stop, r0, r1, c0, c1 = run
         cells = np.flatnonzero((left.T if upright else left)[line, start:stop])
         if len(cells):
@@ -60,7 +60,7 @@ def cover_rectangles(needed: np.ndarray, allowed: np.ndarray) -> Iterator[tuple[
 
 
 def _runs(grid: np.ndarray, upright: int) -> Iterator[_Run]:
-    """Runs of allowed cells along the rows of a grid, and the rectangles grown from them."""
+    """Find runs of allowed cells along the rows of a grid, and the rectangles grown from them."""
     blocked = np.cumsum(np.pad(~grid.T, ((1, 0), (0, 0))), axis=0)  # cells that are not allowed before each column
     for line, row in enumerate(grid):
         ends = np.flatnonzero(np.diff(row, prepend=False, append=False)).reshape(-1, 2)
@@ -68,7 +68,7 @@ def _runs(grid: np.ndarray, upright: int) -> Iterator[_Run]:
 
 
 def _grow(blocked: np.ndarray, upright: int, line: int, start: int, stop: int) -> tuple[int, int, int, int]:
-    """The run from start to stop along a line, and as many equal runs beside it as are allowed."""
+    """Return the run from start to stop along a line, and as many equal runs beside it as are allowed."""
     other = np.flatnonzero(blocked[stop] != blocked[start])
     at = int(np.searchsorted(other, line))
     low = int(other[at - 1]) + 1 if at > 0 else 0
@@ -77,7 +77,7 @@ def _grow(blocked: np.ndarray, upright: int, line: int, start: int, stop: int) -
 
 
 def _shrink(needed: np.ndarray, rectangle: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
-    """The rectangle without rows and columns at its edges that hold no needed cell."""
+    """Return the rectangle without rows and columns at its edges that hold no needed cell."""
     r0, r1, c0, c1 = rectangle
     rows = np.flatnonzero(needed[r0:r1, c0:c1].any(axis=1))
     columns = np.flatnonzero(needed[r0:r1, c0:c1].any(axis=0))
@@ -85,10 +85,10 @@ def _shrink(needed: np.ndarray, rectangle: tuple[int, int, int, int]) -> tuple[i
 
 
 def wall_boxes(plan: FloorPlan) -> tuple[OrientedBox, ...]:
-    """Boxes from the floor up around everything traversable, each as high as what stands there.
+    """Build boxes from the floor up around everything traversable, each as high as what stands there.
 
-    No box stands where a door's leaf turns. A box may reach over what is higher than itself (that has boxes of its
-    own), never over what is lower.
+    No box stands where a door's leaf turns. A box may reach over what is higher than itself (which has separate
+    boxes), never over what is lower.
     """
     free = plan.traversable if plan.leaf is None else plan.traversable | plan.leaf
     needed = border_cells(free)

@@ -1,1 +1,1 @@
-"""Stages' results in, the files of a scene folder out."""
+"""Write the files of a scene folder from the stages' results."""

@@ -1,4 +1,4 @@
-"""Source surfaces in, what is drawn of them out: as they are where they are small, else simplified and baked."""
+"""Prepare source surfaces for drawing: as they are where they are small, else simplified and baked."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ class Drawn:
     """What is drawn of an object (body frame), and how much of its model's surface that is."""
 
     mesh: VisualMesh
-    seen_share: float
+    shown_share: float
     """Of the texels, what the scan showed."""
     kept_share: float
     """Of the model's area."""
@@ -26,7 +26,7 @@ class Drawn:
 
 
 def as_it_is(mesh: TexturedMesh, most_faces: int, size: int) -> VisualMesh | None:
-    """The surface with its own vertices and image; None where it has too many faces or too large an image.
+    """Return the surface with its vertices and image; None where it has too many faces or too large an image.
 
     Args:
         size: most pixels a side of the image, which must not repeat.
@@ -49,20 +49,18 @@ def as_it_is(mesh: TexturedMesh, most_faces: int, size: int) -> VisualMesh | Non
 def draw_objects(
     objects: Sequence[PlacedObject], clouds: Sequence[ColourCloud], most_faces: int, size: int
 ) -> list[Drawn]:
-    """Objects of one model and size: the model is simplified once, by an error first and then to a number of faces.
+    """Draw objects of one model and size: simplify the model once, by an error first, then to a number of faces.
 
-    One that the scan shows takes the scan's colours, any other one its own.
-
-    Args:
-        size: of the texture, pixels.
+    One that the scan shows takes the scan's colours, any other one its model's.
+    `size`: of the texture, pixels.
     """
-    first, own = objects[0], None
+    first, unscanned = objects[0], None
     surface, mesh = first.surface_b, (first.vertices_b, first.faces)
     small = None if surface is None else as_it_is(surface, most_faces, size)
     if small is not None:
-        own = Drawn(small, 0.0, 1.0, 0.0)
+        unscanned = Drawn(small, 0.0, 1.0, 0.0)
     low, loss, done = mesh, (1.0, 0.0), []
-    if own is None or any(len(cloud.points) for cloud in clouds):
+    if unscanned is None or any(len(cloud.points) for cloud in clouds):
         low = simplify_to(*mesh, most_faces)
         loss = surface_loss(*mesh, *low)
     for placed, cloud in zip(objects, clouds, strict=True):
@@ -73,9 +71,9 @@ def draw_objects(
             )
             done.append(Drawn(*bake_object(*mesh, first.face_colours, cloud_b, low, size), *loss))
             continue
-        if own is None:
+        if unscanned is None:
             spacing_m = max(float(np.ptp(first.vertices_b, axis=0).max()) / size, 1e-3)
             cloud_b = cloud if surface is None else textured_cloud(surface, spacing_m)
-            own = Drawn(bake_object(*mesh, first.face_colours, cloud_b, low, size)[0], 0.0, *loss)
-        done.append(own)
+            unscanned = Drawn(bake_object(*mesh, first.face_colours, cloud_b, low, size)[0], 0.0, *loss)
+        done.append(unscanned)
     return done

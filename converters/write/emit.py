@@ -1,4 +1,4 @@
-"""Placed objects, physical properties, walls and visual meshes in; `MjSpec` and assets out.
+"""Write placed objects, physical properties, walls and visual meshes as an `MjSpec` with assets.
 
 Conventions of the written MJCF (classes, groups, names) are in `scenes_mjcf/README.md`.
 """
@@ -49,7 +49,7 @@ class Look:
 
 @dataclasses.dataclass(frozen=True)
 class Assets:
-    """Names of the files that bodies, by name, are made from."""
+    """Names of the files that bodies, by name, are built from."""
 
     looks: dict[str, Look]
     hulls: dict[str, tuple[str, ...]]
@@ -58,7 +58,7 @@ class Assets:
 
 @dataclasses.dataclass(frozen=True)
 class SceneParts:
-    """What a scene's model is made of."""
+    """What a scene's model consists of."""
 
     name: str
     objects: tuple[PlacedObject, ...]
@@ -95,7 +95,7 @@ def _quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def _tidy(values: np.ndarray) -> np.ndarray:
-    """Rounded to a micrometre, without negative zeros: short files, equal bytes."""
+    """Round to a micrometre, without negative zeros: short files, equal bytes."""
     return np.round(np.asarray(values, float), 6) + 0.0
 
 
@@ -131,8 +131,8 @@ def _add_movable(
         _add_look(spec, body, placed.name, look)
     for i, (hull, box) in enumerate(zip(placed.hulls_b, placed.boxes_b, strict=True)):
         name = f"{placed.name}_hull_{i}"
-        own = hulls[i] if hulls else name
-        if own == name:
+        shared = hulls[i] if hulls else name
+        if shared == name:
             mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
             if hulls:
                 mesh.file = f"{name}.obj"
@@ -142,7 +142,7 @@ def _add_movable(
             spec.find_default("hull"),
             name=name,
             type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=own,
+            meshname=shared,
             friction=friction,
         )
         body.add_geom(
@@ -157,7 +157,7 @@ def _add_movable(
 
 
 def _add_look(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, look: Look) -> None:
-    """A textured visual geom; meshes, textures and materials that another body brought are used again."""
+    """Add a textured visual geom; reuse meshes, textures and materials of other bodies."""
     mesh_name = f"{name}_visual" if look.scale != ONE else f"{look.mesh}_visual"
     if mesh_name == f"{name}_visual":
         spec.add_mesh(
@@ -178,7 +178,7 @@ def _add_look(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, look: Look) 
 
 
 def _scale_between(first: VisualMesh, other: VisualMesh) -> tuple[float, float, float] | None:
-    """What turns the first mesh into the other, an axis; None where no scale does."""
+    """Return what turns the first mesh into the other, for each axis; None where no scale does."""
     size, wanted = (np.ptp(m.vertices, axis=0) for m in (first, other))
     scale = np.round(np.where(size > 1e-6, wanted / np.maximum(size, 1e-6), 1.0), 6)
     if np.abs(first.vertices * scale - other.vertices).max() > SAME_M:
@@ -187,7 +187,7 @@ def _scale_between(first: VisualMesh, other: VisualMesh) -> tuple[float, float, 
 
 
 def share_assets(parts: SceneParts) -> Assets:
-    """Which files show and bound each body, with visuals: equal ones are written once, under the first body's name."""
+    """Return the files that show and bound each body; equal ones are written once, under the first body's name."""
     looks, meshes, images, solids, hulls = {}, {}, {}, {}, {}
     drawn = [(o.name, v) for o, v in zip(parts.objects, parts.object_visuals, strict=True)]
     for name, visual in [*drawn, *([("structure", parts.structure_visual)] if parts.structure_visual else [])]:
@@ -204,7 +204,7 @@ def share_assets(parts: SceneParts) -> Assets:
 
 
 def build_spec(parts: SceneParts, assets: Assets | None = None) -> mujoco.MjSpec:
-    """The scene as an `MjSpec`.
+    """Build the scene as an `MjSpec`.
 
     `assets`: names of files in `assets/`; None keeps hulls inside the spec and leaves visuals out (settling).
     """
@@ -222,7 +222,7 @@ def build_spec(parts: SceneParts, assets: Assets | None = None) -> mujoco.MjSpec
 
 
 def _empty_spec(name: str) -> mujoco.MjSpec:
-    """Options and default classes of every scene."""
+    """Set the options and default classes of every scene."""
     spec = mujoco.MjSpec()
     spec.modelname = name
     spec.compiler.degree = False
@@ -236,7 +236,7 @@ def _empty_spec(name: str) -> mujoco.MjSpec:
 
 
 def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[OrientedBox, ...], lit: bool, lamps: tuple[Lamp, ...]) -> None:
-    """Floor, lamps, and a light above the walls' middle: an even one where the structure is `lit` in its own image."""
+    """Add floor, lamps, and a light above the walls' middle: an even one where the structure's image is `lit`."""
     spec.worldbody.add_geom(
         name="floor",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
@@ -266,7 +266,7 @@ def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[OrientedBox, ...], lit: 
 
 
 def _add_structure(spec: mujoco.MjSpec, parts: SceneParts, look: Look | None) -> None:
-    """The cleaned scan as a picture, and the wall boxes."""
+    """Add the cleaned scan as a picture, and the wall boxes."""
     structure = spec.worldbody.add_body(name="structure")
     if look is not None:
         _add_look(spec, structure, "structure", look)
@@ -287,7 +287,7 @@ def _add_structure(spec: mujoco.MjSpec, parts: SceneParts, look: Look | None) ->
 
 
 def paired(faces: np.ndarray, corners: np.ndarray) -> list[list[int]]:
-    """Triangles, and quads in place of two that share an edge.
+    """Return triangles, and quads in place of two that share an edge.
 
     Readers of OBJ cut a quad from its first corner to its third or along its shorter diagonal. The shared edge is both,
     or the quad is a parallelogram, which is the same however it is cut.
@@ -295,7 +295,7 @@ def paired(faces: np.ndarray, corners: np.ndarray) -> list[list[int]]:
     `faces`: (m, 3) triangles of one orientation.
     `corners`: (k, 5) position and texture coordinates of each corner, in units of their last digit.
     """
-    made: list[list[int]] = []
+    polygons: list[list[int]] = []
     free: dict[tuple[int, int], int] = {}
     at = corners[:, :3].tolist()
     for a, b, c in faces.tolist():
@@ -303,7 +303,7 @@ def paired(faces: np.ndarray, corners: np.ndarray) -> list[list[int]]:
             k = free.get((end, start))
             if k is None:
                 continue
-            u, v, w = made[k]
+            u, v, w = polygons[k]
             other = u + v + w - start - end
             shared, across = math.dist(at[start], at[end]), math.dist(at[tip], at[other])
             if (
@@ -313,12 +313,12 @@ def paired(faces: np.ndarray, corners: np.ndarray) -> list[list[int]]:
                 for edge in ((u, v), (v, w), (w, u)):
                     if free.get(edge) == k:
                         del free[edge]
-                made[k] = [start, other, end, tip]
+                polygons[k] = [start, other, end, tip]
                 break
         else:
-            free.update(dict.fromkeys(((a, b), (b, c), (c, a)), len(made)))
-            made.append([a, b, c])
-    return made
+            free.update(dict.fromkeys(((a, b), (b, c), (c, a)), len(polygons)))
+            polygons.append([a, b, c])
+    return polygons
 
 
 def write_obj(
@@ -330,7 +330,7 @@ def write_obj(
     decimals: int = 4,
     uv_decimals: int = 4,
 ) -> None:
-    """Writes a triangle mesh as OBJ, 0.1 mm by default; one with texture coordinates in as few bytes as will do."""
+    """Write a triangle mesh as OBJ, 0.1 mm by default; with texture coordinates in as few bytes as possible."""
     if uv is None or uv_faces is None:
         lines = [f"v {x:.{decimals}f} {y:.{decimals}f} {z:.{decimals}f}" for x, y, z in vertices + 0.0]
         lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]
@@ -348,7 +348,7 @@ def write_obj(
 
 
 def write_scene(parts: SceneParts, folder: Path, palette: int = 96) -> None:
-    """Writes `scene.xml` and `assets/` into an existing folder, textures in `palette` colours."""
+    """Write `scene.xml` and `assets/` into an existing folder, textures in `palette` colours."""
     parts = dataclasses.replace(parts, object_visuals=tuple(map(share_plain, parts.object_visuals)))
     assets, shared = folder / "assets", share_assets(parts)
     assets.mkdir()

@@ -1,4 +1,4 @@
-"""Results of the stages in, `SceneManifest` (scene.json) out."""
+"""Build the `SceneManifest` (scene.json) from the results of the stages."""
 
 import dataclasses
 from importlib.metadata import version
@@ -15,7 +15,7 @@ PACKAGES = ("mujoco", "coacd", "trimesh", "fast-simplification", "xatlas", "nump
 
 
 def scene_objects(parts: SceneParts) -> tuple[SceneObject, ...]:
-    """The scene's movable things, in its order."""
+    """Return the scene's movable objects, in its order."""
     return tuple(
         SceneObject(
             name=placed.name,
@@ -40,7 +40,7 @@ def make_manifest(
     fallbacks: dict[str, str] | None = None,
     maps: SceneMaps | None = None,
 ) -> SceneManifest:
-    """Collects what a scene is, where it came from and which gates it passed; all paths are relative.
+    """Collect what a scene is, where it came from and which gates it passed; all paths are relative.
 
     `fallbacks` names the models whose one convex hull stands for them, and why; with `maps`, it is measured too.
     """

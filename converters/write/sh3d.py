@@ -1,7 +1,7 @@
-"""A scene folder in; a Sweet Home 3D drawing (`.sh3d`, a ZIP with `Home.xml` and models) out, to be edited there.
+"""Export a scene folder as a Sweet Home 3D drawing (`.sh3d`, a ZIP with `Home.xml` and models) to edit there.
 
 Frames: a scene is metres, z up, y to the back of the plan; a drawing is cm, its y points down and its angles turn
-clockwise; models are y up with their front along +z. A door's own frame is z up, x along the wall that it stands in.
+clockwise; models are y up with their front along +z. A door's frame is z up, x along the wall that it stands in.
 """
 
 import io
@@ -68,11 +68,11 @@ def export_sh3d(folder: Path, target: Path) -> list[str]:
         state = "exists" if target.exists() else "has another ending"
         raise FileError(f"{target}: {state}, expected a new file that ends in .sh3d; choose another name")
     drawing = _Export(folder, manifest.name, manifest.licence)
-    told = drawing.fill({o.name: o.category for o in manifest.objects}, load_maps(folder))
+    lines = drawing.fill({o.name: o.category for o in manifest.objects}, load_maps(folder))
     with whole_file(target) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in drawing.files.items():
             archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data, zipfile.ZIP_DEFLATED)
-    return told
+    return lines
 
 
 class _Export:
@@ -96,28 +96,28 @@ class _Export:
         return ElementTree.SubElement(self.root if parent is None else parent, tag, text)
 
     def fill(self, category: dict[str, str], maps: SceneMaps) -> list[str]:
-        """All of it; what there is and what is left out, a line each."""
+        """Fill the drawing; return what there is and what is left out, a line each."""
         geoms = [g for g in self.spec.geoms if g.name.startswith("wall_")]
         self.walls = merged_walls([(np.array(g.pos), np.array(g.size), float(yaw_from_quat(g.quat))) for g in geoms])
         self.low_m = min(WALL_M, 0.8 * max((w.height for w in self.walls), default=0.0))
         self.high = [w for w in self.walls if w.height > self.low_m]
         self.stands = shapely.union_all([w.polygon() for w in self.high])
         self.cloud = self._cloud()
-        told, doors, pieces = ["left out: textures of walls and floors, lamps' light, and masses"], 0, 0
+        lines, doors, pieces = ["left out: textures of walls and floors, lamps' light, and masses"], 0, 0
         if len(self.high) < len(self.walls):
-            told.append("built-in furniture is drawn as low walls")
+            lines.append("built-in furniture is drawn as low walls")
         bodies = [b for b in self.spec.bodies if b.name in category]
         for body in bodies:
             mesh = self._mesh(body)
             hinge = mesh is not None and any(j.type == mujoco.mjtJoint.mjJNT_HINGE for j in body.joints)
             if mesh is None:
-                told.append(f"left out: {body.name}, which has no mesh to look at")
+                lines.append(f"left out: {body.name}, which has no mesh to look at")
             elif hinge and self._door(body, mesh):
                 doors += 1
             else:
                 pieces += 1
                 self._piece(body, mesh, category[body.name])
-                told += [f"{body.name}: stands in no gap of a wall; drawn as a piece that does not turn"] * hinge
+                lines += [f"{body.name}: stands in no gap of a wall; drawn as a piece that does not turn"] * hinge
         sites = [site for site in self.spec.sites if site.name.startswith("window_")]
         for site in sites:
             self._window(site)
@@ -131,7 +131,7 @@ class _Export:
             words = {"height": 100 * top, "thickness": 100 * (wall.thickness - 2 * IN_M), "pattern": "hatchUp"}
             left = run[::-1] * [-1.0, 1.0]
             for side, out in (("left", left), ("right", -left)):
-                words[f"{side}SideColor"] = self._seen(WALL, wall.side(out), out, 0.1, wall.height)
+                words[f"{side}SideColor"] = self._colour(WALL, wall.side(out), out, 0.1, wall.height)
             self._add("wall", id=f"wall{k}", xStart=x0, yStart=y0, xEnd=x1, yEnd=y1, **words)
         low, high = (
             shapely.union_all([w.polygon() for w in self.walls if (w.height > self.low_m) == tall])
@@ -141,7 +141,7 @@ class _Export:
         stands = high.buffer(1e-4, join_style="mitre")
         rooms = rooms_of(maps, low, stands, ROOM_M2, maps.resolution_m if across else 0.0)
         for k, plan in enumerate(rooms):
-            colour = self._seen(FLOOR, plan, np.zeros(2), -SIDE_M, SIDE_M)
+            colour = self._colour(FLOOR, plan, np.zeros(2), -SIDE_M, SIDE_M)
             words = {"areaVisible": "true", "floorColor": colour, "ceilingVisible": "false"}
             room = self._add("room", id=f"room{k}", name=f"Room {k + 1}", **words)
             for x, y in 100 * shapely.get_coordinates(plan.exterior)[:-1] * [1.0, -1.0] + 0.0:
@@ -151,22 +151,22 @@ class _Export:
         count = (
             f"{len(self.walls)} walls, {len(rooms)} rooms, {doors} doors, {len(sites)} windows, {pieces} other things"
         )
-        return [count, *told]
+        return [count, *lines]
 
     def _cloud(self) -> ColourCloud:
-        """Points of what shows the structure."""
+        """Return points of what shows the structure."""
         for geom in (g for g in self.spec.geoms if g.name == "structure_visual"):
             mesh = read_obj(self.folder / self.spec.meshdir / self.spec.mesh(geom.meshname).file)
-            seen = TexturedMesh(mesh.vertices, mesh.faces, mesh.corner_uv, read_image(self._image(geom), "RGB"))
-            return textured_cloud(seen, APART_M)
+            surface = TexturedMesh(mesh.vertices, mesh.faces, mesh.corner_uv, read_image(self._image(geom), "RGB"))
+            return textured_cloud(surface, APART_M)
         return ColourCloud(*(np.zeros((0, 3)),) * 3)
 
     def _image(self, geom: Any) -> Path:
         look = self.spec.material(geom.material).textures[mujoco.mjtTextureRole.mjTEXROLE_RGB]
         return self.folder / self.spec.texturedir / self.spec.texture(look).file
 
-    def _seen(self, default: str, plan: Any, out: np.ndarray, low_m: float, high_m: float) -> str:
-        """Median colour of the structure over a plan, between two heights, that looks along (2,) `out` or, if 0, up."""
+    def _colour(self, default: str, plan: Any, out: np.ndarray, low_m: float, high_m: float) -> str:
+        """Return the structure's median colour over a plan, between two heights, facing (2,) `out` or, if 0, up."""
         cloud, towards = self.cloud, np.array([*out, 0.0 if out.any() else 1.0])
         near = (cloud.normals @ towards > FACING) & (
             np.abs(cloud.points[:, 2] - (low_m + high_m) / 2) < (high_m - low_m) / 2
@@ -179,7 +179,7 @@ class _Export:
         )
 
     def _mesh(self, body: Any) -> Mesh | None:
-        """What shows a body; None where nothing does."""
+        """Return what shows a body; None where nothing does."""
         geom = next((g for g in body.geoms if g.name == f"{body.name}_visual"), None)
         if geom is None:
             return None
@@ -204,7 +204,7 @@ class _Export:
         return Mesh(clouds.pop(), rest, data, (f"{mesh.file} {mesh.scale}", path.name), clouds)
 
     def _model(self, key: Any, place: Place, mesh: Mesh, group: str = "piece", frame: np.ndarray | None = None) -> str:
-        """Entry of a model, written once, of a mesh placed in a frame that is z up and a door frame's bars' corners."""
+        """Return the entry of a model, written once, of a mesh in a frame that is z up and of a door frame's bars."""
         if key in self.models:
             return self.models[key]
         number, vertices = len(self.models) + 1, place(mesh.vertices)
@@ -229,7 +229,7 @@ class _Export:
         return self.models[key]
 
     def _words(self, kind: str, model: str, box: np.ndarray, yaw: float, at: np.ndarray) -> dict[str, Any]:
-        """Attributes of a piece whose model fills a (2, 3) box in a frame at (3,) `at`."""
+        """Return the attributes of a piece whose model fills a (2, 3) box in a frame at (3,) `at`."""
         middle = at[:2] + yaw_matrix(yaw)[:2, :2] @ box.mean(axis=0)[:2]
         width, depth, height = 100 * (box[1] - box[0])
         place = {"x": 100 * middle[0], "y": -100 * middle[1], "elevation": max(100 * (at[2] + box[0, 2]), 0.0)}
@@ -247,19 +247,19 @@ class _Export:
         self._add("pieceOfFurniture", movable="true", **self._words(kind, model, box, yaw, np.array(body.pos)))
 
     def _door(self, body: Any, mesh: Mesh) -> bool:
-        """A door as it stands, with its frame and the wall that it stands in; False where it stands in no gap."""
-        joint, at, own = body.joints[0], np.array(body.pos), matrix_from_quat(np.array(body.quat))
-        leaf, hinge = mesh.vertices @ own.T + at, (own @ joint.pos + at)[:2]
+        """Add a door as it stands, with its frame and the wall that it stands in; False where it stands in no gap."""
+        joint, at, rotation = body.joints[0], np.array(body.pos), matrix_from_quat(np.array(body.quat))
+        leaf, hinge = mesh.vertices @ rotation.T + at, (rotation @ joint.pos + at)[:2]
         middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2 - joint.pos
         axis = int(np.argmax(np.ptp(mesh.vertices, axis=0)[:2]))
-        along = own[:2, axis] * math.copysign(1.0, middle[axis])
+        along = rotation[:2, axis] * math.copysign(1.0, middle[axis])
         rest, length = math.atan2(along[1], along[0]), float(((leaf[:, :2] - hinge) @ along).max())
         lines = {round(math.atan2(*(w.ends[1] - w.ends[0])[::-1]) % (math.pi / 2), 3) for w in self.high}
         gaps = []
         for yaw in (line + k * math.pi / 2 for line in lines for k in range(4)):
             turn = math.remainder(yaw - rest, math.tau)
             if joint.range[0] - SLACK_RAD <= turn <= joint.range[1] + SLACK_RAD:
-                shut = hinge + yaw_matrix(turn)[:2, :2] @ (own @ middle)[:2]
+                shut = hinge + yaw_matrix(turn)[:2, :2] @ (rotation @ middle)[:2]
                 gap = gap_around(self.stands, shut, yaw_matrix(yaw)[:2, 0], length)
                 gaps += [] if gap is None else [(float(np.linalg.norm(gap[1] - gap[0])), yaw, gap)]
         if not gaps:
@@ -270,7 +270,7 @@ class _Export:
         back, centre = yaw_matrix(yaw), np.array([*wall.ends.mean(axis=0), 0.0])
 
         def place(points: np.ndarray) -> np.ndarray:
-            return (points @ own.T + at - centre) @ back
+            return (points @ rotation.T + at - centre) @ back
 
         vertices, pin = place(mesh.vertices), ((hinge - centre[:2]) @ back[:2, :2])
         x, y, top = wide / 2, wall.thickness / 2, vertices[:, 2].max() + 0.01
@@ -290,7 +290,7 @@ class _Export:
         return True
 
     def _window(self, site: Any) -> None:
-        """A pane in a frame as deep as the wall around it, and that wall where a scene has none behind furniture."""
+        """Add a pane in a frame as deep as the wall around it, and the wall if a scene has none behind furniture."""
         at, (x, deep, up), yaw = np.array(site.pos), np.array(site.size), float(yaw_from_quat(site.quat))
         y, high = half_wall(self.stands, at[:2], yaw_matrix(yaw)[:2, 1], deep), 2 * up
         if y is None:
@@ -311,10 +311,10 @@ class _Export:
 
 
 def _lines(vertices: np.ndarray) -> str:
-    """An OBJ's, in cm and y up, of (n, 3) vertices in m and z up."""
+    """Return an OBJ's lines, in cm and y up, of (n, 3) vertices in m and z up."""
     return "".join(f"v {x:.3f} {y:.3f} {z:.3f}\n" for x, y, z in 100 * vertices @ Y_UP_TO_Z_UP + 0.0)
 
 
 def _bar(x0: float, x1: float, z0: float, z1: float, half: float) -> np.ndarray:
-    """(8, 3) corners of an upright bar across a wall: four below, four above."""
+    """Return (8, 3) corners of an upright bar across a wall: four below, four above."""
     return np.array([(x, y, z) for z in (z0, z1) for x, y in ((x0, -half), (x1, -half), (x1, half), (x0, half))])

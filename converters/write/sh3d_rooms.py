@@ -1,4 +1,4 @@
-"""Wall boxes and the map of a scene in; walls of its drawing, their gaps, and the rooms that doorways part, out."""
+"""Find the walls of a scene's drawing from its wall boxes, their gaps, and from its map the rooms."""
 
 import math
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ GAP_M = 0.6
 BESIDE_M = 0.08
 """A leaf may hang so far beside the middle of its wall."""
 BEYOND_M, THICK_M = (0.01, 0.06, 0.11), (0.04, 0.4)
-"""So far beyond a gap's ends it is seen how thick the wall is, within these bounds; else it is `INNER_M`."""
+"""So far beyond a gap's ends it is measured how thick the wall is, within these bounds; else it is `INNER_M`."""
 INNER_M = 0.1
 SIDE_M = 0.08
 """What shows a wall's face or a floor lies so near to it."""
@@ -35,16 +35,16 @@ class Wall(NamedTuple):
     height: float
 
     def polygon(self) -> Any:
-        """Its footprint."""
+        """Return its footprint."""
         return shapely.LineString(self.ends).buffer(self.thickness / 2, cap_style="flat")
 
     def side(self, out: np.ndarray) -> Any:
-        """In plan what is nearest to the face that looks along (2,) unit `out`."""
+        """Return in plan what is nearest to the face that looks along (2,) unit `out`."""
         return shapely.LineString(self.ends + self.thickness / 2 * out).buffer(SIDE_M, cap_style="flat")
 
 
 def merged_walls(boxes: list[tuple[np.ndarray, np.ndarray, float]]) -> list[Wall]:
-    """Walls side by side, of boxes that overlap: (3,) centres, (3,) half sizes, m, and yaws, rad; high ones first."""
+    """Merge boxes into walls side by side: (3,) centres, (3,) half sizes, m, and yaws, rad; high ones first."""
     walls, groups = [], {}
     for centre, half, yaw in boxes:
         turn = round(yaw, 3)
@@ -55,15 +55,15 @@ def merged_walls(boxes: list[tuple[np.ndarray, np.ndarray, float]]) -> list[Wall
         xs, ys = np.unique([x0, x1]), np.unique([y0, y1])
         taken = np.zeros((len(ys) - 1, len(xs) - 1), bool)
         for height in np.unique(top)[::-1]:
-            own = np.zeros_like(taken)
+            level = np.zeros_like(taken)
             for k in np.flatnonzero(top == height):
                 rows, columns = ys.searchsorted([y0[k], y1[k]]), xs.searchsorted([x0[k], x1[k]])
-                own[slice(*rows), slice(*columns)] = True
-            own &= ~taken
-            taken |= own
-            while own.any():
-                r0, r1, c0, c1 = next(cover_rectangles(own, own))
-                own[r0:r1, c0:c1] = False
+                level[slice(*rows), slice(*columns)] = True
+            level &= ~taken
+            taken |= level
+            while level.any():
+                r0, r1, c0, c1 = next(cover_rectangles(level, level))
+                level[r0:r1, c0:c1] = False
                 low, high = np.array([xs[c0], ys[r0]]), np.array([xs[c1], ys[r1]])
                 along = int(np.argmax(high - low))
                 ends = np.tile((low + high) / 2, (2, 1))
@@ -74,7 +74,7 @@ def merged_walls(boxes: list[tuple[np.ndarray, np.ndarray, float]]) -> list[Wall
 
 
 def gap_around(stands: Any, middle: np.ndarray, along: np.ndarray, length: float) -> np.ndarray | None:
-    """(2, 2) ends, in its direction, of the gap between walls in which a shut leaf stands; None where there is none."""
+    """Return (2, 2) ends, in its direction, of the gap between walls around a shut leaf; None where there is none."""
     reach = along * (length + GAP_M)
     band = shapely.LineString([middle - reach, middle + reach]).buffer(BESIDE_M, cap_style="flat")
     parts = shapely.get_parts(shapely.intersection(band, stands))
@@ -87,33 +87,33 @@ def gap_around(stands: Any, middle: np.ndarray, along: np.ndarray, length: float
 
 
 def _crossed(stands: Any, at: np.ndarray, across: np.ndarray, near_m: float = BESIDE_M) -> list[np.ndarray]:
-    """(2,) m along (2,) unit `across` from (2,) `at`: where each wall begins and ends that the line meets near it."""
+    """Return (2,) m along (2,) unit `across` from (2,) `at`: where each wall that the line meets begins and ends."""
     parts = shapely.get_parts(shapely.intersection(shapely.LineString([at - across, at + across]), stands))
     ends = [np.sort((shapely.get_coordinates(p)[[0, -1]] - at) @ across) for p in parts if not p.is_empty]
     return [end for end in ends if end[0] < near_m and end[1] > -near_m]
 
 
 def half_wall(stands: Any, at: np.ndarray, across: np.ndarray, deep_m: float) -> float | None:
-    """How far the wall about a window, so deep to either side of (2,) `at`, reaches from there; None without one."""
+    """Return how far the wall about a window, so deep to either side of (2,) `at`, reaches; None without one."""
     ends = _crossed(stands, at, across, deep_m + BESIDE_M)
     return min(float(np.abs(ends).max()), THICK_M[1]) if ends else None
 
 
 def wall_between(stands: Any, ends: np.ndarray, height: float) -> Wall:
-    """The wall from (2,) end to (2,) end of a gap, as thick as the thicker one beside it."""
+    """Build the wall from (2,) end to (2,) end of a gap, as thick as the thicker one beside it."""
     along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-    across, found = along[::-1] * [-1.0, 1.0], []
+    across, crossed = along[::-1] * [-1.0, 1.0], []
     for end, out in ((ends[0], -along), (ends[1], along)):
         for at in end + np.outer(BEYOND_M, out):
             for low, high in _crossed(stands, at, across):
                 if THICK_M[0] <= high - low <= THICK_M[1]:
-                    found.append((high - low, float((low + high) / 2 + (at - end) @ across)))
-    thick, off = max(found, default=(INNER_M, 0.0))
+                    crossed.append((high - low, float((low + high) / 2 + (at - end) @ across)))
+    thick, off = max(crossed, default=(INNER_M, 0.0))
     return Wall(ends + off * across, thick, height)
 
 
 def rooms_of(maps: SceneMaps, low: Any, high: Any, least_m2: float, slack_m: float) -> list[Any]:
-    """(k) outlines of rooms, the largest first.
+    """Return (k) outlines of rooms, the largest first.
 
     `slack_m`: how far walls that lie across the map's axes leave free between its cells and themselves.
     """

@@ -1,4 +1,4 @@
-"""Meshes and a cloud of coloured scan points in, simplified meshes with UVs and baked textures out."""
+"""Bake textures of meshes from a cloud of coloured scan points, with UVs."""
 
 import dataclasses
 import math
@@ -16,7 +16,7 @@ from converters.records.raw import ScanMesh
 from converters.records.visual import ColourCloud, TexturedMesh, VisualMesh
 from interactive_nav_common.grids import nearest_cell
 
-SEEN_M = 0.08
+VISIBLE_M = 0.08
 """A scan point this close to the model's surface shows it: alignments are off by several centimetres."""
 AGREE = 0.5
 """Least |cosine| between the normals of model and scan (CAD models do not agree with themselves on inside
@@ -31,7 +31,7 @@ def colour_cloud(
     scan: ScanMesh, vertices_w: np.ndarray, faces: np.ndarray, face_index: np.ndarray,
     spacing_m: float = TEXTURE_SPACING_M,
 ) -> ColourCloud:  # fmt: skip
-    """Coloured points of some faces of the scan: their vertices, or a sampling of the texture.
+    """Sample coloured points of some faces of the scan: their vertices, or a sampling of the texture.
 
     `vertices_w`: (n, 3) the scan's vertices in the world, m.
     `faces`: (m, 3) the scan's faces.
@@ -51,7 +51,7 @@ def colour_cloud(
 
 
 def textured_cloud(mesh: TexturedMesh, spacing_m: float) -> ColourCloud:
-    """Coloured points of a whole surface with an image; none without one."""
+    """Sample coloured points of a whole surface with an image; none without one."""
     if mesh.texture is None:
         return ColourCloud(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
     none = np.zeros(len(mesh.vertices), np.int64)
@@ -60,7 +60,7 @@ def textured_cloud(mesh: TexturedMesh, spacing_m: float) -> ColourCloud:
 
 
 def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Texture atlas of a mesh.
+    """Compute the texture atlas of a mesh.
 
     Returns uv (k, 2) in [0, 1], uv_faces (m, 3).
     """
@@ -76,7 +76,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarr
 def texel_surface(
     vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, uv_faces: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where each covered texel lies on the surface.
+    """Find where each covered texel lies on the surface.
 
     Returns texel (k,) flat index into the (size, size) image, point (k, 3) m, face (k,).
     """
@@ -108,7 +108,7 @@ def texel_surface(
 
 
 def fill_image(texel: np.ndarray, colours: np.ndarray, size: int) -> np.ndarray:
-    """(size, size, 3) uint8 image; texels outside every chart take the nearest chart's colour."""
+    """Return a (size, size, 3) uint8 image; texels outside every chart take the nearest chart's colour."""
     image = np.zeros((size * size, 3))
     covered = np.zeros(size * size, bool)
     image[texel], covered[texel] = colours, True
@@ -117,23 +117,23 @@ def fill_image(texel: np.ndarray, colours: np.ndarray, size: int) -> np.ndarray:
 
 
 def as_png(image: np.ndarray) -> Image.Image:
-    """The image (h, w, 3) uint8 to the bit, with a palette where it has at most 256 colours."""
+    """Return the image (h, w, 3) uint8 to the bit, with a palette where it has at most 256 colours."""
     packed = image.astype(np.uint32) @ np.array([65536, 256, 1], np.uint32)
     colours, index = np.unique(packed, return_inverse=True)
     if len(colours) > 256:
         return Image.fromarray(image)
-    made = Image.fromarray(index.reshape(packed.shape).astype(np.uint8)).convert("P")
-    made.putpalette((colours[:, None] >> np.array([16, 8, 0], np.uint32) & 255).astype(np.uint8).tobytes())
-    return made
+    picture = Image.fromarray(index.reshape(packed.shape).astype(np.uint8)).convert("P")
+    picture.putpalette((colours[:, None] >> np.array([16, 8, 0], np.uint32) & 255).astype(np.uint8).tobytes())
+    return picture
 
 
 def quantise(image: np.ndarray, colours: int) -> Image.Image:
-    """Palette image: a third of the bytes, and scan colours carry no more."""
+    """Reduce to a palette image: a third of the bytes, and scan colours carry no more."""
     return Image.fromarray(image).quantize(colours, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
 
 
 def share_plain(visual: VisualMesh) -> VisualMesh:
-    """The same picture in fewer bytes: faces of one colour look up one place, and what nobody looks up is blank.
+    """Return the same picture in fewer bytes: faces of one colour look up one place, and unused texels are blank.
 
     Returns vertices and faces as they were, with another `uv` and `uv_faces`, and an image of the same size.
     """
@@ -173,7 +173,7 @@ def bake_structure(
     size: int,
     turned_m: float = 0.0,
 ) -> VisualMesh:
-    """The simplified scan with a texture interpolated from coloured points (three nearest, by inverse distance).
+    """Bake a texture of the simplified scan from coloured points (three nearest, by inverse distance).
 
     `vertices`: (n, 3) of the simplified scan with its patches, m.
     `faces`: (m, 3).
@@ -183,11 +183,11 @@ def bake_structure(
     """
     uv, uv_faces = unwrap(vertices, faces, size)
     texel, point, face = texel_surface(vertices, faces, uv, uv_faces, size)
-    known, sought = cloud.points, point
+    points, sought = cloud.points, point
     if turned_m:
-        known = np.hstack([known, turned_m * cloud.normals])
+        points = np.hstack([points, turned_m * cloud.normals])
         sought = np.hstack([point, turned_m * unit_normals(vertices, faces)[face]])
-    distance, index = KDTree(known).query(sought, k=min(3, len(known)))
+    distance, index = KDTree(points).query(sought, k=min(3, len(points)))
     distance, index = distance.reshape(len(point), -1), index.reshape(len(point), -1)
     weight = 1.0 / (distance + 0.002)
     colours = (cloud.colours[index] * weight[..., None]).sum(axis=1) / weight.sum(axis=1, keepdims=True)
@@ -202,7 +202,7 @@ def bake_object(
     low: tuple[np.ndarray, np.ndarray],
     size: int,
 ) -> tuple[VisualMesh, float]:
-    """Simplified CAD model, retextured from the scan points that showed the object.
+    """Bake a simplified CAD model, retextured from the scan points that showed the object.
 
     A texel takes the mean of the near scan points whose normal agrees. One that no scan point shows is
     in-painted from the nearest shown texels of the same CAD material, else of any; an object that the scan
@@ -223,35 +223,35 @@ def bake_object(
     cad_colour = face_colours[on_face].astype(float)
     material = np.unique(face_colours, axis=0, return_inverse=True)[1].reshape(-1)[on_face]
 
-    seen = np.zeros(len(point), bool)
+    visible = np.zeros(len(point), bool)
     colours = cad_colour.copy()
     if len(cloud.points):
         count = min(8, len(cloud.points))
-        distance, index = KDTree(cloud.points).query(point, k=count, distance_upper_bound=SEEN_M)
+        distance, index = KDTree(cloud.points).query(point, k=count, distance_upper_bound=VISIBLE_M)
         distance, index = distance.reshape(-1, count), index.reshape(-1, count)
-        found = np.isfinite(distance)
-        index = np.where(found, index, 0)
+        near = np.isfinite(distance)
+        index = np.where(near, index, 0)
         cosine = np.abs(np.einsum("kd,knd->kn", normal[face], cloud.normals[index]))
-        weight = np.where(found & (cosine > AGREE), 1.0 / (distance + 0.005), 0.0)
+        weight = np.where(near & (cosine > AGREE), 1.0 / (distance + 0.005), 0.0)
         total = weight.sum(axis=1)
-        seen = total > 0
+        visible = total > 0
         mixed = (cloud.colours[index] * weight[..., None]).sum(axis=1)
-        colours[seen] = mixed[seen] / total[seen, None]
-    colours = _inpaint(point, colours, seen, material)
+        colours[visible] = mixed[visible] / total[visible, None]
+    colours = _inpaint(point, colours, visible, material)
     image = fill_image(texel, colours, size)
-    return VisualMesh(low_vertices, low_faces, uv, uv_faces, image), float(seen.mean()) if len(seen) else 0.0
+    return VisualMesh(low_vertices, low_faces, uv, uv_faces, image), float(visible.mean()) if len(visible) else 0.0
 
 
-def _inpaint(point: np.ndarray, colours: np.ndarray, seen: np.ndarray, material: np.ndarray) -> np.ndarray:
-    """Unseen texels take the mean of their eight nearest seen ones of the same material, else of any."""
+def _inpaint(point: np.ndarray, colours: np.ndarray, visible: np.ndarray, material: np.ndarray) -> np.ndarray:
+    """Colour hidden texels as the mean of their eight nearest visible ones of the same material, else of any."""
     result = colours.copy()
-    if not seen.any():
+    if not visible.any():
         return result
     for m in np.unique(material):
-        wanted = (material == m) & ~seen
-        source = (material == m) & seen
+        wanted = (material == m) & ~visible
+        source = (material == m) & visible
         if source.sum() < 8:
-            source = seen
+            source = visible
         if wanted.any():
             count = min(8, int(source.sum()))
             index = KDTree(point[source]).query(point[wanted], k=count)[1].reshape(-1, count)

@@ -22,7 +22,7 @@ from topological_nav.config import (
     MapConfig,
     PolicyConfig,
 )
-from train.config_io import load
+from train.config_io import load_config
 
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
@@ -168,7 +168,7 @@ def test_a_policy_told_the_goal_is_trained_where_none_is_given():
     shown = listed("SIZE=full", "PPO=/nowhere/ppo")
     (words,) = [shlex.split(line) for line in re.findall(r"if python -m train (.*?) >>/nowhere", shown)]
     name, settings = words[words.index("--config") + 1], [w for w in words if re.match(r"[\w.]+=", w)]
-    config = load(name, settings)
+    config = load_config(name, settings)
     assert (config.env.robot, len(config.env.scenes), config.run.name) == ("ttbot", 8, "ppo")
     assert not re.findall(r"if python -m train ", listed("SIZE=full"))
 

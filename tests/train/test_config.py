@@ -13,7 +13,7 @@ from interactive_nav_common.config import field_docs
 from interactive_nav_common.errors import ConfigError
 from train import config_io
 from train.config import AUTO, EnvConfig, PPOConfig, RunConfig, TrainConfig, resolve, validate
-from train.config_io import apply_overrides, flatten, from_yaml, help_text, load, to_yaml
+from train.config_io import apply_overrides, flatten, from_yaml, help_text, load_config, to_yaml
 
 BASE = TrainConfig(env=EnvConfig(scenes=("a",)))
 
@@ -29,9 +29,9 @@ def test_round_trip_of_every_kind_of_value():
     assert from_yaml("") == TrainConfig()
 
 
-@pytest.mark.parametrize("name", config_io.known_in())
+@pytest.mark.parametrize("name", config_io.preset_names())
 def test_presets_load_resolve_and_differ_only_where_they_say(name):
-    config = load(name)
+    config = load_config(name)
     resolved = resolve(config, "native")
     assert from_yaml(to_yaml(resolved)) == resolved
     assert resolved.run.name == f"{name}-seed0"
@@ -151,19 +151,19 @@ def test_resolve_fills_what_was_left_open(backend):
 
 def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(ConfigError, match=r"kint.yaml is a sweep, expected one run; python -m train.sweep .*kint.yaml"):
-        load("sweeps/kint")
+        load_config("sweeps/kint")
     with pytest.raises(ConfigError, match="no preset 'demos', did you mean 'demo'"):
-        load("demos")
+        load_config("demos")
     with pytest.raises(ConfigError, match="No such file"):
-        load(str(tmp_path / "none.yaml"))
+        load_config(str(tmp_path / "none.yaml"))
     (tmp_path / "bad.yaml").write_text("env: [1")
     with pytest.raises(ConfigError, match="bad.yaml: not readable as YAML"):
-        load(str(tmp_path / "bad.yaml"))
+        load_config(str(tmp_path / "bad.yaml"))
     (tmp_path / "list.yaml").write_text("- 1")
     with pytest.raises(ConfigError, match="list.yaml: the file: got"):
-        load(str(tmp_path / "list.yaml"))
+        load_config(str(tmp_path / "list.yaml"))
     (tmp_path / "mine.yaml").write_text("env: {scenes: [a]}\nrun: {seed: 4}\n")
-    assert load(str(tmp_path / "mine.yaml")).run.name == "mine-seed4"
+    assert load_config(str(tmp_path / "mine.yaml")).run.name == "mine-seed4"
 
 
 def test_help_lists_every_setting_with_default_and_meaning():
@@ -188,13 +188,13 @@ def test_command_line_says_one_line_and_exits_2():
 
 
 def test_the_preset_of_the_original_code_holds_all_its_values():
-    config = config_io.load("turtlebot_ppo_code")
+    config = config_io.load_config("turtlebot_ppo_code")
     assert {key: getattr(config.env, key) for key in ORIGINAL_CODE} == ORIGINAL_CODE
     assert config.ppo.discounting == 0.98
 
 
 def test_a_set_of_scenes_stands_for_its_folders():
-    assert config_io.load("turtlebot_ppo", ["env.scenes=sparse/test"]).env.scenes == (
+    assert config_io.load_config("turtlebot_ppo", ["env.scenes=sparse/test"]).env.scenes == (
         "scenes_mjcf/rowan",
         "scenes_mjcf/willow",
     )

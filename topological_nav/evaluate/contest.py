@@ -218,14 +218,13 @@ def _digest_of(policy: str) -> str:
 
 
 def _learned(run: Path, scene: Scene, config: EvaluationConfig) -> tuple[Simulator, Any]:
-    from train.runs.run import config_to_play
-    from train.runs.run import make_env as make_trained_env
+    from train.runs.run import build_env, config_to_play
     from train.scoring.evaluation import load_policy
 
     folder, words = RunFolder(run), [f"env.backend={config.backend}"] if config.backend != "auto" else []
     words += [f"env.num_objects={config.objects}"] if config.objects else []
     made = config_to_play(folder, words, [str(scene.path)], SafeConsole(stderr=True))
-    env = make_trained_env(made.env)
+    env = build_env(made.env)
     policy, _ = load_policy(folder, made, env, "best", deterministic=False)
     return Simulator(env), policy
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from interactive_nav_common.statistics import estimate, interval, p_text
 from train.figures import style
-from train.scoring.statistics import RunMean, cells, correlation, learned_rows, run_means, seen_unseen
+from train.scoring.statistics import RunMean, cells, correlation, learned_rows, run_means, train_test_contrast
 
 ALPHAS = np.linspace(0.0, 1.0, 11)
 DOTS = 3000
@@ -181,7 +181,7 @@ def effort_terms(rows: pa.Table, split: str | None) -> Figure:
 
 def seen_and_unseen(rows: pa.Table) -> Figure:
     """INS_0.5 of each cell on training and on test scenes, with the test of the paper (figure 13)."""
-    pairs, test = seen_unseen(rows)
+    pairs, test = train_test_contrast(rows)
     assert test is not None, "there are rows of both"
     by_cell, unseen = (cells([pair[side] for pair in pairs]) for side in (0, 1))
     looks = style.Looks(by_cell)

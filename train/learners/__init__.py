@@ -1,1 +1,1 @@
-"""PPO, SAC and DDPG: environments in, policies out."""
+"""Train policies in environments by PPO, SAC and DDPG."""

@@ -1,11 +1,11 @@
-"""A batched environment and a config in, a policy trained by DDPG out, in the shape of Brax's SAC.
+"""Train a policy by DDPG in a batched environment, in the shape of Brax's SAC.
 
 Deep deterministic policy gradient (Lillicrap et al. 2016, arXiv:1509.02971) as the original benchmark has it: Huber
 loss, target networks of policy and critic, Ornstein-Uhlenbeck noise (reference benchmark, section 8.2). Several
 critics with the least of them as target (Fujimoto et al. 2018, arXiv:1802.09477) are an option.
 
 Time limits: a step with `truncation` = 1 is left out of the critic's loss, as in Brax's SAC: what comes after it is
-not known (the environment shows a new episode's observation).
+not observed (the environment shows a new episode's observation).
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""An update function and run settings in, a trained learner out: face and loop that all learners share."""
+"""Run updates until the run's settings are met: the interface and the loop that all learners share."""
 
 import dataclasses
 import math
@@ -54,31 +54,31 @@ class Callbacks(Protocol):
     """Where a learner meets the world: everything that reads clocks of others, files or signals."""
 
     def restore(self, template: Snapshot) -> Snapshot | None:
-        """The snapshot to continue from, shaped like `template`; None to begin."""
+        """Return the snapshot to continue from, shaped like `template`; None to begin."""
         ...
 
     def should_stop(self) -> bool:
-        """Asked between updates; True saves a checkpoint and ends the loop."""
+        """Return whether to stop, between updates: True saves a checkpoint and ends the loop."""
         ...
 
     def on_start(self, snapshot: Snapshot, total_steps: int) -> None:
-        """Before anything is compiled: the state to begin from and the steps to reach."""
+        """Receive the state to begin from and the steps to reach, before anything is compiled."""
         ...
 
     def on_update(self, env_steps: int) -> None:
-        """After each update; must be cheap."""
+        """Receive the steps after each update; must be cheap."""
         ...
 
     def on_log(self, env_steps: int, metrics: dict[str, float]) -> None:
-        """The means of a log interval."""
+        """Receive the means of a log interval."""
         ...
 
     def on_checkpoint(self, snapshot: Snapshot) -> None:
-        """A snapshot to keep; its arrays may be overwritten once this returns."""
+        """Receive a snapshot to keep; its arrays may be overwritten once this returns."""
         ...
 
     def on_diverged(self, before: Snapshot, update: Update) -> str:
-        """The state before the update that blew up, and that update; returns where they were saved."""
+        """Save the state before the update that blew up, and that update; return where they were saved."""
         ...
 
 
@@ -90,23 +90,23 @@ class TrainResult:
     metrics: dict[str, float]
     """The last log interval's."""
     completed: bool
-    """False when it was asked to stop before its last step."""
+    """False when it was stopped before its last step."""
 
 
 def whole_updates(steps: int, steps_per_update: int) -> int:
-    """Updates that cover `steps`: at least one."""
+    """Return the number of updates that cover `steps`: at least one."""
     return max(1, math.ceil(steps / steps_per_update))
 
 
 def reset_envs(agent: Any, env: Env, key: jax.Array) -> PyTree:
-    """New episodes in every environment."""
+    """Start a new episode in every environment."""
     return jax.jit(env.reset)(jax.random.split(key, agent.config.num_envs or 1))
 
 
 def run_loop(
     update_fn: UpdateFn, start: Snapshot, steps_per_update: int, run: RunConfig, callbacks: Callbacks
 ) -> TrainResult:
-    """Updates until `run.num_timesteps`, reporting and saving on the way.
+    """Update until `run.num_timesteps`, reporting and saving on the way.
 
     Logs and checkpoints fall on fixed update counts, so a run that was killed and resumed takes the same
     updates as one that was not.
@@ -153,7 +153,7 @@ def run_loop(
 
 
 def _diverged(before: Snapshot, update: Update, callbacks: Callbacks) -> DivergedError:
-    """What to raise after an update whose numbers blew up, once that is saved."""
+    """Return what to raise after an update whose numbers blew up, once that is saved."""
     bad = [name for name, loss in sorted(update.losses.items()) if not np.isfinite(loss)]
     saved = callbacks.on_diverged(before, update)
     return DivergedError(
@@ -163,7 +163,7 @@ def _diverged(before: Snapshot, update: Update, callbacks: Callbacks) -> Diverge
 
 
 def interval_metrics(updates: list[Update]) -> dict[str, float]:
-    """Means over updates (losses) and over the episodes that ended in them; no episode, no episode means."""
+    """Return means over updates (losses) and over the episodes that ended in them, if any did."""
     losses = {name: np.mean([float(u.losses[name]) for u in updates]) for name in updates[0].losses}
     sums = {name: np.sum([float(u.episode_sums[name]) for u in updates]) for name in updates[0].episode_sums}
     episodes = sums.pop("episodes")
@@ -175,7 +175,7 @@ def interval_metrics(updates: list[Update]) -> dict[str, float]:
 
 
 def episode_sums(info: dict[str, Any]) -> dict[str, jax.Array]:
-    """Sums over the episodes that ended, from an auto-resetting environment's `info`.
+    """Return sums over the episodes that ended, from an auto-resetting environment's `info`.
 
     Args:
         info: `episode_done` [...] and `episode_metrics` {name: [...]}; scores count where an episode ended,
@@ -190,19 +190,19 @@ def episode_sums(info: dict[str, Any]) -> dict[str, jax.Array]:
 
 
 def all_finite(tree: PyTree) -> jax.Array:
-    """() bool: every floating number of the tree is finite."""
+    """Return () bool: every floating number of the tree is finite."""
     floats = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(jnp.asarray(x).dtype, jnp.floating)]
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in floats]))
 
 
 def strong_types(tree: PyTree) -> PyTree:
-    """The tree with weakly typed leaves made strong, so that every update has one and the same signature."""
+    """Return the tree with weakly typed leaves cast to strong types, so that every update has the same signature."""
     return jax.tree.map(lambda x: jax.lax.convert_element_type(jnp.asarray(x), jnp.asarray(x).dtype), tree)
 
 
 def _strongly_typed(update_fn: UpdateFn) -> UpdateFn:
     def update(learner: PyTree, env_state: PyTree) -> tuple[PyTree, PyTree, Update]:
-        learner, env_state, seen = update_fn(learner, env_state)
-        return strong_types(learner), strong_types(env_state), seen
+        learner, env_state, reported = update_fn(learner, env_state)
+        return strong_types(learner), strong_types(env_state), reported
 
     return update

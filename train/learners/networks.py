@@ -1,8 +1,8 @@
-"""Observation shapes in, actor and critic networks out, as Brax's losses take them.
+"""Build actor and critic networks for the shapes of observations, as Brax's losses take them.
 
-A vector goes through Brax's own multi-layer perceptrons. With images the networks are the original benchmark's
+A vector goes through Brax's multi-layer perceptrons. With images the networks are the original benchmark's
 (reference benchmark, section 8.1): images stacked as channels into three convolutions, the vector
-into a layer of its own, both concatenated, then the head. An action enters a critic through a layer of its own.
+into a separate layer, both concatenated, then the head. An action enters a critic through a separate layer.
 
 Parameters of a network with images are `{"encoder": ..., "head": ...}`, so that learners can share the encoder:
 a `Split` holds both parts.
@@ -33,19 +33,19 @@ GLOROT = jax.nn.initializers.glorot_uniform()
 
 
 def critic_output_init(key: jax.Array, shape: Sequence[int], dtype: Any = jnp.float32) -> jax.Array:
-    """Uniform within 0.003: a new critic predicts about nothing (reference benchmark, section 8.1)."""
+    """Draw uniformly within 0.003: a new critic predicts about nothing (reference benchmark, section 8.1)."""
     return jax.random.uniform(key, tuple(shape), dtype, -0.003, 0.003)
 
 
 def vector_part(observation: Any) -> Any:
-    """What is normalised of an observation: the vector itself, or the dict without its images."""
+    """Return what is normalised of an observation: the vector itself, or the dict without its images."""
     if not isinstance(observation, Mapping):
         return observation
     return {name: value for name, value in observation.items() if not name.startswith(PIXELS)}
 
 
 def init_normalizer(size: ObservationSize) -> running_statistics.RunningStatisticsState:
-    """Running mean and deviation of the vector part that have seen nothing."""
+    """Return the running mean and deviation of the vector part before any observation."""
     shapes: Any = {name: tuple(shape) for name, shape in size.items()} if isinstance(size, Mapping) else (size,)
     if isinstance(shapes, dict):
         arrays: Any = {name: specs.Array(shape, jnp.dtype("float32")) for name, shape in vector_part(shapes).items()}
@@ -57,25 +57,25 @@ def init_normalizer(size: ObservationSize) -> running_statistics.RunningStatisti
 def update_normalizer(
     statistics: running_statistics.RunningStatisticsState, observation: Any
 ) -> running_statistics.RunningStatisticsState:
-    """The statistics after a batch of observations [..., N]."""
+    """Return the statistics after a batch of observations [..., N]."""
     with jax.numpy_rank_promotion("allow"):  # Brax's statistics promote
         return running_statistics.update(statistics, vector_part(observation))
 
 
 def normalize(observation: Any, statistics: running_statistics.RunningStatisticsState) -> Any:
-    """The observation with its vector part normalised; images pass."""
+    """Return the observation with its vector part normalised; images pass."""
     with jax.numpy_rank_promotion("allow"):  # as above
         part = running_statistics.normalize(vector_part(observation), statistics)  # type: ignore[arg-type]
     return {**observation, **part} if isinstance(observation, Mapping) else part  # type: ignore[dict-item]
 
 
 def preprocess(enabled: bool) -> Callable[[Any, Any], Any]:
-    """`normalize`, or nothing."""
+    """Return `normalize`, or a function that changes nothing."""
     return normalize if enabled else lambda observation, _: observation
 
 
 def conv_as_product(images: jax.Array, kernel: jax.Array, strides: Sequence[int]) -> jax.Array:
-    """The convolution of [N, H, W, C] without padding by [k, k, C, F], as one product of matrices."""
+    """Return the convolution of [N, H, W, C] without padding by [k, k, C, F], as one product of matrices."""
     k, step = kernel.shape[0], strides[0]
     height, width = ((size - k) // step * step + 1 for size in images.shape[1:3])
     parts = [images[:, i : i + height : step, j : j + width : step] for i in range(k) for j in range(k)]
@@ -84,8 +84,8 @@ def conv_as_product(images: jax.Array, kernel: jax.Array, strides: Sequence[int]
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def conv_for_cpu(images: Any, kernel: Any, strides: tuple[int, ...]) -> Any:
-    """The same, as the product where gradients are wanted and by XLA where not. On a CPU within a loop, where learners
-    learn and act, XLA's gradients take 20 to 30 times as long, and the product three times as long as XLA's values."""
+    """Return the same, as the product where gradients are wanted and by XLA where not. On a CPU within a loop, where
+    learners learn and act, XLA's gradients take 20 to 30 times as long, the product 3 times as long as XLA's values."""
     return jax.lax.conv_general_dilated(images, kernel, strides, "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC"))
 
 
@@ -97,7 +97,7 @@ conv_for_cpu.defvjp(_as_product, lambda _, back, by_result: back(by_result))
 
 
 class ImageEncoder(linen.Module):
-    """Images [..., H, W, C] to features [..., F]."""
+    """Encode images [..., H, W, C] as features [..., F]."""
 
     config: NetworkConfig
 
@@ -120,7 +120,7 @@ class ImageEncoder(linen.Module):
 
 
 class Encoder(linen.Module):
-    """A dict observation to features: images and vector each through their own layers, concatenated."""
+    """Encode a dict observation: images and vector each through separate layers, concatenated."""
 
     config: NetworkConfig
     images: bool = True
@@ -142,7 +142,7 @@ class Encoder(linen.Module):
 
 
 class Head(linen.Module):
-    """Features, and for a critic of actions the action, to outputs."""
+    """Map features, and for a critic of actions the action, to outputs."""
 
     layer_sizes: Sequence[int]
     outputs: int
@@ -163,7 +163,7 @@ class Head(linen.Module):
 
 
 class TwinHead(linen.Module):
-    """Independent critics side by side: [..., critics]."""
+    """Evaluate independent critics side by side: [..., critics]."""
 
     layer_sizes: Sequence[int]
     action_features: int
@@ -180,7 +180,7 @@ class TwinHead(linen.Module):
 
 
 def check_image_size(config: NetworkConfig, size: ObservationSize) -> None:
-    """Raises ConfigError where the images are too small for the convolutions, or of several sizes."""
+    """Raise ConfigError where the images are too small for the convolutions, or of several sizes."""
     sides = {shape[0] for name, shape in size.items() if name.startswith(PIXELS)} if isinstance(size, Mapping) else ()
     if len(sides) > 1:
         raise ConfigError(
@@ -200,7 +200,7 @@ def check_image_size(config: NetworkConfig, size: ObservationSize) -> None:
 def make_encoder(
     config: NetworkConfig, size: ObservationSize, images: bool, prepare: Callable[[Any, Any], Any]
 ) -> FeedForwardNetwork:
-    """What comes before a head: init(key), apply(normalizer, params, observation) -> features [..., F]."""
+    """Build what comes before a head: init(key), apply(normalizer, params, observation) -> features [..., F]."""
     assert isinstance(size, Mapping)
     check_image_size(config, size)
     if not images and "state" not in size:
@@ -217,14 +217,14 @@ def make_encoder(
 
 @dataclasses.dataclass(frozen=True)
 class Split:
-    """A network in two parts: parameters `{"encoder": ..., "head": ...}`."""
+    """Build a network in two parts: parameters `{"encoder": ..., "head": ...}`."""
 
     encoder: FeedForwardNetwork
     head: FeedForwardNetwork
     """init(key), apply(None, params, features, *action)."""
 
     def whole(self) -> FeedForwardNetwork:
-        """Both parts as one network of observations."""
+        """Return both parts as one network of observations."""
 
         def init(key: jax.Array) -> dict[str, Any]:
             key_encoder, key_head = jax.random.split(key)
@@ -246,7 +246,7 @@ def make_split(
     action_size: int = 0,
     squeeze: bool = False,
 ) -> Split:
-    """An encoder with a head behind it."""
+    """Build an encoder with a head behind it."""
     assert isinstance(size, Mapping)
     encoder = make_encoder(config, size, images, prepare)
     features = jnp.zeros((1, images * config.image_features + ("state" in size) * config.state_features))
@@ -278,7 +278,7 @@ def make_ppo_networks(
     value_sizes: Sequence[int],
     normalize_observations: bool,
 ) -> PpoNetworks:
-    """Policy (mean and deviation of a Gaussian before tanh) and value network."""
+    """Build the policy (mean and deviation of a Gaussian before tanh) and the value network."""
     prepare = preprocess(normalize_observations)
     if not isinstance(size, Mapping):
         plain = ppo_networks.make_ppo_networks(

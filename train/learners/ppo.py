@@ -1,4 +1,4 @@
-"""A batched environment and a config in, a policy trained by PPO out; Brax's losses, networks and unrolls.
+"""Train a policy by PPO in a batched environment, with Brax's losses, networks and unrolls.
 
 Brax's `ppo.train` cannot be stopped and continued: it gives out parameters only, not the optimiser or the
 random key, and keeps its loop to itself. So the loop is ours (`learner.run_loop`) and the update below is

@@ -1,4 +1,4 @@
-"""Steps of many environments in, random transitions out: a ring in device memory that holds each image once.
+"""Keep steps of many environments for random transitions: a ring in device memory that holds each image once.
 
 The ring is [slots, envs, ...]: one slot holds what every environment saw and did in one step. The next observation
 of a step is the observation in the next slot, so nothing is stored twice, and the newest `n_steps` slots cannot be
@@ -24,7 +24,7 @@ class Replay:
     """The ring."""
 
     observation: Any
-    """[slots, envs, ...] before the step; images in their own type, vectors as configured."""
+    """[slots, envs, ...] before the step; images in their type, vectors as configured."""
     action: jax.Array
     """[slots, envs, A]."""
     reward: jax.Array
@@ -40,7 +40,7 @@ class Replay:
 
 
 def init(slots: int, observation: Any, action_size: int, vector_dtype: str = "float32") -> Replay:
-    """An empty ring.
+    """Return an empty ring.
 
     Args:
         observation: a batch of observations [envs, ...]; only shapes and types are read.
@@ -67,12 +67,12 @@ def init(slots: int, observation: Any, action_size: int, vector_dtype: str = "fl
 
 
 def nbytes(replay: Replay) -> int:
-    """Memory of a ring, or of one with the shapes that `jax.eval_shape` tells beforehand, bytes."""
+    """Return the memory of a ring, or of one with the shapes that `jax.eval_shape` computes, bytes."""
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(replay))
 
 
 def describe(replay: Replay) -> str:
-    """A ring's memory in one line; as `nbytes`."""
+    """Return a line about a ring's memory; as `nbytes`."""
     slots, envs = replay.reward.shape
     total, transitions = nbytes(replay), slots * envs
     return (
@@ -84,7 +84,7 @@ def describe(replay: Replay) -> str:
 def insert(
     replay: Replay, observation: Any, action: jax.Array, reward: jax.Array, done: jax.Array, truncated: jax.Array
 ) -> Replay:
-    """The ring with one step of every environment in place of its oldest.
+    """Return the ring with one step of every environment in place of its oldest.
 
     Args:
         observation: [envs, ...] before the step.
@@ -113,12 +113,12 @@ def insert(
 
 
 def size(replay: Replay) -> jax.Array:
-    """() i32: transitions in the ring, those included that cannot be drawn yet."""
+    """Return () i32: transitions in the ring, including those that cannot be drawn yet."""
     return replay.filled * replay.reward.shape[1]
 
 
 def sample(replay: Replay, key: jax.Array, batch_size: int, n_steps: int, discounting: float) -> types.Transition:
-    """Transitions drawn uniformly, with replacement, from all that have `n_steps` younger slots.
+    """Draw transitions uniformly, with replacement, from all that have `n_steps` younger slots.
 
     A transition covers `n_steps` steps, or fewer where the episode ends. For m steps of discount g it holds
     reward r_1 + g r_2 + ... + g^(m-1) r_m and discount g^(m-1), or 0 where the last one is a failure or success:
@@ -164,7 +164,7 @@ def sample(replay: Replay, key: jax.Array, batch_size: int, n_steps: int, discou
 
 
 def _as_learned_from(observation: Any) -> Any:
-    """The observation with its vectors in f32 again."""
+    """Return the observation with its vectors in f32 again."""
     if not isinstance(observation, Mapping):
         return observation.astype(jnp.float32)
     return {name: x if name.startswith(PIXELS) else x.astype(jnp.float32) for name, x in observation.items()}

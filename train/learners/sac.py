@@ -1,4 +1,4 @@
-"""A batched environment and a config in, a policy trained by SAC out; Brax's losses, our loop and replay.
+"""Train a policy by SAC in a batched environment, with Brax's losses, our loop and replay.
 
 Soft actor-critic (Haarnoja et al. 2018, arXiv:1812.05905) with Brax's losses, optimisers and order of steps: a test
 compares the parameters after a gradient step with Brax's arithmetic. What differs is in `train.learners.offpolicy`: one

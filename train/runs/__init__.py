@@ -1,1 +1,1 @@
-"""A config in, a run folder out, and back."""
+"""Write run folders for configs, and read them back."""

@@ -52,7 +52,7 @@ class CheckpointMeta:
     """Scene name -> digest of the task in it (`Scene.task_digest`)."""
 
 
-def save(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, env_state_limit_mb: float) -> Path:
+def save_snapshot(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, env_state_limit_mb: float) -> Path:
     """Write `root/<env steps>/` and remove what is no longer kept: the newest `keep` stay, and the best.
 
     Only the newest holds the environments, and only if they take no more than the limit.
@@ -203,7 +203,7 @@ def load_learner(folder: Path, template: Any) -> Any:
         except Exception as error:  # msgpack and flax raise many kinds for a damaged or foreign file
             raise CheckpointError(
                 f"{path}: not a checkpoint of this learner ({' '.join(str(error).split())[:200]}); "
-                "use the run's own config, or another checkpoint"
+                "use the run's config, or another checkpoint"
             ) from None
 
     def fitting(name: Any, expected: Any, got: Any) -> jax.Array:

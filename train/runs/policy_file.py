@@ -44,7 +44,7 @@ def packed(leaves: Mapping[str, Any], step: float = STEP) -> dict[str, np.ndarra
     their last axis under `<name>:scale`; others as f16; vectors as is.
 
     Rounding is to multiples of `step` standard deviations of each output's weights. Rounded weights hold no
-    repetitions, which is all that zip's own methods would add: those take a tenth more.
+    repetitions, which is all that zip's methods would add: those take a tenth more.
     """
     out: dict[str, np.ndarray] = {}
     for name, leaf in leaves.items():

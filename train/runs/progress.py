@@ -1,4 +1,4 @@
-"""Metrics in, lines or a live bar on the console out."""
+"""Show metrics on the console, as lines or a live bar."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ class TrainingDisplay:
         self._shown.__exit__(*error)
 
     def begin(self, env_steps: int, total_steps: int) -> None:
-        """The range of steps to show."""
+        """Set the range of steps to show."""
         self._total = total_steps
         self._bar(completed=env_steps, total=total_steps)
 
     def update(self, env_steps: int) -> None:
-        """Moves the bar."""
+        """Move the bar."""
         self._bar(completed=env_steps)
 
     def log(self, env_steps: int, metrics: dict[str, float]) -> None:
-        """Shows a log interval's scores."""
+        """Show a log interval's scores."""
         status = describe(metrics)
         self._bar(completed=env_steps, status=status)
         if not self.console.is_terminal:
@@ -46,7 +46,7 @@ class TrainingDisplay:
 
 
 def describe(metrics: dict[str, float]) -> str:
-    """Speed and scores of a log interval in a few words."""
+    """Return the speed and scores of a log interval in a few words."""
     words = [f"{metrics['env_steps_per_s']:,.0f} steps/s"]
     for label, name in (("success", "success"), ("INS", "ins_0.5"), ("reward", "sum_reward")):
         value = metrics.get(f"episode/{name}")

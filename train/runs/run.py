@@ -1,4 +1,4 @@
-"""A config in, a run folder with checkpoints and metrics out: environment, learner, files, signals wired."""
+"""Train a config into a run folder with checkpoints and metrics: wire environment, learner, files and signals."""
 
 import contextlib
 import dataclasses
@@ -39,8 +39,8 @@ from train.runs.progress import TrainingDisplay, describe
 from train.runs.run_folder import GOES_ON, RunFolder, claim
 
 
-def make_env(config: EnvConfig) -> Any:
-    """The environment that a config describes: one, not batched, not resetting itself."""
+def build_env(config: EnvConfig) -> Any:
+    """Build the environment that a config describes: one, not batched, not resetting itself."""
     keep_programs()
     try:
         return interactive_nav.make(**flatten(config))
@@ -51,7 +51,7 @@ def make_env(config: EnvConfig) -> Any:
 def config_to_play(
     folder: RunFolder, words: Sequence[str], scenes: Sequence[str] | None, console: Console
 ) -> TrainConfig:
-    """A run's config with the environment to play in: the run's own, but for what a command line asks for.
+    """Return a run's config with the environment to play in: the trained one, but for what a command line changes.
 
     What a run learned on a GPU can be played without one: where its backend is not here, another one is taken.
 
@@ -68,8 +68,8 @@ def config_to_play(
             resolve_backend(env.backend)
         except ConfigError:
             there = resolve_backend("auto")
-            told = f"{folder.path}: trained with backend {env.backend}, which is not here; played with {there}"
-            console.print(told, highlight=False, soft_wrap=True)
+            note = f"{folder.path}: trained with backend {env.backend}, which is not here; played with {there}"
+            console.print(note, highlight=False, soft_wrap=True)
             sizes = {"windows": (), **dict.fromkeys(WINDOW)} if there == "native" else {}
             env = replace(env, backend=there, **sizes)
     return dataclasses.replace(config, env=env)
@@ -100,7 +100,7 @@ class FolderCallbacks:
         return self._wall_before_s + time.perf_counter() - self._began
 
     def restore(self, template: Snapshot) -> Snapshot | None:
-        """Return the newest intact checkpoint of the folder, or the one that was asked for; None: there is none."""
+        """Return the newest intact checkpoint of the folder, or the one that was requested; None: there is none."""
         checkpoint.remove_partial(self._folder.checkpoints)
         if self._resume_from == "last" and not any(self._folder.checkpoints.glob("[0-9]*")):
             return None
@@ -129,15 +129,15 @@ class FolderCallbacks:
         return Snapshot(meta.env_steps, learner, env_state)
 
     def should_stop(self) -> bool:
-        """True once a signal asked for it."""
+        """Return True once a signal has requested it."""
         return bool(self._stops)
 
     def on_start(self, snapshot: Snapshot, total_steps: int) -> None:
-        """Makes room for checkpoints and cuts what a killed run logged after its last one."""
-        known = getattr(snapshot.env_state, "info", {}).get("episode_metrics", {})
-        if self._config.run.best_metric not in known:
+        """Make room for checkpoints and cut what a killed run logged after its last one."""
+        available = getattr(snapshot.env_state, "info", {}).get("episode_metrics", {})
+        if self._config.run.best_metric not in available:
             raise ConfigError(
-                f"run.best_metric is {self._config.run.best_metric!r}, expected one of {', '.join(sorted(known))}"
+                f"run.best_metric is {self._config.run.best_metric!r}, expected one of {', '.join(sorted(available))}"
             )
         one_mb = checkpoint.megabytes(snapshot.learner)
         env_mb = checkpoint.megabytes(snapshot.env_state)
@@ -157,11 +157,11 @@ class FolderCallbacks:
         self._display.begin(snapshot.env_steps, total_steps)
 
     def on_update(self, env_steps: int) -> None:
-        """Moves the bar."""
+        """Move the bar."""
         self._display.update(env_steps)
 
     def on_log(self, env_steps: int, metrics: dict[str, float]) -> None:
-        """One line of metrics.jsonl, one TensorBoard point a value, one status on the console."""
+        """Write a line of metrics.jsonl and a TensorBoard point for each value; show a status on the console."""
         self._folder.append_metrics({"env_steps": env_steps, "wall_s": round(self._wall_s(), 3), **metrics})
         if self._events:
             with writing(self._folder.tensorboard, GOES_ON):
@@ -171,7 +171,7 @@ class FolderCallbacks:
         self._display.log(env_steps, metrics)
 
     def on_checkpoint(self, snapshot: Snapshot) -> None:
-        """Writes a checkpoint; its score is the mean over the episodes of at least the time that one can take.
+        """Write a checkpoint; its score is the mean over the episodes of at least the time that one can take.
 
         Where all environments began together, those that fail end together too, one time limit later, and what ends
         in between are the short episodes, which succeed: a score is of a whole limit, and of none before the first.
@@ -193,10 +193,10 @@ class FolderCallbacks:
             action_size=int(self._env.action_size),
             scenes=self._scenes,
         )
-        checkpoint.save(self._folder.checkpoints, snapshot, meta, run.keep_checkpoints, run.env_state_limit_mb)
+        checkpoint.save_snapshot(self._folder.checkpoints, snapshot, meta, run.keep_checkpoints, run.env_state_limit_mb)
 
     def on_diverged(self, before: Snapshot, update: Update) -> str:
-        """Saves the batch and the learner that met it."""
+        """Save the batch and the learner that met it."""
         path = self._folder.path / f"diverged-{before.env_steps:012d}"
         with writing(path, "make room"):
             path.mkdir(exist_ok=True)
@@ -207,7 +207,7 @@ class FolderCallbacks:
         return str(path)
 
     def close(self) -> None:
-        """Finishes the event file."""
+        """Finish the event file."""
         if self._events:
             self._events.close()
         if self._tracker:
@@ -215,7 +215,7 @@ class FolderCallbacks:
 
 
 def check_fits(meta: CheckpointMeta, path: Path, config: EnvConfig, env: Any) -> None:
-    """Raises `CheckpointError` where a checkpoint was trained on another robot or other observations."""
+    """Raise `CheckpointError` where a checkpoint was trained on another robot or other observations."""
     facts = (
         ("robot", meta.robot, robot_name(config.robot)),
         ("observations", meta.observations, config.observations),
@@ -226,17 +226,17 @@ def check_fits(meta: CheckpointMeta, path: Path, config: EnvConfig, env: Any) ->
         if got != expected:
             raise CheckpointError(
                 f"{path}: {name} of the checkpoint: {got!r}, of the environment: {expected!r}; "
-                "choose a checkpoint of this robot and these observations, or the run's own env settings"
+                "choose a checkpoint of this robot and these observations, or the run's env settings"
             )
 
 
 def train_run(
     config: TrainConfig,
     console: Console,
-    build_env: Callable[[EnvConfig], Any] = make_env,
+    build_env: Callable[[EnvConfig], Any] = build_env,
     resume_from: str = "last",
 ) -> tuple[TrainResult, RunFolder, int | None]:
-    """Trains as configured, beginning or continuing the run folder.
+    """Train as configured, beginning or continuing the run folder.
 
     Args:
         config: as loaded; sizes may still be `auto`.
@@ -256,7 +256,7 @@ def train_run(
         env = build_env(config.env)
         config = resolve(config, env.backend)
     except UserError:
-        # Nothing half-made stays behind: `rmdir` takes only empty folders.
+        # Nothing half-built stays behind: `rmdir` takes only empty folders.
         with contextlib.suppress(OSError):
             folder.path.rmdir()
             folder.path.parent.rmdir()
@@ -269,7 +269,7 @@ def train_run(
 def _train_in(
     folder: RunFolder, config: TrainConfig, env: Any, console: Console, resume_from: str
 ) -> tuple[TrainResult, RunFolder, int | None]:
-    """Trains in a folder that nobody else writes to."""
+    """Train in a folder that nobody else writes to."""
     exists = folder.open(config)
     console.print(
         f"{folder.path}: {'continuing' if exists else 'training'} {config.algorithm} on {config.env.robot}, "
@@ -279,8 +279,8 @@ def _train_in(
     )
     each, limit = config.run.num_timesteps // num_envs(config), config.env.rules.episode_steps
     if each < limit:
-        told = f"{each:,} steps for each environment, and an episode has up to {limit:,}: none that fails comes to its"
-        console.print(f"{told} end; lower env.episode_steps or train longer", style="yellow", soft_wrap=True)
+        note = f"{each:,} steps for each environment, and an episode has up to {limit:,}: none that fails comes to its"
+        console.print(f"{note} end; lower env.episode_steps or train longer", style="yellow", soft_wrap=True)
     with stop_signals() as stops, TrainingDisplay(console) as display:
         callbacks = FolderCallbacks(folder, config, env, display, stops, resume_from)
         try:
@@ -300,24 +300,24 @@ def _train_in(
     )
     lost = failures(folder)
     if lost:
-        told = ", ".join(f"{name} {count:,.0f}" for name, count in lost.items())
-        console.print(f"what physics lost, summed over ended episodes: {told}", style="yellow", soft_wrap=True)
+        note = ", ".join(f"{name} {count:,.0f}" for name, count in lost.items())
+        console.print(f"what physics lost, summed over ended episodes: {note}", style="yellow", soft_wrap=True)
     return result, folder, stops[0] if stops else None
 
 
 def num_envs(config: TrainConfig) -> int:
-    """Environments that the config's learner steps together."""
+    """Return the number of environments that the config's learner steps together."""
     return getattr(config, config.algorithm).num_envs
 
 
 def last_metrics(folder: RunFolder) -> dict[str, Any]:
-    """The last logged line, without its step; empty if there is none."""
+    """Return the last logged line, without its step; empty if there is none."""
     lines = folder.read_metrics()
     return {k: v for k, v in lines[-1].items() if k not in ("env_steps", "wall_s")} if lines else {}
 
 
 def failures(folder: RunFolder) -> dict[str, float]:
-    """Steps (episodes for `nonfinite`) in which physics failed, over all logged episodes; those that are not 0."""
+    """Return the steps (episodes for `nonfinite`) in which physics failed, over all logged episodes, where not 0."""
     lines = folder.read_metrics()
     totals = {
         name: sum(line.get(f"episode/{name}", 0.0) * line.get("episodes", 0) for line in lines) for name in FAILURES
@@ -326,7 +326,7 @@ def failures(folder: RunFolder) -> dict[str, float]:
 
 
 def summary(config: TrainConfig, folder: RunFolder, result: TrainResult, metrics: dict[str, Any]) -> dict[str, Any]:
-    """How a run ended, for tables over many runs."""
+    """Return how a run ended, for tables over many runs."""
     saved = checkpoint.list_checkpoints(folder.checkpoints)
     best = checkpoint.best_checkpoint(saved)
     return {

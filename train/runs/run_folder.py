@@ -1,4 +1,4 @@
-"""One run's folder: config, versions, metrics, TensorBoard events, summary; nothing else writes there.
+"""Keep one run's folder: config, versions, metrics, TensorBoard events, summary; nothing else writes there.
 
 <out_dir>/<name>/config.yaml       what was run, every value resolved
                  versions.json     packages, device, commit
@@ -6,7 +6,7 @@
                  tensorboard/      the same as events
                  checkpoints/      see `checkpoint`
                  summary.json      how it ended
-                 robot/            the file of a robot of the user's own
+                 robot/            the file of the user's robot
                  lock              held by the process that trains it
 """
 
@@ -38,7 +38,7 @@ GOES_ON = "make room and start again: the run continues from its last checkpoint
 
 @dataclasses.dataclass(frozen=True)
 class _Summary:
-    """What is asked of summary.json."""
+    """What is read of summary.json."""
 
     completed: bool = False
     env_steps: Natural | None = None
@@ -47,7 +47,7 @@ class _Summary:
 
 @dataclasses.dataclass(frozen=True)
 class _Versions:
-    """What is asked of versions.json."""
+    """What is read of versions.json."""
 
     device: dict[str, Any] | None = None
     commit: str | None = None
@@ -67,7 +67,7 @@ class RunFolder:
         self.robot = path / "robot"
 
     def read_config(self) -> TrainConfig:
-        """The resolved config of the run."""
+        """Return the resolved config of the run."""
         if not self.config.is_file():
             raise FileError(f"{self.path}: is no run folder (no config.yaml); expected <out_dir>/<name> of a run")
         try:
@@ -81,7 +81,7 @@ class RunFolder:
         return dataclasses.replace(config, env=replace(config.env, robot=robot[0])) if robot else config
 
     def _kept_robot(self) -> tuple[str, str] | None:
-        """Return the reference and identity of a robot of the user's own."""
+        """Return the reference and identity of the user's robot."""
         if not self.robot.is_dir():
             return None
         from interactive_nav.robots.reference import recorded_robot  # heavy, and most runs need none
@@ -89,7 +89,7 @@ class RunFolder:
         return recorded_robot(self.robot)
 
     def open(self, config: TrainConfig) -> bool:
-        """Writes config and versions of a new run, or checks that an existing one is continued as it began.
+        """Write config and versions of a new run, or check that an existing one is continued as it began.
 
         Returns:
             True where the run exists already.
@@ -113,29 +113,29 @@ class RunFolder:
         return exists
 
     def origin(self) -> dict[str, Any]:
-        """Where the run's numbers come from: env_steps and wall_s so far, device and commit; None where not known."""
-        found = {}
+        """Return the numbers' origin: env_steps and wall_s so far, device and commit; None where not recorded."""
+        record = {}
         for path, kind in ((self.summary, _Summary), (self.path / VERSIONS, _Versions)):
-            found |= dataclasses.asdict(RUNS.record(RUNS.json(path, {}), kind, str(path), others=True))
-        return {**found, "device": (found["device"] or {}).get("kind")}
+            record |= dataclasses.asdict(RUNS.record(RUNS.json(path, {}), kind, str(path), others=True))
+        return {**record, "device": (record["device"] or {}).get("kind")}
 
     def append_metrics(self, line: dict[str, Any]) -> None:
-        """Adds one line to metrics.jsonl."""
+        """Add one line to metrics.jsonl."""
         with writing(self.metrics, GOES_ON):
             append_text(self.metrics, json.dumps(line) + "\n")
 
     def read_metrics(self) -> list[dict[str, Any]]:
-        """The lines of metrics.jsonl; none where nothing was logged."""
+        """Return the lines of metrics.jsonl; none where nothing was logged."""
         return read_metrics(self.metrics) if self.metrics.is_file() else []
 
     def cut_metrics(self, env_steps: int) -> None:
-        """Drops the lines after a checkpoint that a run continues from: their steps are taken again."""
+        """Drop the lines after a checkpoint that a run continues from: their steps are taken again."""
         if self.metrics.is_file():
             write_metrics(self.metrics, [line for line in self.read_metrics() if line["env_steps"] <= env_steps])
 
 
 def claim(path: Path, needed_mb: float = 0.0) -> None:
-    """Makes a folder and makes sure that it can be written to."""
+    """Create a folder and make sure that it can be written to."""
     needed_mb += HEADROOM_MB
     with writing(path, "expected a writable folder (run.out_dir)"):
         path.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,6 @@
-"""Metrics of a run to TensorBoard, and to Weights & Biases for those who want it there too (`run.wandb=true`).
+"""Write a run's metrics to TensorBoard, and with `run.wandb=true` to Weights & Biases too.
 
-The latter's package is an optional extra. Where it writes is its own to say: WANDB_MODE=offline keeps everything in the
+The latter's package is an optional extra. Its settings say where it writes: WANDB_MODE=offline keeps everything in the
 run folder until `wandb sync`, WANDB_API_KEY or `wandb login` sends it; WANDB_ENTITY and the like work as always.
 """
 
@@ -24,7 +24,7 @@ ID_FILE = "wandb_id"
 
 
 def import_wandb() -> Any:
-    """The package."""
+    """Return the package."""
     return optional("wandb", missing("run.wandb=true", "wandb", "wandb", ", or set run.wandb=false"))
 
 
@@ -44,13 +44,13 @@ class Events:
         self._file.write(Event(wall_time=time.time(), **content).SerializeToString())
 
     def log(self, env_steps: int, metrics: dict[str, float]) -> None:
-        """The means of a log interval, on disk afterwards."""
+        """Write the means of a log interval, on disk afterwards."""
         for name, value in metrics.items():
             self._add(step=env_steps, summary=scalar(name if "/" in name else f"run/{name}", value))
         self._file.flush()
 
     def close(self) -> None:
-        """Closes the file, full disk or not."""
+        """Close the file, full disk or not."""
         with contextlib.suppress(OSError):
             self._file.close()
 
@@ -83,14 +83,14 @@ class Tracker:
             raise ConfigError(
                 f"run.wandb: {reason}; run `wandb login`, set WANDB_MODE=offline, or set run.wandb=false"
             ) from None
-        # Steps after the last checkpoint are taken again by a killed run: an axis of its own, not W&B's counter.
+        # Steps after the last checkpoint are taken again by a killed run: a separate axis, not W&B's counter.
         self._run.define_metric("env_steps")
         self._run.define_metric("*", step_metric="env_steps")
 
     def log(self, env_steps: int, metrics: dict[str, float]) -> None:
-        """The means of a log interval."""
+        """Send the means of a log interval."""
         self._run.log({"env_steps": env_steps, **metrics})
 
     def close(self) -> None:
-        """Sends or writes what is left."""
+        """Send or write what is left."""
         self._run.finish()

@@ -1,1 +1,1 @@
-"""Policies in, rows of episodes out."""
+"""Score policies as rows of episodes."""

@@ -1,4 +1,4 @@
-"""`name=module:factory` in, a policy that plays out: any Python callable, NumPy, JAX or PyTorch, on the host."""
+"""Play a policy given as `name=module:factory`: any Python callable, NumPy, JAX or PyTorch, on the host."""
 
 import dataclasses
 import re
@@ -21,7 +21,7 @@ EXPECTED = "expected [name=]module:factory or [name=]path/to/file.py:factory"
 
 @dataclasses.dataclass(frozen=True)
 class PlayedEnv:
-    """What a policy's factory is told of the environment that it is to play in."""
+    """What a policy's factory receives about the environment that it is to play in."""
 
     robot: str
     scenes: tuple[str, ...]
@@ -39,8 +39,8 @@ class PlayedEnv:
     """Linear (m/s) and angular (rad/s) velocity [B] of the base -> actions [B, A]."""
 
 
-def told(env: Any) -> PlayedEnv:
-    """An environment's description."""
+def describe_env(env: Any) -> PlayedEnv:
+    """Describe an environment."""
     obs = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((2,), np.uint32)).obs
     ends = np.cumsum([0, *env.sensors.sizes.values()]).tolist()
     twist = env.robot.twist
@@ -58,7 +58,7 @@ def told(env: Any) -> PlayedEnv:
 
 
 def named(word: str) -> str:
-    """`name=module:factory` of a word of `--policy`; the name is the module's and factory's where none is given."""
+    """Return `name=module:factory` of a word of `--policy`; without a name it is the module's and factory's."""
     name, equals, place = word.rpartition("=")
     module, _, factory = place.rpartition(":")
     if not module or not factory.isidentifier():
@@ -76,27 +76,27 @@ class BroughtPolicy(HostPolicy):
 
     def __init__(self, word: str, env: Any):
         self._name, _, place = word.partition("=")
-        self._act = self._call("factory", import_function(place, "--policy", EXPECTED, PolicyError), told(env))
+        self._act = self._call("factory", import_function(place, "--policy", EXPECTED, PolicyError), describe_env(env))
         if not callable(self._act):
             raise self._error(f"its factory returned type {type(self._act).__name__}, expected a callable")
         self._size = env.action_size
-        self._seen: dict[str, np.ndarray] = {}
+        self._obs: dict[str, np.ndarray] = {}
         self._first_episode = 0
 
     def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> np.ndarray:
-        """Actions [N, A] of one control step; the policy sees the batch as large as it began, whoever is over."""
+        """Return actions [N, A] of one control step; the policy always sees the whole batch, finished episodes too."""
         obs = state.obs if isinstance(state.obs, Mapping) else {"state": state.obs}
         if step == 0:
-            self._seen = {name: np.array(value) for name, value in obs.items()}
+            self._obs = {name: np.array(value) for name, value in obs.items()}
             self._first_episode = int(episode[0])
             if hasattr(self._act, "reset"):
                 self._call("reset", self._act.reset, np.array(episode))
         places = episode - self._first_episode
         for name, value in obs.items():
-            self._seen[name][places] = np.asarray(value)
-        count = len(next(iter(self._seen.values())))
-        seen = {name: value.copy() for name, value in self._seen.items()}  # it may keep them, or write into them
-        got = self._call("policy", self._act, seen, np.full(count, step == 0))
+            self._obs[name][places] = np.asarray(value)
+        count = len(next(iter(self._obs.values())))
+        copies = {name: value.copy() for name, value in self._obs.items()}  # it may keep them, or write into them
+        got = self._call("policy", self._act, copies, np.full(count, step == 0))
         if got is None:
             raise self._error(
                 f"returned None at step {step}, expected actions {(count, self._size)}; is there a return?"
@@ -117,8 +117,8 @@ class BroughtPolicy(HostPolicy):
             return function(*arguments)
         except Exception as error:
             frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename != __file__]
-            own = [frame for frame in frames if "site-packages" not in frame.filename] or frames
-            where = f" at {Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""
+            theirs = [frame for frame in frames if "site-packages" not in frame.filename] or frames
+            where = f" at {Path(theirs[-1].filename).name}:{theirs[-1].lineno}" if theirs else ""
             raise self._error(f"{what}: raised {first_line(error)}{where}") from error
 
     def _error(self, text: str) -> PolicyError:
@@ -126,7 +126,7 @@ class BroughtPolicy(HostPolicy):
 
 
 def _on_host(actions: Any) -> np.ndarray:
-    """Actions of NumPy, JAX or PyTorch (on any device, with or without a gradient) as f32."""
+    """Return actions of NumPy, JAX or PyTorch (on any device, with or without a gradient) as f32."""
     if hasattr(actions, "detach"):
         actions = actions.detach().cpu()
     return np.asarray(actions, np.float32)

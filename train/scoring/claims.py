@@ -1,4 +1,4 @@
-"""Rows of episodes in; what they say to the paper's claims (section V), one comparison a line, out."""
+"""Compare rows of episodes with the paper's claims (section V), one comparison a line."""
 
 import collections
 import dataclasses
@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from interactive_nav_common.statistics import Contrast, estimate, welch
-from train.scoring.statistics import RunMean, cells, contrast, correlation, run_means, seen_unseen
+from train.scoring.statistics import RunMean, cells, contrast, correlation, run_means, train_test_contrast
 
 ALPHAS = tuple(k / 10 for k in range(11))
 LARGE = ("sofa", "table", "desk", "bed", "sideboard", "dresser", "bookcase")
@@ -31,7 +31,7 @@ class Finding:
 
 
 def _verdict(test: Contrast, expected: str) -> str:
-    """What a contrast says to a claim that expects higher, lower or same."""
+    """Return what a contrast says to a claim that expects higher, lower or same."""
     if math.isnan(test.p_value):
         return "too few runs to test"
     return {expected: "holds", "undecided": "undecided"}.get(test.verdict, f"does not hold: {test.verdict}")
@@ -40,7 +40,7 @@ def _verdict(test: Contrast, expected: str) -> str:
 def _compared(
     means: Sequence[RunMean], claim: str, what: str, expected: str, alpha: float, *sides: Any, **where: Any
 ) -> Finding:
-    """A claim about INS_alpha (0: E_eff, 1: P_eff) of two values of an axis; see `contrast`."""
+    """Test a claim about INS_alpha (0: E_eff, 1: P_eff) of two values of an axis; see `contrast`."""
     axis, left, right = sides
     test = contrast(means, axis, left, right, lambda run: run.ins(alpha), **where)
     if test is None:
@@ -49,7 +49,7 @@ def _compared(
 
 
 def _of_sac(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
-    """SAC against the others. INS is linear in alpha: what holds at 0 and at 1 holds between."""
+    """Compare SAC with the others. INS is linear in alpha: what holds at 0 and at 1 holds between."""
     algorithms = {run.algorithm for run in means}
     others = [a for a in ("ppo", "ddpg") if a in algorithms] or ["ppo"]
     for claim, alphas in (("SAC is best overall", (0.5,)), ("SAC is best whatever alpha", (0.0, 1.0))):
@@ -59,29 +59,29 @@ def _of_sac(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
                 yield _compared(means, claim, what, "higher", alpha, "algorithm", "sac", other, robot=robot)
     of_robot = {cell: runs for cell, runs in cells(means).items() if cell[0] == robot}
     best = collections.Counter(_best(of_robot, alpha) for alpha in ALPHAS[1:])
-    told = (f"{algorithm.upper()}, k_int = {k_int:g}: {count}" for (_, algorithm, k_int), count in best.most_common())
+    wins = (f"{algorithm.upper()}, k_int = {k_int:g}: {count}" for (_, algorithm, k_int), count in best.most_common())
     yield Finding(
         "SAC with k_int = 0.1 is best at every alpha but 0",
         f"{robot}: cell of the highest mean INS at alpha 0.1, 0.2, ... 1",
-        "; ".join(told),
+        "; ".join(wins),
         _best_verdict(of_robot, ("sac", 0.1) in {cell[1:] for cell in of_robot}, set(best) == {(robot, "sac", 0.1)}),
     )
 
 
 def _best(of_robot: Cells, alpha: float) -> tuple[str, str, float]:
-    """The cell of the highest mean INS."""
+    """Return the cell of the highest mean INS."""
     return max(of_robot, key=lambda cell: estimate(run.ins(alpha) for run in of_robot[cell]).mean)
 
 
 def _best_verdict(of_robot: Cells, is_there: bool, holds: bool) -> str:
-    """On a claim that one cell is the best of several."""
+    """Judge a claim that one cell is the best of several."""
     if not is_there or len(of_robot) < 2:
         return "no runs to compare"
     return "holds" if holds else "does not hold"
 
 
 def _of_things(means: Sequence[RunMean]) -> Iterator[Finding]:
-    """What is pushed and what is gone round; nothing where rows do not tell by category."""
+    """Compare what is pushed and what is avoided; nothing where rows have no categories."""
 
     def compared(claim: str, what: str, expected: str, test: Contrast | None) -> Finding:
         if test is None or math.isnan(test.difference):
@@ -114,7 +114,7 @@ def _of_things(means: Sequence[RunMean]) -> Iterator[Finding]:
 
 
 def _of_penalties(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
-    """What k_int does to one robot's scores."""
+    """Test what k_int does to one robot's scores."""
     of_robot = {cell: runs for cell, runs in cells(means).items() if cell[0] == robot}
     best = _best(of_robot, 0.0)
     yield Finding(
@@ -133,8 +133,8 @@ def _of_penalties(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
 
 
 def _of_splits(rows: pa.Table) -> Finding:
-    """Train against test scenes."""
-    pairs, test = seen_unseen(rows)
+    """Compare train with test scenes."""
+    pairs, test = train_test_contrast(rows)
     what = f"INS_0.5, unseen minus seen scenes, one-sample t test over {len(pairs)} runs"
     result, verdict = "-", "no runs with rows of train and of test scenes"
     if test is not None:
@@ -144,13 +144,13 @@ def _of_splits(rows: pa.Table) -> Finding:
 
 
 def _of_whole_cells(means: Sequence[RunMean]) -> list[RunMean]:
-    """Runs of the cells that have the most: a seed counts only with all settings, and few would be left."""
+    """Return runs of the cells that have the most: a seed counts only with all settings, and few would be left."""
     most = max(map(len, cells(means).values()), default=0)
     return [run for runs in cells(means).values() if len(runs) == most for run in runs]
 
 
 def claims(rows: pa.Table, split: str | None) -> list[Finding]:
-    """The paper's claims, one comparison a line; those whose runs are missing say so.
+    """Return the paper's claims, one comparison a line; those whose runs are missing say so.
 
     Cells with fewer runs than others are not compared: of a sweep that goes on they are not finished.
 
@@ -160,19 +160,19 @@ def claims(rows: pa.Table, split: str | None) -> list[Finding]:
     runs = run_means(rows, split)
     means = _of_whole_cells(runs)
     robots = sorted({run.robot for run in means})
-    found: list[Finding] = []
+    findings: list[Finding] = []
     for robot in robots:
-        found += _of_sac(means, robot)
+        findings += _of_sac(means, robot)
     for robot in robots:
-        found += _of_penalties(means, robot)
-    found += _of_things(means)
+        findings += _of_penalties(means, robot)
+    findings += _of_things(means)
     for alpha, name, expected in ((0.0, "E_eff", "higher"), (1.0, "P_eff", "same")) if len(robots) > 1 else ():
         claim = "Fetch is more effort-efficient than TurtleBot at the same path efficiency"
         what = f"{name}, Fetch minus TurtleBot, mean over algorithms and k_int"
-        found.append(_compared(means, claim, what, expected, alpha, "robot", "fetch", "turtlebot"))
+        findings.append(_compared(means, claim, what, expected, alpha, "robot", "fetch", "turtlebot"))
     for robot in robots:
         chosen = [run.scores for run in runs if run.robot == robot]
         r = correlation((s["kinematic_effort"] for s in chosen), (s["dynamic_effort"] for s in chosen))
         what = f"{robot}: Pearson's r over runs"
-        found.append(Finding("The two terms of E_eff are correlated", what, str(r), r.verdict))
-    return [*found, _of_splits(rows)]
+        findings.append(Finding("The two terms of E_eff are correlated", what, str(r), r.verdict))
+    return [*findings, _of_splits(rows)]

@@ -1,4 +1,4 @@
-"""A run and an environment in; every policy's fixed episodes played, as rows and recorded paths, out."""
+"""Play fixed episodes of an environment with every policy of a run, as rows and recorded paths."""
 
 import contextlib
 import dataclasses
@@ -26,7 +26,7 @@ from train.runs.run_folder import RunFolder
 from train.scoring.brought import BroughtPolicy
 from train.scoring.policies import BASELINES, make_baseline
 from train.scoring.rollout import BatchPlayer, PlayedEpisodes
-from train.scoring.row_files import EvaluationAsked
+from train.scoring.row_files import EvaluationRequest
 from train.scoring.rows import episode_table
 
 LEARNED = "learned"
@@ -48,9 +48,9 @@ def load_policy(
     env: Any,
     which: str,
     deterministic: bool,
-    known: dict[Any, Any] | None = None,
+    cached: dict[Any, Any] | None = None,
 ) -> tuple[PolicyFn, CheckpointMeta]:
-    """The policy of a checkpoint.
+    """Load the policy of a checkpoint.
 
     Args:
         folder: of the run.
@@ -58,7 +58,7 @@ def load_policy(
         env: to act in.
         which: best, last or env steps.
         deterministic: take the mode of the actions.
-        known: filled and used by calls for the same environment: policies of equal networks then share one function,
+        cached: filled and used by calls for the same environment: policies of equal networks then share one function,
             and what is compiled for it.
     """
     path, meta = checkpoint.find(folder.checkpoints, which)
@@ -70,7 +70,7 @@ def load_policy(
         return algorithm.policy(env, config, learner, deterministic)(observation, key)[0]
 
     kind = (config.algorithm, config.network, getattr(config, config.algorithm), deterministic)
-    act = act if known is None else known.setdefault(kind, act)
+    act = act if cached is None else cached.setdefault(kind, act)
     return jax.tree_util.Partial(act, learner), meta
 
 
@@ -81,38 +81,38 @@ def make_policies(
     env: Any,
     which: str,
     deterministic: bool,
-    known: dict[Any, Any] | None = None,
+    cached: dict[Any, Any] | None = None,
 ) -> dict[str, tuple[Any, CheckpointMeta | None]]:
-    """Policies by name, and the checkpoints of those that learned.
+    """Build policies by name; return them with the checkpoints of those that learned.
 
     See `load_policy`, `make_baseline`, and `BroughtPolicy` for `name=module:factory`.
     """
 
-    def made(name: str) -> tuple[Any, CheckpointMeta | None]:
+    def build(name: str) -> tuple[Any, CheckpointMeta | None]:
         if name == LEARNED and folder:
-            return load_policy(folder, config, env, which, deterministic, known)
+            return load_policy(folder, config, env, which, deterministic, cached)
         return BroughtPolicy(name, env) if "=" in name else make_baseline(name, env), None
 
-    return {name.partition("=")[0]: made(name) for name in names}
+    return {name.partition("=")[0]: build(name) for name in names}
 
 
 def evaluate(
     folder: RunFolder | None,
     config: TrainConfig,
     player: BatchPlayer,
-    asked: EvaluationAsked,
+    request: EvaluationRequest,
     record: int,
     console: Console,
     fixed: EpisodeFile | None = None,
     batch: int | None = None,
 ) -> Iterator[tuple[pa.Table, dict[str, PlayedEpisodes]]]:
-    """Plays the same fixed episodes with each policy: drawn from a seed, or those of a file.
+    """Play the same fixed episodes with each policy: drawn from a seed, or those of a file.
 
     Args:
         folder: of the run; None for policies that never learned.
         config: of the run, with the environment to evaluate in.
         player: of that environment.
-        asked: what to play.
+        request: what to play.
         record: episodes to return paths of.
         console: for progress.
         fixed: episodes to play instead of drawn ones.
@@ -123,16 +123,18 @@ def evaluate(
     """
     env = player.env
     # Everything that can be refused is refused before the first episode.
-    made = make_policies(asked.policies, folder, config, env, asked.checkpoint, asked.deterministic, player.known)
+    policies = make_policies(
+        request.policies, folder, config, env, request.checkpoint, request.deterministic, player.cached
+    )
     starts = starts_of(fixed, env, "--episode-file") if fixed else None
-    turns = np.arange(asked.episodes, dtype=np.int32) % len(env.scenes) if asked.balanced and not fixed else None
-    keys = episode_keys(asked.seed, asked.episodes)
+    turns = np.arange(request.episodes, dtype=np.int32) % len(env.scenes) if request.balanced and not fixed else None
+    keys = episode_keys(request.seed, request.episodes)
     batch = batch or AUTO_BATCH[env.backend]
-    where = _origin(folder, config, env, asked)
+    where = _origin(folder, config, env, request)
     tables, played = [], {}
-    for name, (policy, meta) in made.items():
+    for name, (policy, meta) in policies.items():
         began = time.perf_counter()
-        with _progress(console, name, asked.episodes) as on_progress:
+        with _progress(console, name, request.episodes) as on_progress:
             played[name] = player.play(
                 policy, keys, record, on_progress, starts, turns, batch, lambda note: console.print(note)
             )
@@ -148,12 +150,12 @@ def evaluate(
             table = table.append_column("push_needed", pa.array(needed, pa.bool_()))
         tables.append(table)
         note = f" ({policy.note})" if isinstance(policy, HostPolicy) and policy.note else ""
-        console.print(f"{name}: {asked.episodes} episodes in {wall_s:.0f} s{note}", highlight=False)
+        console.print(f"{name}: {request.episodes} episodes in {wall_s:.0f} s{note}", highlight=False)
         yield pa.concat_tables(tables), played
 
 
-def _origin(folder: RunFolder | None, config: TrainConfig, env: Any, asked: EvaluationAsked) -> dict[str, Any]:
-    """The columns that say where rows come from, in their order; those that differ by policy are empty."""
+def _origin(folder: RunFolder | None, config: TrainConfig, env: Any, request: EvaluationRequest) -> dict[str, Any]:
+    """Return the columns that say where rows come from, in their order; those that differ by policy are empty."""
     here, trained = versions(), folder.origin() if folder else {}
     return {
         "run": config.run.name,
@@ -163,8 +165,8 @@ def _origin(folder: RunFolder | None, config: TrainConfig, env: Any, asked: Eval
         "k_int": float(config.env.rules.k_int),
         "seed": config.run.seed,
         "checkpoint_steps": None,
-        "deterministic": asked.deterministic,
-        "evaluation_seed": asked.seed,
+        "deterministic": request.deterministic,
+        "evaluation_seed": request.seed,
         "backend": env.backend,
         "device": here["device"]["kind"],
         "commit": here["commit"],
@@ -175,7 +177,7 @@ def _origin(folder: RunFolder | None, config: TrainConfig, env: Any, asked: Eval
 
 
 def write_paths(path: Path, played: dict[str, PlayedEpisodes], env: Any) -> None:
-    """Writes the recorded paths with the scenes' maps, so that a figure needs no scene folder."""
+    """Write the recorded paths with the scenes' maps, so that a figure needs no scene folder."""
     arrays: dict[str, Any] = {"policies": np.array(list(played))}
     for policy, episodes in played.items():
         for name, value in dataclasses.asdict(episodes.paths).items():
@@ -193,7 +195,7 @@ def write_paths(path: Path, played: dict[str, PlayedEpisodes], env: Any) -> None
 
 @contextlib.contextmanager
 def _progress(console: Console, name: str, episodes: int) -> Iterator[Callable[[int, int], None]]:
-    """A line that says how many episodes are over."""
+    """Show a line that says how many episodes are over."""
     with progress_bar(console, name, episodes, transient=True) as update:
         update(status="compiling")
         yield lambda finished, step: update(

@@ -1,4 +1,4 @@
-"""Planners that never learn: the scene's state in, wheel actions out, on the host, for many episodes at once.
+"""Plan without learning: choose wheel actions from the scene's state, on the host, for many episodes at once.
 
 They bracket what any policy can reach (paper section IV): the avoider goes round every object, the NAMO-style
 planner weighs pushing against detour (`interactive_nav.navigation.ways`). Both know the state exactly: where
@@ -31,7 +31,7 @@ MAX_TURN_RAD_S = 2.0
 def velocity_towards(
     twist: TwistMap, bearing_rad: Any, cruise_m_s: float, aligned_rad: float, xp: Any
 ) -> tuple[Any, Any]:
-    """Turns towards a point, and drives the faster the better aligned.
+    """Turn towards a point, and drive the faster the better aligned.
 
     Args:
         twist: the robot's limits, of its control mode.
@@ -46,7 +46,7 @@ def velocity_towards(
 
 
 def need_twist(robot: RobotSpec, who: str) -> None:
-    """Raises `UserError` where a robot's control mode takes no base velocity."""
+    """Raise `UserError` where a robot's control mode takes no base velocity."""
     if robot.twist is None:
         raise UserError(
             f"{who}: robot '{robot.name}' takes no base velocity in control mode '{robot.control_mode}', expected one "
@@ -56,20 +56,19 @@ def need_twist(robot: RobotSpec, who: str) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """A way to the goal for one episode."""
+    """A path to the goal for one episode."""
 
     path_w: np.ndarray
     """[p, 2] m; empty where there is none."""
     object_pos_w: np.ndarray
-    """[M, 3] of the objects when it was made."""
+    """[M, 3] of the objects when it was planned."""
     step: int
 
 
 class Planner(HostPolicy):
-    """Plans and steers many episodes; the state in, actions out.
+    """Plan and steer many episodes: choose actions from the state.
 
-    Args:
-        weight: of `Ways`; 0 pushes what stands in the shortest way, None never pushes: the avoider.
+    `weight`: of `Ways`; 0 pushes what stands in the shortest path, None never pushes: the avoider.
     """
 
     def __init__(self, env: Any, weight: float | None):
@@ -80,16 +79,16 @@ class Planner(HostPolicy):
         self._ways = Ways(env, weight)
         self._plans: dict[int, Plan] = {}
         self.no_path = 0
-        """Plans that found no way."""
+        """Plans without a path."""
         self.plans = 0
 
     @property
     def note(self) -> str:  # type: ignore[override]
-        """How often no way was found."""
-        return f"{self.plans:,} plans, {self.no_path:,} of them found no way" if self._weight is None else ""
+        """Return how often there was no path."""
+        return f"{self.plans:,} plans, {self.no_path:,} of them without a path" if self._weight is None else ""
 
     def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> np.ndarray:
-        """Actions [N, A] of one control step, on plans that are as old as what has moved allows."""
+        """Return actions [N, A] of one control step, on plans that are as old as what has moved allows."""
         nav = state.info["nav"]
         qpos = np.asarray(state.pipeline_state.qpos)
         pos, yaw = np.asarray(nav.robot_pos_w)[:, :2], np.asarray(nav.yaw_rad)
@@ -117,7 +116,7 @@ class Planner(HostPolicy):
         return Plan(path, objects.copy(), step)
 
     def _steer(self, path: np.ndarray, pos: np.ndarray, yaw: float) -> tuple[float, float]:
-        """Linear (m/s) and angular (rad/s) velocity towards the point of the path a little ahead of the nearest."""
+        """Return linear (m/s) and angular (rad/s) velocity towards a point a little ahead on the path."""
         nearest = int(np.argmin(np.linalg.norm(path - pos, axis=-1)))
         ahead = path[nearest:]
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ahead, axis=0), axis=-1))])

@@ -1,4 +1,4 @@
-"""Observation and key in, action out: the learned policy and two baselines that never learned.
+"""Choose actions from observation and key: the learned policy and two baselines that never learned.
 
 Every policy is a pure function (observation, key) -> action (A,) in [-1, 1] of one environment, its observation
 a vector (O,) or a dict with images; batch it with `jax.vmap` and a key for each, so that an episode does not
@@ -26,16 +26,15 @@ ALIGNED_RAD = jnp.pi / 3
 
 
 def random_policy(action_size: int, observation: Observation, key: jax.Array) -> jax.Array:
-    """Uniform over all actions."""
+    """Draw an action uniformly."""
     del observation
     return jax.random.uniform(key, (action_size,), minval=-1.0, maxval=1.0)
 
 
 def steer(robot: RobotSpec, target_b: jax.Array) -> jax.Array:
-    """Actions that lead to a point: turn towards it, and drive the faster the better aligned.
+    """Return actions that lead to a point: turn towards it, and drive the faster the better aligned.
 
-    Args:
-        target_b: (2,) x forward, y left, m, robot frame.
+    `target_b`: (2,) x forward, y left, m, robot frame.
 
     Returns:
         (A,) in [-1, 1].
@@ -47,19 +46,19 @@ def steer(robot: RobotSpec, target_b: jax.Array) -> jax.Array:
 
 
 def waypoint_follower(robot: RobotSpec, waypoint: int, observation: Observation, key: jax.Array) -> jax.Array:
-    """Steers to one of the waypoints that lead the observation (numbers 2i and 2i + 1); sees no object."""
+    """Steer to one of the waypoints at the start of the observation (numbers 2i and 2i + 1); ignore objects."""
     del key
     vector = observation["state"] if isinstance(observation, Mapping) else observation
     return steer(robot, vector[2 * waypoint : 2 * waypoint + 2])
 
 
 def make_random(env: Any) -> PolicyFn:
-    """The random baseline."""
+    """Build the random baseline."""
     return functools.partial(random_policy, env.action_size)
 
 
 def make_follower(env: Any) -> PolicyFn:
-    """The baseline that follows the shortest path."""
+    """Build the baseline that follows the shortest path."""
     config = env.config
     need_twist(env.robot, "policy follower")
     if "waypoints" not in config.sensors.observations:
@@ -77,7 +76,7 @@ PLANNERS = ("avoider", "namo:W")
 
 
 def make_baseline(name: str, env: Any) -> PolicyFn | Planner:
-    """A policy or planner that never learns, by name: random, follower, avoider or namo:W."""
+    """Build a policy or planner that never learns, by name: random, follower, avoider or namo:W."""
     if name in BASELINES:
         return BASELINES[name](env)
     if name == "avoider":
@@ -89,5 +88,5 @@ def make_baseline(name: str, env: Any) -> PolicyFn | Planner:
         except ValueError:
             raise UserError(f"policy namo: got {name!r}, expected a weight, as in namo:0.5") from None
         return Planner(env, share)
-    known = ", ".join(("learned", *BASELINES, *PLANNERS))
-    raise UserError(f"--policies: got {name!r}, expected a choice from {known}")
+    choices = ", ".join(("learned", *BASELINES, *PLANNERS))
+    raise UserError(f"--policies: got {name!r}, expected a choice from {choices}")

@@ -56,7 +56,7 @@ class BatchPlayer(Player):
 
     def __init__(self, env: Any):
         super().__init__(env, RECORDERS)
-        self.known: dict[Any, Any] = {}
+        self.cached: dict[Any, Any] = {}
         """Functions of learned policies, by kind: see `train.scoring.evaluation.load_policy`."""
 
     def play(

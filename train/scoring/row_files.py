@@ -1,4 +1,4 @@
-"""What an evaluation was asked to play, and the file of rows that answers it."""
+"""Name the file of rows that answers a request for an evaluation."""
 
 import dataclasses
 import hashlib
@@ -9,8 +9,8 @@ from typing import Any
 
 
 @dataclasses.dataclass(frozen=True)
-class EvaluationAsked:
-    """What an evaluation was asked to play: with the run, it names a file of rows."""
+class EvaluationRequest:
+    """What an evaluation is to play: with the run, it names a file of rows."""
 
     scenes: tuple[str, ...]
     policies: tuple[str, ...]
@@ -26,11 +26,11 @@ class EvaluationAsked:
     """Digest of a file of episodes."""
 
     def plain(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """Return the request as JSON holds it."""
         return json.loads(json.dumps(dataclasses.asdict(self)))
 
     def file_name(self, run: str) -> str:
-        """`<run>-<8 hex>.parquet`: the same question about a run replaces its file, another one adds one."""
+        """Return `<run>-<8 hex>.parquet`: the same request for a run replaces its file, another one adds one."""
         digest = hashlib.sha256(json.dumps(self.plain(), sort_keys=True).encode()).hexdigest()
         return f"{run}-{digest[:8]}.parquet"
 
@@ -40,19 +40,19 @@ PATHS = "_paths"
 
 
 def files_of_run(dataset: Path, run: str, ending: str = ".parquet") -> list[Path]:
-    """Files of rows in a dataset folder that are of one run."""
+    """Return the files of rows in a dataset folder that are of one run."""
     name = re.compile(re.escape(run) + r"-[0-9a-f]{8}" + re.escape(ending))
     return sorted(path for path in dataset.glob(f"*{ending}") if name.fullmatch(path.name))
 
 
 def paths_beside(rows: Path) -> Path:
-    """Where the recorded paths of a file of rows lie: in a dataset's `PATHS`."""
+    """Return where the recorded paths of a file of rows lie: in a dataset's `PATHS`."""
     in_dataset = re.search(r"-[0-9a-f]{8}\.parquet$", rows.name)
     folder = rows.parent / PATHS if in_dataset else rows.parent
     return folder / f"{rows.stem}.npz"
 
 
 def lonely_paths(dataset: Path, run: str) -> list[Path]:
-    """Recorded paths of one run without their rows, which are written after them."""
+    """Return recorded paths of one run without their rows, which are written after them."""
     every = files_of_run(dataset / PATHS, run, ".npz")
     return [path for path in every if not (dataset / f"{path.stem}.parquet").is_file()]

@@ -1,4 +1,4 @@
-"""PlayedEpisodes in, one row each in Parquet files out, those files read back, and means with their intervals."""
+"""Write a row for each played episode to Parquet files, read them back, and show means with their intervals."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def check_rows(rows: pa.Table, path: Path) -> None:
 def episode_table(
     episodes: PlayedEpisodes, scenes: Any, categories: Sequence[Sequence[str]], constants: dict[str, Any]
 ) -> pa.Table:
-    """One row an episode.
+    """Return one row for each episode.
 
     Args:
         episodes: what was played.
@@ -90,12 +90,12 @@ def episode_table(
     columns["split"] = [scenes[i].split for i in episodes.scene_index]
     columns["episode"] = np.arange(count, dtype=np.int32)
     columns |= episodes.metrics
-    told = [_by_category(episodes, i, categories[int(scene)]) for i, scene in enumerate(episodes.scene_index)]
-    return pa.table({**columns, "by_category": pa.array(told, BY_CATEGORY)})
+    entries = [_by_category(episodes, i, categories[int(scene)]) for i, scene in enumerate(episodes.scene_index)]
+    return pa.table({**columns, "by_category": pa.array(entries, BY_CATEGORY)})
 
 
 def _by_category(episodes: PlayedEpisodes, episode: int, categories: Sequence[str]) -> list[dict[str, Any]]:
-    """One episode's entries of `by_category`, in alphabetical order."""
+    """Return one episode's entries of `by_category`, in alphabetical order."""
     path_m, steps, force_n = (episodes.of_objects[name][episode] for name in OF_OBJECTS)
     rows = []
     for category in sorted(set(categories) - {""}):
@@ -114,15 +114,15 @@ def _by_category(episodes: PlayedEpisodes, episode: int, categories: Sequence[st
 
 
 def score_table(rows: pa.Table, title: str) -> Table:
-    """Success, P_eff, E_eff and INS_0.5 of each policy, with intervals."""
-    made = Table(
+    """Return a table of each policy's success, P_eff, E_eff and INS_0.5, with intervals."""
+    table = Table(
         title=title, caption=f"mean [95 % interval]: Wilson for success, bootstrap ({RESAMPLES:,} resamples) elsewhere"
     )
-    made.add_column("policy")
+    table.add_column("policy")
     for label in (*SCORES.values(), "episodes"):
-        made.add_column(label, justify="right")
+        table.add_column(label, justify="right")
     policies = np.asarray(rows["policy"].to_pylist())
     for policy in dict.fromkeys(policies):
         cells = (mean_text(name, rows[name].to_numpy()[policies == policy]) for name in SCORES)
-        made.add_row(policy, *cells, str(int((policies == policy).sum())))
-    return made
+        table.add_row(policy, *cells, str(int((policies == policy).sum())))
+    return table

@@ -1,4 +1,4 @@
-"""Rows of episodes in; means of runs, intervals over seeds, and the tests behind the paper's claims out.
+"""Compute means of runs, intervals over seeds, and the tests behind the paper's claims from rows of episodes.
 
 A run is the unit: its score is the mean over its fixed episodes, and intervals and tests are over runs that differ in
 their seed. Episodes of one run share a policy and are no independent trials of an algorithm.
@@ -39,36 +39,36 @@ class RunMean:
 
     @property
     def cell(self) -> tuple[str, str, float]:
-        """All but the seed."""
+        """Return all axes but the seed."""
         return self.robot, self.algorithm, self.k_int
 
     def ins(self, alpha: float) -> float:
-        """Interactive navigation score: alpha P_eff + (1 - alpha) E_eff."""
+        """Return the interactive navigation score: alpha P_eff + (1 - alpha) E_eff."""
         return alpha * self.scores["path_efficiency"] + (1.0 - alpha) * self.scores["effort_efficiency"]
 
     def of_things(self, what: str, categories: Iterable[str]) -> float:
-        """`touched` or `displacement_m` of `by_category`, for each thing of some categories that was there; NaN for
-        none."""
-        found = [self.things[name] for name in categories if name in self.things]
-        there = sum(things["objects"] for things in found)
-        return sum(things[what] for things in found) / there if there else math.nan
+        """Return `touched` or `displacement_m` of `by_category` for each object of some categories that was there; NaN
+        for none."""
+        matching = [self.things[name] for name in categories if name in self.things]
+        there = sum(things["objects"] for things in matching)
+        return sum(things[what] for things in matching) / there if there else math.nan
 
 
 def learned_rows(rows: pa.Table, split: str | None = None) -> pa.Table:
-    """Those of learned policies, in one part of the scenes or all."""
+    """Return the rows of learned policies, in one part of the scenes or all."""
     kept = pc.field("policy") == "learned"
     return rows.filter(kept if split is None else kept & (pc.field("split") == split))
 
 
 def things_moved(rows: pa.Table, keys: list[str]) -> dict[tuple[Any, ...], Things]:
-    """(value of each key, category) -> sums over episodes of `by_category`; empty where rows do not tell."""
+    """Return (value of each key, category) -> sums over episodes of `by_category`; empty without that column."""
     if "by_category" not in rows.column_names:
         return {}
     rows = rows.filter(pc.is_valid(rows["by_category"]))
-    told = rows["by_category"].combine_chunks()
-    entries = pa.Table.from_struct_array(pc.list_flatten(told))
+    nested = rows["by_category"].combine_chunks()
+    entries = pa.Table.from_struct_array(pc.list_flatten(nested))
     for key in keys:
-        entries = entries.append_column(key, rows[key].combine_chunks().take(pc.list_parent_indices(told)))
+        entries = entries.append_column(key, rows[key].combine_chunks().take(pc.list_parent_indices(nested)))
     numbers = [name for name in entries.column_names if name not in ("category", *keys)]
     summed = entries.group_by([*keys, "category"]).aggregate([(name, "sum") for name in numbers]).to_pylist()
     return {
@@ -77,17 +77,16 @@ def things_moved(rows: pa.Table, keys: list[str]) -> dict[tuple[Any, ...], Thing
 
 
 def run_means(rows: pa.Table, split: str | None = None) -> list[RunMean]:
-    """Means of each learned run over its episodes.
+    """Return the means of each learned run over its episodes.
 
-    Args:
-        split: train or test scenes; None: all.
+    `split`: train or test scenes; None: all.
     """
     chosen = learned_rows(rows, split)
     things = things_moved(chosen, ["run"])
     names = [name for name in SCORES if name in chosen.column_names]
     keys = ["run", "robot", "algorithm", "k_int", "seed"]
     means = chosen.group_by(keys).aggregate([(name, "mean") for name in names] + [("episode", "count")]).to_pylist()
-    found = [
+    runs = [
         RunMean(
             *(row[key] for key in keys),
             episodes=row["episode_count"],
@@ -96,21 +95,21 @@ def run_means(rows: pa.Table, split: str | None = None) -> list[RunMean]:
         )
         for row in means
     ]
-    return sorted(found, key=lambda run: (run.robot, run.algorithm, run.k_int, run.seed, run.run))
+    return sorted(runs, key=lambda run: (run.robot, run.algorithm, run.k_int, run.seed, run.run))
 
 
 def cells(means: Sequence[RunMean]) -> dict[tuple[str, str, float], list[RunMean]]:
-    """Runs by robot, algorithm and k_int."""
-    found: dict[tuple[str, str, float], list[RunMean]] = {}
+    """Group runs by robot, algorithm and k_int."""
+    groups: dict[tuple[str, str, float], list[RunMean]] = {}
     for run in means:
-        found.setdefault(run.cell, []).append(run)
-    return found
+        groups.setdefault(run.cell, []).append(run)
+    return groups
 
 
 def contrast(
     means: Sequence[RunMean], axis: str, left: Any, right: Any, score: Callable[[RunMean], float], **where: Any
 ) -> Contrast | None:
-    """Compares two values of an axis.
+    """Compare two values of an axis.
 
     Each seed counts once: its score is the mean over the settings of the other axes that both sides have.
 
@@ -121,11 +120,11 @@ def contrast(
     others = [name for name in ("robot", "algorithm", "k_int") if name != axis]
 
     def by_setting(value: Any) -> dict[tuple[Any, ...], dict[int, float]]:
-        found: dict[tuple[Any, ...], dict[int, float]] = {}
+        by_others: dict[tuple[Any, ...], dict[int, float]] = {}
         for run in chosen:
             if getattr(run, axis) == value:
-                found.setdefault(tuple(getattr(run, name) for name in others), {})[run.seed] = score(run)
-        return found
+                by_others.setdefault(tuple(getattr(run, name) for name in others), {})[run.seed] = score(run)
+        return by_others
 
     sides = [by_setting(left), by_setting(right)]
     common = set(sides[0]) & set(sides[1])
@@ -142,9 +141,9 @@ def contrast(
     return welch(a, b)
 
 
-def seen_unseen(rows: pa.Table) -> tuple[list[tuple[RunMean, RunMean]], Contrast | None]:
-    """Each run's means on the train and on the test scenes, and the paper's one-sample t test that INS_0.5 of a run is
-    the same on both (difference unseen minus seen, over runs)."""
+def train_test_contrast(rows: pa.Table) -> tuple[list[tuple[RunMean, RunMean]], Contrast | None]:
+    """Return each run's means on the train and on the test scenes, and the paper's one-sample t test that INS_0.5 of a
+    run is the same on both (difference test minus train, over runs)."""
     unseen = {run.run: run for run in run_means(rows, "test")}
     pairs = [(run, unseen[run.run]) for run in run_means(rows, "train") if run.run in unseen]
     if not pairs:
@@ -170,7 +169,7 @@ class Correlation:
 
     @property
     def verdict(self) -> str:
-        """Whether they are correlated, at the 5 % level."""
+        """Return whether they are correlated, at the 5 % level."""
         if math.isnan(self.r):
             return "too few runs to test"
         if self.p_value >= LEVEL:
@@ -184,7 +183,7 @@ class Correlation:
 
 
 def correlation(x: Iterable[float], y: Iterable[float]) -> Correlation:
-    """Pearson's correlation; NaN for fewer than four points or where one does not vary."""
+    """Return Pearson's correlation; NaN for fewer than four points or where one does not vary."""
     a, b = np.asarray(list(x), float), np.asarray(list(y), float)
     if len(a) < 4 or _constant(a) or _constant(b):
         return Correlation(math.nan, math.nan, math.nan, math.nan, len(a))

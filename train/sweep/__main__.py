@@ -1,4 +1,4 @@
-"""`python -m train.sweep`: one YAML file in; trained runs and rows of their evaluation out."""
+"""Run `python -m train.sweep`: train the runs of one YAML file and write rows of their evaluation."""
 
 import argparse
 import sys
@@ -11,7 +11,7 @@ from interactive_nav_common.jobs.processes import Launcher
 from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.signals import stop_signals
 from interactive_nav_common.words import program
-from train.config_io import known_in
+from train.config_io import preset_names
 from train.runs.policy_file import STEP
 from train.runs.run_folder import claim
 from train.sweep import spec
@@ -23,17 +23,17 @@ from train.sweep.table import SweepDisplay, status_table, totals
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
-    told = (
+    """Return the parser of the command line."""
+    epilog = (
         f"keys of the file (default):\n{spec.help_text()}\n\nexit codes: 0 all done (or in another sweep's hands), "
         "1 runs were given up or are not done, 2 the file is wrong, 3 stopped by the time limit, 128 + signal"
     )
-    table, known = Path(__file__).parents[1] / "words.yaml", ", ".join(known_in(spec.SWEEP_DIR))
-    return program(table, "sweep", told, known=known, step=STEP, stages=STAGES)
+    table, sweeps = Path(__file__).parents[1] / "words.yaml", ", ".join(preset_names(spec.SWEEP_DIR))
+    return program(table, "sweep", epilog, sweeps=sweeps, step=STEP, stages=STAGES)
 
 
 def make_launcher(name: str, address: str, sweep: Sweep) -> Launcher:
-    """Where jobs are to run."""
+    """Return where jobs are to run."""
     if name == "ray":
         from interactive_nav_common.jobs.on_ray import RayLauncher
 
@@ -43,7 +43,7 @@ def make_launcher(name: str, address: str, sweep: Sweep) -> Launcher:
 
 @reports_errors("train.sweep")
 def main(argv: Sequence[str] | None = None, programs: Programs | None = None) -> int:
-    """Runs a sweep; see `Outcome.exit_code`."""
+    """Run a sweep; see `Outcome.exit_code`."""
     arguments = parser().parse_args(argv)
     console = SafeConsole()
     chosen = [name for name in (arguments.sweep, arguments.config) if name]
@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None, programs: Programs | None = None) ->
         refuse_unused(arguments, "--ray-address", "without --launcher ray")
     if arguments.unfinished and arguments.only != "evaluate":
         raise ConfigError("--unfinished evaluates without training on; expected --only evaluate with it")
-    sweep = spec.select(spec.load(chosen[0]), arguments.where, arguments.shard)
+    sweep = spec.select(spec.load_sweep(chosen[0]), arguments.where, arguments.shard)
     folder = SweepFolder(sweep)
     if arguments.status:
         states = [folder.state(run) for run in sweep.runs]

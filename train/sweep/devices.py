@@ -1,4 +1,4 @@
-"""What a machine has, and which part of it a run gets."""
+"""Find what a machine has, and choose which part of it a run gets."""
 
 import dataclasses
 import os
@@ -31,12 +31,12 @@ class Share:
 
 
 def find_gpus() -> list[Gpu]:
-    """The NVIDIA GPUs that this process may use; none where there are none."""
+    """Return the NVIDIA GPUs that this process may use."""
     return parse_gpus(gpu_listing("index,uuid,memory.total"), os.environ.get("CUDA_VISIBLE_DEVICES"))
 
 
 def gpu_listing(fields: str) -> str:
-    """nvidia-smi's line for each NVIDIA GPU; nothing where there are none."""
+    """Return nvidia-smi's line for each NVIDIA GPU; nothing where there are none."""
     query = ["nvidia-smi", f"--query-gpu={fields}", "--format=csv,noheader,nounits"]
     try:
         done = subprocess.run(query, capture_output=True, text=True, timeout=60)
@@ -46,16 +46,16 @@ def gpu_listing(fields: str) -> str:
 
 
 def parse_gpus(listing: str, visible: str | None) -> list[Gpu]:
-    """The GPUs of nvidia-smi's `index, uuid, MiB` lines that CUDA_VISIBLE_DEVICES (None: unset) leaves."""
-    found: dict[str, Gpu] = {}
+    """Return the GPUs of nvidia-smi's `index, uuid, MiB` lines that CUDA_VISIBLE_DEVICES (None: unset) leaves."""
+    gpus: dict[str, Gpu] = {}
     for line in listing.splitlines():
         fields = [field.strip() for field in line.split(",")]
         if len(fields) == 3 and fields[2].isdecimal():
             memory_gb = int(fields[2]) * 2**20 / 1e9
-            found[fields[0]] = Gpu(fields[0], memory_gb)
-            found[fields[1]] = Gpu(fields[1], memory_gb)
-    names = [n for n in found if n.isdecimal()] if visible is None else [n.strip() for n in visible.split(",")]
-    return [found[name] for name in names if name in found]
+            gpus[fields[0]] = Gpu(fields[0], memory_gb)
+            gpus[fields[1]] = Gpu(fields[1], memory_gb)
+    names = [n for n in gpus if n.isdecimal()] if visible is None else [n.strip() for n in visible.split(",")]
+    return [gpus[name] for name in names if name in gpus]
 
 
 class Machine(Launcher):
@@ -67,7 +67,7 @@ class Machine(Launcher):
         self._given: list[Share] = []
 
     def take(self, launch: LaunchConfig, factor: float = 1.0) -> Share | None:
-        """A share for a run; None where there is no room."""
+        """Take a share for a run; None where there is no room."""
         if not self._gpus:
             if len(self._given) >= self._slots:
                 return None
@@ -84,7 +84,7 @@ class Machine(Launcher):
         return share
 
     def give_back(self, share: Share) -> None:
-        """A run is over."""
+        """Free the share of a run that is over."""
         self._given.remove(share)
 
     def _begin(self, job: Job) -> Begun | None:
@@ -97,7 +97,7 @@ class Machine(Launcher):
 
 
 def share_env(share: Share, launch: LaunchConfig) -> dict[str, str]:
-    """Environment variables that keep a run within its share."""
+    """Return environment variables that keep a run within its share."""
     if share.gpu is None:
         cores = max(1, int((os.cpu_count() or 1) * share.fraction))
         return {"OMP_NUM_THREADS": str(cores)} if share.fraction < 1.0 else {}
@@ -121,5 +121,5 @@ class RunJob(Job):
     """Times the usual share of a GPU."""
 
     def env_on(self, gpu: str | None, part: float) -> Mapping[str, str]:
-        """Variables that keep it within its part."""
+        """Return variables that keep it within its part."""
         return share_env(Share(Gpu(gpu, 0.0) if gpu else None, part), self.launch)

@@ -1,4 +1,4 @@
-"""A sweep's folder in; what is worth keeping of it out: rows, thinned curves, origins, the best checkpoints.
+"""Export what is worth keeping of a sweep's folder: rows, thinned curves, origins, the best checkpoints.
 
 Rows become one file, which takes half of what a file a run does: many columns are the same in all of them.
 """
@@ -44,7 +44,7 @@ UNSEEN_ONLY = {"by_category", "force_sum_n", "object_displacement_kg_m", "reward
 
 
 def export(folder: SweepFolder, out: Path, step: float = STEP) -> tuple[int, dict[tuple[Any, ...], str]]:
-    """Copies a sweep's results; what is there already of the same runs is replaced.
+    """Copy a sweep's results; what is there already of the same runs is replaced.
 
     Returns:
         Bytes of all that lies there; and by cell the run whose checkpoint was kept: that of the highest mean INS_0.5
@@ -74,12 +74,12 @@ def export(folder: SweepFolder, out: Path, step: float = STEP) -> tuple[int, dic
 
 
 def _merge_rows(folder: SweepFolder, out: Path) -> None:
-    """The sweep's rows, and those of other runs that lie in `out` already, as one file; paths beside it."""
+    """Merge the sweep's rows, and those of other runs in `out`, into one file, with paths beside it."""
     new = sorted(path for path in folder.rows.glob("*.parquet") if not path.name.startswith("."))
     if not new:
         return
     out.mkdir(parents=True, exist_ok=True)
-    rows = without_seen_things(rounded(read_rows(new)))
+    rows = without_train_details(rounded(read_rows(new)))
     replaced = {name for name in rows["run"].unique().to_pylist() if name}
     old = sorted(out.glob("*.parquet"))
     superseded = {path for name in replaced for path in files_of_run(out, name)}  # of an export that did not merge
@@ -87,14 +87,14 @@ def _merge_rows(folder: SweepFolder, out: Path) -> None:
         kept = read_rows([path for path in old if path not in superseded])
         others = pa.array([name not in replaced for name in kept["run"].to_pylist()])
         rows = pa.concat_tables([kept.filter(others), rows], promote_options="permissive")
-    asked = {note for path in {*old, *new} - superseded for note in read_notes(path).get("asked", "").splitlines()}
+    requests = {note for path in {*old, *new} - superseded for note in read_notes(path).get("asked", "").splitlines()}
     # Paths, then rows, then what is no longer wanted: rows are never without paths as new as they.
     paths = [paths_beside(path) for path in new if paths_beside(path).is_file()]
     for path in paths:
         with whole_file(out / PATHS / path.name) as partial:
             shutil.copy2(path, partial)
     rows = rows.sort_by([(name, "ascending") for name in ORDER if name in rows.column_names])
-    write_parquet(rows, out / ROWS, {"asked": "\n".join(sorted(asked))} if asked else None, small=True)
+    write_parquet(rows, out / ROWS, {"asked": "\n".join(sorted(requests))} if requests else None, small=True)
     for path in old:
         if path.name != ROWS:
             path.unlink()
@@ -103,9 +103,8 @@ def _merge_rows(folder: SweepFolder, out: Path) -> None:
             path.unlink()
 
 
-def without_seen_things(rows: pa.Table) -> pa.Table:
-    """Rows that tell of `UNSEEN_ONLY` in test scenes only, where there are any: no table has them of the others.
-    Things by category alone are 44 % of a file."""
+def without_train_details(rows: pa.Table) -> pa.Table:
+    """Return rows with `UNSEEN_ONLY` in test scenes only, if there are any: no table has the others, 44 % of a file."""
     if "split" not in rows.column_names or not pc.any(test := pc.equal(rows["split"], "test")).as_py():
         return rows
     places = pc.if_else(test, pa.array(range(len(rows))), None)
@@ -115,7 +114,7 @@ def without_seen_things(rows: pa.Table) -> pa.Table:
 
 
 def rounded(rows: pa.Table) -> pa.Table:
-    """Rows with numbers as multiples of `STEPS`; what is rounded already stays as it is."""
+    """Return rows with numbers as multiples of `STEPS`; what is rounded already stays as it is."""
     return pa.table({name: _rounded(name, rows[name].combine_chunks()) for name in rows.column_names})
 
 
@@ -130,7 +129,7 @@ def _rounded(name: str, values: Any) -> pa.Array:
 
 
 def best_runs(folder: SweepFolder, runs: Sequence[RunSpec]) -> dict[tuple[Any, ...], str]:
-    """Cell -> its run of the highest mean INS_0.5; cells without rows are left out."""
+    """Return cell -> its run of the highest mean INS_0.5; cells without rows are left out."""
     paths = sorted(folder.rows.glob("*.parquet")) if folder.rows.is_dir() else []
     rows = read_rows(paths) if paths else pa.table({})
     if "policy" not in rows.column_names:
@@ -144,7 +143,7 @@ def best_runs(folder: SweepFolder, runs: Sequence[RunSpec]) -> dict[tuple[Any, .
 
 
 def thinned(lines: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
-    """At most so many lines of metrics: consecutive ones as one, scores as means over their episodes.
+    """Return at most so many lines of metrics: consecutive ones as one, scores as means over their episodes.
 
     Losses are left out, and numbers rounded to five digits.
     """
@@ -152,16 +151,16 @@ def thinned(lines: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
     out = []
     for i in range(0, len(lines), max(size, 1)):
         group = lines[i : i + size]
-        made = {name: group[-1][name] for name in KEPT[:3] if name in group[-1]}
-        made["episodes"] = sum(line.get("episodes", 0.0) for line in group)
+        merged = {name: group[-1][name] for name in KEPT[:3] if name in group[-1]}
+        merged["episodes"] = sum(line.get("episodes", 0.0) for line in group)
         for name in dict.fromkeys(name for line in group for name in line if name.startswith("episode/")):
-            made[name] = mean_over_episodes(group, name)
-        out.append({name: value if isinstance(value, int) else float(f"{value:.5g}") for name, value in made.items()})
+            merged[name] = mean_over_episodes(group, name)
+        out.append({name: value if isinstance(value, int) else float(f"{value:.5g}") for name, value in merged.items()})
     return out
 
 
 def _keep_checkpoint(folder: SweepFolder, run: str, target: Path, step: float) -> None:
-    """Writes the policy of the checkpoint that was evaluated."""
+    """Write the policy of the checkpoint that was evaluated."""
     try:
         path, _ = checkpoint.find(folder.runs / run / "checkpoints", folder.sweep.config.evaluate.checkpoint)
     except CheckpointError:

@@ -1,4 +1,4 @@
-"""A sweep's folder: where its files lie, and how far each run is, read from them alone.
+"""Locate the files of a sweep's folder, and read from them alone how far each run is.
 
 <out_dir>/<name>/configs/<run>.yaml     complete config of a run, as `python -m train --config` takes it
                  runs/<run>/            its run folder
@@ -26,7 +26,7 @@ from interactive_nav_common.records import RUNS
 from interactive_nav_common.rows import read_notes
 from train.config_io import to_yaml
 from train.runs.run_folder import RunFolder
-from train.scoring.row_files import PATHS, EvaluationAsked, files_of_run, lonely_paths, paths_beside
+from train.scoring.row_files import PATHS, EvaluationRequest, files_of_run, lonely_paths, paths_beside
 from train.sweep.spec import EvaluateConfig, RunSpec, Sweep
 
 TAIL_BYTES = 1 << 16
@@ -65,7 +65,7 @@ class SweepFolder:
         self.rows, self.runs = self.root / "rows", self.root / "runs"
 
     def prepare(self) -> None:
-        """Makes the folder, writes the config of each run, and removes what killed evaluations left."""
+        """Create the folder, write the config of each run, and remove what killed evaluations left."""
         for run in self.sweep.runs:
             write_text(self.config(run.name), to_yaml(run.config))
         for name in ("runs", "rows", "logs", "locks", "failed"):
@@ -78,19 +78,19 @@ class SweepFolder:
                     paths.unlink(missing_ok=True)
 
     def config(self, run: str) -> Path:
-        """The config that `python -m train` is given."""
+        """Return the path of the config that `python -m train` is given."""
         return self.root / "configs" / f"{run}.yaml"
 
     def log(self, run: str) -> Path:
-        """What its programs printed."""
+        """Return the path of what its programs printed."""
         return self.root / "logs" / f"{run}.log"
 
     def lock(self, run: str) -> Path:
-        """Held by whoever works on the run."""
+        """Return the path of the lock held by whoever works on the run."""
         return self.root / "locks" / run
 
     def state(self, run: RunSpec) -> RunState:
-        """How far a run is; of finished ones `done` where its rows are up to date."""
+        """Return how far a run is; of finished ones `done` where its rows are up to date."""
         folder = RunFolder(self.runs / run.name)
         metrics = last_line(folder.metrics)
         origin = folder.origin()
@@ -109,19 +109,19 @@ class SweepFolder:
         return RunState(run.name, state, steps, max(total, steps), metrics, "" if state == "done" else failed, over)
 
     def _failure(self, run: str) -> str:
-        """Why a run was given up; empty where it was not. Read once: another sweep may try the run again meanwhile."""
+        """Return why a run was given up, or nothing. Read once: another sweep may try the run again meanwhile."""
         path = self.root / "failed" / f"{run}.json"
         try:
             return RUNS.record(RUNS.json(path, {"reason": "", "attempts": 0}), _Failure, str(path)).reason
         except FileError as error:
             return str(error)
 
-    def asked(self, run: RunSpec) -> EvaluationAsked:
-        """The evaluation that the sweep wants of a run."""
+    def request(self, run: RunSpec) -> EvaluationRequest:
+        """Return the evaluation that the sweep wants of a run."""
         wanted: EvaluateConfig = self.sweep.config.evaluate
         files = self.episode_files(run)
         fixed, digest = _read(files) if files else (None, "")
-        return EvaluationAsked(
+        return EvaluationRequest(
             scenes=tuple(Path(scene).name for scene in wanted.scenes or run.config.env.scenes),
             policies=("learned",),
             episodes=len(fixed.episodes) if fixed else wanted.episodes,
@@ -133,36 +133,36 @@ class SweepFolder:
         )
 
     def episode_files(self, run: RunSpec) -> tuple[str, ...]:
-        """Files of the fixed episodes that a run is to play."""
+        """Return the files of the fixed episodes that a run is to play."""
         from interactive_nav.robots import robot_name  # heavy, and the table of a sweep does without
 
         files = self.sweep.config.evaluate.episode_files
         return tuple(file.replace("{robot}", robot_name(run.config.env.robot)) for file in files)
 
     def evaluated(self, run: RunSpec) -> bool:
-        """Rows are there, as wanted, of the run as far as it is trained."""
-        path = self.rows / self.asked(run).file_name(run.name)
+        """Return whether there are rows, as requested, of the run as far as it is trained."""
+        path = self.rows / self.request(run).file_name(run.name)
         if not path.is_file():
             return False
         steps = read_notes(path).get("trained_steps")
         return steps == json.dumps(RunFolder(self.runs / run.name).origin()["env_steps"])
 
     def drop_old_rows(self, run: RunSpec) -> None:
-        """Removes rows of an evaluation that is no longer wanted, once those that are wanted are there."""
-        wanted = self.rows / self.asked(run).file_name(run.name)
+        """Remove rows of an evaluation that is no longer wanted, once those that are wanted are there."""
+        wanted = self.rows / self.request(run).file_name(run.name)
         for path in files_of_run(self.rows, run.name) if wanted.is_file() else []:
             if path != wanted:
                 path.unlink(missing_ok=True)  # another sweep of the same name may do the same
                 paths_beside(path).unlink(missing_ok=True)
 
     def give_up(self, run: str, reason: str, attempts: int) -> None:
-        """Notes why a run was given up."""
+        """Note why a run was given up."""
         write_text(
             self.root / "failed" / f"{run}.json", json.dumps(dataclasses.asdict(_Failure(reason, attempts))) + "\n"
         )
 
     def try_again(self, run: str) -> None:
-        """Forgets that a run was given up."""
+        """Forget that a run was given up."""
         (self.root / "failed" / f"{run}.json").unlink(missing_ok=True)
 
 
@@ -174,7 +174,7 @@ def _read(files: tuple[str, ...]) -> tuple[Any, str]:
 
 
 def _tail(path: Path) -> list[str]:
-    """The last lines of a file; none where there is none."""
+    """Return the last lines of a file; none where there is none."""
     try:
         with open(regular(path), "rb") as file:
             file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL_BYTES))
@@ -184,36 +184,36 @@ def _tail(path: Path) -> list[str]:
 
 
 def last_line(path: Path) -> dict[str, Any]:
-    """The last whole line of a file of JSON lines; empty where there is none."""
+    """Return the last whole line of a file of JSON lines; empty where there is none."""
     for line in reversed(_tail(path)):
         with contextlib.suppress(ValueError, RecursionError):
-            found = json.loads(line)
-            if isinstance(found, dict) and isinstance(found.get("env_steps", 0), int):
-                return found
+            parsed = json.loads(line)
+            if isinstance(parsed, dict) and isinstance(parsed.get("env_steps", 0), int):
+                return parsed
     return {}
 
 
 def log_tail(path: Path, count: int = 6) -> list[str]:
-    """The last lines of a log that say something, of its last try: a line of `== time name` begins each."""
+    """Return the last lines of a log that are not blank, of its last try: a line of `== time name` begins each."""
     lines = [line.rstrip() for line in _tail(path) if line.strip()]
     begun = max((i for i, line in enumerate(lines) if re.match(r"== \d{4}-\d\d-\d\d ", line)), default=-1)
     return lines[begun + 1 :][-count:]
 
 
 def programs_env() -> dict[str, str]:
-    """Environment of a child that runs our programs: the same code as here, from whatever folder."""
+    """Return the environment of a child that runs our programs: the same code as here, from whatever folder."""
     ours = str(Path(__file__).resolve().parents[2])
     paths = [ours, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     return {"PYTHONPATH": os.pathsep.join(dict.fromkeys(paths)), "PYTHONUNBUFFERED": "1"}
 
 
 def words_of_training(folder: SweepFolder, run: str, program: tuple[str, ...]) -> list[str]:
-    """The command that trains a run, or continues it."""
+    """Return the command that trains a run, or continues it."""
     return [sys.executable, *program, "--config", str(folder.config(run))]
 
 
 def words_of_evaluation(folder: SweepFolder, runs: list[str], program: tuple[str, ...]) -> list[str]:
-    """The command that evaluates runs of one environment."""
+    """Return the command that evaluates runs of one environment."""
 
     def words() -> Iterator[str]:
         wanted = folder.sweep.config.evaluate

@@ -1,4 +1,4 @@
-"""Runs and a launcher in; every run trained and evaluated, given up with a reason, or stopped where it can go on."""
+"""Train and evaluate every run with a launcher, give it up with a reason, or stop it where it can go on."""
 
 import contextlib
 import dataclasses
@@ -55,7 +55,7 @@ class Outcome:
     """Runs left to somebody else who works on them."""
 
     def exit_code(self, done: str) -> int:
-        """0: every run got to `done`, or is worked on elsewhere; 1: not; 3: stopped by the time limit; 128 + signal."""
+        """Return 0: every run is `done` or worked on elsewhere; 1: not; 3: stopped by the time limit; 128 + signal."""
         if self.stopped_by:
             return 128 + self.stopped_by
         enough = {"done": (), "trained": ("trained",), "unfinished": ("trained", "stopped", "waiting")}[done]
@@ -99,7 +99,7 @@ class Scheduler:
         self._stopping = False
 
     def run(self, stops: list[int], time_limit_s: float | None = None, poll_s: float = POLL_S) -> Outcome:
-        """Works until nothing is left, the time is over, or a signal asks to stop; a second one does not wait.
+        """Work until nothing is left, the time is over, or a signal requests a stop; a second one does not wait.
 
         Args:
             time_limit_s: after it all runs are stopped, with their checkpoints; None: no limit.
@@ -142,7 +142,7 @@ class Scheduler:
         return [self._folder.state(run) for run in self._runs.values()]
 
     def _needs(self, stage: str, state: RunState) -> bool:
-        """Whether a stage is to be run for a run as far as it is."""
+        """Return whether a stage is to be run for a run as far as it is."""
         if stage not in self._stages or state.name in self._busy or (stage, state.name) in self._given_up:
             return False
         if stage == "train":
@@ -154,13 +154,13 @@ class Scheduler:
         return [state.name for stage in STAGES for state in states if self._needs(stage, state)]
 
     def _free(self, stage: str, states: Sequence[RunState]) -> list[str]:
-        """Runs that need a stage and that nobody else was seen to work on, begun ones first."""
+        """Return runs that need a stage and that nobody else works on, as far as is visible, started ones first."""
         now = self._clock()
         left = [s for s in states if self._needs(stage, s) and self._not_before.get(s.name, 0.0) <= now]
         return [s.name for s in (sorted(left, key=lambda s: s.env_steps == 0) if stage == "train" else left)]
 
     def _start(self, states: list[RunState]) -> None:
-        """Starts what there is room for: training first, then evaluation."""
+        """Start what there is room for: training first, then evaluation."""
         for name in self._free("train", states):
             command = words_of_training(self._folder, name, self._programs.train)
             if self._runs[name].launch.slots > 1 and not self._runs[name].config.env.physics.threads:
@@ -173,7 +173,7 @@ class Scheduler:
                 return
 
     def _groups(self, names: list[str]) -> list[list[str]]:
-        """Runs to evaluate by one process each: those of one environment (k_int is in no score)."""
+        """Group the runs to evaluate by one process each: those of one environment (k_int is in no score)."""
         kinds: dict[Any, list[str]] = {}
         for name in names:
             env = replace(self._runs[name].config.env, k_int=0.0)
@@ -230,7 +230,7 @@ class Scheduler:
         elif self._stopping and code not in (1, REFUSED):
             self._display.event(f"{job.name}: stopped")
         elif len(job.runs) > 1:
-            # Which of them is to blame shows when each has a process of its own.
+            # Which of them is to blame shows when each has a separate process.
             self._alone.update(left)
             self._display.event(f"{job.name}: {_how(code)}; {len(left)} left, now one by one", "yellow")
         else:
@@ -240,8 +240,8 @@ class Scheduler:
         (name,) = job.runs
         key = (job.kind, name)
         tail = log_tail(job.log, 40)
-        told = tail[-6:] or ["(nothing was printed)"]
-        reason = f"{job.kind}: {_how(code)}: {told[-1][:300]}"
+        shown = tail[-6:] or ["(nothing was printed)"]
+        reason = f"{job.kind}: {_how(code)}: {shown[-1][:300]}"
         attempts = self._attempts[key] = self._attempts.get(key, 0) + 1
         hungry = any(word in line.lower() for line in tail for word in OUT_OF_MEMORY)
         if code == REFUSED or attempts > job.launch.retries:
@@ -257,7 +257,7 @@ class Scheduler:
                 f"the end of {job.log}:",
                 "yellow",
             )
-        for line in told:
+        for line in shown:
             self._display.event(f"    {line}")
 
 
@@ -269,7 +269,7 @@ def _how(code: int) -> str:
     if code == LOST:
         return "the node or its worker was lost"
     if not code:
-        return "ended, but what it was asked for is not there"
+        return "ended, but what it should have written is not there"
     if code < 0:
         with contextlib.suppress(ValueError):
             return f"ended by {signal.Signals(-code).name}"

@@ -1,4 +1,4 @@
-"""One YAML file in, a list of runs with their complete configs out; every mistake named in one line."""
+"""Expand one YAML file to a list of runs with their complete configs; every mistake is named in one line."""
 
 import dataclasses
 import itertools
@@ -98,7 +98,7 @@ class SweepConfig(Settings):
     """Folder of all sweeps."""
     preset: str = ""
     """What every run starts from: a preset or a YAML file of `python -m train`; {algorithm}, {env.robot} and the like
-    stand for the run's own value."""
+    stand for the run's value."""
     grid: Mapping[str, Sequence[Any]] = dataclasses.field(default_factory=dict)
     """Dotted setting -> its values; every combination is a run, the last one varies fastest."""
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -126,7 +126,7 @@ class RunSpec:
 
     @property
     def cell(self) -> tuple[Any, ...]:
-        """Its values without the seed."""
+        """Return its values without the seed."""
         return tuple(str(value) for axis, value in self.values.items() if axis != "run.seed")
 
 
@@ -139,14 +139,14 @@ class Sweep:
     runs: tuple[RunSpec, ...]
 
 
-def load(name_or_path: str) -> Sweep:
-    """Reads a sweep by name or path."""
+def load_sweep(name_or_path: str) -> Sweep:
+    """Read a sweep by name or path."""
     path, plain = config_io.read_file(name_or_path, SWEEP_DIR, "sweep")
-    return expand(read(plain, path.name, path.stem), path.name)
+    return expand(parse_sweep(plain, path.name, path.stem), path.name)
 
 
-def read(plain: Any, where: str, default_name: str) -> SweepConfig:
-    """The typed sweep of nested plain values."""
+def parse_sweep(plain: Any, where: str, default_name: str) -> SweepConfig:
+    """Parse nested plain values as a typed sweep."""
     config = overlay(SweepConfig(), plain, where)
     check_name(config.name or default_name, f"{where}: name", ConfigError)
     if not config.preset:
@@ -156,13 +156,13 @@ def read(plain: Any, where: str, default_name: str) -> SweepConfig:
 
 
 def expand(config: SweepConfig, where: str) -> Sweep:
-    """Every run of a sweep with its complete config."""
-    settings_known = list(flatten(TrainConfig()))
+    """Expand a sweep to its runs with their complete configs."""
+    settings = list(flatten(TrainConfig()))
     for axis, values in config.grid.items():
-        if axis not in settings_known:
-            raise ConfigError(f"{where}: grid: unknown key {axis!r}{nearest(str(axis), settings_known)}")
+        if axis not in settings:
+            raise ConfigError(f"{where}: grid: unknown key {axis!r}{nearest(str(axis), settings)}")
         if axis in ("run.name", "run.out_dir"):
-            raise ConfigError(f"{where}: grid: {axis} is the sweep's own to choose")
+            raise ConfigError(f"{where}: grid: {axis} is chosen by the sweep")
         if not isinstance(values, list) or not values:
             raise ConfigError(f"{where}: grid: {axis}: got {values!r}, expected a list of values")
     axes = list(config.grid)
@@ -175,20 +175,20 @@ def expand(config: SweepConfig, where: str) -> Sweep:
         if any(_matches(skip, values) for skip in skips):
             continue
         name = _run_name(config, values) or "run"
-        told = f"{where}: {name}"
-        train = config_io.load(_filled(config.preset, values, where))
+        label = f"{where}: {name}"
+        train = config_io.load_config(_filled(config.preset, values, where))
         launch = config.launch
         layers = [config.settings] + [entry["settings"] for entry in overrides if _matches(entry["where"], values)]
         for layer in [*layers, values]:
-            train = config_io.from_dict(nested(layer.items(), told), train, told)
+            train = config_io.from_dict(nested(layer.items(), label), train, label)
         for entry in overrides:
             if _matches(entry["where"], values):
-                launch = overlay(launch, entry["launch"], told, "launch.")
+                launch = overlay(launch, entry["launch"], label, "launch.")
         run = dataclasses.replace(train.run, name=name, out_dir=str(root / "runs"))
         train = config_io.with_scenes(dataclasses.replace(train, run=run))
         validate(train)
         if name in runs:
-            raise ConfigError(f"{where}: two runs are named {name!r}; give the grid values that can be told apart")
+            raise ConfigError(f"{where}: two runs are named {name!r}; give the grid values that can be distinguished")
         runs[name] = RunSpec(name, values, train, launch)
     if not runs:
         raise ConfigError(f"{where}: no run is left of the grid; expected at least one that skip does not name")
@@ -196,7 +196,7 @@ def expand(config: SweepConfig, where: str) -> Sweep:
 
 
 def select(sweep: Sweep, where: Sequence[str], shard: str | None) -> Sweep:
-    """The part of a sweep that one machine takes.
+    """Return the part of a sweep that one machine takes.
 
     Args:
         where: `setting=value[,value]` words; a run must match them all.
@@ -225,7 +225,7 @@ def select(sweep: Sweep, where: Sequence[str], shard: str | None) -> Sweep:
 
 
 def help_text() -> str:
-    """One line for each key of a sweep's file."""
+    """Return one line for each key of a sweep's file."""
     return settings_help(SweepConfig(), equals=": ")
 
 
@@ -236,17 +236,17 @@ def _mapping(value: Any, where: str, what: str) -> Any:
 
 
 def _override(entry: Any, config: SweepConfig, where: str) -> dict[str, Any]:
-    known = ("where", "settings", "launch")
+    keys = ("where", "settings", "launch")
     _mapping(entry, where, "the entry")
     for key in entry:
-        if key not in known:
-            raise ConfigError(f"{where}: unknown key {key!r}{nearest(str(key), known)}")
-    made = {key: _mapping(entry.get(key) or {}, where, key) for key in known}
-    return {**made, "where": _where(made["where"], config, where)}
+        if key not in keys:
+            raise ConfigError(f"{where}: unknown key {key!r}{nearest(str(key), keys)}")
+    parts = {key: _mapping(entry.get(key) or {}, where, key) for key in keys}
+    return {**parts, "where": _where(parts["where"], config, where)}
 
 
 def _where(entry: Any, config: SweepConfig, where: str) -> dict[str, list[Any]]:
-    """Axis -> the values that match."""
+    """Return axis -> the values that match."""
     wanted = {}
     for axis, value in _mapping(entry, where, "where").items():
         if axis not in config.grid:

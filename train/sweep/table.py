@@ -1,4 +1,4 @@
-"""States of runs in, a live table or plain lines on the console out."""
+"""Show states of runs on the console, as a live table or plain lines."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LINE_EVERY_S = 60.0
 
 
 def totals(states: Sequence[RunState]) -> str:
-    """How far the sweep is, in a line."""
+    """Return how far the sweep is, in a line."""
     counts = Counter(state.state for state in states)
     words = ", ".join(f"{counts[name]} {name}" for name in ORDER if counts[name])
     left = sum(state.total_steps - state.env_steps for state in states if not state.over)
@@ -32,17 +32,17 @@ def totals(states: Sequence[RunState]) -> str:
 
 
 def status_table(states: Sequence[RunState], where: dict[str, str] | None = None) -> Table:
-    """One line a run."""
-    made = Table(box=None, pad_edge=False, header_style="bold")
-    made.add_column("run")
-    made.add_column("state")
+    """Return a table with one line for each run."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("run")
+    table.add_column("state")
     for label in ("env steps", "", "steps/s", "success", "INS"):
-        made.add_column(label, justify="right")
-    made.add_column("", overflow="fold")
+        table.add_column(label, justify="right")
+    table.add_column("", overflow="fold")
     for s in states:
         share = f"{100 * s.env_steps / max(s.total_steps, 1):.0f} %"
         speed = s.metrics.get("env_steps_per_s")
-        made.add_row(
+        table.add_row(
             s.name,
             Text(s.state, STYLES[s.state]),
             f"{s.env_steps:,}",
@@ -52,7 +52,7 @@ def status_table(states: Sequence[RunState], where: dict[str, str] | None = None
             _score(s, "episode/ins_0.5"),
             (where or {}).get(s.name, s.reason),
         )
-    return made
+    return table
 
 
 class SweepDisplay:
@@ -73,11 +73,11 @@ class SweepDisplay:
             self._live.stop()
 
     def event(self, text: str, style: str = "") -> None:
-        """Prints a line."""
+        """Print a line."""
         self._console.print(Text(f"{time.strftime('%H:%M:%S')} {text}", style), soft_wrap=True)
 
     def update(self, states: Sequence[RunState], where: dict[str, str]) -> None:
-        """Shows how far the runs are, every few seconds."""
+        """Show how far the runs are, every few seconds."""
         now = time.monotonic()
         if now - self._shown_at < (REFRESH_S if self._live else LINE_EVERY_S):
             return

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw
 from rich.console import Console
 
 from interactive_nav.task.rollout import episode_keys, policy_key_of
-from train.runs.run import config_to_play, make_env
+from train.runs.run import build_env, config_to_play
 from train.runs.run_folder import RunFolder
 from train.scoring.evaluation import SEED, load_policy
 
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     given = words.parse_intermixed_args(argv)
     folder = RunFolder(given.run)
     config = config_to_play(folder, given.overrides, given.scenes, Console())
-    env = make_env(config.env)
+    env = build_env(config.env)
     policy, _ = load_policy(folder, config, env, given.checkpoint, deterministic=True)
     key = episode_keys(SEED, given.episode + 1)[given.episode]
     act, step, chances = jax.jit(policy), jax.jit(env.step), policy_key_of(key)

@@ -40,7 +40,7 @@ def test_a_source_adds_scan_and_cut(tiny_scene, pristine, tmp_path):
 def test_the_source_of_another_scene_is_refused(tiny_scene, gibson_raw, tmp_path):
     path = gibson_raw / "floors.txt"
     path.write_text(path.read_text() + "\n")
-    with pytest.raises(SceneError, match=r"floors.txt differs.; give its own --source"):
+    with pytest.raises(SceneError, match=r"floors.txt differs.; give its --source"):
         preview(tiny_scene[0], tmp_path / "p.png", gibson_raw)
     shutil.rmtree(gibson_raw)
     assert main(["preview", str(tiny_scene[0]), "-o", str(tmp_path / "p.png"), "--source", str(gibson_raw)]) == 2

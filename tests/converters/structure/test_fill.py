@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from converters.geometry.faces import face_areas, sample_faces
-from converters.structure.fill import BEHIND_M, FREE, OVERLAP, Plane, Shown, seen_in_plane, wall_planes
+from converters.structure.fill import BEHIND_M, FREE, OVERLAP, Plane, Shown, faces_in_plane, wall_planes
 from interactive_nav_common.rotations import yaw_matrix
 
 LEVEL = 0.004
@@ -37,12 +37,12 @@ def without(vertices, faces, gone) -> np.ndarray:
 
 def patches(vertices, faces, plane: Plane, box) -> tuple[np.ndarray, np.ndarray]:
     """Of what is not seen whole of a box (left, bottom, right, top) in a plane."""
-    points, _ = sample_faces(vertices, faces[seen_in_plane(vertices, faces, plane)], CELL_M / 2)
+    points, _ = sample_faces(vertices, faces[faces_in_plane(vertices, faces, plane)], CELL_M / 2)
     low, size = np.array(box[:2]) - PAD * CELL_M, np.round((np.array(box[2:]) - box[:2]) / CELL_M).astype(int)
     shown = Shown.of(plane, points, low, (size[1] + 2 * PAD, size[0] + 2 * PAD), CELL_M)
-    wanted = np.zeros(shown.seen.shape, bool)
+    wanted = np.zeros(shown.visible.shape, bool)
     wanted[PAD:-PAD, PAD:-PAD] = True
-    return shown.patches(wanted & ~shown.seen)
+    return shown.patches(wanted & ~shown.visible)
 
 
 def hits(vertices: np.ndarray, faces: np.ndarray, eye: np.ndarray, targets: np.ndarray) -> np.ndarray:

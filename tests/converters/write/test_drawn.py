@@ -51,7 +51,7 @@ def test_a_small_surface_is_drawn_with_its_own_vertices_and_image() -> None:
     surface = painted(*chair(1))
     drawn, again = draw_objects([placed(surface), placed(surface, 2.0)], [NOTHING, NOTHING], len(surface.faces), 32)
     assert drawn is again
-    assert (drawn.seen_share, drawn.kept_share, drawn.off_m) == (0.0, 1.0, 0.0)
+    assert (drawn.shown_share, drawn.kept_share, drawn.off_m) == (0.0, 1.0, 0.0)
     assert (drawn.mesh.vertices[drawn.mesh.faces] == surface.vertices[surface.faces]).all()
     assert surface.corner_uv is not None
     assert np.allclose(drawn.mesh.uv[drawn.mesh.uv_faces], surface.corner_uv, atol=1e-12)
@@ -85,7 +85,7 @@ def test_what_the_scan_shows_takes_the_scans_colours() -> None:
     green = ColourCloud(points + [2.0, 0, 0], normals, np.tile([0.0, 200.0, 0.0], (len(points), 1)))
     own, scanned = draw_objects([placed(surface), placed(surface, 2.0)], [NOTHING, green], 3000, 32)
     assert own.mesh.exact and not scanned.mesh.exact
-    assert scanned.seen_share > 0.9 and (scanned.mesh.image == [0, 200, 0]).all(axis=2).mean() > 0.9
+    assert scanned.shown_share > 0.9 and (scanned.mesh.image == [0, 200, 0]).all(axis=2).mean() > 0.9
 
 
 def test_a_ceiling_on_the_faces_costs_surface_and_says_how_much() -> None:

@@ -36,7 +36,7 @@ CIRCLE = "a: &a {b: [*a]}"
 def test_aliases_that_stand_for_much_are_refused_in_one_line(tmp_path, text):
     (tmp_path / "c.yaml").write_text(text)
     with pytest.raises(ConfigError, match=r"c.yaml: not readable as YAML .*aliases repeat") as refused:
-        config_io.load(str(tmp_path / "c.yaml"))
+        config_io.load_config(str(tmp_path / "c.yaml"))
     assert len(str(refused.value)) < 400 and "\n" not in str(refused.value)
 
 
@@ -93,7 +93,7 @@ def test_what_is_no_regular_file_is_not_opened(tmp_path, special):
     (tmp_path / "c.json.gz").symlink_to(path)
     reads = [
         lambda: Reader(FileError, "make it again").json(path),
-        lambda: config_io.load(str(path)),
+        lambda: config_io.load_config(str(path)),
         lambda: read_rows([tmp_path / "b.parquet"]),
         lambda: episodes.load_episode_file(tmp_path / "c.json.gz"),
         lambda: read_metrics(path),

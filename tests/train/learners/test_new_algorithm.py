@@ -80,14 +80,14 @@ def test_it_trains_resumes_and_its_export_plays_the_same(added, tmp_path):
     halves = jax.tree.map(lambda x: x.astype(jnp.float16).astype(x.dtype), learner.policy_params)
     whole = RunFolder(tmp_path / "whole")
     snapshot = Snapshot(meta.env_steps, learner.replace(policy_params=halves), None)
-    path = checkpoint.save(whole.checkpoints, snapshot, meta, 1, 0.0)
+    path = checkpoint.save_snapshot(whole.checkpoints, snapshot, meta, 1, 0.0)
     exported = RunFolder(tmp_path / "exported")
     checkpoint.keep_policy(path, exported.checkpoints / path.name)
     with np.load(exported.checkpoints / path.name / "policy.npz") as stored:
         parts = {name.partition("/")[0] for name in stored.files}
     assert parts == {"policy_params", "normalizer_params"}
     player, keys = BatchPlayer(env), episode_keys(3, 12)
-    policies = [load_policy(run, config, env, "last", True, player.known)[0] for run in (whole, exported, folder)]
+    policies = [load_policy(run, config, env, "last", True, player.cached)[0] for run in (whole, exported, folder)]
     policies.append(jax.tree_util.Partial(policies[0].func, template))
     played = [player.play(policy, keys) for policy in policies]
     for name, scores in played[0].metrics.items():

@@ -31,7 +31,7 @@ def three(tmp_path):
         snapshot = types.SimpleNamespace(
             learner={"w": np.full(300, steps, np.float32)}, env_state={"x": np.arange(4, dtype=np.int32)}
         )
-        checkpoint.save(tmp_path, snapshot, dataclasses.replace(META, env_steps=steps, score=score), 3, 1.0)
+        checkpoint.save_snapshot(tmp_path, snapshot, dataclasses.replace(META, env_steps=steps, score=score), 3, 1.0)
     return tmp_path
 
 
@@ -122,7 +122,7 @@ def test_a_run_does_not_continue_in_a_scene_that_changed(tmp_path):
 def test_an_exported_policy_has_a_digest_of_its_own(tmp_path):
     learner = {"params": {"policy": np.ones((3, 2), np.float32)}, "normalizer_params": {}}
     snapshot = types.SimpleNamespace(learner=learner, env_state=None)
-    path = checkpoint.save(tmp_path, snapshot, dataclasses.replace(META, env_steps=7), 1, 0.0)
+    path = checkpoint.save_snapshot(tmp_path, snapshot, dataclasses.replace(META, env_steps=7), 1, 0.0)
     checkpoint.keep_policy(path, tmp_path / "exported" / path.name)
     kept, _ = checkpoint.find(tmp_path / "exported", "last")
     flip(kept / "policy.npz")

@@ -64,7 +64,7 @@ def actions(env, config, learner):
 
 def saved(root, algorithm, learner):
     meta = checkpoint.CheckpointMeta(5, 1.0, 0.5, algorithm, "turtlebot", ("goal",), 3, 2)
-    return checkpoint.save(root, Snapshot(5, learner, None), meta, 1, 1.0)
+    return checkpoint.save_snapshot(root, Snapshot(5, learner, None), meta, 1, 1.0)
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "sac", "ddpg"])

@@ -135,7 +135,7 @@ def test_only_the_newest_and_the_best_checkpoints_stay(tmp_path):
     scores = {100: None, 200: 0.9, 300: 0.5, 400: 0.7, 500: 0.8}
     for steps, score in scores.items():
         snapshot = type("S", (), {"learner": {"w": np.full(3, steps, np.float32)}, "env_state": {"x": np.arange(4)}})()
-        checkpoint.save(tmp_path, snapshot, dataclasses.replace(meta, env_steps=steps, score=score), 2, 1.0)
+        checkpoint.save_snapshot(tmp_path, snapshot, dataclasses.replace(meta, env_steps=steps, score=score), 2, 1.0)
     assert [c.env_steps for c in checkpoint.list_checkpoints(tmp_path)] == [200, 400, 500]
     assert checkpoint.find(tmp_path, "best")[1].env_steps == 200
     assert checkpoint.find(tmp_path, "last")[1].env_steps == 500
@@ -171,7 +171,7 @@ def test_a_checkpoint_that_goes_is_gone_for_readers_at_once(tmp_path, monkeypatc
 
     monkeypatch.setattr(checkpoint.shutil, "rmtree", slow)
     for steps in (100, 200):
-        checkpoint.save(tmp_path, snapshot, dataclasses.replace(meta, env_steps=steps), 1, 1.0)
+        checkpoint.save_snapshot(tmp_path, snapshot, dataclasses.replace(meta, env_steps=steps), 1, 1.0)
     assert seen == [[200]] and [path.name for path in tmp_path.iterdir()] == ["000000000200"]
 
 
@@ -285,10 +285,10 @@ def test_disk_that_fills_up_leaves_the_last_checkpoint(tmp_path, monkeypatch):
 
     meta = checkpoint.CheckpointMeta(100, 0.0, None, "ppo", "turtlebot", ("goal",), 3, 2)
     snapshot = type("S", (), {"learner": {"w": np.zeros(3)}, "env_state": None})()
-    checkpoint.save(tmp_path, snapshot, meta, 2, 1.0)
+    checkpoint.save_snapshot(tmp_path, snapshot, meta, 2, 1.0)
     monkeypatch.setattr(checkpoint.os, "fsync", full)
     with pytest.raises(FileError, match="cannot write the checkpoint \\(No space left on device\\)"):
-        checkpoint.save(tmp_path, snapshot, dataclasses.replace(meta, env_steps=200), 2, 1.0)
+        checkpoint.save_snapshot(tmp_path, snapshot, dataclasses.replace(meta, env_steps=200), 2, 1.0)
     assert [c.env_steps for c in checkpoint.list_checkpoints(tmp_path)] == [100]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["000000000100"]
 

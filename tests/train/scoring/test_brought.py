@@ -18,7 +18,7 @@ from interactive_nav_common.errors import ConfigError
 from tests.train.toy_env import ToyEnv
 from tests.train.toy_run import build_toy
 from train import evaluate
-from train.scoring.brought import BroughtPolicy, _on_host, named, told
+from train.scoring.brought import BroughtPolicy, _on_host, describe_env, named
 from train.scoring.policies import make_follower
 from train.scoring.rollout import BatchPlayer
 
@@ -183,7 +183,7 @@ def test_tensors_leave_their_graph_and_device_first():
 
 
 def test_what_a_factory_is_told(env):
-    description = told(env)
+    description = describe_env(env)
     assert description.robot == "turtlebot" and description.scenes == ("plane",)
     assert {name: (x.shape, x.dtype) for name, x in description.observations.items()} == {
         "state": ((29,), np.dtype(np.float32))
@@ -262,7 +262,7 @@ def test_rows_of_a_command(module, tmp_path):
         (["m=my_policy:no_numbers"], "policy m: policy's actions: raised ValueError: could not convert string"),
         (["m=my_policy:not_finite"], "policy m: actions of episode 1 at step 1 are [inf  0.], expected finite numbers"),
         (["m=my_policy:raises"], "policy m: policy: raised KeyError: 'stat' at my_policy.py:55"),
-        (["m=my_policy:raises", "m=my_policy:broken"], "--policy: name 'm' is taken, expected one of its own"),
+        (["m=my_policy:raises", "m=my_policy:broken"], "--policy: name 'm' is taken, expected another one"),
     ],
 )
 def test_mistakes_are_one_line_and_exit_2(module, tmp_path, capsys, words, message):

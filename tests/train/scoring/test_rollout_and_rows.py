@@ -20,7 +20,7 @@ from interactive_nav_common.statistics import interval
 from tests.train.toy_env import ToyConfig, ToyEnv
 from train.scoring.policies import make_follower, make_random
 from train.scoring.rollout import BatchPlayer, Paths, PlayedEpisodes
-from train.scoring.row_files import EvaluationAsked, files_of_run
+from train.scoring.row_files import EvaluationRequest, files_of_run
 from train.scoring.rows import episode_table
 
 
@@ -229,8 +229,8 @@ def test_rows_of_many_files_are_one_table(tmp_path):
 
 
 def test_a_question_names_its_file(tmp_path):
-    asked = EvaluationAsked(("alder",), ("learned",), 10, 1, True, "best", False)
-    same = EvaluationAsked(("alder",), ("learned",), 10, 1, True, "best", False)
+    asked = EvaluationRequest(("alder",), ("learned",), 10, 1, True, "best", False)
+    same = EvaluationRequest(("alder",), ("learned",), 10, 1, True, "best", False)
     other = dataclasses.replace(asked, episodes=11)
     assert asked.file_name("a") == same.file_name("a") != other.file_name("a")
     for name in (asked.file_name("a"), other.file_name("a"), asked.file_name("a-b"), "a.parquet", "a-xy.parquet"):

@@ -13,7 +13,7 @@ from interactive_nav_common.statistics import estimate, p_text, welch
 from tests.train.synthetic import K_INTS, baseline_rows, paper_like, run_rows
 from train.scoring.claims import LARGE, MEDIUM, SMALL, claims
 from train.scoring.rows import BY_CATEGORY
-from train.scoring.statistics import contrast, correlation, run_means, seen_unseen
+from train.scoring.statistics import contrast, correlation, run_means, train_test_contrast
 
 
 def test_a_run_counts_once_whatever_its_episodes():
@@ -69,7 +69,7 @@ def test_seen_against_unseen():
     """Differences of INS_0.5 of -0.01, -0.02 and -0.06: mean -0.03, deviation sqrt(0.0007), t = -1.964 at 2 degrees."""
     shifts = (-0.02, -0.04, -0.12)  # of P_eff, which is half of INS_0.5
     tables = [run_rows("turtlebot", "sac", 0.1, s, 0.7, (0.8, 0.8), unseen=shift) for s, shift in enumerate(shifts)]
-    pairs, test = seen_unseen(pa.concat_tables(tables))
+    pairs, test = train_test_contrast(pa.concat_tables(tables))
     assert test is not None and len(pairs) == 3 and test.difference == pytest.approx(-0.03)
     half = 4.302653 * math.sqrt(0.0007) / math.sqrt(3)
     assert (test.low, test.high) == pytest.approx((-0.03 - half, -0.03 + half), abs=1e-6)
@@ -77,7 +77,7 @@ def test_seen_against_unseen():
     # Student's distribution at two degrees of freedom in closed form: p = 1 - t / sqrt(t^2 + 2).
     assert test.p_value == pytest.approx(1.0 - t / math.sqrt(t * t + 2.0), abs=1e-6)
     only_train = [table.filter(pa.compute.equal(table["split"], "train")) for table in tables]
-    assert seen_unseen(pa.concat_tables(only_train)) == ([], None)
+    assert train_test_contrast(pa.concat_tables(only_train)) == ([], None)
 
 
 def test_correlation_by_hand():

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 import yaml
 
 from interactive_nav_common.files import whole_file, write_text
-from train.scoring.row_files import EvaluationAsked
+from train.scoring.row_files import EvaluationRequest
 
 
 def fates(run: Path) -> dict[str, list[str]]:
@@ -73,7 +73,7 @@ def evaluate(words: list[str]) -> int:
             return 2
         if "no-rows" in plan.get(run.name, []):
             return 0
-        asked = EvaluationAsked(
+        asked = EvaluationRequest(
             scenes=tuple(Path(scene).name for scene in words[words.index("--scenes") + 1 :]),
             policies=("learned",),
             episodes=int(after("--episodes")),

@@ -19,7 +19,7 @@ from train.scoring.row_files import paths_beside
 from train.sweep import export as export_module
 from train.sweep import spec
 from train.sweep.__main__ import main
-from train.sweep.export import ORDER, rounded, thinned, without_seen_things
+from train.sweep.export import ORDER, rounded, thinned, without_train_details
 from train.sweep.folder import SweepFolder
 
 
@@ -78,19 +78,19 @@ def test_what_no_table_has_of_seen_homes_is_kept_of_unseen_ones_where_there_are_
     rows = pa.table(
         {"by_category": told, "force_sum_n": [8.0, 16.0, 0.0], "split": ["train", "test", "test"], "n": [0, 1, 2]}
     )
-    kept = without_seen_things(rows)
+    kept = without_train_details(rows)
     assert kept.schema.equals(rows.schema) and kept["by_category"].to_pylist() == [None, [{"objects": 3}], None]
     assert kept["force_sum_n"].to_pylist() == [None, 16.0, 0.0]
     left = ["by_category", "force_sum_n"]
     assert kept.drop(left).equals(rows.drop(left))
-    assert without_seen_things(rows[:1]).equals(rows[:1]) and without_seen_things(rows[:0]).equals(rows[:0])
-    assert without_seen_things(rows.drop(left)).equals(rows.drop(left))
+    assert without_train_details(rows[:1]).equals(rows[:1]) and without_train_details(rows[:0]).equals(rows[:0])
+    assert without_train_details(rows.drop(left)).equals(rows.drop(left))
 
 
 @pytest.fixture
 def swept(tmp_path):
     """Two cells of two runs; seed 1 is the better one at k_int = 0, seed 0 at k_int = 1 (which has no checkpoint)."""
-    folder = SweepFolder(spec.load(str(write_sweep(tmp_path))))
+    folder = SweepFolder(spec.load_sweep(str(write_sweep(tmp_path))))
     folder.prepare()
     for run in folder.sweep.runs:
         home = folder.runs / run.name
@@ -100,13 +100,13 @@ def swept(tmp_path):
         (home / "metrics.jsonl").write_text(json.dumps({"env_steps": 5, "episodes": 1.0}) + "\n")
         rows = run_rows("turtlebot", "ppo", k_int, seed, 0.5 + 0.1 * (seed if k_int == 0.0 else -seed), (0.5, 0.5))
         rows = rows.set_column(0, "run", [[run.name] * len(rows)])
-        write_parquet(rows, folder.rows / folder.asked(run).file_name(run.name), {"trained_steps": "5"})
+        write_parquet(rows, folder.rows / folder.request(run).file_name(run.name), {"trained_steps": "5"})
         if k_int == 0.0:
             meta = checkpoint.CheckpointMeta(5, 1.0, 0.5, "ppo", "turtlebot", ("goal",), 3, 2)
             state = {"x": np.zeros(4)}
             learner = {"params": {"w": np.full(3, seed, np.float32)}, "normalizer_params": {}}
             snapshot = type("S", (), {"learner": learner, "env_state": state})()
-            checkpoint.save(home / "checkpoints", snapshot, meta, 1, 1.0)
+            checkpoint.save_snapshot(home / "checkpoints", snapshot, meta, 1, 1.0)
     return folder
 
 

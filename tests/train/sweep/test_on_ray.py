@@ -39,7 +39,7 @@ def cluster():
 
 def sweep(path: Path, stops: list[int] | None = None, clock=time.monotonic, limit_s: float | None = None):
     console = Console(file=io.StringIO(), width=400)
-    folder = SweepFolder(spec.load(str(path)))
+    folder = SweepFolder(spec.load_sweep(str(path)))
     folder.prepare()
     launcher = RayLauncher("auto")
     with SweepDisplay(console) as display:

@@ -12,7 +12,7 @@ import yaml
 from interactive_nav_common.errors import ConfigError
 from scenes_mjcf import sets
 from train import evaluate
-from train.config_io import known_in
+from train.config_io import preset_names
 from train.sweep import spec
 from train.sweep.__main__ import main
 from train.sweep.folder import SweepFolder, words_of_evaluation
@@ -42,7 +42,7 @@ launch: {runs_per_gpu: 4}
 
 
 def sweep_of(text: str) -> spec.Sweep:
-    return spec.expand(spec.read(yaml.safe_load(text), "s.yaml", "s"), "s.yaml")
+    return spec.expand(spec.parse_sweep(yaml.safe_load(text), "s.yaml", "s"), "s.yaml")
 
 
 def test_every_combination_but_the_skipped_has_its_own_settings():
@@ -91,7 +91,7 @@ def test_machines_can_share_a_sweep():
         ("env.k_int: [0.0, 1.0]\n", "k_int: [0.0, 1.0]\n", "grid: unknown key 'k_int', did you mean 'env.k_int'?"),
         ("[0.0, 1.0]\n", "[0.0, 1.0, x]\n", "env.k_int: got 'x' (str), expected a number"),
         ("env.k_int: [0.0, 1.0]\n", "env.k_int: 1.0\n", "grid: env.k_int: got 1.0, expected a list of values"),
-        ("env.robot: [turtlebot]", "run.name: [a]", "grid: run.name is the sweep's own to choose"),
+        ("env.robot: [turtlebot]", "run.name: [a]", "grid: run.name is chosen by the sweep"),
         ("episodes: 50", "episodes: 0", "evaluate.episodes is 0, expected at least 1"),
         ("episodes: 50", "episods: 50", "unknown key 'evaluate.episods', did you mean"),
         ("episodes: 50", "checkpoint: newest", "checkpoint is 'newest', expected best, last or a number"),
@@ -137,10 +137,10 @@ def test_every_sweep_of_the_package_can_be_run(monkeypatch):
     of_set = sets._members
     homes = ["cluttered_000", "cluttered_001"]
     monkeypatch.setattr(sets, "_members", lambda word: homes if word.startswith("cluttered/") else of_set(word))
-    assert {"kint", "cluttered"} <= set(known_in(spec.SWEEP_DIR))
-    for name in known_in(spec.SWEEP_DIR):
-        assert spec.load(name).runs
-    sweep = spec.load("cluttered")
+    assert {"kint", "cluttered"} <= set(preset_names(spec.SWEEP_DIR))
+    for name in preset_names(spec.SWEEP_DIR):
+        assert spec.load_sweep(name).runs
+    sweep = spec.load_sweep("cluttered")
     assert {len(run.config.env.scenes) for run in sweep.runs} == {2} and len(sweep.runs) == 54
     assert {run.config.env.rules.num_objects for run in sweep.runs} == {4}
 
@@ -152,7 +152,7 @@ def test_fixed_episodes_of_each_run_s_robot_are_played(monkeypatch):
         "[turtlebot]", "[turtlebot, fetch]"
     )
     folder = SweepFolder(sweep_of(text))
-    asked = {run.config.env.robot: folder.asked(run) for run in folder.sweep.runs}
+    asked = {run.config.env.robot: folder.request(run) for run in folder.sweep.runs}
     assert {robot: (a.episodes, a.seed, a.balanced) for robot, a in asked.items()} == dict.fromkeys(
         ("turtlebot", "fetch"), (2000, 0, False)
     )

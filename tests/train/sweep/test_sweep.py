@@ -49,7 +49,7 @@ def write_sweep(folder: Path, steps: int = 50, seeds: int = 2, **parts: object) 
 def sweep(path: Path, machine: Machine | None = None, limit_s: float | None = None, **keywords: object):
     """(outcome, what was printed, folder) of one command."""
     console = Console(file=io.StringIO(), width=400)
-    folder = SweepFolder(spec.load(str(path)))
+    folder = SweepFolder(spec.load_sweep(str(path)))
     folder.prepare()
     launcher = machine or Machine([], 2)
     with SweepDisplay(console) as display:
@@ -116,7 +116,7 @@ def test_stages_can_be_run_and_repeated_alone(tmp_path):
 
 
 def test_how_far_a_run_is_is_told_while_another_sweep_tries_it_again(tmp_path):
-    folder = SweepFolder(spec.load(str(write_sweep(tmp_path))))
+    folder = SweepFolder(spec.load_sweep(str(write_sweep(tmp_path))))
     folder.prepare()
     run, over = folder.sweep.runs[0], threading.Event()
 
@@ -141,7 +141,7 @@ def test_how_far_a_run_is_is_told_while_another_sweep_tries_it_again(tmp_path):
 
 def test_a_truncated_reason_is_told_with_the_status(tmp_path, capsys):
     path = write_sweep(tmp_path)
-    folder = SweepFolder(spec.load(str(path)))
+    folder = SweepFolder(spec.load_sweep(str(path)))
     folder.prepare()
     (folder.root / "failed" / f"{folder.sweep.runs[0].name}.json").write_text('{"reason": "tr')
     assert main([str(path), "--status"]) == 0
@@ -209,7 +209,7 @@ def test_an_evaluation_that_ends_well_without_rows_has_failed(tmp_path, monkeypa
     outcome, printed, _ = sweep(write_sweep(tmp_path))
     states = {s.name: s for s in outcome.states}
     assert outcome.exit_code("done") == 1 and states["k_int1-seed1"].state == "trained"
-    what = "evaluate: ended, but what it was asked for is not there: (nothing was printed)"
+    what = "evaluate: ended, but what it should have written is not there: (nothing was printed)"
     assert states["k_int1-seed1"].reason == what and "given up after 2 tries" in printed
     assert [s.state for s in outcome.states].count("done") == 3
 
@@ -295,7 +295,7 @@ def test_children_end_with_the_sweep_however_it_ends(tmp_path, number):
 
 def test_a_run_that_somebody_else_works_on_is_left_alone(tmp_path):
     path = write_sweep(tmp_path)
-    folder = SweepFolder(spec.load(str(path)))
+    folder = SweepFolder(spec.load_sweep(str(path)))
     folder.prepare()
     held = take_lock(folder.lock("k_int0-seed1"))
     assert held is not None and is_locked(folder.lock("k_int0-seed1")) and not is_locked(folder.lock("k_int0-seed0"))
