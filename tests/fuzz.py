@@ -235,6 +235,7 @@ def runs() -> dict[str, Target]:
         (root / "exported").mkdir()
         flat = {"params/kernel": np.ones((3, 2), np.float32), "params/bias": np.zeros(2, np.float32)}
         np.savez(root / "exported" / policy_file.POLICY, **policy_file.packed(flat))  # type: ignore[arg-type]
+        shutil.copy(path / checkpoint.META, root / "exported")
         path.rename(root / "newest")
 
     def read_checkpoint(root: Path) -> None:

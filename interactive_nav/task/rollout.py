@@ -76,8 +76,8 @@ def policy_key_of(key: jax.Array) -> jax.Array:
 class Player:
     """Plays episodes of one environment, not batched and not resetting itself.
 
-    What is compiled is kept: policies that are `jax.tree_util.Partial`s of one function share it, as do chunks of one
-    size.
+    What is compiled is kept: policies that are each a `jax.tree_util.Partial` of one function share it, as do chunks of
+    one size.
     """
 
     def __init__(self, env: Any, recorders: Mapping[str, Recorder]):
@@ -106,7 +106,7 @@ class Player:
 
         Args:
             keys: [N, 2]; an episode is drawn, and its policy's randomness is, from its key alone.
-            starts: `EpisodeStart`s, leaves [N, ...]: these episodes instead of drawn ones.
+            starts: an `EpisodeStart` with leaves [N, ...]: these episodes instead of drawn ones.
             scene_index: [N] i32, the scene of each drawn episode; None: drawn as well.
             record: E of the recorders at each step; None: all.
             batch: episodes played at a time; None: all. Where the device's memory lacks room, half as many are tried.

@@ -366,12 +366,13 @@ def test_one_array_tells_what_the_state_holds():
         name: jnp.asarray(value, value.dtype if value.dtype != float else jnp.float32) for name, value in nav.items()
     }
     physics = SimpleNamespace(qpos=jnp.asarray(rng.normal(size=(3, 9)), jnp.float32))
-    info, metrics = {"nav": SimpleNamespace(**nav)}, {"nonfinite": jnp.zeros(3)}
+    pose = {name: nav.pop(name) for name in ("robot_pos_w", "yaw_rad")}
+    info, metrics = {"nav": SimpleNamespace(**pose, memory=nav)}, {"nonfinite": jnp.zeros(3)}
     state = SimpleNamespace(info=info, metrics=metrics, pipeline_state=physics)
     simulator = Simulator(SimpleNamespace(**dict.fromkeys(("reset_to", "advance", "step", "strew"), abs)))
     seen = simulator.seen(state)
-    assert (seen.xy_w == np.asarray(nav["robot_pos_w"])[:, :2]).all() and seen.xy_w.dtype == float
-    assert (seen.yaw_rad == np.asarray(nav["yaw_rad"])).all()
+    assert (seen.xy_w == np.asarray(pose["robot_pos_w"])[:, :2]).all() and seen.xy_w.dtype == float
+    assert (seen.yaw_rad == np.asarray(pose["yaw_rad"])).all()
     assert (seen.path_m == np.asarray(nav["robot_path_m"])).all()
     assert seen.movable.tolist() == [True, False, False]
     assert seen.wall.tolist() == [False, True, False]
