@@ -8,7 +8,6 @@ import ast
 import io
 import re
 import subprocess
-import sys
 import tarfile
 from collections import Counter
 from pathlib import PurePosixPath
@@ -58,7 +57,3 @@ def main(commits: list[str]) -> None:
     """Print the report of each commit."""
     for commit in commits or ["HEAD"]:
         print(commit, *report(product(commit)), sep="\n  ")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
