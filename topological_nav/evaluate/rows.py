@@ -54,7 +54,7 @@ def play_contest(contest: Contest, scenes: Sequence[ContestScene], tell: Progres
 
             episodes, began = scene.episodes.take(rows), time.perf_counter()
             played = play(contender, simulator, episodes, contest.config, told)
-            _write(scene, name, simulator.env, episodes, played, time.perf_counter() - began)
+            _write(contest, scene, name, simulator.env, episodes, played, time.perf_counter() - began)
             done += len(rows)
             tell(what, done, total)
     return pa.concat_tables([_rows(contest.out, stem, len(scene.episodes)) for scene, _, stem in plan])
@@ -92,8 +92,10 @@ def _rows(out: Path, stem: str, count: int) -> pa.Table:
     return rows.take(first[number < count])
 
 
-def _write(scene: ContestScene, name: str, env: Any, episodes: DrivenEpisodes, played: Played, wall_s: float) -> None:
-    config, out, here = scene.contest.config, scene.contest.out, versions()
+def _write(
+    contest: Contest, scene: ContestScene, name: str, env: Any, episodes: DrivenEpisodes, played: Played, wall_s: float
+) -> None:
+    config, out, here = contest.config, contest.out, versions()
     navigates = name in ("dense", "sparse")
     constants = {
         "contender": name,
