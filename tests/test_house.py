@@ -102,6 +102,15 @@ def test_the_drawn_map_is_that_of_the_imports(sources):
     assert drawn == svg(room_graph(sources)), "python docs/package_map.py draws it anew"
 
 
+def test_no_link_is_tracked():
+    """A link to a folder of one machine replaces that folder wherever the branch is merged."""
+    listed = subprocess.run(("git", "ls-files", "-s"), cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("not a Git checkout")
+    lines = listed.stdout.splitlines()
+    assert lines and [line for line in lines if line.startswith("120000")] == []
+
+
 def test_the_checkout_is_small():
     listed = subprocess.run(("git", "ls-files", "-z"), cwd=ROOT, capture_output=True, text=True)
     if listed.returncode:
