@@ -162,7 +162,7 @@ def texture_options(text: str, unused: collections.Counter[str]) -> tuple[str, n
     base and the gain of the image.
     """
     placing = PLAIN.copy()
-    while (words := text.split(None, 1))[0].startswith("-") and len(words) > 1:
+    while len(words := text.split(None, 1)) > 1 and words[0].startswith("-"):
         option, text = words[0].lower(), words[1]
         unused[option] += option in UNUSED_OPTIONS
         values: list[float] = []

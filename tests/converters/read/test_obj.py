@@ -112,6 +112,8 @@ def test_mtl_options_and_colours():
         ("my wood 2.png", "my wood 2.png", [[1, 1], [0, 0], [0, 0], [0, 1]]),
         ("-clamp on -s 2 3 1 my wood.png", "my wood.png", [[2, 3], [0, 0], [1, 1], [0, 1]]),
         ("-clamp off -s 2 -o 0.5 -0.25 wood.png", "wood.png", [[2, 1], [0.5, -0.25], [0, 0], [0, 1]]),
+        ("-clamp on", "", [[1, 1], [0, 0], [1, 1], [0, 1]]),
+        ("-s 2", "", [[1, 1], [0, 0], [0, 0], [0, 1]]),
         ("-mm 0.1 0.5 -bm 0.5 -imfchan r -texres 512 -t 1 1 1 a.png", "a.png", [[1, 1], [0, 0], [0, 0], [0.1, 0.5]]),
     ],
 )
