@@ -104,7 +104,7 @@ class NavInfo:
     step_count: jax.Array
     """[] i32 control steps done."""
     memory: dict[str, Any]
-    """What each term remembers, by its name (`interactive_nav.task.terms`)."""
+    """The memory of each term, by its key (`interactive_nav.task.terms`)."""
     round_field: tuple[GoalField, jax.Array] | None = None
     """With `potential_round`: what the geodesic round heavy furniture needs to know, and [] bool whether it counts."""
 

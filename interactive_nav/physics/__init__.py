@@ -31,7 +31,7 @@ def keep_programs() -> None:
     """Keep programs that JAX compiles for an accelerator in the cache folder, from which later processes load them.
 
     JAX names them by their source, the device and the versions. Those that call Warp name the call alone:
-    what is called each process has from its tracing. Whoever set JAX_COMPILATION_CACHE_DIR has chosen.
+    the kernels themselves come from each process's tracing. A JAX_COMPILATION_CACHE_DIR that is set is kept.
     """
     chosen = "JAX_COMPILATION_CACHE_DIR" in os.environ or jax.config.jax_compilation_cache_dir
     if not chosen and jax.default_backend() != "cpu":

@@ -52,7 +52,7 @@ def bodies_by_name(scene: Scene, small: Sequence[SmallObject]) -> dict[str, Body
 
 @dataclasses.dataclass(frozen=True)
 class SlotTables:
-    """What is in the slots of a world: S scenes, M slots, B boxes; an empty slot has mass 0 and no boxes."""
+    """Holds the contents of the slots of a world: S scenes, M slots, B boxes; an empty slot has mass 0 and no boxes."""
 
     bodies: tuple[tuple[Body | None, ...], ...]
     """[S][M]"""

@@ -41,7 +41,7 @@ class World:
     """[S, nq]: furniture settled, robot and small objects parked."""
     robot_mass_kg: float
     slots: SlotTables
-    """What may move, by scene."""
+    """The movable bodies of each scene."""
 
 
 def _settle(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> np.ndarray:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env, State
 
-from interactive_nav.config import NavConfig
+from interactive_nav.config import SIGNALS, NavConfig
 from interactive_nav.navigation.lookup import (
     all_free,
     cell_centre,
@@ -78,7 +78,9 @@ class InteractiveNav(Env):
         observed = config.sensors.observations
         self.terms = (*(t for t in TERMS if t.kind != "observation" or t.name in observed), *terms)
         keys = [t.key for t in self.terms]
-        if repeated := [key for key in keys if keys.count(key) > 1]:
+        repeated = [key for key in keys if keys.count(key) > 1]
+        repeated += [t.name for t in terms if t.kind == "observation" and t.name in SIGNALS]
+        if repeated:
             raise ConfigError(f"terms: two are called '{repeated[0]}', expected different names; rename one")
         self.metric_names = tuple(t.key for t in self.terms if t.kind == "metric")
         self.reward_names = tuple(t.key for t in self.terms if t.kind == "reward")
@@ -203,7 +205,7 @@ class InteractiveNav(Env):
         physics: PhysicsState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
         moment = Moment(*self._constants, nav, physics, self._robot_pose(physics)[1])
         parts = [t for t in self.terms if t.kind == "observation"]
-        remembered = {t.name: t.value(nav.memory.get(t.key), moment) for t in parts if t.value}
+        remembered = {t.name: t.evaluate(nav.memory.get(t.key), moment) for t in parts}
         obs = self.sensors.observe(physics, nav, state.info["rng"], remembered)
         return state.replace(obs=jax.tree.map(lambda x: jnp.where(blank, jnp.zeros_like(x), x), obs))
 
@@ -230,10 +232,11 @@ class InteractiveNav(Env):
         truncated = timed_out | lost if rules.bootstrap_at_time_limit else lost
         ends = {"truncation": truncated.astype(jnp.float32), "time_out": timed_out.astype(jnp.float32)}
 
-        memory = {t.key: t.update(step.last.memory[t.key], step) for t in self.terms if t.start}
+        memory = {t.key: t.updated(step.last.memory[t.key], step) for t in self.terms if t.start}
         nav = nav.replace(memory=memory)
         step = dataclasses.replace(step, nav=nav)
-        values = {t.key: t.value(memory.get(t.key), step) for t in self.terms if t.kind != "observation" and t.value}
+        scored = [t for t in self.terms if t.kind in ("reward", "metric")]
+        values = {t.key: t.evaluate(memory.get(t.key), step) for t in scored}
         metrics = {name: done * jnp.asarray(values[name], jnp.float32) for name in self.metric_names}
         rewards = {name: values[name] for name in self.reward_names}
         reward = functools.reduce(operator.add, rewards.values())

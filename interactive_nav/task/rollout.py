@@ -27,7 +27,7 @@ class HostPolicy:
     """A policy that acts on the host, step by step, for a batch of episodes."""
 
     note = ""
-    """What a reader of its scores should know."""
+    """A remark to print beside its scores."""
 
     def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> np.ndarray:
         """Return the actions [N, A] of one control step.
@@ -76,8 +76,8 @@ def policy_key_of(key: jax.Array) -> jax.Array:
 class Player:
     """Plays episodes of one environment, not batched and not resetting itself.
 
-    What is compiled is kept: policies that are each a `jax.tree_util.Partial` of one function share it, as do chunks of
-    one size.
+    Compiled programs are kept: policies that are each a `jax.tree_util.Partial` of one function share one, as do
+    chunks of one size.
     """
 
     def __init__(self, env: Any, recorders: Mapping[str, Recorder]):

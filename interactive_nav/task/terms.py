@@ -20,6 +20,7 @@ from interactive_nav.reward import interactive_navigation_reward
 from interactive_nav.sensing.observation import advance_odometry, waypoints_in_body
 from interactive_nav.sensing.sensors import TRAIL, TRAIL_STEPS, stream
 from interactive_nav.types import NavInfo, SceneTables
+from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import wrap_angle
 
 STILL_M = 1e-4
@@ -73,7 +74,7 @@ class Term:
     name: str
     """Key in `state.metrics` and `NavInfo.memory` (`reward/<name>` of a reward), or the part of the observation."""
     doc: str
-    """What it is, with its unit and range."""
+    """A description with its unit and range."""
     kind: Literal["reward", "metric", "observation", "memory"]
     value: Callable[[Any, Any], jax.Array] | None = None
     """(memory, Step) -> [] of a reward, which is added, or of a metric, reported in the episode's last step.
@@ -85,10 +86,43 @@ class Term:
     size: int = 0
     """Length of an observation."""
 
+    def __post_init__(self) -> None:
+        """Raise ConfigError where the fields do not fit the kind."""
+        if (self.value is None) != (self.kind == "memory"):
+            expected = _VALUES[self.kind]
+            raise ConfigError(f"term '{self.name}' ({self.kind}): value is {self.value}, expected {expected}")
+        if (self.size > 0) != (self.kind == "observation"):
+            length = "its length" if self.kind == "observation" else "0"
+            raise ConfigError(f"term '{self.name}': size is {self.size}, expected {length} for kind='{self.kind}'")
+        if self.start is None and (self.update is not Term.update or self.kind == "memory"):
+            raise ConfigError(f"term '{self.name}': has a memory but no start, expected (nav) -> memory; give start=")
+
+    def evaluate(self, memory: Any, at: Any) -> jax.Array:
+        """Return its value, of the shape that its kind has."""
+        assert self.value is not None
+        value, shape = jnp.asarray(self.value(memory, at)), (self.size,) if self.size else ()
+        if value.shape != shape:
+            raise ConfigError(f"term '{self.name}': its value has shape {value.shape}, expected {shape}")
+        return value
+
+    def updated(self, memory: Any, step: Step) -> Any:
+        """Return its memory after a control step, of the shapes and types that it had."""
+        new = self.update(memory, step)
+        before, after = (jax.tree.map(lambda x: f"{x.dtype}{list(x.shape)}", tree) for tree in (memory, new))
+        if before != after:
+            raise ConfigError(f"term '{self.name}': update returns {after}, expected what start returns: {before}")
+        return new
+
     @property
     def key(self) -> str:
         """Return its key in `state.metrics` and `NavInfo.memory`."""
         return f"reward/{self.name}" if self.kind == "reward" else self.name
+
+
+_VALUES = {
+    **dict.fromkeys(("reward", "metric"), "(memory, Step) -> []"),
+    **{"observation": "(memory, Moment) -> (size,)", "memory": "none; call it a metric to report it"},
+}
 
 
 def _moved_m(delta: jax.Array) -> jax.Array:

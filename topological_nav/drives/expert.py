@@ -94,8 +94,8 @@ def sample(grid: jax.Array, origin_w: jax.Array, resolution_m: jax.Array, xy_w: 
 def window(velocity: jax.Array, config: ExpertConfig) -> tuple[jax.Array, jax.Array]:
     """Return the velocities that can be reached within a control period: linear [C] and angular [C], all pairs.
 
-    What of the lattice is out of reach is brought as near as can be reached. `velocity` [2] is the last command (m/s,
-    rad/s).
+    Velocities of the lattice that are out of reach are clipped to the nearest that is in reach. `velocity` [2] is the
+    last command (m/s, rad/s).
     """
 
     def around(now, change, lattice):

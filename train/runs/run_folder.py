@@ -38,7 +38,7 @@ GOES_ON = "make room and start again: the run continues from its last checkpoint
 
 @dataclasses.dataclass(frozen=True)
 class _Summary:
-    """What is read of summary.json."""
+    """The fields of summary.json that are read."""
 
     completed: bool = False
     env_steps: Natural | None = None
@@ -47,7 +47,7 @@ class _Summary:
 
 @dataclasses.dataclass(frozen=True)
 class _Versions:
-    """What is read of versions.json."""
+    """The fields of versions.json that are read."""
 
     device: dict[str, Any] | None = None
     commit: str | None = None

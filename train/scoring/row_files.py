@@ -10,7 +10,7 @@ from typing import Any
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationRequest:
-    """What an evaluation is to play: with the run, it names a file of rows."""
+    """The episodes and policies of an evaluation; together with the run it names a file of rows."""
 
     scenes: tuple[str, ...]
     policies: tuple[str, ...]

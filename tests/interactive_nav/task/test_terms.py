@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -100,3 +102,36 @@ def test_two_terms_of_one_name_are_refused(env):
     twice = Term("success", "Twice.", "reward", lambda _, step: jnp.zeros(()))
     with pytest.raises(ConfigError, match="two are called 'reward/success', expected different names; rename one"):
         env.__class__(env.robot, env.scenes, env.config, (twice,))
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"kind": "metric"}, "'x' \\(metric\\): value is None, expected \\(memory, Step\\) -> \\[\\]"),
+        ({"kind": "memory", "value": lambda m, s: m, "start": jnp.zeros}, "\\(memory\\): value is .*, expected none"),
+        ({"kind": "observation", "value": lambda m, at: m}, "size is 0, expected its length for kind='observation'"),
+        ({"kind": "reward", "value": lambda m, s: m, "size": 2}, "size is 2, expected 0 for kind='reward'"),
+        ({"kind": "metric", "value": lambda m, s: m, "update": lambda m, s: m}, "no start, .*; give start="),
+        ({"kind": "memory"}, "no start, expected"),
+    ],
+)
+def test_terms_whose_fields_do_not_fit_are_refused(fields, words):
+    with pytest.raises(ConfigError, match=words):
+        Term("x", "Anything.", **fields)
+
+
+@pytest.mark.parametrize(
+    ("term", "words"),
+    [
+        (dataclasses.replace(BEFORE, size=3), "'before': its value has shape \\(2,\\), expected \\(3,\\)"),
+        (dataclasses.replace(BEFORE, name="lidar"), "two are called 'lidar'"),
+        (dataclasses.replace(WALL, value=lambda _, step: step.touches),
+         "'wall': its value has shape .*, expected \\(\\)"),
+        (dataclasses.replace(FARTHEST, update=lambda far_m, step: step.touches),
+         "'farthest_m': update returns bool.*, expected what start returns: float32\\[\\]"),
+    ],
+)  # fmt: skip
+def test_values_and_memories_of_another_shape_are_refused_with_the_terms_name(env, term, words):
+    with pytest.raises(ConfigError, match=words):
+        other = env.__class__(env.robot, env.scenes, env.config, (term,))
+        jax.eval_shape(lambda key: other.step(other.reset(key), jnp.zeros(2)), jax.random.PRNGKey(0))
