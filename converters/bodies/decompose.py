@@ -1,6 +1,6 @@
-"""CAD meshes in, convex hulls out: coacd in one process a model, results cached by content.
+"""Decompose CAD meshes into convex hulls: coacd in one process per model, results cached by content.
 
-A model on which coacd fails or runs past the time limit gets its convex hull instead, which the result names.
+A model on which coacd fails or runs past the time limit gets its convex hull instead, and the result names it.
 
 coacd runs outside this process because it prints its log to the terminal, may crash on bad meshes, and
 cannot be interrupted from Python. A model is decomposed once, unscaled: scaling keeps a hull convex.
@@ -10,7 +10,6 @@ import concurrent.futures
 import contextlib
 import dataclasses
 import errno
-import hashlib
 import os
 import subprocess
 import sys
@@ -24,9 +23,11 @@ import numpy as np
 
 from converters.clock import peak_memory_mib
 from converters.geometry.boxes import Hull, convex_hull
-from converters.records.cache import LIMIT_BYTES, store, touch
+from converters.records.cache import MISSING, NOT_HASHED, StageCache
 from converters.records.errors import CANNOT_WRITE, StageFailed
 from interactive_nav_common import files
+
+WORKER = "converters.bodies.coacd_worker"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +44,7 @@ class DecomposeConfig:
     max_ch_vertex: int = 32
     """Vertices of a hull: keeps collision cheap and the assets small."""
     seed: int = 0
-    timeout_s: float = 240.0
+    timeout_s: float = dataclasses.field(default=240.0, metadata=NOT_HASHED)
 
 
 DOOR_OVERRIDES = {"threshold": 0.02, "max_convex_hull": 4, "preprocess_resolution": 60}
@@ -52,40 +53,8 @@ within the threshold, and a voxel is 7 cm, so that a leaf of 4 cm would become a
 
 
 def cache_folder() -> Path:
-    """`converters` in the package's cache folder."""
+    """Return `converters` in the package's cache folder."""
     return files.cache_folder() / "converters"
-
-
-def content_key(vertices: np.ndarray, faces: np.ndarray, config: DecomposeConfig) -> str:
-    """sha256 over the mesh, the parameters and coacd's version."""
-    from importlib.metadata import version
-
-    digest = hashlib.sha256()
-    digest.update(np.ascontiguousarray(vertices, np.float64).tobytes())
-    digest.update(np.ascontiguousarray(faces, np.int64).tobytes())
-    parameters = {k: v for k, v in dataclasses.asdict(config).items() if k != "timeout_s"}
-    digest.update(repr((sorted(parameters.items()), version("coacd"))).encode())
-    return digest.hexdigest()
-
-
-def _load(path: Path) -> tuple[Hull, ...] | None:
-    """Hulls from a cache file; None where it is missing or damaged (then it is made again)."""
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            count = int(arrays["count"])
-            return tuple(Hull(arrays[f"v{i}"], arrays[f"f{i}"]) for i in range(count)) or None
-    except Exception:  # a damaged archive fails in zipfile, zlib, struct or NumPy, each in its own way
-        return None
-
-
-def _store(path: Path, hulls: tuple[Hull, ...], limit_bytes: int = LIMIT_BYTES) -> None:
-    arrays = {f"v{i}": h.vertices for i, h in enumerate(hulls)} | {f"f{i}": h.faces for i, h in enumerate(hulls)}
-    count = len(hulls)
-    store(
-        path,
-        lambda partial: np.savez_compressed(partial, count=count, **arrays),  # pyright: ignore[reportArgumentType]
-        limit_bytes,
-    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +78,7 @@ def decompose_all(
     overrides: Mapping[str, Mapping[str, float]] | None = None,
     strict: bool = False,
 ) -> Decomposition:
-    """Decomposes every mesh, `jobs` processes at a time.
+    """Decompose every mesh, `jobs` processes at a time.
 
     Args:
         meshes: name -> (vertices (n, 3), faces (m, 3)).
@@ -119,23 +88,22 @@ def decompose_all(
     """
     changes = overrides or {}
     configs = {name: dataclasses.replace(config, **changes.get(name, {})) for name in meshes}  # pyright: ignore
-    keys = {name: content_key(v, f, configs[name]) for name, (v, f) in meshes.items()}
-    done: dict[str, tuple[Hull, ...]] = {}
+    stored = StageCache(cache)
+    keys = {
+        name: stored.key(
+            "hulls", WORKER, np.ascontiguousarray(v, float), np.ascontiguousarray(f, np.int64), configs[name]
+        )
+        for name, (v, f) in meshes.items()
+    }
+    done = {key: hulls for key in set(keys.values()) if (hulls := stored.load(key)) is not MISSING}
+    waiting = list({key: (key, name) for name, key in reversed(keys.items()) if key not in done}.values())
     worker_mib = 0.0
     failed: dict[str, str] = {}
-    waiting: list[tuple[str, str]] = []
-    for name, key in keys.items():
-        found = _load(cache / f"{key}.npz")
-        if found is not None:
-            touch(cache / f"{key}.npz")
-            done[key] = found
-        elif key not in {k for k, _ in waiting}:
-            waiting.append((key, name))
     # The largest first: the tail of the stage is then short.
     waiting.sort(key=lambda item: -len(meshes[item[1]][1]))
     total = len(set(keys.values()))
-    tell = progress or (lambda share: None)
-    tell(len(done) / max(total, 1))
+    report = progress or (lambda share: None)
+    report(len(done) / max(total, 1))
     with contextlib.closing(_results(waiting, meshes, configs, max(jobs, 1))) as results:
         for (key, name), (hulls, reason, peak_mib) in results:
             worker_mib = max(worker_mib, peak_mib)
@@ -144,9 +112,9 @@ def decompose_all(
                     raise StageFailed(f"decompose: {reason}")
                 hulls, failed[key] = (convex_hull(meshes[name][0]),), reason
             else:
-                _store(cache / f"{key}.npz", hulls)
+                stored.store(key, hulls)
             done[key] = hulls
-            tell(len(done) / max(total, 1))
+            report(len(done) / max(total, 1))
     return Decomposition(
         {name: done[key] for name, key in keys.items()},
         {name: failed[key] for name, key in keys.items() if key in failed},
@@ -189,8 +157,9 @@ def _run(
     code, output = process.returncode, scratch / f"{key}.npz"
     if code == CANNOT_WRITE:
         raise OSError(errno.ENOSPC, "the decomposition's result cannot be written", str(scratch))
-    hulls = _load(output) if code == 0 else None
-    if hulls is not None:
+    if code == 0:
+        with np.load(output, allow_pickle=False) as arrays:
+            hulls = tuple(Hull(arrays[f"v{i}"], arrays[f"f{i}"]) for i in range(int(arrays["count"])))
         return hulls, "", peak_mib
     log = output.with_suffix(".log").read_text(errors="replace").strip().splitlines()
     return None, f"coacd failed on {name} (exit code {code}: {log[-1] if log else 'no message'})", peak_mib
@@ -206,7 +175,7 @@ def _start(
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     with output.with_suffix(".log").open("wb") as log:
         return subprocess.Popen(
-            [sys.executable, "-m", "converters.bodies.coacd_worker", str(mesh_path), str(output)],
+            [sys.executable, "-m", WORKER, str(mesh_path), str(output)],
             stdout=log,
             stderr=subprocess.STDOUT,
             env=environment,

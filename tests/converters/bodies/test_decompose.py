@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 
+import joblib
 import numpy as np
 import pytest
 import trimesh
 
 from converters.bodies import decompose
-from converters.bodies.decompose import DecomposeConfig, content_key, decompose_all
-from converters.geometry.boxes import convex_hull
+from converters.bodies.decompose import DecomposeConfig, decompose_all
+from converters.records.cache import StageCache
 from converters.records.errors import StageFailed
 from tests.converters import tiny_raw
 
@@ -38,7 +38,9 @@ def test_a_table_becomes_a_top_and_four_legs(hull_cache):
 def test_the_cache_is_used_and_a_damaged_entry_is_made_again(tmp_path, hull_cache, monkeypatch):
     vertices, faces = table()
     first = decompose_all({"a": (vertices, faces)}, CONFIG, 1, hull_cache).hulls["a"]
-    entry = hull_cache / f"{content_key(vertices, faces, CONFIG)}.npz"
+    (entry,) = [
+        p for p in hull_cache.glob("hulls-*.pkl") if joblib.load(p)[0].vertices.tobytes() == first[0].vertices.tobytes()
+    ]
     own = tmp_path / entry.name
     own.write_bytes(entry.read_bytes()[:100])  # cut short
     made = decompose_all({"a": (vertices, faces)}, CONFIG, 1, tmp_path)
@@ -58,24 +60,16 @@ def test_the_cache_is_used_and_a_damaged_entry_is_made_again(tmp_path, hull_cach
     assert len(cached["a"]) == len(cached["b"]) == len(first)
 
 
-def test_hulls_that_are_used_are_not_the_oldest(tmp_path):
+def test_the_key_follows_content_and_parameters_only(tmp_path):
     vertices, faces = table()
-    path = tmp_path / f"{content_key(vertices, faces, CONFIG)}.npz"
-    decompose._store(path, (convex_hull(vertices),))
-    os.utime(path, (0, 0))
-    assert decompose_all({"a": (vertices, faces)}, CONFIG, 1, tmp_path).fallbacks == {}
-    assert path.stat().st_mtime > 0
-    os.utime(path, (0, 0))
-    decompose._store(tmp_path / "other.npz", (convex_hull(vertices),), limit_bytes=0)
-    assert [p.name for p in tmp_path.iterdir()] == ["other.npz"]  # hulls alone are kept within the limit, too
 
+    def key(vertices, faces, **changes):
+        return StageCache(tmp_path).key(
+            "hulls", decompose.WORKER, vertices, faces, dataclasses.replace(CONFIG, **changes)
+        )
 
-def test_the_key_follows_content_and_parameters_only():
-    vertices, faces = table()
-    key = content_key(vertices, faces, CONFIG)
-    assert key == content_key(vertices.copy(), faces.astype(np.int32), dataclasses.replace(CONFIG, timeout_s=1.0))
-    assert key != content_key(vertices * 1.001, faces, CONFIG)
-    assert key != content_key(vertices, faces, dataclasses.replace(CONFIG, threshold=0.2))
+    assert key(vertices, faces) == key(vertices.copy(), faces.copy(), timeout_s=1.0)
+    assert len({key(vertices, faces), key(vertices * 1.001, faces), key(vertices, faces, threshold=0.2)}) == 3
 
 
 def test_a_failing_and_a_slow_model_get_their_convex_hull(tmp_path):
