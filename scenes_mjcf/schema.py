@@ -70,7 +70,7 @@ class SceneManifest:
     warnings: tuple[str, ...] = ()
     """What the converter repaired, left out or found missing in the source."""
     measures: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """How full the scene is and how hard to get through (`converters/write/measures.py`); empty: not measured."""
+    """How full the scene is and how hard to get through (`converters/write/manifest.py`); empty: not measured."""
     floor_unseen_m2: float = 0.0
     """Of the floor, what the source does not show: under and behind furniture, and gaps that were bridged."""
     scan_kept: float | None = None

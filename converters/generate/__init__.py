@@ -10,8 +10,8 @@ import numpy as np
 from converters.generate.design.config import BuildingConfig, GenerationError
 from converters.generate.design.furnish import Effort, furnish_plan, no_place
 from converters.generate.design.instance import Instance
-from converters.generate.design.maps import floor_maps
 from converters.generate.design.plan import Plan, make_plan
+from converters.generate.design.space import floor_maps
 from converters.generate.homes.config import HomeConfig
 from converters.generate.homes.design import design_home
 from converters.generate.surface.annotate import annotate_items

@@ -1,15 +1,107 @@
-"""Build the `SceneManifest` (scene.json) from the results of the stages."""
+"""Measure a finished scene, and build its `SceneManifest` (scene.json) from the results of the stages."""
 
 import dataclasses
+import math
+from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
+import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
+from scipy.spatial import ConvexHull
+
 from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig
+from converters.bodies.objects import PlacedObject, to_world
+from converters.geometry.density import ROBOTS, must_push_shares
+from converters.geometry.faces import face_areas
 from converters.records.gate import Gate
 from converters.records.raw import RawScene
+from converters.structure.maps import Grid
 from converters.write.emit import SceneParts
-from converters.write.measures import measure_scene
+from interactive_nav_common.grids import clearance, largest_component
 from scenes_mjcf.schema import SceneManifest, SceneMaps, SceneObject
+
+NAVIGATION_CELL_M = 0.1
+STARTS = 32
+"""Places from which ways to all others are looked at."""
+LEAST_APART_M = 1.0
+"""Two places closer than this are no pair: a thin wall between them makes the ratio as large as one likes."""
+
+
+def shadow(objects: Sequence[PlacedObject], maps: SceneMaps, height_m: float = math.inf) -> np.ndarray:
+    """Return [rows, columns] bool: cells with their middle below a movable's hull that reaches below a height."""
+    out = np.zeros_like(maps.traversable)
+    grid = Grid(0.0, maps.origin_w, out.shape, maps.resolution_m)
+    for placed in objects:
+        for hull in placed.hulls_b:
+            points_w = to_world(placed, hull.vertices)
+            if points_w[:, 2].min() <= height_m:
+                grid.add_below(out, points_w, 0.0)
+    return out
+
+
+def specific_surface_1_m(surfaces: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Return the area of meshes over the volume of the convex hull of all of them, 1/m."""
+    area_m2 = sum(float(face_areas(vertices, faces).sum()) for vertices, faces in surfaces)
+    return area_m2 / float(ConvexHull(np.vstack([vertices for vertices, _ in surfaces])).volume)
+
+
+def navigation_complexity(free: np.ndarray, cell_m: float, radius_m: float) -> float:
+    """Return the largest ratio of shortest path to straight line of two places a metre or more apart.
+
+    Paths lead through the middles of cells of `NAVIGATION_CELL_M`, along rows, columns and diagonals, in the largest
+    region that a disc's middle may be in; 1 where there is no such pair. Diagonals may cut corners, so that
+    `grids.grid_graph`, whose paths go round them, gives larger values than those in the packaged scenes.
+    """
+    step = max(round(NAVIGATION_CELL_M / cell_m), 1)
+    mask = largest_component((clearance(free, cell_m) >= radius_m)[step // 2 :: step, step // 2 :: step])
+    if not mask.any():
+        return 1.0
+    height, width = mask.shape
+    number = np.full((height, width), -1)
+    number[mask] = np.arange(mask.sum())
+    rows, columns, lengths = [], [], []
+    for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        a = number[: height - dr, max(-dc, 0) : width - max(dc, 0)]
+        b = number[dr:, max(dc, 0) : width + min(dc, 0)]
+        both = (a >= 0) & (b >= 0)
+        rows.append(a[both])
+        columns.append(b[both])
+        lengths.append(np.full(int(both.sum()), np.hypot(dr, dc) * step * cell_m))
+    edges = (np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns)))
+    graph = sparse.coo_matrix(edges, (int(mask.sum()),) * 2).tocsr()
+    starts = np.random.default_rng(0).permutation(int(mask.sum()))[:STARTS]
+    way_m = np.asarray(csgraph.dijkstra(graph, directed=False, indices=starts))
+    places = np.argwhere(mask) * step * cell_m
+    line_m = np.linalg.norm(places[starts][:, None] - places[None], axis=2)
+    far = line_m >= LEAST_APART_M
+    return float((way_m[far] / line_m[far]).max()) if far.any() else 1.0
+
+
+def measure_scene(parts: SceneParts, maps: SceneMaps) -> dict[str, Any]:
+    """Measure a scene with its visuals.
+
+    Returns `movable_share`: share of the traversable floor (built-in furniture is no part of it) below movables;
+    `must_push_share`: robot -> `converters.geometry.density.Ways.must_push_share`; `specific_surface_1_m` and
+    `navigation_complexity`, the latter for the smallest robot with the movables where they stand.
+    """
+    structure, objects = parts.structure_visual, parts.objects
+    assert structure is not None
+    visuals = zip(objects, parts.object_visuals, strict=True)
+    surfaces = [(structure.vertices, structure.faces), *((to_world(o, v.vertices), v.faces) for o, v in visuals)]
+    below = shadow(objects, maps)
+    free = {robot: maps.traversable & ~shadow(objects, maps, facts.height_m) for robot, facts in ROBOTS.items()}
+    must_push = must_push_shares(maps.traversable, free, maps.resolution_m)
+    smallest = min(ROBOTS, key=lambda robot: ROBOTS[robot].radius_m)
+    complexity = navigation_complexity(free[smallest], maps.resolution_m, ROBOTS[smallest].radius_m)
+    return {
+        "movable_share": round(float(below[maps.traversable].mean()), 4),
+        "must_push_share": {robot: round(share, 4) for robot, share in must_push.items()},
+        "specific_surface_1_m": round(specific_surface_1_m(surfaces), 4),
+        "navigation_complexity": round(complexity, 3),
+    }
+
 
 PACKAGES = ("mujoco", "coacd", "trimesh", "fast-simplification", "xatlas", "numpy", "scipy", "pillow", "shapely")
 

@@ -22,7 +22,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from benchmarks.measurement import append_row, command_line, origin
+from benchmarks.steps_per_second import append_row, command_line, origin
 from converters.generate import BuildingConfig, generate_building
 
 PACKAGES = ("mujoco", "coacd", "trimesh", "numpy", "scipy", "xatlas")

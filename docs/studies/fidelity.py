@@ -25,7 +25,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.measurement import SCENE, append_row, command_line, origin
+from benchmarks.steps_per_second import SCENE, append_row, command_line, origin
 from interactive_nav.config import NavConfig, PhysicsConfig
 from interactive_nav.physics import PhysicsState, make_physics, resolve_backend
 from interactive_nav.robots import get_robot

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import interactive_nav
-from benchmarks.measurement import SCENE, append_row, command_line, origin, timed
+from benchmarks.steps_per_second import SCENE, append_row, command_line, origin, timed
 from interactive_nav.sensing import CameraPose, Lens, build_boxes, make_renderer
 
 STREAMS = ("observation", "depth", "segmentation", "normals", "rgb", "rgb_textured")

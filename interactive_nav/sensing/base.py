@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from interactive_nav.physics.batching import one_of_batch
+from interactive_nav.physics.base import one_of_batch
 from interactive_nav.sensing.boxes import BoxTables
 from interactive_nav.sensing.shading import Look
 

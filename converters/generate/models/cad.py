@@ -10,17 +10,56 @@ import dataclasses
 import functools
 import hashlib
 from collections import Counter
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from converters.generate.models.drawings import DRAWN, SPARSE, Drawing
+from converters.generate.models import parts as shapes
 from converters.generate.models.parts import MATERIALS, Part, on_floor
 from converters.geometry.faces import stacked
 from converters.geometry.pieces import convex_pieces
 from converters.library.store import read_index, read_shape
 from converters.read.cad import MOST_OWN, OWN_SLACK
 from converters.records.visual import VisualMesh
+from interactive_nav_common.records import read_packaged
 from scenes_mjcf.categories import CATEGORIES
+
+
+@dataclasses.dataclass(frozen=True)
+class Drawing:
+    """How a model is drawn."""
+
+    category: str
+    parts: tuple[list[Any], ...] = ()
+    """Functions of `parts`, each with its arguments in order and, last, those by name; none of a library model."""
+    sym: str = "__SYM_NONE"
+    """Scan2CAD's symmetry class."""
+    front: int = 1
+    """+1: the model faces +z; -1: it faces -z, as some ShapeNet models do."""
+    held_out: bool = False
+    """Only homes to test in have it."""
+
+    def draw(self) -> list[Part]:
+        """Its parts."""
+        drawn = [_shape(row) for row in self.parts]
+        return [part for made in drawn for part in (made if isinstance(made, list) else [made])]
+
+
+def _shape(row: list[Any]) -> Any:
+    """What a row makes; an argument that is a row is made first, one of points becomes an array."""
+    name, *values = row
+    named = values.pop() if isinstance(values[-1], dict) else {}
+    points = [np.array(v) if isinstance(v, list) and isinstance(v[0], list) else v for v in values]
+    made = [_shape(v) if isinstance(v, list) and isinstance(v[0], str) else v for v in points]
+    return getattr(shapes, name)(*made, **named)
+
+
+_TABLES = read_packaged(Path(__file__).with_name("drawings.yaml"), dict[str, dict[str, Drawing]])
+SPARSE: dict[str, Drawing] = _TABLES["sparse"]
+"""Model name -> how it is drawn, of what sparse homes have."""
+DRAWN: dict[str, Drawing] = SPARSE | _TABLES["furnished"]
+"""The same of all homes."""
 
 
 @dataclasses.dataclass(frozen=True)

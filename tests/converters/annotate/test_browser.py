@@ -12,9 +12,8 @@ import pytest
 import trimesh
 
 from converters.__main__ import main
-from converters.annotate.browser import Page
+from converters.annotate.browser import Page, hit
 from converters.annotate.session import Store, start
-from converters.annotate.view import hit
 from converters.bodies.alignment import apply_alignment
 from converters.bodies.placement import upright
 from converters.propose.proposals import bounds, box_iou, propose_instances

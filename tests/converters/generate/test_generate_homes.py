@@ -18,9 +18,9 @@ from converters.generate.models.cad import (
     LIBRARY,
     TEST_MODELS,
     TRAIN_MODELS,
+    Drawing,
     cad_model,
 )  # fmt: skip
-from converters.generate.models.drawings import Drawing
 from converters.generate.models.parts import (
     Part,
     ball,

@@ -19,8 +19,7 @@ from converters.generate.design.plan import Plan, Rect
 from converters.generate.homes.config import HomeConfig, home_config
 from converters.generate.surface.annotate import annotate_items
 from converters.generate.surface.charts import assemble, polygon
-from converters.generate.surface.light import space_of
-from converters.generate.surface.modelled import model_building
+from converters.generate.surface.modelled import model_building, space_of
 from converters.generate.surface.scan import NYU40, Scan
 from converters.generate.surface.sides import FLOOR_M, entrance_place, sides_of
 from converters.generate.surface.texture import Atlas

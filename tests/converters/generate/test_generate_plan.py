@@ -15,8 +15,7 @@ from scipy import ndimage
 from converters.generate import Building, BuildingConfig, GenerationError, design_building
 from converters.generate.design.doors import DOOR_GAP_M
 from converters.generate.design.instance import Instance, place
-from converters.generate.design.maps import floor_maps, image_size
-from converters.generate.design.space import GRID_M, free_grid, passes, room_mask, static_grid
+from converters.generate.design.space import GRID_M, floor_maps, free_grid, image_size, passes, room_mask, static_grid
 from converters.generate.models.cad import TEST_MODELS, cad_model
 from interactive_nav_common.grids import clearance
 

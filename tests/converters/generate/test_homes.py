@@ -22,10 +22,10 @@ from converters.generate.design.plan import Plan, Rect, make_plan
 from converters.generate.homes import design, furnish, passages
 from converters.generate.homes.arrange import Showroom, apart, arrange, stand
 from converters.generate.homes.config import MOST_SHARE, TIERS, home_config, home_fields
+from converters.generate.homes.design import USES, assign_uses, home_plan, programme
 from converters.generate.homes.floor import Floor
 from converters.generate.homes.furnish import Home, furnish_home
 from converters.generate.homes.groups import TABLES
-from converters.generate.homes.rooms import USES, assign_uses, home_plan, programme
 from converters.generate.models.cad import HOME_TRAIN_MODELS, LIBRARY
 from converters.geometry.density import ROBOTS
 from scenes_mjcf.categories import CATEGORIES

@@ -12,8 +12,16 @@ import yaml
 
 from converters.geometry.faces import loose_parts
 from converters.geometry.simplify import Surface, simplify_within
-from converters.library.build import MOST_FACES, SELECTION, as_catalogued, make_model, on_top, read_selection
-from converters.library.catalogue import Piece, read_catalogue
+from converters.library.build import (
+    MOST_FACES,
+    SELECTION,
+    Piece,
+    as_catalogued,
+    make_model,
+    on_top,
+    read_catalogue,
+    read_selection,
+)
 from converters.library.store import ATTRIBUTION, PACKED, attribution, read_index, read_shape, write_library
 from converters.read.obj import TexturedMesh
 from converters.records.errors import SceneRejected

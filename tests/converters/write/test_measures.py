@@ -17,7 +17,7 @@ from converters.geometry.boxes import convex_hull
 from converters.geometry.density import ROBOTS, Ways, must_push_shares
 from converters.records.visual import VisualMesh
 from converters.write.emit import SceneParts
-from converters.write.measures import measure_scene, navigation_complexity, shadow, specific_surface_1_m
+from converters.write.manifest import measure_scene, navigation_complexity, shadow, specific_surface_1_m
 from interactive_nav_common.grids import clearance
 from scenes_mjcf.schema import SceneMaps, load_manifest
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from interactive_nav.physics.batching import one_of_batch
+from interactive_nav.physics.base import one_of_batch
 
 
 def test_nested_vmaps_call_the_batch_function_once_with_all_elements():

@@ -10,8 +10,7 @@ import warnings
 import numpy as np
 import pytest
 
-from interactive_nav.scenes.checks import objects_apart
-from interactive_nav.scenes.scene import load_scene
+from interactive_nav.scenes.scene import load_scene, objects_apart
 from scenes_mjcf.schema import SceneError, load_maps, save_maps
 from scenes_mjcf.sets import HERE
 from tests.toys import write_room
