@@ -21,11 +21,8 @@ from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
-from interactive_nav.pictures.camera import BEHIND_M, clear_way, straight_down
-from interactive_nav.pictures.replay import Replay, ReplayError, load_replay, replay_path
-from interactive_nav.pictures.scene_model import ROBOT, SCENE
-from interactive_nav.pictures.views import (
-    INSIDE,
+from interactive_nav.pictures.camera import (
+    BEHIND_M,
     OUTSIDE,
     FloorPaint,
     SceneView,
@@ -34,14 +31,16 @@ from interactive_nav.pictures.views import (
     mask_picture,
     robot_camera,
 )
+from interactive_nav.pictures.replay import Replay, ReplayError, load_replay, replay_path
+from interactive_nav.pictures.scene_model import ROBOT, SCENE, clear_way
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
-from interactive_nav.sensing.base import CameraPose, Lens, look_along
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.jobs.progress import SafeConsole, progress_bar
 from interactive_nav_common.rotations import yaw_from_quat
 from interactive_nav_common.words import add_words, program, read_commands
+from scenes_mjcf.look import CameraPose, Lens, look_along, straight_down
 
 FORMATS = (".mp4", ".gif", ".webp")
 VIEWS = (*BEHIND_M, "above")
@@ -102,11 +101,12 @@ class Compositor:
             panes = [self._view.textured(*self._camera(v, step), (*SCENE, ROBOT), paint) for v in self.views]
             return np.concatenate([np.concatenate(panes, 1), self._caption(step)], 0)
         camera = chase_camera(self._target[step], float(self._yaw[step]), height, self._columns)
-        behind = self._view.render(*camera, OUTSIDE, paint).colour
+        behind = self._view.render(*camera, OUTSIDE, paint)["rgb"]
         side = height // 3
         cameras = [robot_camera(self._view, n, n, replay.image_fov_deg) for n in (side, CAMERA_PIXELS)]
-        colour, image = self._view.render(*cameras[0], INSIDE).colour, self._view.render(*cameras[1], INSIDE)
-        small = [depth_picture(image.depth_m), mask_picture(image.classes, replay.segmentation_classes)]
+        colour, image = self._view.render(*cameras[0], SCENE)["rgb"], self._view.render(*cameras[1], SCENE)
+        depth_m, mask = image["depth"], image["segmentation"]
+        small = [depth_picture(depth_m), mask_picture(mask, depth_m, replay.segmentation_classes)]
         column = [
             colour,
             *(np.asarray(Image.fromarray(x).resize((side, side), Image.Resampling.NEAREST)) for x in small),

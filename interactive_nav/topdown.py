@@ -21,8 +21,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, PathPatch
 from matplotlib.path import Path as Outline
 
+from interactive_nav.pictures.camera import COLOURS
 from interactive_nav.pictures.replay import Replay, ReplayError, load_replay
-from interactive_nav.pictures.views import COLOURS
 from interactive_nav.record import check_replay_scene
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene

@@ -19,15 +19,15 @@ import numpy as np
 
 from interactive_nav.navigation.tables import furniture_map
 from interactive_nav.pictures.camera import BEHIND_M
-from interactive_nav.pictures.scene_model import cast, furnished_spec
+from interactive_nav.pictures.scene_model import furnished_spec
 from interactive_nav.robots import RobotSpec, get_robot, robot_names
 from interactive_nav.scenes.objects import SPLITS, VISUAL_GROUP, SmallObject, add_shapes, body_names, pick
 from interactive_nav.scenes.scene import Scene, load_scene
-from interactive_nav.sensing.base import look_along
 from interactive_nav_common.errors import UserError, missing, reports_errors
 from interactive_nav_common.grids import cell_centres, clearance
 from interactive_nav_common.untrusted.guard import guarded_server
 from interactive_nav_common.words import program
+from scenes_mjcf.look import cast, look_along
 
 GAP_M = 0.03
 """Least gap between what is placed at random."""

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from converters.check.render import Picture, over
+from converters.check.render import Picture
 from converters.generate.models.cad import LIBRARY, cad_model
 from converters.generate.models.parts import MATERIALS
 from converters.read.meshes import textured_by_face
@@ -14,6 +14,7 @@ from converters.read.obj import join_meshes
 from converters.records.visual import TexturedMesh
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.files import whole_file
+from scenes_mjcf.look import over
 
 PIXELS = 200
 """Side of a model's picture."""
@@ -47,7 +48,7 @@ def mesh_picture(mesh: TexturedMesh, axes: np.ndarray, pixels: int, one_sided: b
     """Draw a (pixels, pixels, 3) uint8 picture of a whole mesh on white, along axes such as `camera_axes`'."""
     turned = mesh.vertices @ axes.T
     half, middle = np.ptp(turned, axis=0)[:2].max() / 2 / 0.94, (turned.min(axis=0) + turned.max(axis=0)) / 2
-    picture = Picture(over(axes, middle - half, middle + half - 1e-9, 2 * half / pixels))
+    picture = Picture(*over(axes, middle - half, middle + half, 2 * half / pixels))
     picture.draw(mesh, one_sided)
     return picture.image
 

@@ -10,9 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.spatial import ConvexHull
 
-from converters.check.render import Picture, over
+from converters.check.render import Picture
 from converters.check.surfaces import geom_surface
 from interactive_nav_common.files import check_name
+from scenes_mjcf.look import over
 from scenes_mjcf.schema import SCENES, SceneError
 
 VIEWS = {
@@ -55,7 +56,7 @@ def draw_object(folder: Path) -> Figure:
         points = surface_w.vertices @ axes_w[:2].T
         low, high = points.min(axis=0) - 0.1 * size_m, points.max(axis=0) + 0.1 * size_m
         pixel_m = float((high - low).max()) / PIXELS
-        picture = Picture(over(axes_w, low, high, pixel_m))
+        picture = Picture(*over(axes_w, low, high, pixel_m))
         picture.draw(surface_w)
         rows, columns = picture.image.shape[:2]
         extent = (low[0], low[0] + columns * pixel_m, low[1], low[1] + rows * pixel_m)

@@ -9,11 +9,12 @@ import shapely
 from PIL import Image
 
 from converters.check.object_preview import geom_outline
-from converters.check.render import Camera, Picture, looking_at, over
+from converters.check.render import Picture
 from converters.check.surfaces import geom_surface
 from converters.geometry.faces import face_vectors
 from converters.records.visual import TexturedMesh
 from interactive_nav_common.grids import clearance
+from scenes_mjcf.look import CameraPose, Lens, look_along, over
 from scenes_mjcf.schema import SceneMaps
 
 ELEVATION_RAD = math.radians(53.0)
@@ -40,9 +41,9 @@ def world_surfaces(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, Text
     return surfaces
 
 
-def _taken(camera: Camera, surfaces: dict[str, TexturedMesh], cut_m: float = np.inf) -> np.ndarray:
+def _taken(pose: CameraPose, lens: Lens, surfaces: dict[str, TexturedMesh], cut_m: float = np.inf) -> np.ndarray:
     """Draw the picture (rows, columns, 3) of bodies."""
-    picture = Picture(camera)
+    picture = Picture(pose, lens)
     for body, surface in surfaces.items():
         structure = body == "structure"
         picture.draw(surface, one_sided=structure, below_m=cut_m if structure else np.inf)
@@ -60,11 +61,10 @@ def from_the_south(
     """
     sin, cos = math.sin(ELEVATION_RAD), math.cos(ELEVATION_RAD)
     axes_w = np.array([[1.0, 0.0, 0.0], [0.0, sin, cos], [0.0, -cos, sin]])
-    scale = pixels / (high[0] - low[0])
-    rows = math.ceil(scale * (sin * (high[1] - low[1]) + cos * CUT_M))
-    middle = np.array([*(low + high) / 2, CUT_M / 2])
+    half = np.array([high[0] - low[0], sin * (high[1] - low[1]) + cos * CUT_M]) / 2
+    middle = axes_w[:2] @ [*(low + high) / 2, CUT_M / 2]
     surfaces = surfaces | {"structure": _without_near_side(surfaces["structure"], maps)}
-    return _taken(Camera(middle + 100 * axes_w[2], axes_w, (rows, pixels), scale, True), surfaces, CUT_M)
+    return _taken(*over(axes_w, middle - half, middle + half, 2 * half[0] / pixels), surfaces, CUT_M)
 
 
 def _without_near_side(structure: TexturedMesh, maps: SceneMaps) -> TexturedMesh:
@@ -80,7 +80,7 @@ def _without_near_side(structure: TexturedMesh, maps: SceneMaps) -> TexturedMesh
 
 def from_above(surface: TexturedMesh, low: np.ndarray, high: np.ndarray, pixel_m: float) -> np.ndarray:
     """Draw what looks up, between corners (2,) m; the last row is the southernmost."""
-    return _taken(over(np.eye(3), low, high, pixel_m), {"structure": surface})
+    return _taken(*over(np.eye(3), low, high, pixel_m), {"structure": surface})
 
 
 def at_eye_height(
@@ -90,8 +90,9 @@ def at_eye_height(
     """Draw what somebody sees from where most is visible."""
     eye, heading = _vantage(model, data, surfaces, maps)
     eye_w = np.array([*eye, EYE_M])
-    fine = SHARP * shape[0], SHARP * shape[1]
-    picture = _taken(looking_at(eye_w, eye_w + [*heading, -DOWN], fine, EYE_VIEW_RAD), surfaces)
+    tall = math.degrees(2 * math.atan(math.tan(EYE_VIEW_RAD / 2) * shape[0] / shape[1]))
+    lens = Lens(SHARP * shape[1], SHARP * shape[0], tall)
+    picture = _taken(look_along(eye_w, np.array([*heading, -DOWN])), lens, surfaces)
     return np.asarray(Image.fromarray(picture).reduce(SHARP))
 
 

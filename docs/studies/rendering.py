@@ -24,7 +24,8 @@ import numpy as np
 
 import interactive_nav
 from benchmarks.steps_per_second import SCENE, append_row, command_line, origin, timed
-from interactive_nav.sensing import CameraPose, Lens, build_boxes, make_renderer
+from interactive_nav.sensing import build_boxes, make_renderer
+from scenes_mjcf.look import CameraPose, Lens
 
 STREAMS = ("observation", "depth", "segmentation", "normals", "rgb", "rgb_textured")
 TURN_RAD = 0.1

@@ -22,7 +22,7 @@ import numpy as np
 import interactive_nav
 from interactive_nav.interop.gym_steps import NONFINITE_ACTIONS, reset_where, step
 from interactive_nav.interop.torch_bridge import to_jax, to_torch
-from interactive_nav.pictures.views import ThirdPerson
+from interactive_nav.pictures.camera import ThirdPerson
 from interactive_nav.robots import robot_names
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav.task.wrappers import reset_all, scene_of_slot

@@ -1,32 +1,52 @@
-"""Draw pictures for people of one environment's state: RGB, normals, depth and segmentation at any size.
+"""Draw pictures for people: of an environment's state, or of a scene whose bodies are put where one wants them.
 
     frame = PictureCamera(env).frame(state, 640, 480, streams=("rgb", "normals"), view="follow")
 
 Pictures show the scene's visual meshes. Depth, normals and segmentation come from C MuJoCo's rays, which run
-anywhere. RGB comes from MuJoCo's renderer where a GL is (see `interactive_nav.pictures.gl`), or
+anywhere. RGB comes from MuJoCo's renderer where a GL is (see `scenes_mjcf.look`), or
 from MJX-Warp's, both with textures; where neither is, from rays with a flat colour for each object. MJX-Warp's runs
 on a CPU too, after a compilation of ten seconds a size, so there it is used only on request.
+Policies see `interactive_nav.sensing` (or nothing but numbers); nothing here is on their path.
 """
 
+import colorsys
+import dataclasses
 import functools
 import math
 from collections.abc import Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
+from scipy.spatial import cKDTree
 
 from interactive_nav.physics import resolve_backend
-from interactive_nav.pictures.gl import GlPainter
-from interactive_nav.pictures.scene_model import ROBOT, ROBOT_SOLIDS, SCENE, SceneModel, cast, trace
-from interactive_nav.sensing.base import FAR_M, CameraPose, Lens, look_along
-from interactive_nav.sensing.shading import SKY_COLOUR, lambert
+from interactive_nav.pictures.scene_model import CUT_WALLS, ROBOT, ROBOT_SOLIDS, SCENE, THINGS, SceneModel, clear_way
+from interactive_nav.robots import RobotSpec
+from interactive_nav.scenes.objects import SmallObject
+from interactive_nav.scenes.scene import Scene
+from interactive_nav.sensing.base import FAR_M
+from interactive_nav.sensing.shading import lambert
 from interactive_nav_common.errors import ConfigError, UserError
+from interactive_nav_common.rotations import yaw_from_quat
+from scenes_mjcf.categories import SEGMENTATIONS, TABLE, MaskClasses
+from scenes_mjcf.look import SKY_COLOUR, CameraPose, GlPainter, Lens, look_along, straight_down, trace
 
 STREAMS = ("rgb", "normals", "depth", "segmentation")
 VIEWS = ("robot", "top", "follow")
 BEHIND_M = {"follow": (1.8, 1.8), "eye": (2.6, 1.5)}
 """Views of films and viewers: how far behind the robot and how high a camera is, m; it looks at its middle."""
 ENGINES = ("auto", "gl", "warp", "rays")
+
+COLOURS = {category.name: category.colour for category in TABLE}
+"""RGB in [0, 1] by category, in colour and mask pictures alike."""
+GOAL_COLOUR = (0.30, 0.72, 0.36)
+TRAIL_COLOUR = (0.16, 0.47, 0.84)
+FLOOR_COLOUR = (0.80, 0.78, 0.74)
+ON_FLOOR_M = 0.03
+"""What is no higher, such as a carpet, is painted on."""
+OUTSIDE = (THINGS, CUT_WALLS, ROBOT)
+"""What a view from outside shows: walls cut low."""
 
 
 class Painter:
@@ -70,20 +90,6 @@ class Painter:
             return trace(model.model, model.data, pose, lens, groups)[2]
         one = CameraPose(np.asarray(pose.pos_w)[None], np.asarray(pose.axes_w)[None])
         return self._painters[model, lens.width, lens.height].draw(model.data, one, lens.fov_deg, groups, depth=True)[0]
-
-
-def clear_way(model: SceneModel, target_w: np.ndarray, back_w: np.ndarray, groups: Sequence[int] = SCENE) -> float:
-    """Return the share of the way from a target (3,) along (3,), both m, at which a camera clears what is behind."""
-    reach = np.linalg.norm(back_w)
-    hit = cast(model.model, model.data, target_w, back_w[None] / reach, groups)[1][0] / reach
-    return min(1.0, 0.9 * hit) if hit > 0 else 1.0
-
-
-def straight_down(low_w: np.ndarray, high_w: np.ndarray, aspect: float, fov_deg: float) -> CameraPose:
-    """Return a camera, x to the right and y up, over the floor between two corners (2,), m, and its walls."""
-    size, centre = np.subtract(high_w, low_w), np.add(high_w, low_w) / 2
-    above = max(size[1], size[0] / aspect) / 2 / math.tan(math.radians(fov_deg / 2)) + 2.5
-    return CameraPose(np.array([*centre, above]), np.array([[0, 1, 0], [0, 0, 1], [-1, 0, 0]], float))
 
 
 class PictureCamera:
@@ -147,7 +153,7 @@ class PictureCamera:
             if drawn is not None:
                 out["rgb"] = drawn
         if set(streams) - set(out):
-            out |= _by_rays(model, pose, lens, groups, set(streams) - set(out))
+            out = by_rays(model, pose, lens, groups) | out
         return {name: out[name] for name in streams}
 
     def _pose(self, model: SceneModel, qpos: np.ndarray, scene: int, view: str, aspect: float):
@@ -160,27 +166,155 @@ class PictureCamera:
             maps = env.scenes[scene].maps
             size = np.array(maps.traversable.shape[::-1]) * maps.resolution_m
             return straight_down(maps.origin_w, maps.origin_w + size, aspect, 40.0), 40.0
-        base = model.data.body(env.world.robot.base_body)
-        ahead = base.xmat.reshape(3, 3)[:, 0] * [1, 1, 0]
-        ahead /= max(np.linalg.norm(ahead), 1e-6)
-        target = base.xpos + [0, 0, 0.6 * env.world.robot.height_m]
-        back = -1.8 * ahead + [0, 0, 1.1]
-        eye = target + back * clear_way(model, target, back)
-        return look_along(eye, target - eye), 70.0
+        return behind(model), 60.0
 
 
-def _by_rays(
-    model: SceneModel, pose: CameraPose, lens: Lens, groups: tuple[int, ...], streams: set[str]
-) -> dict[str, np.ndarray]:
+def by_rays(model: SceneModel, pose: CameraPose, lens: Lens, groups: Sequence[int]) -> dict[str, np.ndarray]:
+    """Return all streams of `PictureCamera.frame`, without textures."""
     ray, geom, depth, faces = trace(model.model, model.data, pose, lens, groups)
     met = (geom >= 0) & (depth > 0) & (depth < FAR_M)
-    out: dict[str, np.ndarray] = {"depth": np.where(met, depth, 0.0).astype(np.float32)}
-    out["segmentation"] = np.where(met, model.class_id[geom], 0).astype(np.uint8)
-    if streams & {"normals", "rgb"}:
-        # Meshes may be visible from behind: normals are turned to the viewer.
-        faces = np.where(((faces * ray).sum(-1) > 0)[..., None], -faces, faces) * met[..., None]
-        forward, right_w, up_w = pose.axes_w.T
-        out["normals"] = np.stack([faces @ right_w, faces @ up_w, -(faces @ forward)], -1).astype(np.float32)
-        base = np.where(met[..., None], model.colour[geom], np.array(SKY_COLOUR, np.float32))
-        out["rgb"] = lambert(base, faces, forward, met, np)
-    return {name: out[name] for name in streams}
+    # Meshes may be visible from behind: normals are turned to the viewer.
+    faces = np.where(((faces * ray).sum(-1) > 0)[..., None], -faces, faces) * met[..., None]
+    forward, right_w, up_w = pose.axes_w.T
+    base = np.where(met[..., None], model.colour[geom], np.array(SKY_COLOUR, np.float32))
+    return {
+        "rgb": lambert(base, faces, forward, met, np),
+        "normals": np.stack([faces @ right_w, faces @ up_w, -(faces @ forward)], -1).astype(np.float32),
+        "depth": np.where(met, depth, 0.0).astype(np.float32),
+        "segmentation": np.where(met, model.class_id[geom], 0).astype(np.uint8),
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class FloorPaint:
+    """What is drawn on the floor of views from outside."""
+
+    goal_xy_w: np.ndarray | None = None
+    """(2,) m."""
+    goal_radius_m: float = 0.33
+    trail_xy_w: np.ndarray | None = None
+    """[n, 2] path so far, m."""
+
+
+class SceneView(SceneModel):
+    """One scene with a robot and small objects, in the colours of their categories or with textures."""
+
+    def __init__(self, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject], classes: MaskClasses = 4):
+        """Compile the model to look at; see `SceneModel`."""
+        super().__init__(robot, scene, small, classes)
+        self._painter = Painter()
+
+    @functools.cached_property
+    def colour(self) -> np.ndarray:
+        """Return [ngeom, 3] in [0, 1]: of each geom's category; objects of one kind differ a little."""
+        floor, things = self.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, self.model.geom_group == THINGS
+        colour = np.array([COLOURS[category] for category in self.category])
+        for g in np.flatnonzero(things):
+            colour[g] = FLOOR_COLOUR if floor[g] else _varied(colour[g], int(self.model.geom_bodyid[g]))
+        return colour
+
+    def render(
+        self, pose: CameraPose, lens: Lens, groups: Sequence[int] = OUTSIDE, paint: FloorPaint | None = None
+    ) -> dict[str, np.ndarray]:
+        """Return the streams of `by_rays`, with `paint` on a chequered floor."""
+        out = by_rays(self, pose, lens, groups)
+        return out | {"rgb": _painted(out["rgb"], out["depth"], pose, lens, paint or FloorPaint(), 0.96)}
+
+    def textured(
+        self, pose: CameraPose, lens: Lens, groups: Sequence[int], paint: FloorPaint | None = None
+    ) -> np.ndarray:
+        """Render [rows, columns, 3] u8 with textures, or as `render` colours it where no engine draws them."""
+        drawn = self._painter.draw(self, pose, lens, groups)
+        if drawn is None:
+            return self.render(pose, lens, groups, paint)["rgb"]
+        return _painted(drawn, self._painter.depth(self, pose, lens, groups), pose, lens, paint or FloorPaint())
+
+
+def robot_camera(view: SceneView, rows: int, columns: int, fov_deg: float | None = None) -> tuple[CameraPose, Lens]:
+    """Return the robot's camera, at the pose that its body has been placed at; `fov_deg` for another field of view."""
+    mount = view.robot.camera
+    body = mujoco.mj_name2id(view.model, mujoco.mjtObj.mjOBJ_BODY, mount.body)
+    axes = view.data.xmat[body].reshape(3, 3)
+    forward = axes @ [math.cos(mount.pitch_rad), 0.0, -math.sin(mount.pitch_rad)]
+    pos = view.data.xpos[body] + axes @ np.asarray(mount.pos_m)
+    return look_along(pos, forward), Lens(columns, rows, fov_deg or mount.fov_deg)
+
+
+def chase_camera(
+    robot_pos_w: np.ndarray, yaw_rad: float, rows: int, columns: int, distance_m: float = 3.6
+) -> tuple[CameraPose, Lens]:
+    """Return a camera behind and above the robot, 40 degrees down."""
+    pitch = math.radians(40)
+    ahead = np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0])
+    forward = math.cos(pitch) * ahead - np.array([0.0, 0.0, math.sin(pitch)])
+    target = np.array([robot_pos_w[0], robot_pos_w[1], 0.15]) + 0.45 * ahead
+    return look_along(target - distance_m * forward, forward), Lens(columns, rows, 48.0)
+
+
+def behind(model: SceneModel) -> CameraPose:
+    """Return a camera behind the robot, in front of what would hide it."""
+    robot, (back_m, up_m), middle_m = model.robot, BEHIND_M["follow"], 0.6 * model.robot.height_m
+    base = model.data.body(robot.base_body)
+    yaw, target = yaw_from_quat(base.xquat), base.xpos + [0, 0, middle_m - robot.spawn_height_m]
+    back = np.array([-back_m * np.cos(yaw), -back_m * np.sin(yaw), up_m - middle_m])
+    back *= clear_way(model, target, back)
+    return look_along(target + back, -back)
+
+
+class ThirdPerson:
+    """The camera behind the robot, for a running environment."""
+
+    def __init__(self, env: Any, rows: int = 360, columns: int = 480):
+        """Prepare nothing before it is needed; `env` is an `InteractiveNav`."""
+        self._env, self._lens = env, Lens(columns, rows, 60.0)
+        small, classes = env.world.small_objects, env.config.sensors.segmentation_classes
+        self._view = functools.cache(lambda scene: SceneView(env.robot, env.scenes[scene], small, classes))
+
+    def frames(self, state: Any) -> tuple[np.ndarray, ...]:
+        """Draw [rows, columns, 3] u8 of each environment of a batch, or of one that is alone."""
+        nav, qpos = state.info["nav"], np.asarray(state.pipeline_state.qpos)
+        which = np.asarray(nav.scene_index).reshape(-1), np.asarray(nav.goal_xy_w).reshape(-1, 2)
+        each = zip(which[0], qpos.reshape(-1, qpos.shape[-1]), which[1], strict=True)
+        return tuple(self._frame(int(scene), *row) for scene, *row in each)
+
+    def _frame(self, scene: int, qpos: np.ndarray, goal_xy_w: np.ndarray) -> np.ndarray:
+        view = self._view(scene)
+        view.pose(self._env.world, scene, qpos)
+        paint = FloorPaint(goal_xy_w, self._env.success_distance_m)
+        return view.textured(behind(view), self._lens, (*SCENE, ROBOT), paint)
+
+
+def depth_picture(depth_m: np.ndarray, far_m: float = 5.0) -> np.ndarray:
+    """Convert [rows, columns] depth to [rows, columns, 3] u8: near bright, far and nothing (0) black."""
+    near = np.where(depth_m > 0, 1.0 - np.clip(depth_m / far_m, 0.0, 1.0), 0.0)
+    return np.repeat((255 * near**2).astype(np.uint8)[..., None], 3, -1)
+
+
+def mask_picture(mask: np.ndarray, depth_m: np.ndarray, classes: MaskClasses = 4) -> np.ndarray:
+    """Convert [rows, columns] ids to [rows, columns, 3] u8 in the classes' colours; nothing, of depth 0, is black."""
+    return (np.array(SEGMENTATIONS[classes].colours) * 255).astype(np.uint8)[mask] * (depth_m > 0)[..., None]
+
+
+def _varied(colour: np.ndarray, index: int) -> np.ndarray:
+    hue, light, saturation = colorsys.rgb_to_hls(*colour)
+    light = np.clip(light + 0.05 * ((index * 5) % 7 - 3) / 3, 0, 1)
+    return np.array(colorsys.hls_to_rgb(hue, light, saturation))
+
+
+def _painted(
+    drawn: np.ndarray, depth_m: np.ndarray, pose: CameraPose, lens: Lens, paint: FloorPaint, check: float = 1.0
+) -> np.ndarray:
+    """Return [H, W, 3] u8 with the floor painted, every second square of which is `check` as bright."""
+    points = pose.pos_w + lens.rays(pose) * depth_m[..., None]
+    floor = (np.abs(points[..., 2]) < ON_FLOOR_M) & (depth_m > 0)
+    out, colour, xy_w = drawn / 255, drawn[floor] / 255, points[floor, :2]
+    colour[np.floor(xy_w / 0.5).sum(-1) % 2 == 0] *= check
+    if paint.goal_xy_w is not None:
+        away = np.linalg.norm(xy_w - paint.goal_xy_w, axis=1)
+        colour[away < paint.goal_radius_m] = np.array(GOAL_COLOUR)
+        colour[away < 0.75 * paint.goal_radius_m] = 0.55 * np.array(GOAL_COLOUR) + 0.45
+    if paint.trail_xy_w is not None and len(paint.trail_xy_w):
+        near, _ = cKDTree(paint.trail_xy_w).query(xy_w, distance_upper_bound=0.04)
+        colour[np.isfinite(near)] = TRAIL_COLOUR
+    out[floor] = colour
+    return (out * 255 + 0.5).astype(np.uint8)

@@ -15,11 +15,11 @@ from interactive_nav.scenes.objects import VISUAL_GROUP, SmallObject, add_boxes,
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.slots import bodies_by_name
 from interactive_nav.scenes.world import World
-from interactive_nav.sensing.base import CameraPose, Lens
 from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, geom_colour
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.categories import MaskClasses, class_id
+from scenes_mjcf.look import cast
 
 THINGS, BUILDING, CUT_WALLS, ROBOT, ROBOT_SOLIDS, HIDDEN = range(6)
 """Geom groups: the floor and what stands on it; walls at full height; walls cut low; the robot; the collision shapes
@@ -160,35 +160,11 @@ def carried_geoms(
     return geoms, pos, axes_w @ matrix_from_quat(model.geom_quat[geoms])
 
 
-def cast(
-    model: mujoco.MjModel, data: mujoco.MjData, origin_w: np.ndarray, unit_w: np.ndarray, groups: Sequence[int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return what rays from (3,), m, with unit directions [n, 3] meet first of some geom groups.
-
-    These are [n] geoms, -1 for nothing; [n] distances, m; [n, 3] normals.
-    """
-    count = len(unit_w)
-    geom, distance, normal = np.zeros(count, np.int32), np.zeros(count), np.zeros(3 * count)
-    origin, flat = np.asarray(origin_w, float), np.ascontiguousarray(unit_w).ravel()
-    shown = np.isin(np.arange(6), groups).astype(np.uint8)
-    far = mujoco.mjMAXVAL
-    mujoco.mj_multiRay(model, data, origin, flat, shown, 1, -1, geom, distance, normal, count, far)
-    return geom, distance, normal.reshape(-1, 3)
-
-
-def trace(
-    model: mujoco.MjModel, data: mujoco.MjData, pose: CameraPose, lens: Lens, groups: Sequence[int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return what the pixels of a camera show of some geom groups.
-
-    These are [H, W, 3] rays, see `Lens.rays`; [H, W] geoms, -1 for nothing; [H, W] depths along the optical axis, m;
-    [H, W, 3] normals.
-    """
-    ray = lens.rays(pose)
-    length = np.linalg.norm(ray, axis=-1, keepdims=True)
-    geom, distance, normal = cast(model, data, pose.pos_w, (ray / length).reshape(-1, 3), groups)
-    shape = ray.shape[:2]
-    return ray, geom.reshape(shape), distance.reshape(shape) / length[..., 0], normal.reshape(ray.shape)
+def clear_way(model: SceneModel, target_w: np.ndarray, back_w: np.ndarray) -> float:
+    """Return the share of the way from a target (3,) along (3,), both m, at which a camera clears what is behind."""
+    reach = np.linalg.norm(back_w)
+    hit = cast(model.model, model.data, target_w, back_w[None] / reach, SCENE)[1][0] / reach
+    return min(1.0, 0.9 * hit) if hit > 0 else 1.0
 
 
 def _add_cut_walls(spec: mujoco.MjSpec, walls: np.ndarray) -> None:

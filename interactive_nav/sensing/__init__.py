@@ -1,8 +1,9 @@
 """Render depth, class ids and distances for cameras and scanners; `make_renderer` picks the renderer."""
 
 from interactive_nav.scenes.world import World
-from interactive_nav.sensing.base import CameraPose, Lens, Renderer, look_along
+from interactive_nav.sensing.base import Renderer
 from interactive_nav.sensing.boxes import BoxTables, build_boxes
+from scenes_mjcf.look import CameraPose, Lens, look_along
 
 
 def make_renderer(tables: BoxTables, lens: Lens, name: str, backend: str, meshes: World | None = None) -> Renderer:

@@ -4,87 +4,18 @@ from __future__ import annotations
 
 import abc
 import copy
-import dataclasses
 import functools
-import math
-from typing import Any
 
-import flax.struct
 import jax
-import jax.numpy as jnp
-import numpy as np
 
 from interactive_nav.physics.base import one_of_batch
 from interactive_nav.sensing.boxes import BoxTables
 from interactive_nav.sensing.shading import Look
+from scenes_mjcf.look import CameraPose, Lens
 
 NEAR_M = 0.01
 FAR_M = 100.0
 """Near and far plane of the original's renderer (reference benchmark, section 1.3); what is farther is empty."""
-
-
-@flax.struct.dataclass
-class CameraPose:
-    """Where a camera is, world frame."""
-
-    pos_w: Any
-    """[..., 3], m: f32 of JAX, or NumPy's on the host."""
-    axes_w: Any
-    """[..., 3, 3], columns: forward, right, up."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Lens:
-    """A pinhole camera with square pixels."""
-
-    width: int
-    height: int
-    fov_deg: float
-    """Vertical field of view."""
-
-    @property
-    def half_height(self) -> float:
-        """Return half of the image's height at depth 1."""
-        return math.tan(math.radians(self.fov_deg) / 2)
-
-    @property
-    def pixel(self) -> float:
-        """Return the side of a pixel at depth 1."""
-        return 2 * self.half_height / self.height
-
-    @property
-    def columns(self) -> np.ndarray:
-        """Return [width] f32: rightward offset of the pixels' centres at depth 1, left to right."""
-        return ((np.arange(self.width) + 0.5 - self.width / 2) * self.pixel).astype(np.float32)
-
-    @property
-    def rows(self) -> np.ndarray:
-        """Return [height] f32: upward offset at depth 1, top to bottom."""
-        return ((self.height / 2 - np.arange(self.height) - 0.5) * self.pixel).astype(np.float32)
-
-    def rays(self, pose: CameraPose) -> np.ndarray:
-        """Return the rays [height, width, 3] of one camera's pixels, world frame; along its axis their length is 1."""
-        right, up = np.meshgrid(self.columns.astype(float), self.rows.astype(float))
-        return np.stack([np.ones_like(right), right, up], -1) @ np.asarray(pose.axes_w, float).T
-
-
-def look_along(pos_w: Any, forward_w: Any) -> CameraPose:
-    """Return a camera without roll: its right is horizontal, as if the world's z were up.
-
-    NumPy's arrays stay NumPy's: JAX would compile each operation anew for every number of cameras.
-
-    Args:
-        pos_w: [..., 3] m.
-        forward_w: [..., 3], any length; a vertical one takes the world's -y as right.
-    """
-    xp = jnp if isinstance(forward_w, jax.Array) else np
-    forward = forward_w / xp.linalg.norm(forward_w, axis=-1, keepdims=True)
-    flat = xp.stack([forward[..., 1], -forward[..., 0], xp.zeros_like(forward[..., 0])], -1)
-    length = xp.linalg.norm(flat, axis=-1, keepdims=True)
-    aside = xp.broadcast_to(xp.asarray([0.0, -1.0, 0.0], forward.dtype), flat.shape)
-    right = xp.where(length > 1e-6, flat / xp.where(length > 1e-6, length, 1.0), aside)
-    up = xp.cross(right, forward)
-    return CameraPose(pos_w, xp.stack([forward, right, up], -1))
 
 
 class Renderer(abc.ABC):

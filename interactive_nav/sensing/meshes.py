@@ -20,13 +20,14 @@ from scipy.spatial import ConvexHull
 
 from interactive_nav.physics.warp_callbacks import held, keep_collector_out
 from interactive_nav.scenes.world import World
-from interactive_nav.sensing.base import FAR_M, NEAR_M, Lens, Renderer
+from interactive_nav.sensing.base import FAR_M, NEAR_M, Renderer
 from interactive_nav.sensing.boxes import BoxTables, apply_axes, body_poses, geom_box, robot_geoms
-from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, SKY_COLOUR, geom_colour, visual_geoms
+from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, geom_colour, visual_geoms
 from interactive_nav.sensing.surfaces import lit_images
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.agreement import is_lit
 from scenes_mjcf.categories import class_id
+from scenes_mjcf.look import SKY_COLOUR, Lens
 
 NEAR, FAR = wp.constant(NEAR_M), wp.constant(FAR_M)
 SKY, FLOOR = wp.constant(wp.vec3(*SKY_COLOUR)), wp.constant(wp.vec3(*FLOOR_COLOUR))

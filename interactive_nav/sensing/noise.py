@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.camera_config import CameraNoise
-from interactive_nav.sensing.base import Lens
+from scenes_mjcf.look import Lens
 
 KeyOf = Callable[[str], jax.Array]
 """An error's name to its PRNG key: each has a separate stream, so that switching one on leaves the others alone."""

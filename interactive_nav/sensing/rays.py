@@ -13,10 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from interactive_nav.sensing.base import FAR_M, NEAR_M, CameraPose, Lens
+from interactive_nav.sensing.base import FAR_M, NEAR_M
 from interactive_nav.sensing.boxes import BoxTables, apply_axes, box_poses, compose, slab
 from interactive_nav.sensing.surfaces import BoxRenderer
 from scenes_mjcf.categories import SEGMENTATIONS
+from scenes_mjcf.look import CameraPose, Lens
 
 _EMPTY = np.int32(2**31 - 1)
 _BOXES_AT_ONCE = 8

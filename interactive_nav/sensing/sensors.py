@@ -33,8 +33,7 @@ from interactive_nav.config import IMAGES, NavConfig, SensorConfig
 from interactive_nav.physics.base import PhysicsState
 from interactive_nav.robots.spec import RobotCamera
 from interactive_nav.scenes.world import World
-from interactive_nav.sensing import Lens, Renderer, build_boxes, make_renderer
-from interactive_nav.sensing.base import CameraPose, look_along
+from interactive_nav.sensing import Renderer, build_boxes, make_renderer
 from interactive_nav.sensing.boxes import Links, apply_axes, make_links
 from interactive_nav.sensing.noise import disturbed
 from interactive_nav.sensing.observation import task_observation
@@ -45,6 +44,7 @@ from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import matrix_from_quat, wrap_angle
 from scenes_mjcf.categories import SEGMENTATIONS
+from scenes_mjcf.look import CameraPose, Lens, look_along
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,9 +11,8 @@ import numpy as np
 from interactive_nav.scenes.objects import VISUAL_GROUP
 from interactive_nav.scenes.scene import Scene
 from scenes_mjcf.categories import SEGMENTATIONS, MaskClasses
+from scenes_mjcf.look import SKY_COLOUR
 
-SKY_COLOUR = (0.93, 0.95, 0.97)
-"""RGB in [0, 1] of pictures where nothing is met."""
 FLOOR_COLOUR = (0.56, 0.50, 0.43)
 PALETTES = {
     classes: np.array([*masks.colours, FLOOR_COLOUR, SKY_COLOUR], np.float32)

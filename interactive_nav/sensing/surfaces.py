@@ -5,9 +5,10 @@ import abc
 import jax
 import jax.numpy as jnp
 
-from interactive_nav.sensing.base import CameraPose, Lens, Renderer
+from interactive_nav.sensing.base import Renderer
 from interactive_nav.sensing.boxes import BoxTables, apply_axes, box_poses, slab
-from interactive_nav.sensing.shading import SKY_COLOUR, Look, lit
+from interactive_nav.sensing.shading import Look, lit
+from scenes_mjcf.look import SKY_COLOUR, CameraPose, Lens
 
 _FLOOR_HALF_M = (1e4, 1e4, 1.0)
 """The floor as one more box, whose top is z = 0."""

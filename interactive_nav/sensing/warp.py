@@ -15,11 +15,11 @@ from mujoco import mjx
 
 from interactive_nav.physics.base import uncommitted
 from interactive_nav.physics.warp_callbacks import held, keep_collector_out
-from interactive_nav.sensing.base import FAR_M, NEAR_M, CameraPose, Lens
+from interactive_nav.sensing.base import FAR_M, NEAR_M
 from interactive_nav.sensing.boxes import BoxTables, box_poses
 from interactive_nav.sensing.rays import camera_boxes, in_view
-from interactive_nav.sensing.shading import SKY_COLOUR
 from interactive_nav.sensing.surfaces import BoxRenderer
+from scenes_mjcf.look import SKY_COLOUR, CameraPose, Lens
 
 _HIDDEN_W = (0.0, 0.0, -50.0)
 """Padding, and boxes that the camera does not see, lie here, below the floor, which hides them."""

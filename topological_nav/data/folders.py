@@ -12,11 +12,11 @@ import numpy as np
 
 from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
-from interactive_nav.sensing.base import CameraPose, Lens
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import readable
 from interactive_nav_common.files import write_text
 from interactive_nav_common.locks import alone_in
+from scenes_mjcf.look import CameraPose, Lens
 from topological_nav.config import CameraConfig
 from topological_nav.data.shards import THREADS, in_order, write_shard
 from topological_nav.errors import DatasetError, Progress

@@ -21,9 +21,9 @@ import numpy as np
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
-from interactive_nav.sensing.base import CameraPose
 from interactive_nav_common.files import write_arrays
 from interactive_nav_common.locks import alone_in
+from scenes_mjcf.look import CameraPose
 from topological_nav.config import DataConfig, DriveConfig, MapConfig
 from topological_nav.data.folders import Folder, draw_missing, load_scenes
 from topological_nav.data.shards import numbered, read_arrays, read_shards

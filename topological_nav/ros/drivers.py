@@ -12,7 +12,7 @@ from interactive_nav_common.errors import UserError
 from topological_nav.ros.config import HeadingConfig
 
 if TYPE_CHECKING:
-    from interactive_nav.sensing.base import Lens
+    from scenes_mjcf.look import Lens
     from topological_nav.navigate.navigator import Navigator
     from topological_nav.navigate.state import State
 

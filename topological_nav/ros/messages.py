@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from PIL import Image as Pillow
 
-from interactive_nav.sensing.base import Lens
 from interactive_nav_common.errors import UserError
+from scenes_mjcf.look import Lens
 
 RGB = "rgb8"
 _ORDER = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0)}

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from interactive_nav.sensing.base import Lens
+from scenes_mjcf.look import Lens
 from topological_nav.ros import messages, topics
 from topological_nav.ros.debian import RosError
 from topological_nav.ros.drivers import Command, Driver

@@ -13,14 +13,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from interactive_nav.pictures.gl import GlPainter
 from interactive_nav.pictures.scene_model import SCENE, carried_geoms, picture_spec
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import SmallObject, body_names
 from interactive_nav.scenes.scene import Scene
-from interactive_nav.sensing.base import CameraPose, Lens, look_along
 from interactive_nav_common.errors import UserError, missing, optional
 from interactive_nav_common.rotations import matrix_from_quat
+from scenes_mjcf.look import CameraPose, GlPainter, Lens, look_along
 
 CPU_IMAGES = (1, 2, 6, 18)
 """Images a call on a CPU, which takes as long for each; 18 are the headings of one position and pitch."""

@@ -13,15 +13,14 @@ import numpy as np
 import shapely
 from matplotlib.axes import Axes
 
-from interactive_nav.pictures.camera import straight_down
+from interactive_nav.pictures.camera import SceneView
 from interactive_nav.pictures.replay import Replay, load_replay
 from interactive_nav.pictures.scene_model import ROBOT, SCENE
-from interactive_nav.pictures.views import SceneView
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav.scenes.slots import bodies_by_name
-from interactive_nav.sensing.base import CameraPose, Lens
 from interactive_nav.topdown import shadow
+from scenes_mjcf.look import CameraPose, Lens, straight_down
 from train.figures import style
 
 LENS = Lens(480, 360, 20.0)

@@ -13,14 +13,12 @@ import mujoco
 import numpy as np
 from matplotlib.figure import Figure
 
-from interactive_nav.pictures.gl import GlPainter
-from interactive_nav.pictures.scene_model import trace
 from interactive_nav.robots import get_robot
 from interactive_nav.robots.build import stand
 from interactive_nav.robots.spec import RobotSpec
-from interactive_nav.sensing.base import CameraPose, Lens, look_along
 from interactive_nav.sensing.shading import lambert
 from interactive_nav_common.errors import UserError
+from scenes_mjcf.look import CameraPose, GlPainter, Lens, look_along, trace
 
 _SIZE = (480, 480)
 _VIEW_AZIMUTH_DEG, _VIEW_ELEVATION_DEG = 145.0, -22.0

@@ -15,11 +15,12 @@ import mujoco
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from converters.check.render import Picture, over
+from converters.check.render import Picture
 from converters.check.views import world_surfaces
 from converters.propose.proposals import bounds, box_iou
 from converters.records.visual import TexturedMesh
 from converters.segment.labelling import FOUND_IOU
+from scenes_mjcf.look import over
 from scenes_mjcf.schema import load_manifest
 
 TITLES = "a  mesh only", "b  the network's labels", "c  the room's true labels", "d  people's annotations"
@@ -68,7 +69,7 @@ def tinted(surface: TexturedMesh, hue: float) -> TexturedMesh:
 def panel(scene: Path, low: np.ndarray, high: np.ndarray, title: str) -> Image.Image:
     """One scene from above: what moves in colours, the rest as it is."""
     pixel_m = float((high - low)[0]) / PANEL_PX
-    picture = Picture(over(np.eye(3), low, high, pixel_m))
+    picture = Picture(*over(np.eye(3), low, high, pixel_m))
     manifest = load_manifest(scene)
     names = {o.name: o.category for o in manifest.objects}
     for body, surface in surfaces_of(scene).items():

@@ -9,14 +9,21 @@ import mujoco
 import numpy as np
 import pytest
 
-from converters.check.render import Camera, Picture, looking_at
+from converters.check.render import Picture
 from converters.check.views import at_eye_height, from_the_south, world_surfaces
 from converters.records.visual import TexturedMesh
+from scenes_mjcf.look import CameraPose, Lens, look_along, over
 from scenes_mjcf.schema import load_maps
 
 RED, BLUE, MAGENTA = (200, 0, 0), (0, 0, 200), (255, 0, 255)
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Looks along +y, x to the right."""
+
+
+def ahead(shape: tuple[int, int], focal: float) -> tuple[CameraPose, Lens]:
+    """A camera at the origin that looks along +y, of so many pixels focal length."""
+    lens = Lens(shape[1], shape[0], math.degrees(2 * math.atan(shape[0] / 2 / focal)))
+    return look_along(np.zeros(3), np.array([0.0, 1.0, 0.0])), lens
 
 
 def wall(y_m: float, half_m: float, texture: np.ndarray) -> TexturedMesh:
@@ -38,7 +45,7 @@ def hue(picture: np.ndarray) -> np.ndarray:
 
 def test_the_nearer_wall_hides_the_farther_as_perspective_has_it():
     """Focal length 20: a half metre two metres off is 5 pixels from the middle, two metres four metres off are 10."""
-    picture = Picture(Camera(np.zeros(3), UPRIGHT, (40, 40), 20.0))
+    picture = Picture(*ahead((40, 40), 20.0))
     picture.draw(wall(2.0, 0.5, plain(RED)))
     picture.draw(wall(4.0, 2.0, plain(BLUE)))
     seen = hue(picture.image)
@@ -49,7 +56,9 @@ def test_the_nearer_wall_hides_the_farther_as_perspective_has_it():
 @pytest.mark.parametrize("parallel", [False, True])
 def test_texels_stand_where_their_coordinates_say(parallel):
     texture = np.array([[RED, BLUE], [BLUE, BLUE]], np.uint8)  # red at the upper left
-    picture = Picture(Camera(np.zeros(3), UPRIGHT, (20, 20), 8.0, parallel))
+    picture = Picture(
+        *(over(UPRIGHT, np.full(2, -1.25), np.full(2, 1.25), 0.125) if parallel else ahead((20, 20), 8.0))
+    )
     picture.draw(wall(1.0, 1.0, texture))
     seen = hue(picture.image)
     assert (seen[2:8, 2:8] == "r").all() and (seen[12:18, 2:18] == "b").all() and (seen[2:8, 12:18] == "b").all()
@@ -59,7 +68,7 @@ def test_a_face_seen_from_behind_is_left_out_where_sides_matter_and_none_above_t
     away = wall(2.0, 1.0, plain(RED))
     away = dataclasses.replace(away, faces=away.faces[:, ::-1])
     for one_sided, below_m, count in ((True, np.inf, 0), (False, np.inf, 400), (False, 0.0, 200)):
-        picture = Picture(Camera(np.zeros(3), UPRIGHT, (40, 40), 20.0))
+        picture = Picture(*ahead((40, 40), 20.0))
         picture.draw(away, one_sided, below_m)
         assert (hue(picture.image) == "r").sum() == count
 
@@ -67,7 +76,7 @@ def test_a_face_seen_from_behind_is_left_out_where_sides_matter_and_none_above_t
 def test_a_floor_that_passes_under_the_eye_fills_the_lower_half():
     corners = np.array([[-50.0, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]])
     floor = dataclasses.replace(wall(0.0, 1.0, plain(RED)), vertices=corners)
-    picture = Picture(looking_at(np.array([0.0, 0, 1.5]), np.array([1.0, 0, 1.5]), (30, 40), math.radians(75)))
+    picture = Picture(look_along(np.array([0.0, 0, 1.5]), np.array([1.0, 0, 0])), Lens(40, 30, 60.0))
     picture.draw(floor, one_sided=True)
     seen = hue(picture.image)
     assert (seen[17:] == "r").all() and (seen[:15] == ".").all()

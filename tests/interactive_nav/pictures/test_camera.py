@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from interactive_nav.config import NavConfig
-from interactive_nav.pictures.camera import STREAMS, PictureCamera
-from interactive_nav.pictures.views import SceneView
+from interactive_nav.pictures.camera import STREAMS, PictureCamera, SceneView
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import load_scene

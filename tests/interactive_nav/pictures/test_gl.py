@@ -4,15 +4,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from interactive_nav.pictures import gl
-from interactive_nav.pictures.gl import SKY, GlPainter
+import scenes_mjcf.look as gl
 from interactive_nav_common.errors import UserError
+from scenes_mjcf.look import SKY, GlPainter
 from tests.gl_program import drawn, need_gl
 
 BOX = """
 import mujoco, sys, numpy as np
-from interactive_nav.sensing.base import look_along
-from interactive_nav.pictures.gl import GlPainter
+from scenes_mjcf.look import look_along
+from scenes_mjcf.look import GlPainter
 spec = mujoco.MjSpec()
 box = mujoco.mjtGeom.mjGEOM_BOX
 spec.worldbody.add_geom(type=box, pos=[3.5, 0, 0], size=[0.5, 1.0, 1.0], rgba=[1, 0, 0, 1], group=2)

@@ -19,11 +19,8 @@ import interactive_nav
 from interactive_nav import record, topdown
 from interactive_nav.interop import gym_env
 from interactive_nav.pictures import replay
-from interactive_nav.pictures.replay import EpisodePlayer, ReplayError
-from interactive_nav.pictures.views import (
+from interactive_nav.pictures.camera import (
     GOAL_COLOUR,
-    INSIDE,
-    NOTHING,
     OUTSIDE,
     FloorPaint,
     SceneView,
@@ -31,15 +28,17 @@ from interactive_nav.pictures.views import (
     mask_picture,
     robot_camera,
 )
+from interactive_nav.pictures.replay import EpisodePlayer, ReplayError
+from interactive_nav.pictures.scene_model import SCENE
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.slots import bodies_by_name
-from interactive_nav.sensing.base import Lens, look_along
 from interactive_nav.task.rollout import policy_key_of
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.rotations import yaw_from_quat
 from scenes_mjcf.categories import CATEGORIES, SEGMENTATIONS, class_id
+from scenes_mjcf.look import Lens, look_along
 from tests.gl_program import drawn, need_gl
 
 CLASSES = SEGMENTATIONS[4].names
@@ -120,21 +119,21 @@ def test_depth_and_classes_by_hand(view):
     """A room of 4 x 3 m with a cube of 0.4 m on the floor at (0.7, 0); the eye is at 0.3 m."""
     view.place(("chair_0",), np.array([[0.7, 0.0, 0.2]]), np.array([IDENTITY]))
     eye = look_along(np.array([-1.0, 0.0, 0.3]), np.array([1.0, 0, 0])), Lens(101, 101, 90.0)
-    seen = view.render(*eye, INSIDE)
-    assert CLASSES[seen.classes[50, 50]] == "chair" and seen.depth_m[50, 50] == pytest.approx(1.5, abs=1e-5)
+    seen = view.render(*eye, SCENE)
+    assert CLASSES[seen["segmentation"][50, 50]] == "chair" and seen["depth"][50, 50] == pytest.approx(1.5, abs=1e-5)
     # Beside the cube the wall, 3 m ahead of the eye: depth is along the axis, so equal over the wall.
-    wall = seen.depth_m[50, 75], seen.depth_m[40, 30]
+    wall = seen["depth"][50, 75], seen["depth"][40, 30]
     assert wall == pytest.approx((3.0, 3.0), abs=1e-5)
-    assert CLASSES[seen.classes[50, 75]] == "structure"
+    assert CLASSES[seen["segmentation"][50, 75]] == "structure"
     # The floor k rows below the middle is at depth 0.3 / (k / 50.5).
-    assert seen.depth_m[80, 50] == pytest.approx(0.3 * 50.5 / 30, rel=1e-5)
+    assert seen["depth"][80, 50] == pytest.approx(0.3 * 50.5 / 30, rel=1e-5)
     # Away with the cube: the wall behind it, 0.3 m above the floor.
     view.place(("chair_0",), np.array([[0.7, 9.0, 0.2]]), np.array([IDENTITY]))
-    assert view.render(*eye, INSIDE).depth_m[50, 50] == pytest.approx(3.0, abs=1e-5)
+    assert view.render(*eye, SCENE)["depth"][50, 50] == pytest.approx(3.0, abs=1e-5)
     # Turned by 45 degrees it shows an edge: half a diagonal in front of its middle.
     turned = [math.cos(math.pi / 8), 0, 0, math.sin(math.pi / 8)]
     view.place(("chair_0",), np.array([[0.7, 0.0, 0.2]]), np.array([turned]))
-    assert view.render(*eye, INSIDE).depth_m[50, 50] == pytest.approx(1.7 - 0.2 * math.sqrt(2), abs=1e-3)
+    assert view.render(*eye, SCENE)["depth"][50, 50] == pytest.approx(1.7 - 0.2 * math.sqrt(2), abs=1e-3)
 
 
 def test_the_robot_is_seen_from_outside_only(view):
@@ -146,15 +145,15 @@ def test_the_robot_is_seen_from_outside_only(view):
     np.testing.assert_allclose(camera.pos_w, np.array([-0.5, 0.3, 0.0]) + robot.camera.pos_m, atol=1e-9)
     np.testing.assert_allclose(camera.axes_w[:, 0], [1, 0, 0], atol=1e-9)
     index = CLASSES.index("robot")
-    assert not (view.render(camera, lens, INSIDE).classes == index).any()
+    assert not (view.render(camera, lens, SCENE)["segmentation"] == index).any()
     above = look_along(np.array([-1.5, 0.3, 2.0]), np.array([1.0, 0, -1.0])), Lens(60, 60, math.degrees(1.0))
-    assert (view.render(*above, OUTSIDE).classes == index).sum() > 20
+    assert (view.render(*above, OUTSIDE)["segmentation"] == index).sum() > 20
 
 
 def test_goal_and_path_are_painted_on_the_floor(view):
     down = look_along(np.array([-1.2, 0.0, 3.0]), np.array([1e-3, 0, -1.0])), Lens(41, 41, math.degrees(0.3))
     paint = FloorPaint(np.array([-1.2, 0.0]), 0.2, np.array([[-1.2, 0.3]]))
-    plain, painted = view.render(*down, OUTSIDE).colour, view.render(*down, OUTSIDE, paint).colour
+    plain, painted = view.render(*down, OUTSIDE)["rgb"], view.render(*down, OUTSIDE, paint)["rgb"]
     changed = (plain != painted).any(-1)
     # A disc of 0.2 m and a dot of 0.04 m, in a view of 2 * 3 m * tan(0.15).
     share = (math.pi * 0.2**2 + math.pi * 0.04**2) / (2 * 3.0 * math.tan(0.15)) ** 2
@@ -230,11 +229,11 @@ def test_a_body_that_is_not_there_is_refused(view):
 
 
 def test_pictures_of_depth_and_classes():
-    depth = depth_picture(np.array([[0.0, 2.5, 5.0, np.inf]]))
-    assert depth[0, :, 0].tolist() == [255, 63, 0, 0]  # (1 - d / 5)^2
-    mask = mask_picture(np.array([[NOTHING, CLASSES.index("shoe")]], np.uint8))
+    depth = depth_picture(np.array([[1e-6, 2.5, 5.0, 0.0]]))
+    assert depth[0, :, 0].tolist() == [254, 63, 0, 0]  # (1 - d / 5)^2
+    mask = mask_picture(np.array([[0, CLASSES.index("shoe")]], np.uint8), np.array([[0.0, 1.0]]))
     assert mask[0, 0].tolist() == [0, 0, 0] and mask[0, 1].tolist() == [204, 71, 76]
-    bed = mask_picture(np.array([[class_id("bed", "all")]], np.uint8), "all")[0, 0]
+    bed = mask_picture(np.array([[class_id("bed", "all")]], np.uint8), np.ones((1, 1)), "all")[0, 0]
     assert bed.tolist() == [int(255 * value) for value in CATEGORIES["bed"].colour]
 
 

@@ -12,11 +12,11 @@ from interactive_nav.robots.spec import RobotCamera
 from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
-from interactive_nav.sensing.base import look_along
 from interactive_nav.sensing.boxes import body_poses, box_poses, build_boxes
 from interactive_nav.sensing.sensors import make_mount
 from interactive_nav_common.errors import UserError
 from scenes_mjcf.categories import OBJECT_CATEGORIES, SEGMENTATIONS, class_id
+from scenes_mjcf.look import look_along
 
 
 def test_class_ids_are_the_originals(world, boxes):

@@ -12,14 +12,14 @@ import pytest
 from PIL import Image
 
 from interactive_nav.config import NavConfig
-from interactive_nav.pictures.scene_model import SCENE, SceneModel, trace
+from interactive_nav.pictures.scene_model import SCENE, SceneModel
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing import make_renderer
-from interactive_nav.sensing.base import CameraPose, Lens, look_along
 from interactive_nav.sensing.boxes import build_boxes
 from interactive_nav_common.errors import ConfigError
+from scenes_mjcf.look import CameraPose, Lens, look_along, trace
 from tests.toys import write_room
 
 pytest.importorskip("warp")

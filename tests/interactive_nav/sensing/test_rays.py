@@ -15,10 +15,10 @@ from interactive_nav.config import NavConfig
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
-from interactive_nav.sensing.base import CameraPose, Lens, look_along
 from interactive_nav.sensing.boxes import box_poses, build_boxes
 from interactive_nav.sensing.rays import RayRenderer, camera_boxes, cast_fan, in_view
 from scenes_mjcf.categories import SEGMENTATIONS, MaskClasses, class_id
+from scenes_mjcf.look import CameraPose, Lens, look_along
 from tests.toys import write_room
 
 HAS_WARP = importlib.util.find_spec("warp") is not None

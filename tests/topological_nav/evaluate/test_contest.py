@@ -9,10 +9,10 @@ import pytest
 
 from interactive_nav.pictures.scene_model import world_poses
 from interactive_nav.robots import get_robot
-from interactive_nav.sensing.base import Lens
 from interactive_nav_common.config import replace
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rows import read_rows
+from scenes_mjcf.look import Lens
 from tests.topological_nav.conftest import Made
 from topological_nav.__main__ import main
 from topological_nav.config import DataConfig, EvaluationConfig

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from interactive_nav.sensing.base import Lens
 from interactive_nav_common.errors import UserError
+from scenes_mjcf.look import Lens
 from topological_nav.ros.config import HeadingConfig
 from topological_nav.ros.drivers import Command, HeadingDriver, PilotDriver
 

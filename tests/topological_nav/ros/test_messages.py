@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from interactive_nav.sensing.base import Lens
+from scenes_mjcf.look import Lens
 from topological_nav.ros import messages
 from topological_nav.ros.topics import Headings, time_parts
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from interactive_nav.sensing.base import Lens
+from scenes_mjcf.look import Lens
 from topological_nav.ros import nodes, topics
 from topological_nav.ros.config import HeadingConfig, SimulatorConfig
 from topological_nav.ros.debian import RosError

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from interactive_nav.pictures.gl import SKY
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
-from interactive_nav.sensing.base import Lens
+from scenes_mjcf.look import SKY, Lens
 from tests.gl_program import drawn, need_gl
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose
 
@@ -18,7 +17,7 @@ HEADINGS = np.array([np.pi, 0.2, 1.2, -2.4])
 ROOMS = """
 import gc, sys, weakref, numpy as np
 from pathlib import Path
-from interactive_nav.sensing.base import Lens
+from scenes_mjcf.look import Lens
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose

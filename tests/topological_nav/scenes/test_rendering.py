@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
-from interactive_nav.sensing.base import Lens
 from interactive_nav.sensing.sensors import make_mount
 from interactive_nav_common.errors import UserError
+from scenes_mjcf.look import Lens
 from topological_nav.scenes import rendering
 from topological_nav.scenes.rendering import CPU_IMAGES, SceneRenderer, batch_sizes, calls, camera_pose, shrink
 

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from interactive_nav.pictures.scene_model import SCENE, SceneModel, trace, world_poses
+from interactive_nav.pictures.scene_model import SCENE, SceneModel, world_poses
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import body_names
 from interactive_nav.scenes.scene import load_scene
-from interactive_nav.sensing.base import Lens
+from scenes_mjcf.look import Lens, trace
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose
 from topological_nav.scenes.simulation import Simulator, make_env, scene_camera
 

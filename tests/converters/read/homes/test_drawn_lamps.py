@@ -23,10 +23,10 @@ FLOOR = HOME[4].replace("floorColor='FF102030'", "floorColor='FF606060'")
 PLAIN = [*HOME[:4], FLOOR, *HOME[5:7]]
 PICTURE = """
 import mujoco, sys, numpy as np
-from interactive_nav.pictures.gl import GlPainter
+from scenes_mjcf.look import GlPainter
 from interactive_nav.pictures.scene_model import SCENE, picture_spec
 from interactive_nav.scenes.scene import load_scene
-from interactive_nav.sensing.base import look_along
+from scenes_mjcf.look import look_along
 model = picture_spec(load_scene(sys.argv[2])).compile()
 data = mujoco.MjData(model)
 mujoco.mj_forward(model, data)

@@ -8,8 +8,8 @@ from PIL import Image
 
 import interactive_nav
 from docs.studies.policies.strips import LENS, floor_seen, main, touched_longest
-from interactive_nav.pictures.camera import straight_down
 from interactive_nav.pictures.replay import EpisodePlayer, Replay, save_replay
+from scenes_mjcf.look import straight_down
 
 
 @pytest.fixture(scope="module")

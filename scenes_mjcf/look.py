@@ -1,0 +1,232 @@
+"""Define cameras, and draw what they see of a MuJoCo model: with its renderer, offscreen, or with its rays.
+
+`mujoco.Renderer` reads MUJOCO_GL when mujoco is imported, and without it and without a display it looks for a window
+system and fails. Here the library is chosen when the first picture is requested: MUJOCO_GL where it is set, else EGL
+where there is no display.
+"""
+
+import atexit
+import dataclasses
+import importlib
+import math
+import os
+import warnings
+import weakref
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from interactive_nav_common.errors import UserError
+
+LIBRARIES = ("egl", "osmesa", "glfw")
+SKY_COLOUR = (0.93, 0.95, 0.97)
+"""RGB in [0, 1] of pictures where nothing is met."""
+SKY = tuple(round(255 * c) for c in SKY_COLOUR)
+"""Where nothing is hit; MuJoCo's would be black."""
+
+
+class CameraPose(NamedTuple):
+    """Where a camera is, world frame; a pytree."""
+
+    pos_w: Any
+    """[..., 3], m: f32 of JAX, or NumPy's on the host."""
+    axes_w: Any
+    """[..., 3, 3], columns: forward, right, up."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Lens:
+    """A pinhole camera with square pixels."""
+
+    width: int
+    height: int
+    fov_deg: float
+    """Vertical field of view."""
+
+    @property
+    def half_height(self) -> float:
+        """Return half of the image's height at depth 1."""
+        return math.tan(math.radians(self.fov_deg) / 2)
+
+    @property
+    def pixel(self) -> float:
+        """Return the side of a pixel at depth 1."""
+        return 2 * self.half_height / self.height
+
+    @property
+    def columns(self) -> np.ndarray:
+        """Return [width] f32: rightward offset of the pixels' centres at depth 1, left to right."""
+        return ((np.arange(self.width) + 0.5 - self.width / 2) * self.pixel).astype(np.float32)
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Return [height] f32: upward offset at depth 1, top to bottom."""
+        return ((self.height / 2 - np.arange(self.height) - 0.5) * self.pixel).astype(np.float32)
+
+    def rays(self, pose: CameraPose) -> np.ndarray:
+        """Return the rays [height, width, 3] of one camera's pixels, world frame; along its axis their length is 1."""
+        right, up = np.meshgrid(self.columns.astype(float), self.rows.astype(float))
+        return np.stack([np.ones_like(right), right, up], -1) @ np.asarray(pose.axes_w, float).T
+
+
+def look_along(pos_w: Any, forward_w: Any) -> CameraPose:
+    """Return a camera without roll: its right is horizontal, as if the world's z were up.
+
+    NumPy's arrays stay NumPy's: JAX would compile each operation anew for every number of cameras.
+
+    Args:
+        pos_w: [..., 3] m.
+        forward_w: [..., 3], any length; a vertical one takes the world's -y as right.
+    """
+    xp = forward_w.__array_namespace__()
+    forward = forward_w / xp.linalg.norm(forward_w, axis=-1, keepdims=True)
+    flat = xp.stack([forward[..., 1], -forward[..., 0], xp.zeros_like(forward[..., 0])], -1)
+    length = xp.linalg.norm(flat, axis=-1, keepdims=True)
+    aside = xp.broadcast_to(xp.asarray([0.0, -1.0, 0.0], forward.dtype), flat.shape)
+    right = xp.where(length > 1e-6, flat / xp.where(length > 1e-6, length, 1.0), aside)
+    up = xp.cross(right, forward)
+    return CameraPose(pos_w, xp.stack([forward, right, up], -1))
+
+
+def straight_down(low_w: np.ndarray, high_w: np.ndarray, aspect: float, fov_deg: float) -> CameraPose:
+    """Return a camera, x to the right and y up, over the floor between two corners (2,), m, and its walls."""
+    size, centre = np.subtract(high_w, low_w), np.add(high_w, low_w) / 2
+    above = max(size[1], size[0] / aspect) / 2 / math.tan(math.radians(fov_deg / 2)) + 2.5
+    return CameraPose(np.array([*centre, above]), np.array([[0, 1, 0], [0, 0, 1], [-1, 0, 0]], float))
+
+
+def over(axes_w: np.ndarray, low: np.ndarray, high: np.ndarray, pixel_m: float) -> tuple[CameraPose, Lens]:
+    """Return a camera so far off a rectangle that its rays are parallel.
+
+    Args:
+        axes_w: (3, 3) rows: what points to the right, up, and at the viewer.
+        low: (2 or 3,) m along these axes, lower left corner of the picture.
+        pixel_m: width of a pixel; the picture is some whole pixels large, from the lower left corner on.
+    """
+    columns, rows = np.ceil((high - low)[:2] / pixel_m - 1e-6).astype(int).tolist()
+    away, half = 1e4 * pixel_m * max(columns, rows), np.array([columns, rows]) * pixel_m / 2
+    axes = np.stack([-axes_w[2], axes_w[0], axes_w[1]], -1)
+    lens = Lens(columns, rows, math.degrees(2 * math.atan(half[1] / away)))
+    return CameraPose(np.array([*low[:2] + half, away]) @ axes_w, axes), lens
+
+
+def cast(
+    model: mujoco.MjModel, data: mujoco.MjData, origin_w: np.ndarray, unit_w: np.ndarray, groups: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what rays from (3,), m, with unit directions [n, 3] meet first of some geom groups.
+
+    These are [n] geoms, -1 for nothing; [n] distances, m; [n, 3] normals.
+    """
+    count = len(unit_w)
+    geom, distance, normal = np.zeros(count, np.int32), np.zeros(count), np.zeros(3 * count)
+    origin, flat = np.asarray(origin_w, float), np.ascontiguousarray(unit_w).ravel()
+    shown = np.isin(np.arange(6), groups).astype(np.uint8)
+    far = mujoco.mjMAXVAL
+    mujoco.mj_multiRay(model, data, origin, flat, shown, 1, -1, geom, distance, normal, count, far)
+    return geom, distance, normal.reshape(-1, 3)
+
+
+def trace(
+    model: mujoco.MjModel, data: mujoco.MjData, pose: CameraPose, lens: Lens, groups: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return what the pixels of a camera show of some geom groups.
+
+    These are [H, W, 3] rays, see `Lens.rays`; [H, W] geoms, -1 for nothing; [H, W] depths along the optical axis, m;
+    [H, W, 3] normals.
+    """
+    ray = lens.rays(pose)
+    length = np.linalg.norm(ray, axis=-1, keepdims=True)
+    geom, distance, normal = cast(model, data, pose.pos_w, (ray / length).reshape(-1, 3), groups)
+    shape = ray.shape[:2]
+    return ray, geom.reshape(shape), distance.reshape(shape) / length[..., 0], normal.reshape(ray.shape)
+
+
+class GlPainter:
+    """Draws one model, one camera after the other; it must stay in the thread that created it."""
+
+    def __init__(self, model: mujoco.MjModel, width: int, height: int, sky: tuple[int, ...] | None = SKY):
+        """Create a context.
+
+        Args:
+            width: of the pictures, pixels.
+            height: pixels.
+            sky: colour where nothing is hit; None: the model's.
+        """
+        buffer = model.vis.global_
+        if width > buffer.offwidth or height > buffer.offheight:
+            raise UserError(
+                f"engine 'gl' got pictures of {width} x {height} pixels, expected at most {buffer.offwidth} x "
+                f"{buffer.offheight}; ask for smaller ones, or for engine=rays"
+            )
+        self._model, self._size, self._sky = model, (height, width), sky
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                self._context = _context_class()(width, height)
+                # At exit, before the library that was imported just now ends.
+                atexit.register(weakref.finalize(self, self._context.free))
+                self._context.make_current()
+                self._drawn = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        except Exception as error:  # noqa: BLE001  (GL bindings raise what they like where no GL is)
+            raise UserError(
+                f"engine 'gl' does not start here ({' '.join(repr(error).split())[:200]}); install libegl1 and "
+                "libgl1-mesa-dri, or libosmesa6 and set MUJOCO_GL=osmesa; or engine=warp"
+            ) from error
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._drawn)
+        self._scene = mujoco.MjvScene(model, model.ngeom + 100)
+        self._view = mujoco.MjrRect(0, 0, width, height)
+
+    def draw(
+        self, data: mujoco.MjData, pose: CameraPose, fov_deg: float, groups: Sequence[int], depth: bool = False
+    ) -> np.ndarray:
+        """Draw pictures of cameras.
+
+        Args:
+            pose: of N cameras without roll, leaves [N, ...].
+            depth: distances along the axis (m) rather than colours.
+
+        Returns:
+            [N, H, W, 3] u8, or [N, H, W] f32.
+        """
+        self._context.make_current()
+        self._model.vis.global_.fovy = fov_deg
+        option = mujoco.MjvOption()
+        option.geomgroup[:] = np.isin(np.arange(6), groups)
+        every = mujoco.mjtCatBit.mjCAT_ALL.value
+        images = []
+        for pos_w, axes_w in zip(np.asarray(pose.pos_w, float), np.asarray(pose.axes_w), strict=True):
+            camera = _free_camera(pos_w, axes_w[:, 0], axes_w[:, 2])
+            mujoco.mjv_updateScene(self._model, data, option, None, camera, every, self._scene)
+            images.append(self._read(depth))
+        return np.stack(images)
+
+    def _read(self, depth: bool) -> np.ndarray:
+        mujoco.mjr_render(self._view, self._scene, self._drawn)
+        colour, window = np.zeros((*self._size, 3), np.uint8), np.zeros(self._size, np.float32)
+        mujoco.mjr_readPixels(colour, window, self._view, self._drawn)
+        if not depth:
+            if self._sky is not None:
+                colour[window >= 1.0] = self._sky
+            return colour[::-1].copy()
+        extent, planes = self._model.stat.extent, self._model.vis.map
+        near, far = planes.znear * extent, planes.zfar * extent
+        return (near / (1.0 - window * (1.0 - near / far)))[::-1].copy()
+
+
+def _free_camera(pos_w: np.ndarray, forward: np.ndarray, up: np.ndarray) -> mujoco.MjvCamera:
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    camera.lookat[:], camera.distance = pos_w + forward, 1.0
+    camera.elevation = math.degrees(math.asin(np.clip(forward[2], -1.0, 1.0)))
+    flat = forward if abs(forward[2]) < 1 - 1e-9 else up
+    camera.azimuth = math.degrees(math.atan2(flat[1], flat[0]))
+    return camera
+
+
+def _context_class() -> Any:
+    library = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if library not in LIBRARIES:
+        library = "glfw" if os.environ.get("DISPLAY") else "egl"
+    return importlib.import_module(f"mujoco.{library}").GLContext
