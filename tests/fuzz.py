@@ -180,12 +180,13 @@ def scenes() -> dict[str, Target]:
 
 def runs() -> dict[str, Target]:
     """What training writes."""
+    from interactive_nav_common.runs.weights import rounded, write_weights
     from tests.train.sweep.test_sweep import write_sweep
     from tests.train.toy_run import toy_config
     from topological_nav.learn.runs import read_description, read_weights, write_network
     from topological_nav.maps.graph import TopologicalMap, load_map, save_map
     from train.config_io import to_yaml
-    from train.runs import checkpoint, policy_file
+    from train.runs import checkpoint
     from train.runs.run_folder import RunFolder
     from train.sweep import spec
     from train.sweep.folder import SweepFolder
@@ -234,7 +235,7 @@ def runs() -> dict[str, Target]:
         path = checkpoint.save_snapshot(root, snapshot, meta, 2, 10.0)
         (root / "exported").mkdir()
         flat = {"params/kernel": np.ones((3, 2), np.float32), "params/bias": np.zeros(2, np.float32)}
-        np.savez(root / "exported" / policy_file.POLICY, **policy_file.packed(flat))  # type: ignore[arg-type]
+        write_weights(root / "exported" / checkpoint.POLICY, rounded(flat, 0.5, 1), {})
         shutil.copy(path / checkpoint.META, root / "exported")
         path.rename(root / "newest")
 

@@ -87,7 +87,7 @@ def test_longer_runs_in_cluttered_homes_played_the_same_episodes_and_score_as_th
     assert len(scores) == 17 and len(scores.pop(("longer-k_int1-fetch", "test", 13107200))) == 2
     for group in scores.values():
         assert len(group) == 3 and f"{sum(group) / 3:.3f}" in page
-    policies = sorted(path.parts[-4] for path in kept.rglob("policy.npz"))
+    policies = sorted(path.parts[-4] for path in kept.rglob("policy.safetensors"))
     assert policies == ["homes100-fetch-seed2", "sac100-turtlebot-seed0"]
     assert all((kept / "runs" / name / "config.yaml").is_file() for name in policies)
 

@@ -13,7 +13,7 @@ from converters.propose.report import annotated_vertices
 from converters.read.storeys import storey_of
 from converters.read.surfaces import floor_level
 from converters.records.raw import UNLABELLED, RawScene, ScanMesh
-from converters.segment.network import WEIGHTS, Scores, make_scores, read_weights, score_voxels
+from converters.segment.network import WEIGHTS, Scores, load_network, make_scores, score_voxels
 from converters.segment.samples import TIERS, building_surface
 from converters.segment.voxels import (
     NAMES,
@@ -33,7 +33,7 @@ Report = Callable[[str, float], None]
 
 def load_scores(weights: Path | None = None) -> Scores:
     """The network with weights, for `label_scan`; None: the packaged ones."""
-    return make_scores(*read_weights(weights or WEIGHTS))
+    return make_scores(*load_network(weights or WEIGHTS))
 
 
 def score_points(surface: Surface, floors_m: tuple[float, ...], scores: Scores, report: Report) -> np.ndarray:

@@ -13,14 +13,14 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax.traverse_util import flatten_dict, unflatten_dict
+from flax.traverse_util import unflatten_dict
 
 from converters.records.errors import SceneRejected
 from converters.segment.voxels import BELOW_M, FEATURES, LAYERS, NAMES, VOXEL_M, Voxels
-from interactive_nav_common.files import write_arrays
-from interactive_nav_common.untrusted.reading import read_npz
+from interactive_nav_common.errors import readable
+from interactive_nav_common.runs import weights
 
-WEIGHTS = Path(__file__).with_name("weights.npz")
+WEIGHTS = Path(__file__).with_name("weights.safetensors")
 """The package's own."""
 TILE, MARGIN = 160, 16
 """Voxels of a tile's side, and of its border, which is left to the next tile."""
@@ -124,25 +124,19 @@ def score_voxels(voxels: Voxels, scores: Scores, report: Callable[[float], None]
     return out
 
 
-def write_weights(path: Path, net: VoxelNet, variables: Any) -> None:
-    """Writes weights of a byte each, with a factor for each output of a layer; vectors as float16."""
-    arrays: dict[str, np.ndarray] = {"widths": np.array(net.widths)}
-    for name, value in flatten_dict(variables["params"], sep="/").items():
-        value = np.asarray(value, np.float32)
-        if value.ndim > 1:
-            factor = np.abs(value).max(axis=tuple(range(value.ndim - 1))) / 127
-            arrays[f"{name}@"] = factor
-            arrays[name] = np.round(value / np.maximum(factor, 1e-12)).astype(np.int8)
-        else:
-            arrays[name] = value.astype(np.float16)
-    write_arrays(path, **arrays)
+def save_network(path: Path, net: VoxelNet, variables: Any) -> None:
+    """Write weights of a byte each, with a factor for each output of a layer; vectors in half precision."""
+    params = {name: np.asarray(value, np.float32) for name, value in weights.flat(variables["params"]).items()}
+    tensors = {name: value if value.ndim > 1 else value.astype(np.float16) for name, value in params.items()}
+    about = {"task": "segment", "widths": list(net.widths), "names": list(NAMES), "voxel_m": VOXEL_M}
+    weights.write_weights(path, weights.rounded(tensors, step=0.0, least=0), about)
 
 
-def read_weights(path: Path = WEIGHTS) -> tuple[VoxelNet, dict[str, Any]]:
-    """Read what `write_weights` wrote."""
-    remedy = "give weights.npz of 'python -m converters segment-train'"
-    with read_npz(path, SceneRejected, remedy) as file:
-        arrays = {name: np.asarray(file[name]) for name in file.files}
-        net = VoxelNet(tuple(int(w) for w in arrays.pop("widths")))
-        params = {n: jnp.asarray(v * arrays.get(f"{n}@", 1), jnp.float32) for n, v in arrays.items() if n[-1] != "@"}
+def load_network(path: Path = WEIGHTS) -> tuple[VoxelNet, dict[str, Any]]:
+    """Return what `save_network` was given; weights of a byte each are restored."""
+    remedy = f"give {WEIGHTS.name} of 'python -m converters segment-train'"
+    tensors, about = weights.read_weights(path, SceneRejected, remedy)
+    with readable(path, SceneRejected, remedy):
+        net = VoxelNet(tuple(int(w) for w in about["widths"]))
+        params = {name: jnp.asarray(tensor, jnp.float32) for name, tensor in tensors.items()}
         return net, {"params": unflatten_dict(params, sep="/")}

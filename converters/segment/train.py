@@ -1,7 +1,7 @@
 """Settings in, a folder with weights out: buildings are generated beside the training, which goes on where it stopped.
 
 OUT/crops/SEED.npz   labelled voxels of a generated building, held_out/SEED.npz of those with other furniture
-    checkpoint.msgpack, weights.npz, metrics.jsonl   as of the last save
+    checkpoint.msgpack, weights.safetensors, metrics.jsonl   as of the last save
 """
 
 import contextlib
@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from converters.segment.network import VoxelNet, dense, write_weights
+from converters.segment.network import VoxelNet, dense, save_network
 from converters.segment.samples import Crop, generate_crops, read_crops
 from converters.segment.voxels import FEATURES, NAMES, UNKNOWN, intersection_over_union
 from interactive_nav_common.config import AtLeastOne, Count, Positive, Seed, Settings
@@ -210,7 +210,7 @@ class _Learner:
         if self.at["steps"]:
             with whole_file(self.out / "checkpoint.msgpack") as partial:
                 partial.write_bytes(flax.serialization.to_bytes(jax.device_get(self.at)))
-            write_weights(self.out / "weights.npz", self.net, {"params": self.at["state"][0]})
+            save_network(self.out / "weights.safetensors", self.net, {"params": self.at["state"][0]})
 
     def score(self, most: int) -> dict[str, float]:
         """IoU by class of so many held-out crops, and `mean`: one line of metrics.jsonl, and of the console."""

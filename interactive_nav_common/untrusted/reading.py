@@ -29,15 +29,15 @@ def read_bytes(path: str | Path) -> bytes:
     return regular(path).read_bytes()
 
 
-def unpack(data: bytes, kind: str) -> bytes:
+def unpack(data: bytes, kind: str, most: int | None = None) -> bytes:
     """Return what gzip, zlib or xz packed; ValueError where that is damaged, cut short or too much."""
-    most, decoder = max(MOST_TEXT, MOST_TIMES * len(data)), _DECODERS[kind]()
+    most, decoder = most or max(MOST_TEXT, MOST_TIMES * len(data)), _DECODERS[kind]()
     try:
         content = decoder.decompress(data, most)
     except (zlib.error, lzma.LZMAError, EOFError) as error:
         raise ValueError(f"it is not readable as packed with {kind}: {error}") from None
     if not decoder.eof:
-        how = f"unpacks to more than {most >> 20} MiB"
+        how = f"unpacks to more than {most / 2**20:g} MiB"
         if len(content) < most:
             how = f"is not readable as packed with {kind}: cut short"
         raise ValueError(f"it {how}")

@@ -2,7 +2,7 @@
 
 RUN/config.yaml      settings; a run that is started again with the same ones goes on
     versions.json, metrics.jsonl, checkpoint.msgpack, results.json, curves.png   as in `training`
-    weights.msgpack  the policy and the scale of its input; the forward model is not kept
+    weights.safetensors  the policy and the scale of its input; the forward model is not kept
     network.json     how to build it, and which runs embed its images
 """
 

@@ -210,7 +210,7 @@ def _digest_of(policy: str) -> str:
     if policy == PASSAGE_POLICY:
         return ""
     files = sorted(
-        p for p in Path(policy).glob("*") if p.suffix in (".msgpack", ".xz", ".npz", ".json") and "check" not in p.name
+        p for p in Path(policy).glob("*") if p.suffix in (".safetensors", ".xz", ".json") and "check" not in p.name
     )
     if not files:
         raise RunError(f"{policy}: holds no trained policy; name the run folder of one, or {PASSAGE_POLICY}")

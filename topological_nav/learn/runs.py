@@ -2,9 +2,7 @@
 
 import contextlib
 import dataclasses
-import hashlib
 import json
-import lzma
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,20 +10,20 @@ from typing import Any, TypeVar
 
 import flax.serialization
 import jax
-import jax.numpy as jnp
 import numpy as np
 import yaml
 
-from interactive_nav_common.errors import readable, regular
+from interactive_nav_common.errors import readable
 from interactive_nav_common.files import append_text, whole_file, write_text
 from interactive_nav_common.locks import alone_in
 from interactive_nav_common.records import METRICS, Reader, read_metrics, write_metrics
-from interactive_nav_common.untrusted.reading import Loader, unpack
+from interactive_nav_common.runs import weights
+from interactive_nav_common.untrusted.reading import Loader
 from interactive_nav_common.versions import versions
 from topological_nav.errors import Host, RunError, Stopped
 
 CONFIG, CHECKPOINT = "config.yaml", "checkpoint.msgpack"
-WEIGHTS, DESCRIPTION, RESULTS = "weights.msgpack", "network.json", "results.json"
+WEIGHTS, DESCRIPTION, RESULTS = "weights.safetensors", "network.json", "results.json"
 PACKED_WEIGHTS = f"{WEIGHTS}.xz"
 """Of an exported run."""
 State = TypeVar("State")
@@ -102,13 +100,16 @@ def run_epochs(
 
 
 def write_network(out: Path, variables: Any, about: dict[str, Any]) -> dict[str, Any]:
-    """Writes weights and their description; returns this with the weights' digest."""
-    weights = flax.serialization.to_bytes(jax.device_get(variables))
-    about = {**about, "digest": hashlib.sha256(weights).hexdigest()}
-    with whole_file(out / WEIGHTS) as partial:
-        partial.write_bytes(weights)
+    """Write weights and their description; return the latter with the weights' digest."""
+    header = weights.write_weights(out / WEIGHTS, weights.flat(jax.device_get(variables)), shown(about))
+    about = {**about, "digest": header["digest"]}
     write_text(out / DESCRIPTION, json.dumps(about, indent=1) + "\n")
     return about
+
+
+def shown(about: dict[str, Any]) -> dict[str, Any]:
+    """Return what the file of the weights repeats of a network.json."""
+    return {name: about[name] for name in ("task", "parameters") if name in about}
 
 
 def write_results(out: Path, results: dict[str, Any]) -> dict[str, Any]:
@@ -117,15 +118,10 @@ def write_results(out: Path, results: dict[str, Any]) -> dict[str, Any]:
     return results
 
 
-def packed(content: bytes) -> bytes:
-    """A file of fp16 weights by LZMA, a seventh smaller: the two bytes a number are modelled apart."""
-    return lzma.compress(content, filters=[{"id": lzma.FILTER_LZMA2, "preset": 9, "lc": 0, "lp": 1, "pb": 1}])
-
-
-def weights_content(run: Path) -> bytes:
-    """The msgpack of a run's weights, whether it was exported or not."""
-    path = run / PACKED_WEIGHTS
-    return unpack(path.read_bytes(), "xz") if path.is_file() else regular(run / WEIGHTS).read_bytes()
+def weights_file(run: Path) -> Path:
+    """Return where the weights of a run are, whether it was exported or not."""
+    packed = run / PACKED_WEIGHTS
+    return packed if packed.is_file() else run / WEIGHTS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,16 +145,13 @@ def read_description(run: Path, kind: str, task: str) -> dict[str, Any]:
 
 
 def read_weights(run: Path, template: Any, about: dict[str, Any]) -> Any:
-    """Variables of a finished run, in the template's precision."""
-    path = run / (PACKED_WEIGHTS if (run / PACKED_WEIGHTS).is_file() else WEIGHTS)
-    with readable(path, RunError, "train again"):
-        content = weights_content(run)
-        zeros = jax.tree.map(lambda s: np.zeros(s.shape, s.dtype), template)
-        variables = flax.serialization.from_bytes(zeros, content)
-    digest = about.get("export", {}).get("weights_digest")
-    if digest and hashlib.sha256(content).hexdigest() != digest:
+    """Return the variables of a finished run, in the template's precision."""
+    path, again = weights_file(run), "train again"
+    tensors, header = weights.read_weights(path, RunError, again)
+    if about.get("export", {}).get("weights_digest", header["digest"]) != header["digest"]:
         raise RunError(f"{path}: is not the file that was exported with its {DESCRIPTION}; export the run again")
-    return jax.tree.map(lambda s, x: jnp.asarray(x, s.dtype), template, variables)
+    variables = weights.fill(template, tensors, path, weights.flat(template), RunError, again)
+    return weights.fitting(template, variables, path, RunError)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any] | None:
@@ -170,12 +163,12 @@ def read_checkpoint(path: Path) -> dict[str, Any] | None:
 
 
 def _restored(template: State, state: Any, path: Path) -> State:
-    """A learner as the checkpoint at a path holds it."""
+    """Return a learner as the checkpoint at a path holds it."""
     try:
         learner = flax.serialization.from_state_dict(template, state)
     except (ValueError, KeyError) as error:
         raise RunError(f"{path}: does not fit the network ({error}); delete it to begin again") from None
-    return jax.tree.map(lambda t, x: jnp.asarray(x, jnp.asarray(t).dtype), template, learner)
+    return weights.fitting(template, learner, path, RunError)
 
 
 def _cut_metrics(path: Path, phase: str, last: int) -> None:

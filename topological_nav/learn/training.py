@@ -4,7 +4,7 @@ RUN/config.yaml      settings; a run that is started again with the same ones go
     versions.json    packages, device, commit
     metrics.jsonl    one line an epoch, of both phases
     checkpoint.msgpack  the last epoch's learner
-    weights.msgpack, network.json   what was learned, and how to build it
+    weights.safetensors, network.json   what was learned, and how to build it
     results.json     scores on what was held out
     curves.png
 """

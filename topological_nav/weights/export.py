@@ -1,17 +1,16 @@
 """Finished runs in, a small folder out that carries them: weights in half precision, where they came from, maps.
 
-OUT/rooms/ passages/ policy/   weights.msgpack.xz, network.json, config.yaml, versions.json, results.json
+OUT/rooms/ passages/ policy/   weights.safetensors.xz, network.json, config.yaml, versions.json, results.json
     maps/SCENE.npz             embeddings in half precision
     export.json                commit, device and digest of every run, sizes, how well the networks agree with the runs'
 
 Everything that reads a run folder reads these. Kernels and matrices are fp16; biases, scales and statistics, one number
 in a hundred, stay f32: a variance may exceed what fp16 holds. `digest` in network.json stays that of the run, so that
 maps and policies made with either belong to both: an export whose predictions differ is refused.
-`export.weights_digest` is of what `weights.msgpack.xz` unpacks to.
+`export.weights_digest` is that of the tensors in `weights.safetensors.xz`.
 """
 
 import dataclasses
-import hashlib
 import json
 import os
 import shutil
@@ -20,8 +19,6 @@ from collections.abc import Iterator
 from pathlib import Path, PurePath
 from typing import Any
 
-import flax.serialization
-import jax
 import numpy as np
 from scipy.spatial.distance import cdist
 
@@ -30,13 +27,14 @@ from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import whole_folder, write_text
 from interactive_nav_common.records import Reader
+from interactive_nav_common.runs import weights
 from interactive_nav_common.versions import versions
 from topological_nav.config import PITCHES, ExportConfig
 from topological_nav.data.dataset import headings, load_rooms
 from topological_nav.drives.driving import TrainedPolicy, load_policy
 from topological_nav.errors import MapError, Progress, RunError
 from topological_nav.learn.pairs import SAME, camera_of, load_pair
-from topological_nav.learn.runs import CONFIG, DESCRIPTION, PACKED_WEIGHTS, RESULTS, packed, weights_content
+from topological_nav.learn.runs import CONFIG, DESCRIPTION, PACKED_WEIGHTS, RESULTS, shown, weights_file
 from topological_nav.learn.training import Trained, load_trained
 from topological_nav.maps.build import Pictures
 from topological_nav.maps.graph import load_map, save_map
@@ -151,23 +149,6 @@ def size_lines(sizes: dict[str, int], limit_mib: float) -> str:
     return said
 
 
-def half(variables: Any) -> Any:
-    """Variables with every array of two or more axes in half precision."""
-
-    def halved(path: Any, leaf: Any) -> np.ndarray:
-        value = np.asarray(leaf)
-        if value.ndim < 2:
-            return value
-        with np.errstate(over="ignore"):
-            small = value.astype(np.float16)
-        if not np.isfinite(small).all():
-            where = "/".join(str(getattr(key, "key", key)) for key in path)
-            raise RunError(f"{where} holds {np.abs(value).max():.3g}, more than {PRECISION} can; train again")
-        return small
-
-    return jax.tree_util.tree_map_with_path(halved, flax.serialization.to_state_dict(jax.device_get(variables)))
-
-
 def compare(
     networks: tuple[Trained, Trained],
     exported: tuple[Trained, Trained],
@@ -252,13 +233,13 @@ def _export_run(task: str, run: Path, out: Path, config: ExportConfig) -> dict[s
     if not made["commit"] or not device:
         raise RunError(f"{run}: {VERSIONS} names no {'device' if made['commit'] else 'commit'}; say commit=HASH")
     about = json.loads((run / DESCRIPTION).read_text())
-    weights = flax.serialization.msgpack_serialize(half(flax.serialization.msgpack_restore(weights_content(run))))
-    about["export"] = {"precision": PRECISION, "weights_digest": hashlib.sha256(weights).hexdigest()}
+    tensors, _ = weights.read_weights(weights_file(run), RunError, "train again")
     if task == "policy":
         for network, other in zip(about["networks"], ("rooms", "passages"), strict=True):
             network["run"] = f"../{other}"
-    out.mkdir(parents=True)
-    (out / PACKED_WEIGHTS).write_bytes(packed(weights))
+    header = {**shown(about), "commit": made["commit"]}
+    header = weights.write_weights(out / PACKED_WEIGHTS, weights.half(tensors), header)
+    about["export"] = {"precision": PRECISION, "weights_digest": header["digest"]}
     write_text(out / DESCRIPTION, json.dumps(about, indent=1) + "\n")
     write_text(out / VERSIONS, json.dumps(made, indent=1) + "\n")
     for name in (CONFIG, RESULTS):

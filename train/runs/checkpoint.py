@@ -20,12 +20,18 @@ from interactive_nav_common.config import Natural
 from interactive_nav_common.errors import FileError, regular
 from interactive_nav_common.files import check_name, writing
 from interactive_nav_common.records import Reader
+from interactive_nav_common.runs import weights
 from interactive_nav_common.untrusted.reading import read_npz
 from train.errors import CheckpointError
-from train.runs import policy_file
-from train.runs.run_folder import GOES_ON
+from train.runs.run_folder import GOES_ON, RunFolder
 
 LEARNER, ENV_STATE, META = "learner.msgpack", "env_state.npz", "meta.json"
+POLICY = "policy.safetensors"
+"""Holds the policy alone: it acts nearly as the original (docs/results.md says how nearly) and cannot be trained."""
+STEP = 0.5
+"""What its large weights are rounded to, in standard deviations of an output's weights: about 3 bits a weight."""
+SHOWN = ("algorithm", "robot", "observations", "observation_size", "action_size", "env_steps")
+"""Fields of `CheckpointMeta` that a policy's file repeats."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,32 +177,49 @@ def read_meta(folder: Path) -> CheckpointMeta:
 
 def is_whole(folder: Path) -> bool:
     """Return whether a checkpoint holds all of the learner; one that was exported holds the policy alone."""
-    return (folder / LEARNER).is_file() or not (folder / policy_file.POLICY).is_file()
+    return (folder / LEARNER).is_file() or not (folder / POLICY).is_file()
 
 
-def keep_policy(folder: Path, target: Path, step: float = policy_file.STEP) -> None:
-    """Write what evaluating a checkpoint needs to another folder: `policy.npz` and `meta.json`."""
+def policy_leaves(path: Path, learner: Mapping[str, Any], algorithm: str) -> dict[str, Any]:
+    """Return the leaves of a learner that its policy reads, by names such as "params/policy/..."."""
+    from train.learners.algorithms import ALGORITHMS  # takes seconds, and `--help` needs none
+
+    try:
+        return weights.flat(ALGORITHMS[algorithm].policy_part(learner))
+    except (AttributeError, KeyError, TypeError):
+        names = ", ".join(ALGORITHMS)
+        raise CheckpointError(f"{path}: holds no policy of {algorithm!r}, expected one of {names}") from None
+
+
+def keep_policy(folder: Path, target: Path, step: float = STEP) -> None:
+    """Write what evaluating a checkpoint needs to another folder: `policy.safetensors` and `meta.json`."""
     meta = read_meta(folder)
     target.mkdir(parents=True)
     if is_whole(folder):
-        policy_file.write(folder / LEARNER, meta.algorithm, target / policy_file.POLICY, step)
+        learner = flax.serialization.msgpack_restore(regular(folder / LEARNER).read_bytes())
+        leaves = policy_leaves(folder / LEARNER, learner, meta.algorithm)  # type: ignore[arg-type]
+        about = {name: getattr(meta, name) for name in SHOWN}
+        about["commit"] = RunFolder(folder.parents[1]).origin()["commit"]
+        weights.write_weights(target / POLICY, weights.rounded(leaves, step), about)
     else:
-        shutil.copy2(folder / policy_file.POLICY, target)
-    kept = dataclasses.replace(meta, sha256={policy_file.POLICY: _sha256(target / policy_file.POLICY)})
+        shutil.copy2(folder / POLICY, target)
+    kept = dataclasses.replace(meta, sha256={POLICY: _sha256(target / POLICY)})
     _write(target / META, json.dumps(dataclasses.asdict(kept), indent=1).encode())
 
 
 def weights_digest(folder: Path) -> str:
     """Return the SHA-256 of a checkpoint's weights."""
-    return _sha256(folder / (LEARNER if is_whole(folder) else policy_file.POLICY))
+    return _sha256(folder / (LEARNER if is_whole(folder) else POLICY))
 
 
 def load_learner(folder: Path, template: Any) -> Any:
     """Return a checkpoint's learner as arrays in the template's structure; of an exported one the policy counts."""
     path = folder / LEARNER
     if not is_whole(folder):
-        path = folder / policy_file.POLICY
-        learner = policy_file.read(path, template, read_meta(folder).algorithm)
+        path, again = folder / POLICY, "export the run again"
+        tensors, _ = weights.read_weights(path, CheckpointError, again)
+        needed = policy_leaves(path, flax.serialization.to_state_dict(template), read_meta(folder).algorithm)
+        learner = weights.fill(template, tensors, path, needed, CheckpointError, again)
     else:
         try:
             learner = flax.serialization.from_bytes(template, regular(path).read_bytes())
@@ -205,20 +228,7 @@ def load_learner(folder: Path, template: Any) -> Any:
                 f"{path}: not a checkpoint of this learner ({' '.join(str(error).split())[:200]}); "
                 "use the run's config, or another checkpoint"
             ) from None
-
-    def fitting(name: Any, expected: Any, got: Any) -> jax.Array:
-        if np.shape(got) != np.shape(expected):
-            raise CheckpointError(
-                f"{path}: {jax.tree_util.keystr(name)} has shape {np.shape(got)}, "
-                f"expected {np.shape(expected)}; use the config that the checkpoint was trained with"
-            )
-        if jnp.issubdtype(jnp.asarray(got).dtype, jnp.inexact) and not np.isfinite(got).all():
-            raise CheckpointError(
-                f"{path}: {jax.tree_util.keystr(name)} has values that are not finite; use another checkpoint"
-            )
-        return jnp.asarray(got, jnp.asarray(expected).dtype)
-
-    return jax.tree_util.tree_map_with_path(fitting, template, learner)
+    return weights.fitting(template, learner, path, CheckpointError)
 
 
 def load_env_state(folder: Path, template: Any) -> Any | None:

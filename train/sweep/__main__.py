@@ -12,7 +12,7 @@ from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.signals import stop_signals
 from interactive_nav_common.words import program
 from train.config_io import preset_names
-from train.runs.policy_file import STEP
+from train.runs.checkpoint import STEP
 from train.runs.run_folder import claim
 from train.sweep import spec
 from train.sweep.devices import Machine, find_gpus

@@ -17,7 +17,7 @@ from interactive_nav_common.records import METRICS, PACKED_METRICS, mean_over_ep
 from interactive_nav_common.rows import read_notes, read_rows, write_parquet
 from train.errors import CheckpointError
 from train.runs import checkpoint
-from train.runs.policy_file import STEP
+from train.runs.checkpoint import STEP
 from train.runs.run_folder import RunFolder
 from train.scoring.row_files import PATHS, files_of_run, paths_beside
 from train.scoring.statistics import run_means

@@ -21,7 +21,7 @@ from converters.records.errors import SceneRejected
 from converters.records.raw import ScanMesh
 from converters.segment import labelling
 from converters.segment.labelling import label_scan, score_homes
-from converters.segment.network import VoxelNet, read_weights, score_voxels, write_weights
+from converters.segment.network import VoxelNet, load_network, save_network, score_voxels
 from converters.segment.samples import Crop, building_surface, make_crop, read_crops
 from converters.segment.train import HELD_OUT_SEED, SegmentConfig, batch_of, make_step, score_crops, turned
 from converters.segment.voxels import (
@@ -120,8 +120,8 @@ def test_a_few_steps_learn_one_sample_by_heart_and_weights_keep_it(tmp_path):
         losses.append(float(loss))
     assert losses[-1] < 0.2 * losses[0]
     assert score_crops(net, state[0], [stair()], TINY) == {"wall": 1.0, "floor": 1.0}
-    write_weights(tmp_path / "weights.npz", net, {"params": state[0]})
-    kept, variables = read_weights(tmp_path / "weights.npz")
+    save_network(tmp_path / "weights.safetensors", net, {"params": state[0]})
+    kept, variables = load_network(tmp_path / "weights.safetensors")
     assert kept.widths == (16, 24)
     assert score_crops(kept, variables["params"], [stair()], TINY) == {"wall": 1.0, "floor": 1.0}
 
@@ -192,7 +192,7 @@ def test_labels_of_a_room_are_read_back(room):
 
 def test_the_command_writes_what_the_reader_takes_and_replaces_nothing(room, tmp_path, capsys):
     net = VoxelNet((8,))
-    write_weights(tmp_path / "w.npz", net, jax.jit(net.init)(jax.random.key(0), jnp.zeros((1, 8, 8, 8, FEATURES + 2))))
+    save_network(tmp_path / "w.npz", net, jax.jit(net.init)(jax.random.key(0), jnp.zeros((1, 8, 8, 8, FEATURES + 2))))
     words = ["segment", str(room), "--weights", str(tmp_path / "w.npz")]
     assert main(words) == 0
     with np.load(beside(room, "labels.npz")) as file:
@@ -321,4 +321,4 @@ def test_training_goes_on_where_it_stopped(tmp_path):
     steps = [row["step"] for row in rows]
     assert steps == sorted(steps) and steps[-1] == 4 and 2 in steps and np.isfinite(rows[-1]["loss"])
     assert rows[-1]["iou"].keys() == {"wall", "floor", "mean"}
-    assert read_weights(tmp_path / "run/weights.npz")[0].widths == (8, 8)
+    assert load_network(tmp_path / "run/weights.safetensors")[0].widths == (8, 8)

@@ -19,11 +19,11 @@ from interactive_nav_common.errors import ConfigError, FileError, UserError, rea
 from interactive_nav_common.locks import is_locked, locked
 from interactive_nav_common.records import Reader, read_metrics
 from interactive_nav_common.rows import read_rows
+from interactive_nav_common.runs.weights import read_weights
 from interactive_nav_common.untrusted import reading
 from interactive_nav_common.untrusted.reading import Loader, check_named, read_npz, unpack
 from tests.toys import write_room
 from train import config_io
-from train.runs import policy_file
 
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n" for a, b in zip("abcdefghi", "bcdefghij", strict=True)
@@ -79,10 +79,9 @@ def test_bombs_in_the_files_of_runs_are_refused(tmp_path, monkeypatch):
         episodes.load_episode_file(tmp_path / "e.json.gz")
     with pytest.raises(FileError, match="unpacks to more than 1 MiB"):
         read_metrics(tmp_path / "metrics.jsonl.gz")
-    codes = np.frombuffer(zlib.compress(bytes(2**20 + 1)), np.uint8)
-    np.savez(tmp_path / "policy.npz", **{"a": codes, "a:shape": np.array([1]), "a:scale": np.ones(1)})  # pyright: ignore
-    with pytest.raises(UserError, match=r"policy.npz: not readable .*unpacks to more than 1 MiB"):
-        policy_file.read(tmp_path / "policy.npz", {}, "ppo")
+    (tmp_path / "weights.safetensors.xz").write_bytes(lzma.compress(bytes(2**20 + 1)))
+    with pytest.raises(UserError, match=r"weights.safetensors.xz: not readable .*unpacks to more than 1 MiB"):
+        read_weights(tmp_path / "weights.safetensors.xz", FileError, "make it again")
 
 
 @pytest.mark.parametrize("special", ["fifo", "zero"])

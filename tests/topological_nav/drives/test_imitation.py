@@ -97,7 +97,7 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(frames, run, tmp_pat
         load_policy(out)
     assert imitation.train_policy(frames, out, CONFIG, Host(told.append)) is not None
     assert len(told) == 10
-    assert (out / "weights.msgpack").read_bytes() == (run / "weights.msgpack").read_bytes()
+    assert (out / "weights.safetensors").read_bytes() == (run / "weights.safetensors").read_bytes()
     lines = [read_metrics(path / "metrics.jsonl") for path in (out, run)]
     strip = [[{k: v for k, v in line.items() if k != "seconds"} for line in one] for one in lines]
     assert strip[0] == strip[1]

@@ -118,10 +118,10 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(made, whole, tmp_pat
 
 
 def test_a_finished_run_is_left_as_it_is(made, whole):
-    before = (whole[0] / "weights.msgpack").read_bytes()
+    before = (whole[0] / "weights.safetensors").read_bytes()
     told = []
     assert training.train("rooms", made.data, whole[0], whole[1], Host(told.append)) is not None
-    assert told == [] and (whole[0] / "weights.msgpack").read_bytes() == before
+    assert told == [] and (whole[0] / "weights.safetensors").read_bytes() == before
 
 
 def test_other_settings_are_refused(made, whole):
@@ -148,9 +148,9 @@ def test_images_of_another_size_are_refused(whole):
 
 def test_damaged_weights_are_refused(whole, tmp_path):
     shutil.copytree(whole[0], tmp_path / "run")
-    path = tmp_path / "run" / "weights.msgpack"
+    path = tmp_path / "run" / "weights.safetensors"
     path.write_bytes(path.read_bytes()[:-50])
-    with pytest.raises(RunError, match="weights.msgpack: not readable .* train again"):
+    with pytest.raises(RunError, match="weights.safetensors: not readable .* train again"):
         training.load_trained(tmp_path / "run")
 
 

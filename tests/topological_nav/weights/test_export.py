@@ -4,22 +4,22 @@ import dataclasses
 import json
 import shutil
 
-import flax.serialization
 import jax
 import numpy as np
 import pytest
 from PIL import Image
 
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.runs.weights import read_weights, write_weights
 from topological_nav.__main__ import main
 from topological_nav.data.dataset import load_passages, load_rooms
 from topological_nav.drives.driving import load_policy
 from topological_nav.errors import RunError
-from topological_nav.learn.runs import packed, weights_content
+from topological_nav.learn.runs import weights_file
 from topological_nav.learn.training import load_trained, save_trained
 from topological_nav.maps.graph import load_map, save_map
 from topological_nav.maps.sight import NetworkSight
-from topological_nav.weights.export import half, level_images, size_lines, sizes_of
+from topological_nav.weights.export import level_images, size_lines, sizes_of
 
 pytestmark = pytest.mark.heavy
 
@@ -31,20 +31,21 @@ def words(made, out, *more):
 
 def test_matrices_are_stored_in_half_precision_and_nothing_but_weights(made, steered, exported):
     for task, run in (("rooms", made.rooms), ("passages", made.passages), ("policy", steered)):
-        before, after = (
-            jax.tree.leaves_with_path(flax.serialization.msgpack_restore(weights_content(folder)))
-            for folder in (run, exported / task)
+        (before, _), (after, header) = (
+            read_weights(weights_file(folder), RunError, "") for folder in (run, exported / task)
         )
-        assert [path for path, _ in before] == [path for path, _ in after]
-        for (_, was), (_, now) in zip(before, after, strict=True):
-            assert now.dtype == (np.float16 if was.ndim >= 2 else np.float32)
-            np.testing.assert_array_equal(now, was.astype(now.dtype))
-        names = {"weights.msgpack.xz", "network.json", "config.yaml", "versions.json", "results.json"}
+        assert list(before) == list(after) and header["task"] == task
+        assert (
+            header["digest"] == json.loads((exported / task / "network.json").read_text())["export"]["weights_digest"]
+        )
+        for name, was in before.items():
+            assert after[name].dtype == (np.float16 if was.ndim >= 2 else np.float32)
+            np.testing.assert_array_equal(after[name], was.astype(after[name].dtype))
+        names = {"weights.safetensors.xz", "network.json", "config.yaml", "versions.json", "results.json"}
         assert {path.name for path in (exported / task).iterdir()} == names
     assert {path.name for path in exported.iterdir()} == {"rooms", "passages", "policy", "maps", "export.json"}
-    whole, half = (len(weights_content(folder)) for folder in (made.passages, exported / "passages"))
-    assert 0.5 < half / whole < 0.51
-    assert (exported / "passages/weights.msgpack.xz").stat().st_size < 0.95 * half
+    sizes = [weights_file(folder).stat().st_size for folder in (made.passages, exported / "passages")]
+    assert sizes[1] < 0.95 * 0.5 * sizes[0]
 
 
 def test_an_exported_network_computes_with_its_rounded_weights(made, exported):
@@ -127,7 +128,11 @@ def test_what_is_too_large_is_refused_and_nothing_is_left(made, tmp_path, capsys
 
 
 def test_sizes_are_told_by_part(tmp_path):
-    for name, size in (("rooms/weights.msgpack.xz", 3 << 20), ("rooms/config.yaml", 1 << 19), ("maps/a.npz", 1 << 20)):
+    for name, size in (
+        ("rooms/weights.safetensors.xz", 3 << 20),
+        ("rooms/config.yaml", 1 << 19),
+        ("maps/a.npz", 1 << 20),
+    ):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(bytes(size))
     sizes = sizes_of(tmp_path)
@@ -147,14 +152,6 @@ def test_an_export_is_replaced_and_another_folder_is_not(made, tmp_path, capsys)
     (other / "mine").write_text("kept")
     assert main(words(made, other, "commit=toy")) == 2
     assert "is something else than an export" in capsys.readouterr().err and (other / "mine").exists()
-
-
-def test_numbers_that_half_precision_cannot_hold_are_refused():
-    kept = half({"kernel": np.full((1, 2), 65504.0, np.float32), "var": np.array([1e6, 1e-9], np.float32)})
-    assert kept["kernel"].dtype == np.float16 and kept["kernel"][0, 0] == 65504
-    assert kept["var"].tolist() == pytest.approx([1e6, 1e-9])
-    with pytest.raises(RunError, match="body/kernel holds 7e"):
-        half({"body": {"kernel": np.full((1, 2), -7e4, np.float32)}})
 
 
 def test_predictions_that_differ_are_refused(made, tmp_path, capsys):
@@ -186,7 +183,8 @@ def test_what_does_not_belong_is_refused(made, tmp_path, capsys):
 
 def test_weights_that_were_not_exported_with_it_are_refused(made, exported, tmp_path):
     shutil.copytree(exported / "rooms", tmp_path / "rooms")
-    (tmp_path / "rooms" / "weights.msgpack.xz").write_bytes(packed((made.rooms / "weights.msgpack").read_bytes()))
+    tensors, header = read_weights(made.rooms / "weights.safetensors", RunError, "")
+    write_weights(tmp_path / "rooms" / "weights.safetensors.xz", tensors, header)
     with pytest.raises(RunError, match=r"is not the file that was exported with its network.json"):
         load_trained(tmp_path / "rooms")
 

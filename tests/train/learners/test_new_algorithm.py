@@ -12,12 +12,14 @@ import pytest
 from rich.console import Console
 
 from interactive_nav.task.rollout import episode_keys
+from interactive_nav_common.runs.weights import read_weights
 from tests.train.learners.td3 import ALGORITHM, TD3, TrainConfigWithTD3
 from tests.train.learners.test_sac import KEY, transitions
 from tests.train.toy_env import batched
 from tests.train.toy_run import build_toy, toy_config
 from train import config_io
 from train.config import AUTO
+from train.errors import CheckpointError
 from train.learners.algorithms import ALGORITHMS
 from train.learners.learner import Snapshot
 from train.runs import checkpoint
@@ -83,8 +85,8 @@ def test_it_trains_resumes_and_its_export_plays_the_same(added, tmp_path):
     path = checkpoint.save_snapshot(whole.checkpoints, snapshot, meta, 1, 0.0)
     exported = RunFolder(tmp_path / "exported")
     checkpoint.keep_policy(path, exported.checkpoints / path.name)
-    with np.load(exported.checkpoints / path.name / "policy.npz") as stored:
-        parts = {name.partition("/")[0] for name in stored.files}
+    tensors, _ = read_weights(exported.checkpoints / path.name / "policy.safetensors", CheckpointError, "")
+    parts = {name.partition("/")[0] for name in tensors}
     assert parts == {"policy_params", "normalizer_params"}
     player, keys = BatchPlayer(env), episode_keys(3, 12)
     policies = [load_policy(run, config, env, "last", True, player.cached)[0] for run in (whole, exported, folder)]

@@ -125,8 +125,8 @@ def test_an_exported_policy_has_a_digest_of_its_own(tmp_path):
     path = checkpoint.save_snapshot(tmp_path, snapshot, dataclasses.replace(META, env_steps=7), 1, 0.0)
     checkpoint.keep_policy(path, tmp_path / "exported" / path.name)
     kept, _ = checkpoint.find(tmp_path / "exported", "last")
-    flip(kept / "policy.npz")
-    with pytest.raises(CheckpointError, match="policy.npz: damaged"):
+    flip(kept / "policy.safetensors")
+    with pytest.raises(CheckpointError, match="policy.safetensors: damaged"):
         checkpoint.verify(kept)
 
 

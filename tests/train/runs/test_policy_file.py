@@ -14,17 +14,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from rich.console import Console
 
+from interactive_nav_common.runs import weights
 from tests.train.toy_pixels import SMALL, ToyPixels
 from tests.train.toy_run import build_toy, toy_config
 from train.config import EnvConfig, TrainConfig, resolve
 from train.errors import CheckpointError
 from train.learners.algorithms import ALGORITHMS
 from train.learners.learner import Snapshot
-from train.runs import checkpoint, policy_file
+from train.runs import checkpoint
 from train.runs.run import train_run
 
 TOY = EnvConfig.of(scenes=("toy",), backend="native")
@@ -70,18 +69,21 @@ def saved(root, algorithm, learner):
 @pytest.mark.parametrize("algorithm", ["ppo", "sac", "ddpg"])
 @pytest.mark.parametrize(("env", "share"), [(ToyPixels(), False), (ToyPixels(), True)])
 def test_what_acting_reads_and_no_more(tmp_path, monkeypatch, env, share, algorithm):
-    monkeypatch.setattr(policy_file, "LARGE", 1024)  # these networks are small
+    monkeypatch.setattr(weights.rounded, "__defaults__", (1024,))  # these networks are small
     config, learner = learner_of(env, algorithm, share)
     before = actions(env, config, learner)
     path = saved(tmp_path / "whole", algorithm, learner)
     checkpoint.keep_policy(path, tmp_path / "kept" / path.name, step=0.03)
     kept, _ = checkpoint.find(tmp_path / "kept", "best")
-    with np.load(kept / policy_file.POLICY) as stored:
-        arrays = dict(stored)
-    lost = next(name for name in arrays if "policy" in name and ":" not in name)
-    np.savez(tmp_path / "less.npz", **{k: v for k, v in arrays.items() if k.partition(":")[0] != lost})
-    with pytest.raises(CheckpointError, match=f"lacks {lost}, which this learner's policy reads"):
-        policy_file.read(tmp_path / "less.npz", ALGORITHMS[algorithm].template(env, config), algorithm)
+    tensors, about = weights.read_weights(kept / checkpoint.POLICY, CheckpointError, "")
+    assert [about[name] for name in ("algorithm", "robot", "observations", "env_steps")] == [
+        *(algorithm, "turtlebot", ["goal"], 5)
+    ]
+    lost = next(name for name in tensors if "policy" in name)
+    shutil.copytree(kept, tmp_path / "less")
+    weights.write_weights(tmp_path / "less" / checkpoint.POLICY, {k: v for k, v in tensors.items() if k != lost}, about)
+    with pytest.raises(CheckpointError, match=f"lacks {lost}, which this network reads; export the run again"):
+        checkpoint.load_learner(tmp_path / "less", ALGORITHMS[algorithm].template(env, config))
     assert not checkpoint.is_whole(kept) and checkpoint.is_whole(path)
     assert sum(p.stat().st_size for p in kept.iterdir()) < 0.5 * sum(p.stat().st_size for p in path.iterdir())
     template = ALGORITHMS[algorithm].template(env, config)
@@ -90,7 +92,7 @@ def test_what_acting_reads_and_no_more(tmp_path, monkeypatch, env, share, algori
     assert 0 < np.abs(after - before).mean() < 0.02 and np.abs(after - before).max() < 0.3
     # Everything else may be anything; none of what is kept may.
     state = flax.serialization.to_state_dict(learner)
-    acting = policy_file.policy_leaves(path, state, algorithm)
+    acting = checkpoint.policy_leaves(path, state, algorithm)
     parts = {"ppo": "params/policy/ normalizer_params/"}.get(algorithm, "policy_params/ normalizer_params/").split()
     parts += [{"ppo": "params/encoder/"}.get(algorithm, "q_params/encoder/")] if share else []
     flat: dict[str, Any] = flax.traverse_util.flatten_dict(state, sep="/", keep_empty_nodes=True)
@@ -107,44 +109,13 @@ def test_what_acting_reads_and_no_more(tmp_path, monkeypatch, env, share, algori
         assert np.abs(actions(env, config, other) - before).max() > 1e-6, name
 
 
-@given(st.integers(1, 100), st.integers(1, 100), st.floats(1e-3, 1e3), st.floats(0.01, 2.0))
-def test_within_half_a_step(outputs, inputs, size, step):
-    weights = (np.random.default_rng(inputs).normal(size=(inputs, outputs)) * size).astype(np.float32)
-    stored = policy_file.packed({"a/kernel": weights, "a/bias": weights[0]}, step)
-    large = {"a/kernel:scale", "a/kernel:shape"} if weights.size >= policy_file.LARGE else set()
-    assert set(stored) == {"a/kernel", "a/bias"} | large and (not large or stored["a/kernel"].dtype == np.uint8)
-    back = policy_file.unpacked(stored)
-    np.testing.assert_array_equal(back["a/bias"], weights[0])
-    if weights.size < policy_file.LARGE:
-        np.testing.assert_array_equal(back["a/kernel"], weights.astype(np.float16))
-    else:
-        half = np.maximum(step * weights.std(0), np.abs(weights).max(0) / 127) / 2
-        assert (np.abs(back["a/kernel"] - weights) <= half * (1 + 1e-5) + 1e-30).all()
-
-
-def test_an_output_without_weights_stays_zero():
-    weights = np.zeros((4_000, 2), np.float32)
-    weights[:, 1] = np.tile([2.0, -2.0, 1.0, -1.0], 1_000)  # a deviation of the root of 2.5
-    back = policy_file.unpacked(policy_file.packed({"w": weights}, 1.0))["w"]
-    assert not back[:, 0].any()
-    np.testing.assert_allclose(back[:4, 1], np.array([1, -1, 1, -1]) * 2.5**0.5, rtol=1e-6)
-
-
-def test_a_weight_beyond_the_range_of_eight_bits_widens_the_steps():
-    weights = np.zeros((5_000, 1), np.float32)
-    weights[7] = 5.0  # 70 deviations
-    stored = policy_file.packed({"w": weights}, 0.1)
-    back = policy_file.unpacked(stored)["w"]
-    assert (back / stored["w:scale"]).max() == pytest.approx(127) and back[7] == pytest.approx(5.0)
-
-
 def test_foreign_and_damaged_files_are_told(tmp_path):
     config, learner = learner_of(ToyPixels(), "sac", True)
     path = saved(tmp_path / "whole", "sac", learner)
     checkpoint.keep_policy(path, tmp_path / "kept" / path.name)
     kept, _ = checkpoint.find(tmp_path / "kept", "best")
     other = dataclasses.replace(resolve(TrainConfig(env=TOY), "native"), network=config.network)
-    with pytest.raises(CheckpointError, match="policy_params/.*which this learner has not"):
+    with pytest.raises(CheckpointError, match="policy_params/.*which this network has not"):
         checkpoint.load_learner(kept, ALGORITHMS["ppo"].template(ToyPixels(), other))
     unknown = dataclasses.replace(checkpoint.read_meta(path), algorithm="ppo2")
     (path / checkpoint.META).write_text(json.dumps(dataclasses.asdict(unknown)))
@@ -152,11 +123,11 @@ def test_foreign_and_damaged_files_are_told(tmp_path):
         CheckpointError, match="learner.msgpack: holds no policy of 'ppo2', expected one of ppo, sac, d"
     ):
         checkpoint.keep_policy(path, tmp_path / "unknown")
-    files = (path, checkpoint.LEARNER), (kept, policy_file.POLICY)
+    files = (path, checkpoint.LEARNER), (kept, checkpoint.POLICY)
     digests = [hashlib.sha256((home / name).read_bytes()).hexdigest() for home, name in files]
     assert [checkpoint.weights_digest(home) for home in (path, kept)] == digests
-    (kept / policy_file.POLICY).write_bytes(b"PK garbage")
-    with pytest.raises(CheckpointError, match="policy.npz: not readable"):
+    (kept / checkpoint.POLICY).write_bytes(b"PK garbage")
+    with pytest.raises(CheckpointError, match="policy.safetensors: not readable"):
         checkpoint.load_learner(kept, ALGORITHMS["sac"].template(ToyPixels(), config))
 
 

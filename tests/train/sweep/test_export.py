@@ -136,7 +136,7 @@ def test_what_is_kept(swept, tmp_path, capsys):
         assert kept.name == paths_beside(rows).name and kept.read_bytes() == b"where it went"
         assert sorted(path.name for path in (out / "runs").iterdir()) == [run.name for run in swept.sweep.runs]
         assert read_metrics(out / "runs" / "k_int1-seed0" / PACKED_METRICS) == [{"env_steps": 5, "episodes": 1.0}]
-        (kept,) = out.rglob("policy.npz")
+        (kept,) = out.rglob("policy.safetensors")
         assert kept.parts[-4] == "k_int0-seed1" and not list(out.rglob(checkpoint.ENV_STATE))
         path, _ = checkpoint.find(out / "runs" / "k_int0-seed1" / "checkpoints", "best")
         learner = checkpoint.load_learner(path, {"params": {"w": np.zeros(3, np.float32)}, "normalizer_params": {}})
@@ -147,8 +147,8 @@ def test_what_is_kept(swept, tmp_path, capsys):
     shutil.rmtree(brought)
     shutil.copytree(path.parent, brought)
     assert main([str(tmp_path / "small.yaml"), "--export", str(tmp_path / "again")]) == 0
-    (again,) = (tmp_path / "again").rglob("policy.npz")
-    assert again.read_bytes() == (path / "policy.npz").read_bytes()
+    (again,) = (tmp_path / "again").rglob("policy.safetensors")
+    assert again.read_bytes() == (path / "policy.safetensors").read_bytes()
 
 
 def test_a_sweep_that_never_began_exports_nothing(tmp_path, capsys):
