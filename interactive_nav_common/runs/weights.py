@@ -8,7 +8,7 @@ import hashlib
 import json
 import lzma
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -123,14 +123,19 @@ def read_weights(path: Path, kind: type[UserError], remedy: str) -> tuple[dict[s
 
 
 def fill(
-    template: Tree, tensors: Tensors, path: Path, needed: Iterable[str], kind: type[UserError], remedy: str
+    template: Tree,
+    tensors: Tensors,
+    path: Path,
+    needed: Callable[[], Iterable[str]],
+    kind: type[UserError],
+    remedy: str,
 ) -> Tree:
-    """Return the template with a file's tensors in the places of their names, which must include those `needed`."""
+    """Return the template with a file's tensors in the places of their names; those of `needed()` must be there."""
     state = flatten_dict(flax.serialization.to_state_dict(template), sep="/", keep_empty_nodes=True)
     unknown = [name for name in sorted(tensors) if state.get(name, empty_node) is empty_node]
-    missing = sorted(set(needed) - set(tensors))
     if unknown:
         raise kind(f"{path}: holds {unknown[0]}, which this network has not; use the config that it was trained with")
+    missing = sorted(set(needed()) - set(tensors))
     if missing:
         raise kind(f"{path}: lacks {missing[0]}, which this network reads; {remedy}")
     return flax.serialization.from_state_dict(template, unflatten_dict({**state, **tensors}, sep="/"))  # type: ignore[return-value]

@@ -150,7 +150,7 @@ def read_weights(run: Path, template: Any, about: dict[str, Any]) -> Any:
     tensors, header = weights.read_weights(path, RunError, again)
     if about.get("export", {}).get("weights_digest", header["digest"]) != header["digest"]:
         raise RunError(f"{path}: is not the file that was exported with its {DESCRIPTION}; export the run again")
-    variables = weights.fill(template, tensors, path, weights.flat(template), RunError, again)
+    variables = weights.fill(template, tensors, path, lambda: weights.flat(template), RunError, again)
     return weights.fitting(template, variables, path, RunError)
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -218,7 +219,8 @@ def load_learner(folder: Path, template: Any) -> Any:
     if not is_whole(folder):
         path, again = folder / POLICY, "export the run again"
         tensors, _ = weights.read_weights(path, CheckpointError, again)
-        needed = policy_leaves(path, flax.serialization.to_state_dict(template), read_meta(folder).algorithm)
+        state, algorithm = flax.serialization.to_state_dict(template), read_meta(folder).algorithm
+        needed = functools.partial(policy_leaves, path, state, algorithm)
         learner = weights.fill(template, tensors, path, needed, CheckpointError, again)
     else:
         try:

@@ -139,7 +139,7 @@ def test_tensors_fill_the_places_of_their_names(tmp_path):
     tensors = {"params/w": np.array([[1.5], [2.5]], np.float16)}
 
     def fill(tensors):
-        state = weights.fill(template, tensors, tmp_path, ["params/w"], FileError, "train again")
+        state = weights.fill(template, tensors, tmp_path, lambda: ["params/w"], FileError, "train again")
         return weights.fitting(template, state, tmp_path, FileError)
 
     state = fill(tensors)
