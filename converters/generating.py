@@ -63,7 +63,7 @@ def _list_scenes(arguments: argparse.Namespace, console: Console) -> None:
 
 
 def _models(arguments: argparse.Namespace, console: Console) -> None:
-    from converters.check.model_sheet import model_sheet
+    from converters.check.pictures import model_sheet
 
     count = model_sheet(arguments.output, arguments.names)
     console.print(f"{arguments.output}: picture of {count} models", soft_wrap=True)

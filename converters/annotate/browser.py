@@ -17,7 +17,7 @@ import trimesh
 
 from converters.annotate.session import Item, Session, Store, step_of
 from converters.bodies.alignment import MIN_POINTS, Alignment, AlignmentError, apply_alignment, gross_outliers
-from converters.check.model_sheet import camera_axes, mesh_picture
+from converters.check.pictures import camera_axes, mesh_picture
 from converters.propose.proposals import Proposal, bounds
 from converters.propose.report import floor_of
 from converters.propose.retrieval import retrieve

@@ -5,6 +5,7 @@ Drawn by matplotlib's Agg, which needs neither display nor GPU.
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from pathlib import Path
 
 import matplotlib
@@ -14,24 +15,30 @@ import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from PIL import Image
 
 from converters.bodies.objects import PlacedObject
-from converters.check.object_preview import draw_object, geom_outline
-from converters.check.surfaces import geom_mesh
-from converters.check.views import CUT_M, EYE_M, EYE_VIEW_RAD, at_eye_height, from_above, from_the_south, world_surfaces
+from converters.check.pictures import (
+    CUT_M,
+    EYE_M,
+    EYE_VIEW_RAD,
+    Picture,
+    at_eye_height,
+    from_the_south,
+    world_surfaces,
+)
+from converters.check.surfaces import geom_mesh, geom_outline
 from converters.geometry.boxes import convex_hull
-from converters.geometry.faces import face_vectors
-from converters.read.meshes import textured_by_face
+from converters.read.obj import in_colour, textured_by_face
 from converters.records.raw import RawScene, ScanMesh
 from converters.records.visual import TexturedMesh
 from converters.structure.cut import cut_furniture
-from interactive_nav_common.files import whole_file
+from interactive_nav_common.files import check_name, whole_file
 from scenes_mjcf.categories import CATEGORIES
-from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
+from scenes_mjcf.look import over
+from scenes_mjcf.schema import SCENES, SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
 
 LEGEND_ENTRY_IN, LEGEND_LINE_IN = 1.25, 0.19
 """Inches that an entry of the legend takes across and down."""
@@ -39,6 +46,12 @@ LETTER_IN = 0.05
 """Width of a letter of an object's label, 6 points high."""
 MARGIN_M = 0.3
 """Empty border around the map."""
+VIEWS = {
+    "from above": np.eye(3),
+    "from the front": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "from the side": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+}
+"""Rows: what runs to the right, what runs up, and what looks at the reader."""
 SURFACE_PIXELS = 480
 """Longer side of a surface's picture; a panel is about as large on the page."""
 COLUMNS, PANEL_IN, LEAST_WIDTH_IN = 3, 3.3, 9.0
@@ -51,13 +64,17 @@ WALL = (0.75, 0.75, 0.75)
 
 
 def _geoms(model: mujoco.MjModel) -> list[tuple[str, str, int]]:
-    """Return (geom name, body name, geom id) of every named geom."""
-    geoms = []
-    for geom in range(model.ngeom):
-        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or ""
-        body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, int(model.geom_bodyid[geom])) or ""
-        geoms.append((name, body, geom))
-    return geoms
+    """Return (geom name, body name, geom id) of every geom."""
+    return [(model.geom(g).name, model.body(model.geom_bodyid[g]).name, g) for g in range(model.ngeom)]
+
+
+@dataclasses.dataclass(frozen=True)
+class _About:
+    """What is read of object.json."""
+
+    name: str
+    category: str
+    mass_kg: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,14 +98,25 @@ def _frame(axes: Axes, scene: _Scene, title: str) -> None:
     axes.text(left + 0.5, bottom - 0.27, "1 m", ha="center", va="bottom", fontsize=8)
 
 
-def _draw_surface(axes: Axes, scene: _Scene, surface: TexturedMesh, title: str) -> None:
-    """Draw what looks up of a surface, from above."""
+def _draw_along(
+    axes: Axes, axes_w: np.ndarray, low: np.ndarray, high: np.ndarray, meshes: Iterable[TexturedMesh], sided: bool
+) -> tuple[float, float, float, float]:
+    """Draw meshes between corners (2,) m along `axes_w`, `sided` without backs; return the picture's extent."""
+    pixel_m = float((high - low).max()) / SURFACE_PIXELS
+    picture = Picture(*over(axes_w, low, high, pixel_m))
+    for mesh in meshes:
+        picture.draw(mesh, one_sided=sided)
+    rows, columns = picture.image.shape[:2]
+    extent = (low[0], low[0] + columns * pixel_m, low[1], low[1] + rows * pixel_m)
+    clear = 255 * (picture.image < 255).any(axis=2, keepdims=True).astype(np.uint8)
+    axes.imshow(np.dstack([picture.image, clear]), extent=extent, interpolation="nearest")
+    return extent
+
+
+def _draw_from_above(axes: Axes, scene: _Scene, meshes: Iterable[TexturedMesh], title: str, sided: bool = True) -> None:
     left, right, bottom, top = scene.maps.extent_w
     low, high = np.array([left, bottom]) - MARGIN_M, np.array([right, top]) + MARGIN_M
-    pixel_m = float((high - low).max()) / SURFACE_PIXELS
-    image = from_above(surface, low, high, pixel_m)
-    extent = (low[0], low[0] + image.shape[1] * pixel_m, low[1], low[1] + image.shape[0] * pixel_m)
-    axes.imshow(image, extent=extent, interpolation="nearest")
+    _draw_along(axes, np.eye(3), low, high, meshes, sided)
     _frame(axes, scene, title)
 
 
@@ -146,25 +174,17 @@ def apart(centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:
 def _draw_objects(axes: Axes, scene: _Scene) -> None:
     """Draw each movable object's CAD surface in its category's colour, lit from above, with its name."""
     _draw_ground(axes, scene)
-    for item in scene.manifest.objects:
-        surface = scene.surfaces[item.name]
-        corners = surface.vertices[surface.faces]
-        normal = face_vectors(surface.vertices, surface.faces)
-        light = np.abs(normal[:, 2]) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
-        order = np.argsort(corners[:, :, 2].max(axis=1), kind="stable")
-        colours = np.outer(0.55 + 0.45 * light, CATEGORIES[item.category].preview_colour)[order]
-        axes.add_collection(
-            PolyCollection(list(corners[order, :, :2]), facecolors=colours, edgecolors=colours, linewidth=0.2)
-        )
-    names = [item.name for item in scene.manifest.objects]
+    colours = {o.name: np.array(CATEGORIES[o.category].preview_colour) for o in scene.manifest.objects}
+    meshes = [in_colour(scene.surfaces[name], colour) for name, colour in colours.items()]
+    area = f"{scene.manifest.floor_area_m2:.1f} m² traversable"
+    _draw_from_above(axes, scene, meshes, f"{len(meshes)} objects, {area}", sided=False)
+    names = list(colours)
     metre_in = PANEL_IN / (scene.maps.extent_w[3] - scene.maps.extent_w[2] + 0.5 + MARGIN_M)
     sizes = np.array([(LETTER_IN * len(name) + 0.03, 2.2 * LETTER_IN) for name in names]).reshape(-1, 2) / metre_in
     centres = np.array([scene.data.body(name).xipos[:2] for name in names]).reshape(-1, 2)
     for name, (x, y) in zip(names, apart(centres, sizes), strict=True):
         box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "alpha": 0.75, "linewidth": 0}
         axes.text(x, y, name, ha="center", va="center", fontsize=6, bbox=box)
-    area = f"{scene.manifest.floor_area_m2:.1f} m² traversable"
-    _frame(axes, scene, f"{len(scene.manifest.objects)} objects, {area}")
 
 
 def _draw_collision(axes: Axes, scene: _Scene, kind: str) -> None:
@@ -250,8 +270,8 @@ def draw(scene: _Scene, raw: RawScene | None) -> Figure:
             (panels.pop(0), np.arange(len(keep)), f"scan, {len(keep):,} triangles"),
             (panels.pop(0), np.flatnonzero(keep), f"cut, {int(keep.sum()):,} triangles left"),
         ):
-            _draw_surface(axes, scene, _scan_surface(scan, vertices_w, chosen), title)
-        _draw_surface(panels.pop(0), scene, scene.surfaces["structure"], "filled: the static structure")
+            _draw_from_above(axes, scene, [_scan_surface(scan, vertices_w, chosen)], title)
+        _draw_from_above(panels.pop(0), scene, [scene.surfaces["structure"]], "filled: the static structure")
     objects, hulls, boxes = panels
     _draw_objects(objects, scene)
     _draw_collision(hulls, scene, "hull")
@@ -266,6 +286,55 @@ def draw(scene: _Scene, raw: RawScene | None) -> Figure:
     lines = math.ceil(len(handles) / across)
     figure.tight_layout(rect=(0, 0.01 + LEGEND_LINE_IN * lines / figure.get_figheight(), 1, 0.985))
     return figure
+
+
+def draw_object(folder: Path) -> Figure:
+    """Draw the textured surface, and the hulls and boxes that collide, as the object stands at rest."""
+    described = folder / "object.json"
+    about = SCENES.record(SCENES.json(described), _About, str(described), others=True)
+    name = check_name(about.name, f"{described}: name", SceneError)
+    try:
+        model = mujoco.MjModel.from_xml_path(str(folder / "object.xml"))
+        body = model.body(name).id
+    except (OSError, KeyError, ValueError) as error:
+        raise SceneError(f"{folder}: is no readable object ({error}); convert it again") from error
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    mesh = world_surfaces(model, data)[name]
+    size_m = float(np.ptp(mesh.vertices, axis=0).max())
+    figure, grid = plt.subplots(2, 3, figsize=(10.5, 7.4), dpi=100)
+    for (title, axes_w), (surface, solid) in zip(VIEWS.items(), grid.T, strict=True):
+        points = mesh.vertices @ axes_w[:2].T
+        low, high = points.min(axis=0) - 0.1 * size_m, points.max(axis=0) + 0.1 * size_m
+        extent = _draw_along(surface, axes_w, low, high, [mesh], sided=False)
+        _draw_solids(solid, model, data, body, axes_w)
+        for axes in (surface, solid):
+            axes.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
+            axes.axis("off")
+            if title != "from above":
+                axes.axhline(0.0, color="0.6", linewidth=0.8)  # the floor
+        surface.set_title(title, fontsize=10)
+    bar_m = 10.0 ** np.floor(np.log10(size_m))
+    left, bottom = grid[0, 0].get_xlim()[0], grid[0, 0].get_ylim()[0]
+    grid[0, 0].plot([left, left + bar_m], [bottom] * 2, color="black", linewidth=4, solid_capstyle="butt")
+    grid[0, 0].text(left, bottom, f" {100 * bar_m:g} cm", va="bottom", fontsize=8)
+    hulls = sum(model.geom_type[g] == mujoco.mjtGeom.mjGEOM_BOX for g in range(model.ngeom))
+    figure.suptitle(
+        f"{name}: {about.category}, {about.mass_kg:.3g} kg; below: {hulls} hulls (filled) and their boxes (lines)"
+    )
+    figure.tight_layout()
+    return figure
+
+
+def _draw_solids(axes: Axes, model: mujoco.MjModel, data: mujoco.MjData, body: int, axes_w: np.ndarray) -> None:
+    """Draw outlines of hulls, filled, and boxes, as lines."""
+    for geom in np.flatnonzero(model.geom_bodyid == body):
+        box = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX
+        if not box and not model.geom_contype[geom]:
+            continue  # the surface
+        outline = geom_outline(model, data, int(geom), axes_w)
+        fill, line = ("none", "#b03020") if box else ("#3070c040", "none")
+        axes.fill(*outline.T, facecolor=fill, edgecolor=line, linewidth=0.8)
 
 
 def preview(folder: Path, target: Path, source: Path | None = None) -> None:

@@ -42,6 +42,18 @@ def geom_surface(model: mujoco.MjModel, geom: int) -> TexturedMesh:
     return TexturedMesh(vertices, faces, uv, pixels[..., :3])
 
 
+def geom_outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int, axes_w: np.ndarray) -> np.ndarray:
+    """Return (k, 2) m: outline of a mesh or box geom, viewed along the third of the axes."""
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
+        corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T * model.geom_size[geom]
+    else:
+        mesh = model.geom_dataid[geom]
+        first = model.mesh_vertadr[mesh]
+        corners = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+    points = (corners @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]) @ axes_w[:2].T
+    return points[ConvexHull(points).vertices]
+
+
 def kept_share(vertices: np.ndarray, faces: np.ndarray, drawn: tuple[np.ndarray, np.ndarray]) -> float:
     """Return the share of a scan's area that lies within `KEPT_M` of what is drawn of the structure.
 

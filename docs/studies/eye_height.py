@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from converters.check.views import at_eye_height, from_the_south, world_surfaces
+from converters.check.pictures import at_eye_height, from_the_south, world_surfaces
 from scenes_mjcf.schema import load_maps
 
 SHAPE = (360, 600)

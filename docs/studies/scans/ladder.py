@@ -15,8 +15,7 @@ import mujoco
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from converters.check.render import Picture
-from converters.check.views import world_surfaces
+from converters.check.pictures import Picture, world_surfaces
 from converters.propose.proposals import bounds, box_iou
 from converters.records.visual import TexturedMesh
 from converters.segment.labelling import FOUND_IOU

@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 
 from converters.__main__ import main
-from converters.check.model_sheet import LABEL_PIXELS, PIXELS, camera_axes, model_picture, model_sheet
+from converters.check.pictures import LABEL_PIXELS, PIXELS, camera_axes, model_picture, model_sheet
 from converters.generate.models.cad import cad_model
 from converters.generate.models.parts import MATERIALS
 

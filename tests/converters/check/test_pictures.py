@@ -9,8 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from converters.check.render import Picture
-from converters.check.views import at_eye_height, from_the_south, world_surfaces
+from converters.check.pictures import Picture, at_eye_height, from_the_south, world_surfaces
 from converters.records.visual import TexturedMesh
 from scenes_mjcf.look import CameraPose, Lens, look_along, over
 from scenes_mjcf.schema import load_maps

@@ -1,0 +1,295 @@
+"""Draw pictures of textured meshes: of compiled scenes, slantwise from the south, from above and at eye height, and
+of CAD models, each from the front, the right and above; in NumPy: neither display nor GPU is needed.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import shapely
+from PIL import Image, ImageDraw
+from scipy.ndimage import map_coordinates
+from trimesh.intersections import slice_faces_plane
+
+from converters.check.surfaces import geom_outline, geom_surface
+from converters.generate.models.cad import LIBRARY, cad_model
+from converters.generate.models.parts import MATERIALS
+from converters.geometry.faces import face_vectors, unit_normals
+from converters.read.obj import in_colour, join_meshes
+from converters.records.visual import TexturedMesh
+from interactive_nav_common.errors import UserError
+from interactive_nav_common.files import whole_file
+from interactive_nav_common.grids import cell_centres, clearance
+from scenes_mjcf.look import CameraPose, Lens, look_along, over
+from scenes_mjcf.schema import SceneMaps
+
+NEAREST_M = 0.05
+"""Nothing nearer is drawn."""
+LAMP_W = np.array([0.35, -0.45, 0.82])
+"""Where the little light comes from that is not even."""
+EVEN = 0.72
+"""Of the light that is."""
+SQUARE = 0.35
+"""Texels a pixel; colours are mixed where there are fewer."""
+FRAGMENTS = 2_000_000
+"""Pixels that are looked at together, of boxes about triangles."""
+ELEVATION_RAD = math.radians(53.0)
+CUT_M = 1.3
+"""Height that walls are cut at in the view from the south."""
+EYE_M, EYE_VIEW_RAD, DOWN = 1.5, math.radians(75.0), 0.2
+"""Height and width of the view of somebody who stands there, and how far down they look in a metre."""
+FREE_M, NEAR_M, FAR_M = 0.5, 1.2, 7.0
+"""Around somebody who stands there; and how far off is what counts as visible."""
+HEADINGS, PLACES = 24, 200
+SHARP = 2
+"""Pixels a side that become one, at eye height: from farther off that is noise, which makes files large."""
+PIXELS = 200
+"""Side of a model's picture."""
+LABEL_PIXELS = 30
+COLUMNS = 8
+AZIMUTH_RAD, ABOVE_RAD = 0.6, 0.42
+"""Where the reader stands: to the right of the front, and above."""
+
+
+class Picture:
+    """A picture that meshes are drawn into, near before far; white where nothing is."""
+
+    def __init__(self, pose: CameraPose, lens: Lens) -> None:
+        """Start an empty picture."""
+        self._pose, self._lens = pose, lens
+        self._depth = np.full(lens.height * lens.width, np.inf)
+        self._colours = np.full((len(self._depth), 3), 255, np.uint8)
+
+    @property
+    def image(self) -> np.ndarray:
+        """Return (rows, columns, 3) uint8."""
+        return self._colours.reshape(self._lens.height, self._lens.width, 3)
+
+    def draw(self, mesh: TexturedMesh, one_sided: bool = False, below_m: float = np.inf) -> None:
+        """Draw a mesh."""
+        assert mesh.corner_uv is not None and mesh.texture is not None
+        lens, eye, axes_w = self._lens, self._pose.pos_w, self._pose.axes_w
+        points, uv = mesh.vertices[mesh.faces].reshape(-1, 3), mesh.corner_uv.reshape(-1, 2)
+        faces = np.arange(len(points)).reshape(-1, 3)
+        if one_sided:
+            faces = faces[(unit_normals(points, faces) * (eye - points[::3])).sum(axis=1) > 0]
+        points, faces, uv = slice_faces_plane(points, faces, axes_w[:, 0], eye + NEAREST_M * axes_w[:, 0], uv)
+        if np.isfinite(below_m):
+            points, faces, uv = slice_faces_plane(points, faces, np.array([0, 0, -1]), np.array([0, 0, below_m]), uv)
+        depth, x, y = np.moveaxis((points[faces] - eye) @ axes_w, -1, 0)
+        size, uv = np.array([lens.width, lens.height]), np.asarray(uv)[faces]
+        pixels = np.stack([x, -y], axis=-1) / lens.pixel / depth[..., None] + size / 2
+        keep = np.flatnonzero(_areas(pixels) > 1e-9)
+        light = (EVEN + (1 - EVEN) * np.abs(unit_normals(points, faces) @ LAMP_W))[keep]
+        depth, pixels, uv = depth[keep], pixels[keep], uv[keep]
+        texture, between = _fitted(mesh.texture, _areas(uv), _areas(pixels), depth.min(axis=1, initial=np.inf))
+        low, high = np.ceil(pixels.min(axis=1) - 0.5), np.floor(pixels.max(axis=1) - 0.5) + 1
+        low, high = (np.clip(v, 0, size).astype(int) for v in (low, high))
+        inverse = np.linalg.inv(np.dstack([pixels, np.ones_like(depth)]) * depth[..., None])
+        for part, face, at in _fragments(low, np.maximum(high, low)):
+            share = np.einsum("nk,nkc->nc", np.column_stack([at + 0.5, np.ones(len(at))]), inverse[part][face])
+            outside = share < -1e-6 * np.abs(share).sum(axis=1, keepdims=True)  # no gaps between neighbours
+            inside = np.flatnonzero(~outside.any(axis=1))
+            face, share = part[face[inside]], share[inside] / share[inside].sum(axis=1, keepdims=True)
+            far = (share * depth[face]).sum(axis=1)
+            where = at[inside, 1] * lens.width + at[inside, 0]
+            order = np.flatnonzero(far < self._depth[where])
+            order = order[np.argsort(-far[order], kind="stable")]  # the nearest is written last
+            face, share, where = face[order], share[order], where[order]
+            self._depth[where] = far[order]
+            colours = _looked_up(texture, np.einsum("nc,ncd->nd", share, uv[face]), between)
+            self._colours[where] = colours * light[face, None]
+
+
+def _areas(corners: np.ndarray) -> np.ndarray:
+    """Return twice the areas (m,) of triangles (m, 3, 2)."""
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+
+def _looked_up(texture: np.ndarray, uv: np.ndarray, between: bool) -> np.ndarray:
+    """Return (n, 3) colours at texture coordinates (n, 2): the nearest texel's, or `between` four."""
+    at = (np.stack([1 - uv[:, 1] % 1, uv[:, 0] % 1], axis=1) * texture.shape[:2]).T - 0.5
+    return np.stack([map_coordinates(texture[..., k], at, order=int(between), mode="nearest") for k in range(3)], -1)
+
+
+def _fragments(low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield blocks of boxes: which boxes (p,), and of every pixel in them which of these (n,) and where (n, 2)."""
+    count = (high - low).prod(axis=1)
+    some = np.flatnonzero(count)
+    for part in np.split(some, np.flatnonzero(np.diff(np.cumsum(count[some]) // FRAGMENTS)) + 1):
+        box = np.repeat(np.arange(len(part)), count[part])
+        step = np.arange(len(box)) - np.repeat(np.cumsum(count[part]) - count[part], count[part])
+        wide = (high - low)[part, 0][box]
+        yield part, box, low[part][box] + np.stack([step % wide, step // wide], axis=1)
+
+
+def _fitted(
+    texture: np.ndarray, uv_areas: np.ndarray, pixels: np.ndarray, depth: np.ndarray
+) -> tuple[np.ndarray, bool]:
+    """Return the texture with no more texels than it has pixels in the picture, and whether one shows as a square.
+
+    Areas are of faces (m,), in texture coordinates and pixels; what was cut at the near plane does not count.
+    """
+    rows, columns = texture.shape[:2]
+    front = depth > 2 * NEAREST_M
+    per_pixel = np.sqrt(uv_areas[front].sum() * rows * columns / max(pixels[front].sum(), 1.0))
+    factor = min(int(per_pixel), rows, columns)
+    small = texture if factor < 2 else np.asarray(Image.fromarray(texture).reduce(factor))
+    return small, bool(per_pixel < SQUARE)
+
+
+def world_surfaces(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, TexturedMesh]:
+    """Return body -> what is drawn of it, in the world."""
+    surfaces = {}
+    for geom in range(model.ngeom):
+        name = model.geom(geom).name
+        if name.endswith("_visual"):
+            body, surface = model.geom_bodyid[geom], geom_surface(model, geom)
+            points = surface.vertices @ data.xmat[body].reshape(3, 3).T + data.xpos[body]
+            surfaces[model.body(body).name] = dataclasses.replace(surface, vertices=points)
+    return surfaces
+
+
+def _taken(pose: CameraPose, lens: Lens, surfaces: dict[str, TexturedMesh], cut_m: float = np.inf) -> np.ndarray:
+    """Draw the picture (rows, columns, 3) of bodies."""
+    picture = Picture(pose, lens)
+    for body, surface in surfaces.items():
+        structure = body == "structure"
+        picture.draw(surface, one_sided=structure, below_m=cut_m if structure else np.inf)
+    return picture.image
+
+
+def from_the_south(
+    surfaces: dict[str, TexturedMesh], maps: SceneMaps, low: np.ndarray, high: np.ndarray, pixels: int
+) -> np.ndarray:
+    """Draw everything, slantwise, `pixels` wide: walls are cut at `CUT_M`; no ceiling or near wall hides a room.
+
+    Args:
+        low: (2,) least x and y, m.
+        high: (2,) largest.
+    """
+    sin, cos = math.sin(ELEVATION_RAD), math.cos(ELEVATION_RAD)
+    axes_w = np.array([[1.0, 0.0, 0.0], [0.0, sin, cos], [0.0, -cos, sin]])
+    half = np.array([high[0] - low[0], sin * (high[1] - low[1]) + cos * CUT_M]) / 2
+    middle = axes_w[:2] @ [*(low + high) / 2, CUT_M / 2]
+    surfaces = surfaces | {"structure": _without_near_side(surfaces["structure"], maps)}
+    return _taken(*over(axes_w, middle - half, middle + half, 2 * half[0] / pixels), surfaces, CUT_M)
+
+
+def _without_near_side(structure: TexturedMesh, maps: SceneMaps) -> TexturedMesh:
+    """Return the structure less upright faces that look south where no floor lies south of them."""
+    assert structure.corner_uv is not None
+    normal, centre = face_vectors(structure.vertices, structure.faces), structure.vertices[structure.faces].mean(axis=1)
+    first = np.where(maps.traversable.any(axis=0), maps.traversable.argmax(axis=0), len(maps.traversable))
+    column = np.floor((centre[:, 0] - maps.origin_w[0]) / maps.resolution_m).astype(int)
+    south_m = maps.origin_w[1] + maps.resolution_m * first[np.clip(column, 0, len(first) - 1)]
+    near = (centre[:, 1] < south_m) & (-normal[:, 1] > 0.7 * np.linalg.norm(normal, axis=1))
+    return dataclasses.replace(structure, faces=structure.faces[~near], corner_uv=structure.corner_uv[~near])
+
+
+def at_eye_height(
+    model: mujoco.MjModel, data: mujoco.MjData, surfaces: dict[str, TexturedMesh], maps: SceneMaps,
+    shape: tuple[int, int],
+) -> np.ndarray:  # fmt: skip
+    """Draw what somebody sees from where most is visible."""
+    eye, heading = _vantage(model, data, surfaces, maps)
+    eye_w = np.array([*eye, EYE_M])
+    tall = math.degrees(2 * math.atan(math.tan(EYE_VIEW_RAD / 2) * shape[0] / shape[1]))
+    lens = Lens(SHARP * shape[1], SHARP * shape[0], tall)
+    picture = _taken(look_along(eye_w, np.array([*heading, -DOWN])), lens, surfaces)
+    return np.asarray(Image.fromarray(picture).reduce(SHARP))
+
+
+def _vantage(
+    model: mujoco.MjModel, data: mujoco.MjData, surfaces: dict[str, TexturedMesh], maps: SceneMaps
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return place (2,) and heading (2,) with most objects, the larger and nearer the better, before no wall."""
+    clear = clearance(maps.traversable, maps.resolution_m)
+    places = cell_centres(clear >= min(FREE_M, 0.8 * float(clear.max())), maps.resolution_m, maps.origin_w)
+    places = places[np.unique(np.linspace(0, len(places) - 1, PLACES).astype(int))]
+    boxes = [
+        np.stack([s.vertices[:, :2].min(axis=0), s.vertices[:, :2].max(axis=0)])
+        for body, s in surfaces.items() if body != "structure"
+    ]  # fmt: skip
+    low, high = np.array(boxes).reshape(-1, 2, 2).transpose(1, 0, 2)
+    off = np.maximum(np.maximum(low - places[:, None], places[:, None] - high), 0.0)
+    stands = (np.linalg.norm(off, axis=2) > FREE_M / 2).all(axis=1)
+    places = places[stands] if stands.any() else places
+    way = (low + high) / 2 - places[:, None]
+    distance = np.linalg.norm(way, axis=2)
+    weight = np.linalg.norm(high - low, axis=1) / np.maximum(distance, NEAR_M)
+    visible = (distance > NEAR_M) & (distance < FAR_M) & ~_hidden(model, data, places, way)
+    turns = np.arange(HEADINGS) * 2 * math.pi / HEADINGS
+    headings = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    ahead = way @ headings.T > math.cos(0.8 * EYE_VIEW_RAD / 2) * distance[..., None]
+    score = np.einsum("pk,pkh->ph", np.where(visible, weight, 0.0), ahead)
+    place, heading = np.unravel_index(score.argmax(), score.shape)
+    return places[place], headings[heading]
+
+
+def _hidden(model: mujoco.MjModel, data: mujoco.MjData, places: np.ndarray, way: np.ndarray) -> np.ndarray:
+    """Return (p, k) whether a wall stands in the way (p, k, 2) from a place (p, 2)."""
+    walls = [g for g in range(model.ngeom) if model.geom(g).name.startswith("wall_")]
+    outlines = [shapely.Polygon(geom_outline(model, data, g, np.eye(3))) for g in walls]
+    start = np.broadcast_to(places[:, None], way.shape)
+    lines = shapely.linestrings(np.stack([start, start + way], axis=2))
+    return np.asarray(shapely.intersects(lines, shapely.union_all(outlines)))
+
+
+def camera_axes() -> np.ndarray:
+    """Return rows that point right, up and at the reader; the model faces +z, y is up."""
+    (sin_a, cos_a), (sin_e, cos_e) = [(np.sin(a), np.cos(a)) for a in (AZIMUTH_RAD, ABOVE_RAD)]
+    toward = np.array([sin_a * cos_e, sin_e, cos_a * cos_e])
+    right = np.array([cos_a, 0.0, -sin_a])
+    return np.stack([right, np.cross(toward, right), toward])
+
+
+def model_picture(name: str, pixels: int = PIXELS) -> np.ndarray:
+    """Draw a (pixels, pixels, 3) uint8 picture of a model, in the colours of its materials or texture, on white."""
+    model = cad_model(name)
+    if (surface := model.surface) is not None:
+        mesh = TexturedMesh(surface.vertices, surface.faces, surface.uv[surface.uv_faces], surface.image)
+    else:
+        parts = ((TexturedMesh(p.vertices, p.faces, None, None), np.array(MATERIALS[p.material])) for p in model.parts)
+        mesh = join_meshes(*(in_colour(*part) for part in parts))
+    return mesh_picture(mesh, camera_axes() * [model.front, 1, model.front], pixels, one_sided=True)
+
+
+def mesh_picture(mesh: TexturedMesh, axes: np.ndarray, pixels: int, one_sided: bool = False) -> np.ndarray:
+    """Draw a (pixels, pixels, 3) uint8 picture of a whole mesh on white, along axes such as `camera_axes`'."""
+    turned = mesh.vertices @ axes.T
+    half, middle = np.ptp(turned, axis=0)[:2].max() / 2 / 0.94, (turned.min(axis=0) + turned.max(axis=0)) / 2
+    picture = Picture(*over(axes, middle - half, middle + half, 2 * half / pixels))
+    picture.draw(mesh, one_sided)
+    return picture.image
+
+
+def model_sheet(target: Path, names: Sequence[str] = ()) -> int:
+    """Draw models into a PNG, whole or not at all.
+
+    Returns:
+        How many models there are on it.
+    """
+    unknown = [n for n in names if n not in LIBRARY and n not in {d.category for d in LIBRARY.values()}]
+    if unknown:
+        categories = ", ".join(sorted({d.category for d in LIBRARY.values()}))
+        raise UserError(f"no model or category named {', '.join(unknown)}; categories: {categories}")
+    wanted = [n for n, d in LIBRARY.items() if not names or n in names or d.category in names]
+    wanted.sort(key=lambda name: LIBRARY[name].category)
+    rows = -(-len(wanted) // COLUMNS)
+    columns = min(COLUMNS, len(wanted))
+    sheet = Image.new("RGB", (columns * PIXELS, rows * (PIXELS + LABEL_PIXELS)), "white")
+    draw = ImageDraw.Draw(sheet)
+    for k, name in enumerate(wanted):
+        x, y = k % COLUMNS * PIXELS, k // COLUMNS * (PIXELS + LABEL_PIXELS)
+        sheet.paste(Image.fromarray(model_picture(name)), (x, y))
+        size = " x ".join(f"{v:.2f}" for v in 2 * cad_model(name).half_extents * cad_model(name).unit_m)
+        draw.text((x + 4, y + PIXELS + 2), name, fill="black", font_size=12)
+        draw.text((x + 4, y + PIXELS + 15), f"{size} m", fill="grey", font_size=11)
+    with whole_file(target) as partial:
+        sheet.save(partial, format="PNG", optimize=True)
+    return len(wanted)
