@@ -179,6 +179,12 @@ def write_metrics(path: Path, lines: Sequence[dict[str, Any]]) -> None:
         write_text(path, text)
 
 
+def cut_metrics(path: Path, keep: Callable[[dict[str, Any]], bool]) -> None:
+    """Keep only those lines of a metrics.jsonl, if there is one, for which `keep` returns True."""
+    if path.is_file():
+        write_metrics(path, [line for line in read_metrics(path) if keep(line)])
+
+
 def mean_over_episodes(lines: Sequence[dict[str, Any]], name: str) -> float | None:
     """Return the mean of a score over the episodes of some lines of metrics; None where none ended."""
     scored = [(line[name], line["episodes"]) for line in lines if name in line]

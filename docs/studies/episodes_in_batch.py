@@ -28,7 +28,7 @@ from topological_nav.config import EvaluationConfig
 from topological_nav.evaluate.contenders import NavigatorPlayer
 from topological_nav.evaluate.contest import Contest, ContestScene, local_policy
 from topological_nav.evaluate.evaluation import Played, Tell, play
-from topological_nav.learn.pairs import load_networks
+from topological_nav.learn.training import load_networks
 from topological_nav.navigate.navigator import Navigator
 from topological_nav.weights.packaged import packaged_weights
 

@@ -21,8 +21,7 @@ from benchmarks.steps_per_second import timed
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.rows import markdown
-from topological_nav.learn.pairs import camera_of
-from topological_nav.learn.training import Trained, load_trained
+from topological_nav.learn.training import Trained, camera_of, load_trained
 from topological_nav.maps.build import renderer_of
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.space import free_space

@@ -7,8 +7,7 @@ import pytest
 from docs.studies import supersample
 from interactive_nav.scenes.scene import load_scene
 from tests.topological_nav.conftest import Made
-from topological_nav.learn.pairs import camera_of
-from topological_nav.learn.training import load_trained
+from topological_nav.learn.training import camera_of, load_trained
 
 
 def test_the_largest_is_compared_with_itself_and_the_others_with_it(made: Made, monkeypatch):

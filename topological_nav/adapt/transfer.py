@@ -34,9 +34,16 @@ from topological_nav.data.passages import balanced
 from topological_nav.errors import ALONE, DatasetError, Host, MapError
 from topological_nav.learn.learning import Learner, labelled_epoch, make_learner, over
 from topological_nav.learn.localise import Places, in_words, localisation_scores
-from topological_nav.learn.pairs import Networks, need_task
 from topological_nav.learn.runs import claimed, run_epochs, write_results
-from topological_nav.learn.training import Trained, class_scores, length_scores, load_trained, save_trained
+from topological_nav.learn.training import (
+    Networks,
+    Trained,
+    class_scores,
+    length_scores,
+    load_trained,
+    need_task,
+    save_trained,
+)
 from topological_nav.maps.build import judged_map
 from topological_nav.maps.graph import near_pairs
 from topological_nav.scenes.space import free_space

@@ -12,9 +12,8 @@ from topological_nav.drives.frames import embedded
 from topological_nav.drives.imitation import fresh_params
 from topological_nav.drives.policy import Forward, Policy, standardised
 from topological_nav.errors import RunError
-from topological_nav.learn.pairs import load_pair, need_task
 from topological_nav.learn.runs import read_description, read_weights
-from topological_nav.learn.training import Trained
+from topological_nav.learn.training import Trained, load_pair, need_task
 from topological_nav.maps.sight import PassagePolicy, Sight
 
 

@@ -14,8 +14,7 @@ from topological_nav.config import DriveConfig
 from topological_nav.drives.dataset import Drives, drive_images, load_drives, read_drives_header
 from topological_nav.errors import ALONE, Host, RunError, Stopped
 from topological_nav.learn.learning import in_batches
-from topological_nav.learn.pairs import SAME, load_pair, seen_by
-from topological_nav.learn.training import Trained
+from topological_nav.learn.training import SAME, Trained, load_pair, seen_by
 
 _TOLD_EVERY = 10
 """Files of images between two lines about embedding."""

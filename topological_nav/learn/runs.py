@@ -16,14 +16,14 @@ import yaml
 from interactive_nav_common.errors import readable
 from interactive_nav_common.files import append_text, whole_file, write_text
 from interactive_nav_common.locks import alone_in
-from interactive_nav_common.records import METRICS, Reader, read_metrics, write_metrics
+from interactive_nav_common.records import METRICS, Reader, cut_metrics
 from interactive_nav_common.runs import weights
 from interactive_nav_common.untrusted.reading import Loader
 from interactive_nav_common.versions import versions
 from topological_nav.errors import Host, RunError, Stopped
 
 CONFIG, CHECKPOINT = "config.yaml", "checkpoint.msgpack"
-WEIGHTS, DESCRIPTION, RESULTS = "weights.safetensors", "network.json", "results.json"
+WEIGHTS, DESCRIPTION, RESULTS, VERSIONS = "weights.safetensors", "network.json", "results.json", "versions.json"
 PACKED_WEIGHTS = f"{WEIGHTS}.xz"
 """Of an exported run."""
 State = TypeVar("State")
@@ -34,27 +34,21 @@ SAVE_EVERY_S = 60.0
 
 @contextlib.contextmanager
 def claimed(out: Path, settings: dict[str, Any]) -> Iterator[None]:
-    """A run folder for the block: of these settings, written to config.yaml, and of this process alone."""
-    path = out / CONFIG
+    """Reserve a run folder for the block, for these settings, written to config.yaml, and for this process alone."""
+    path, remedy = out / CONFIG, "choose another folder (-o) or delete it"
     with alone_in(out):
+        there = settings
         if path.is_file():
-            _compare(path, settings)
-        else:
+            with readable(path, RunError, remedy):
+                there = dict(yaml.load(path.read_text(), Loader))
+        for name, value in settings.items():
+            if there.get(name) != value:
+                shown = ("another", "this one") if isinstance(value, dict) else (there.get(name), value)
+                raise RunError(f"{out}: the run there has {name} = {shown[0]!r}, this one {shown[1]!r}; {remedy}")
+        if there is settings:
             write_text(path, yaml.safe_dump(settings, sort_keys=False))
-        write_text(out / "versions.json", json.dumps(versions(), indent=1) + "\n")
+        write_text(out / VERSIONS, json.dumps(versions(), indent=1) + "\n")
         yield
-
-
-def _compare(path: Path, settings: dict[str, Any]) -> None:
-    with readable(path, RunError, "choose another folder (-o) or delete it"):
-        there = dict(yaml.load(path.read_text(), Loader))
-    for name, value in settings.items():
-        if there.get(name) != value:
-            shown = (there.get(name), value) if not isinstance(value, dict) else ("another", "this one")
-            raise RunError(
-                f"{path.parent}: the run there has {name} = {shown[0]!r}, this one {shown[1]!r}; "
-                "choose another folder (-o) or delete it"
-            )
 
 
 def run_epochs(
@@ -75,7 +69,8 @@ def run_epochs(
     saved, first = read_checkpoint(out / checkpoint), 0
     if saved and saved.get("phase", phase) == phase:
         first, learner = saved["epoch"], _restored(learner, saved["learner"], out / checkpoint)
-    _cut_metrics(out / METRICS, phase, first)
+    # Epochs after the last one that the checkpoint holds are run again.
+    cut_metrics(out / METRICS, lambda line: line["phase"] != phase or line["epoch"] <= first)
     began = saved_at = time.perf_counter()
     for number in range(first, epochs):
         started = time.perf_counter()
@@ -99,21 +94,17 @@ def run_epochs(
     return learner
 
 
-def write_network(out: Path, variables: Any, about: dict[str, Any]) -> dict[str, Any]:
-    """Write weights and their description; return the latter with the weights' digest."""
-    header = weights.write_weights(out / WEIGHTS, weights.flat(jax.device_get(variables)), shown(about))
-    about = {**about, "digest": header["digest"]}
-    write_text(out / DESCRIPTION, json.dumps(about, indent=1) + "\n")
-    return about
-
-
-def shown(about: dict[str, Any]) -> dict[str, Any]:
-    """Return what the file of the weights repeats of a network.json."""
-    return {name: about[name] for name in ("task", "parameters") if name in about}
+def write_network(out: Path, tensors: Any, about: dict[str, Any], precision: str = "") -> None:
+    """Write weights and their description, which gains their digest; with a precision those of an export, packed."""
+    header = {name: about[name] for name in ("task", "parameters", "commit") if name in about}
+    path = out / (PACKED_WEIGHTS if precision else WEIGHTS)
+    digest = weights.write_weights(path, weights.flat(jax.device_get(tensors)), header)["digest"]
+    about |= {"export": {"precision": precision, "weights_digest": digest}} if precision else {"digest": digest}
+    write_text(out / DESCRIPTION, json.dumps({k: v for k, v in about.items() if k != "commit"}, indent=1) + "\n")
 
 
 def write_results(out: Path, results: dict[str, Any]) -> dict[str, Any]:
-    """Writes results.json; returns its content."""
+    """Write results.json; return its content."""
     write_text(out / RESULTS, json.dumps(results, indent=1) + "\n")
     return results
 
@@ -126,7 +117,7 @@ def weights_file(run: Path) -> Path:
 
 @dataclasses.dataclass(frozen=True)
 class _Description:
-    """What is asked of every network.json."""
+    """The fields that every network.json needs."""
 
     task: str
     digest: str
@@ -134,7 +125,7 @@ class _Description:
 
 
 def read_description(run: Path, kind: str, task: str) -> dict[str, Any]:
-    """The network.json of a finished run."""
+    """Return the network.json of a finished run."""
     path = run / DESCRIPTION
     if not path.is_file():
         raise RunError(f"{run}: holds no trained {kind}; finish it: python -m topological_nav train {task} -o {run}")
@@ -155,10 +146,10 @@ def read_weights(run: Path, template: Any, about: dict[str, Any]) -> Any:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any] | None:
-    """A checkpoint as plain mappings; None: there is none."""
+    """Return a checkpoint as plain mappings, or None where there is none."""
     if not path.is_file():
         return None
-    with readable(path, RunError, "delete it to begin again"):
+    with readable(path, RunError, "delete it to start again"):
         return flax.serialization.msgpack_restore(path.read_bytes())  # type: ignore[return-value]
 
 
@@ -167,12 +158,5 @@ def _restored(template: State, state: Any, path: Path) -> State:
     try:
         learner = flax.serialization.from_state_dict(template, state)
     except (ValueError, KeyError) as error:
-        raise RunError(f"{path}: does not fit the network ({error}); delete it to begin again") from None
+        raise RunError(f"{path}: does not fit the network ({error}); delete it to start again") from None
     return weights.fitting(template, learner, path, RunError)
-
-
-def _cut_metrics(path: Path, phase: str, last: int) -> None:
-    """Drops a phase's lines after its last epoch that a checkpoint holds: these epochs are run again."""
-    if path.is_file():
-        kept = [line for line in read_metrics(path) if line["phase"] != phase or line["epoch"] <= last]
-        write_metrics(path, kept)

@@ -20,9 +20,9 @@ import numpy as np
 import optax
 from sklearn.metrics import confusion_matrix, f1_score
 
-from interactive_nav_common.config import to_dict
+from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import readable
-from topological_nav.config import PITCHES, NetworkTrainConfig
+from topological_nav.config import PITCHES, DataConfig, NetworkTrainConfig
 from topological_nav.data.dataset import PassageImages, RoomImages, load_passages, load_rooms, read_header
 from topological_nav.data.passages import logits_at
 from topological_nav.errors import ALONE, Host, RunError
@@ -49,6 +49,9 @@ from topological_nav.learn.runs import (
     write_network,
     write_results,
 )
+
+SAME = ("robot", "engine", "width", "height", "fov_deg")
+"""What two networks' images must have in common to look through one camera."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,9 +179,10 @@ def _about(header: dict[str, Any], work: _Work, config: NetworkTrainConfig, lear
 
 
 def save_trained(out: Path, trained: Trained) -> Trained:
-    """Writes a network as `load_trained` reads it; returns it with the digest of its weights in `about`."""
-    kept = {name: value for name, value in trained.about.items() if name != "export"}
-    return dataclasses.replace(trained, about=write_network(out, trained.variables, kept))
+    """Write a network as `load_trained` reads it; return it with the digest of its weights in `about`."""
+    about = {name: value for name, value in trained.about.items() if name != "export"}
+    write_network(out, trained.variables, about)
+    return dataclasses.replace(trained, about=about)
 
 
 def load_trained(run: Path) -> Trained:
@@ -306,3 +310,60 @@ def _started_from(learner: Learner, run: Path) -> Learner:
         raise RunError(
             f"init: {run} does not fit: {error}; it is {donor.about['backbone']} of width {donor.about['width']}"
         ) from None
+
+
+def seen_by(network: Trained) -> dict[str, Any]:
+    """Return the settings of the images that a network learned from, the lens as it was."""
+    return {**network.about["data"], "fov_deg": network.about["fov_deg"]}
+
+
+def need_task(about: dict[str, Any], task: str, who: str) -> None:
+    """Refuse a run of another task."""
+    if about["task"] != task:
+        raise RunError(f"{who} was trained for '{about['task']}', expected a run of 'train {task}'")
+
+
+def load_pair(localiser_run: Path, detector_run: Path, same: Sequence[str] = SAME) -> tuple[Trained, Trained]:
+    """Load a room classifier and a passage detector of finished runs."""
+    networks = load_trained(localiser_run), load_trained(detector_run)
+    for run, network, task in zip((localiser_run, detector_run), networks, ("rooms", "passages"), strict=True):
+        need_task(network.about, task, f"{run}:")
+    _need_one_camera(*networks, same)
+    return networks
+
+
+@dataclasses.dataclass(frozen=True)
+class Networks:
+    """Group what a navigator sees by."""
+
+    localiser: Trained
+    detector: Trained
+    camera: DataConfig
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """Return the digests of the weights, as a map names those that it was built with."""
+        return {"localiser": self.localiser.about["digest"], "detector": self.detector.about["digest"]}
+
+
+def load_networks(localiser: Path, detector: Path) -> Networks:
+    """Load the networks of two finished runs; the first may be of either task, as any embedding localises."""
+    pair = load_trained(localiser), load_trained(detector)
+    return Networks(*pair, camera_of(*pair))
+
+
+def camera_of(localiser: Trained, detector: Trained) -> DataConfig:
+    """Return the settings of the camera that both networks learned from."""
+    need_task(detector.about, "passages", "the detector")
+    _need_one_camera(localiser, detector, (*SAME, "headings"))
+    return overlay(DataConfig(), seen_by(localiser), "network.json")
+
+
+def _need_one_camera(localiser: Trained, detector: Trained, same: Sequence[str]) -> None:
+    first, second = seen_by(localiser), seen_by(detector)
+    for name in same:
+        if first[name] != second[name]:
+            raise RunError(
+                f"the localiser learned from images with {name} = {first[name]!r}, the detector {second[name]!r}; "
+                "train both on one dataset"
+            )

@@ -22,9 +22,8 @@ from topological_nav.data.dataset import headings
 from topological_nav.data.folders import lens_of
 from topological_nav.errors import Progress, SpaceError
 from topological_nav.learn.localise import nearest_turn
-from topological_nav.learn.pairs import Networks, load_networks
 from topological_nav.learn.runs import DESCRIPTION
-from topological_nav.learn.training import Trained
+from topological_nav.learn.training import Networks, Trained, load_networks
 from topological_nav.maps.graph import TopologicalMap, assemble, lengths
 from topological_nav.maps.nodes import place_nodes
 from topological_nav.maps.sight import NetworkSight, Sight, place_distances

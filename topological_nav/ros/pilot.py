@@ -11,7 +11,7 @@ from interactive_nav_common.errors import ConfigError
 from topological_nav.config import NavigatorConfig
 from topological_nav.data.folders import lens_of
 from topological_nav.drives.driving import local_policy
-from topological_nav.learn.pairs import load_networks
+from topological_nav.learn.training import load_networks
 from topological_nav.maps.graph import load_map
 from topological_nav.maps.sight import NetworkSight
 from topological_nav.navigate.navigator import Navigator

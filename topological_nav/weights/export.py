@@ -33,9 +33,8 @@ from topological_nav.config import PITCHES, ExportConfig
 from topological_nav.data.dataset import headings, load_rooms
 from topological_nav.drives.driving import TrainedPolicy, load_policy
 from topological_nav.errors import MapError, Progress, RunError
-from topological_nav.learn.pairs import SAME, camera_of, load_pair
 from topological_nav.learn.runs import CONFIG, DESCRIPTION, PACKED_WEIGHTS, RESULTS, shown, weights_file
-from topological_nav.learn.training import Trained, load_trained
+from topological_nav.learn.training import SAME, Trained, camera_of, load_pair, load_trained
 from topological_nav.maps.build import Pictures
 from topological_nav.maps.graph import load_map, save_map
 from topological_nav.scenes.space import free_space

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav_common.config import Natural
-from interactive_nav_common.errors import FileError, regular
-from interactive_nav_common.files import check_name, writing
+from interactive_nav_common.errors import regular
+from interactive_nav_common.files import check_name, remove_stale, whole_folder, write_text, writing
 from interactive_nav_common.records import Reader
 from interactive_nav_common.runs import weights
 from interactive_nav_common.untrusted.reading import read_npz
@@ -65,25 +65,15 @@ def save_snapshot(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, en
     Only the newest holds the environments, and only if they take no more than the limit.
     """
     final = root / f"{meta.env_steps:012d}"
-    partial = root / f".partial-{meta.env_steps:012d}"
-    try:
-        with writing(final, GOES_ON, "cannot write the checkpoint"):
-            remove_partial(root)
-            partial.mkdir(parents=True)
-            _write(partial / LEARNER, flax.serialization.to_bytes(jax.device_get(snapshot.learner)))
-            if snapshot.env_state is not None and megabytes(snapshot.env_state) <= env_state_limit_mb:
-                leaves = [np.asarray(raw) for raw in map(_raw, jax.tree.leaves(snapshot.env_state))]
-                with open(partial / ENV_STATE, "wb") as file:
-                    np.savez(file, *leaves)
-                    _flush(file)
-            meta = dataclasses.replace(meta, sha256={p.name: _sha256(p) for p in sorted(partial.iterdir())})
-            _write(partial / META, json.dumps(dataclasses.asdict(meta), indent=1).encode())
-            if final.exists():
-                _remove(final)
-            os.replace(partial, final)
-    except FileError:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
+    with writing(final, GOES_ON, "cannot write the checkpoint"), whole_folder(final, overwrite=True) as part:
+        (part / LEARNER).write_bytes(flax.serialization.to_bytes(jax.device_get(snapshot.learner)))
+        if snapshot.env_state is not None and megabytes(snapshot.env_state) <= env_state_limit_mb:
+            np.savez(part / ENV_STATE, *(np.asarray(_raw(leaf)) for leaf in jax.tree.leaves(snapshot.env_state)))
+        meta = dataclasses.replace(meta, sha256={p.name: _sha256(p) for p in sorted(part.iterdir())})
+        (part / META).write_text(json.dumps(dataclasses.asdict(meta), indent=1))
+        for path in part.iterdir():  # on disk before the checkpoint that it replaces is gone
+            with open(path, "rb") as file:
+                os.fsync(file.fileno())
     kept = list_checkpoints(root)
     best = best_checkpoint(kept)
     for old in kept[:-keep]:
@@ -205,7 +195,7 @@ def keep_policy(folder: Path, target: Path, step: float = STEP) -> None:
     else:
         shutil.copy2(folder / POLICY, target)
     kept = dataclasses.replace(meta, sha256={POLICY: _sha256(target / POLICY)})
-    _write(target / META, json.dumps(dataclasses.asdict(kept), indent=1).encode())
+    write_text(target / META, json.dumps(dataclasses.asdict(kept), indent=1))
 
 
 def weights_digest(folder: Path) -> str:
@@ -264,30 +254,17 @@ def megabytes(tree: Any) -> float:
 
 def remove_partial(root: Path) -> None:
     """Remove what a killed run left half written."""
-    for left_over in root.glob(".partial-*"):
-        shutil.rmtree(left_over, ignore_errors=True)
+    for left_over in root.glob(".[0-9]*"):
+        remove_stale(root / left_over.name.split(".")[1])
 
 
 def _remove(folder: Path) -> None:
     """Remove a folder at once: a reader sees all of it or nothing."""
-    gone = folder.with_name(f".partial-gone-{folder.name}")
-    os.replace(folder, gone)
-    shutil.rmtree(gone)
+    shutil.rmtree(folder.rename(folder.with_name(f".{folder.name}.part-{os.getpid()}")))
 
 
 def _sha256(path: Path) -> str:
     return hashlib.sha256(regular(path).read_bytes()).hexdigest()
-
-
-def _write(path: Path, data: bytes) -> None:
-    with open(path, "wb") as file:
-        file.write(data)
-        _flush(file)
-
-
-def _flush(file: Any) -> None:
-    file.flush()
-    os.fsync(file.fileno())
 
 
 def _is_key(leaf: Any) -> bool:

@@ -35,8 +35,8 @@ from train.learners.algorithms import ALGORITHMS
 from train.learners.learner import Snapshot, TrainResult, Update
 from train.runs import checkpoint, tracking
 from train.runs.checkpoint import CheckpointMeta
-from train.runs.progress import TrainingDisplay, describe
 from train.runs.run_folder import GOES_ON, RunFolder, claim
+from train.runs.tracking import TrainingDisplay, describe
 
 
 def build_env(config: EnvConfig) -> Any:

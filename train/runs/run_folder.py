@@ -20,7 +20,7 @@ from typing import Any
 from interactive_nav_common.config import Natural, NotNegative, flatten, replace
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import append_text, write_text, writing
-from interactive_nav_common.records import METRICS, RUNS, read_metrics, write_metrics
+from interactive_nav_common.records import METRICS, RUNS, cut_metrics, read_metrics
 from interactive_nav_common.versions import versions
 from train.config import TrainConfig
 from train.config_io import from_yaml, to_yaml
@@ -130,8 +130,7 @@ class RunFolder:
 
     def cut_metrics(self, env_steps: int) -> None:
         """Drop the lines after a checkpoint that a run continues from: their steps are taken again."""
-        if self.metrics.is_file():
-            write_metrics(self.metrics, [line for line in self.read_metrics() if line["env_steps"] <= env_steps])
+        cut_metrics(self.metrics, lambda line: line["env_steps"] <= env_steps)
 
 
 def claim(path: Path, needed_mb: float = 0.0) -> None:

@@ -18,8 +18,7 @@ from topological_nav.config import RUNS, DataConfig
 from topological_nav.data.passages import draw_passages
 from topological_nav.drives.driving import load_policy
 from topological_nav.errors import RunError
-from topological_nav.learn.pairs import camera_of
-from topological_nav.learn.training import load_trained
+from topological_nav.learn.training import camera_of, load_trained
 from topological_nav.maps.build import renderer_of
 from topological_nav.maps.graph import load_map, save_map
 from topological_nav.ros.__main__ import _seeing

@@ -68,7 +68,7 @@ def test_folder_of_a_finished_run(finished):
     summary = json.loads((folder.path / "summary.json").read_text())
     assert summary["env_steps"] == 1280 and summary["completed"] and summary["run"] == "toy"
     assert "100 %" in printed and "steps/s" in printed and "success" in printed and "s left" in printed
-    assert not list(folder.path.rglob("*partial*"))
+    assert not list(folder.checkpoints.glob(".*"))
 
 
 def test_fewer_steps_for_an_environment_than_an_episode_may_have_are_told(finished, tmp_path):
@@ -93,7 +93,8 @@ def test_resume_through_files_equals_uninterrupted_run(finished, tmp_path):
     half = RunFolder(tmp_path / "toy")
     with open(half.metrics, "a") as file:  # a killed run's lines beyond its checkpoint, the last cut short
         file.write('{"env_steps": 700}\n{"env_st')
-    (half.checkpoints / ".partial-000000000768").mkdir()
+    (half.checkpoints / ".000000000768.part-123-0123abcd").mkdir()
+    os.utime(half.checkpoints / ".000000000768.part-123-0123abcd", (0, 0))
     resumed, half, _ = train_run(toy_config(tmp_path, updates=5), quiet(), build_env=build_toy)
     jax.tree.map(np.testing.assert_array_equal, resumed.snapshot.learner, result.snapshot.learner)
     saved = learner_of(half, result.snapshot.learner)
@@ -103,7 +104,7 @@ def test_resume_through_files_equals_uninterrupted_run(finished, tmp_path):
         [{k: v for k, v in line.items() if k not in clocks} for line in read_metrics(f.metrics)] for f in (half, folder)
     ]
     assert lines[0] == lines[1]
-    assert not list(half.checkpoints.glob(".partial*"))
+    assert not list(half.checkpoints.glob(".*"))
 
 
 def test_another_config_in_the_same_folder_is_refused(finished):
