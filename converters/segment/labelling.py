@@ -1,4 +1,4 @@
-"""An unlabelled scan in, NYU40 labels of its vertices out, and how well they fit a labelled one's."""
+"""Label the vertices of an unlabelled scan with NYU40 ids; score how well they fit those of a labelled one."""
 
 import dataclasses
 from collections.abc import Callable
@@ -32,42 +32,38 @@ Report = Callable[[str, float], None]
 
 
 def load_scores(weights: Path | None = None) -> Scores:
-    """The network with weights, for `label_scan`; None: the packaged ones."""
+    """Load the network for `label_scan`; None: with the packaged weights."""
     return make_scores(*load_network(weights or WEIGHTS))
 
 
 def score_points(surface: Surface, floors_m: tuple[float, ...], scores: Scores, report: Report) -> np.ndarray:
-    """(n, classes) scores of a surface's points, storey by storey; zeros too high above a floor."""
+    """Return (n, classes) scores of a surface's points, storey by storey; zeros too high above a floor."""
     out, of = np.zeros((len(surface.points), len(NAMES)), np.float32), storey_of(surface.points[:, 2], floors_m)
     for k, floor_m in enumerate(floors_m):
         mine = np.flatnonzero(of == k)
         colours = None if surface.colours is None else surface.colours[mine]
         part = Surface(surface.points[mine], surface.normals[mine], colours, surface.face[mine])
         voxels = voxelise(part, floor_m)
-        found = score_voxels(voxels, scores, lambda share, k=k: report("segment", (k + share) / len(floors_m)))
+        scored = score_voxels(voxels, scores, lambda share, k=k: report("segment", (k + share) / len(floors_m)))
         inside = voxels.of_point >= 0
-        out[mine[inside]] = found[voxels.of_point[inside]]
+        out[mine[inside]] = scored[voxels.of_point[inside]]
     return out
 
 
 def label_scan(raw: RawScene, scores: Scores, report: Report = lambda stage, share: None) -> np.ndarray:
-    """(n,) int64 NYU40 ids of the scan's vertices; its own labels are not looked at.
-
-    Args:
-        report: progress, (stage, share).
-    """
+    """Return (n,) int64 NYU40 ids of the scan's vertices; its labels are not read. `report` takes stage, share."""
     scan = raw.scan
     floors = tuple(s.height_m for s in raw.storeys)
     if not floors:
         given = raw.floor_height_m
         floors = (floor_level(scan.vertices, scan.faces, raw.name) if given is None else given,)
     surface = sample_surface(scan)
-    found = at_vertices(score_points(surface, floors, scores, report), surface, scan.faces, len(scan.vertices))
-    return np.where(found.any(axis=1), NYU40[found.argmax(axis=1)], UNLABELLED)
+    scored = at_vertices(score_points(surface, floors, scores, report), surface, scan.faces, len(scan.vertices))
+    return np.where(scored.any(axis=1), NYU40[scored.argmax(axis=1)], UNLABELLED)
 
 
 def objects_found(raw: RawScene, scan: ScanMesh) -> int:
-    """How many of a source's annotated objects `propose` finds by the labels of a scan: same category, `FOUND_IOU`."""
+    """Return how many of a source's annotated objects `propose` finds by a scan's labels: category, `FOUND_IOU`."""
     proposals = propose_instances(scan)
     boxes = [(a.category, bounds(annotated_vertices(a, raw.cads))) for a in raw.annotations]
     return sum(
@@ -77,20 +73,16 @@ def objects_found(raw: RawScene, scan: ScanMesh) -> int:
 
 
 def score_source(raw: RawScene, scores: Scores, report: Report) -> dict[str, Any]:
-    """IoU by class at the vertices of a labelled source, and the annotated objects found beside true labels."""
+    """Return IoU by class at the vertices of a labelled source, and how many annotated objects `propose` finds."""
     labels = label_scan(raw, scores, report)
     iou = intersection_over_union(classes_of(raw.scan.labels), classes_of(labels))
-    found = objects_found(raw, dataclasses.replace(raw.scan, labels=labels))
-    return {"iou": iou, "objects": len(raw.annotations), "found": found, "found_true": objects_found(raw, raw.scan)}
+    count = objects_found(raw, dataclasses.replace(raw.scan, labels=labels))
+    return {"iou": iou, "objects": len(raw.annotations), "found": count, "found_true": objects_found(raw, raw.scan)}
 
 
 def score_homes(seed: int, count: int, scores: Scores, report: Report) -> dict[str, float]:
-    """IoU by class over the surfaces of whole generated buildings of all tiers, their furniture held out.
-
-    Args:
-        report: progress, (stage, share).
-    """
-    truth, found = [], []
+    """Return IoU by class over the surfaces of generated buildings of all tiers, their furniture held out."""
+    truth, predicted = [], []
     while len(truth) < count:
         seed += 1
         try:
@@ -100,6 +92,6 @@ def score_homes(seed: int, count: int, scores: Scores, report: Report) -> dict[s
         guess = score_points(surface, (0.0,), scores, lambda stage, share: None)
         inside = guess.any(axis=1)
         truth.append(classes[inside])
-        found.append(guess[inside].argmax(axis=1))
+        predicted.append(guess[inside].argmax(axis=1))
         report("score", len(truth) / count)
-    return intersection_over_union(np.concatenate(truth), np.concatenate(found))
+    return intersection_over_union(np.concatenate(truth), np.concatenate(predicted))

@@ -1,4 +1,4 @@
-"""Dense tiles of voxels in, class scores of every voxel out: a 3-D U-Net whose finest maps have half the resolution.
+"""Score the classes of every voxel of dense tiles: a 3-D U-Net whose finest maps have half the resolution.
 
 Each cell of 2 x 2 x 2 voxels is one place with eight times the channels, on the way in and out: an eighth of the work,
 and nothing is lost. Normalisation is over channels alone, so that a tile's size changes nothing.
@@ -29,14 +29,14 @@ MULTIPLE = 8
 
 
 class VoxelNet(nn.Module):
-    """Scores [N, X, Y, Z, classes] of tiles [N, X, Y, Z, FEATURES + 2]."""
+    """Compute scores [N, X, Y, Z, classes] of tiles [N, X, Y, Z, FEATURES + 2]."""
 
     widths: Sequence[int] = (40, 64, 96)
     dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Scores of every voxel; sides are multiples of `MULTIPLE`."""
+        """Return the scores of every voxel; sides are multiples of `MULTIPLE`."""
         x, skips = _fold(x.astype(self.dtype)), []
         for level, width in enumerate(self.widths):
             if level:
@@ -55,25 +55,23 @@ class VoxelNet(nn.Module):
 
 
 def _fold(x: jax.Array) -> jax.Array:
-    """[N, X, Y, Z, C] -> [N, X/2, Y/2, Z/2, 8C]."""
+    """Turn [N, X, Y, Z, C] into [N, X/2, Y/2, Z/2, 8C]."""
     n, a, b, c, f = x.shape
     x = x.reshape(n, a // 2, 2, b // 2, 2, c // 2, 2, f).transpose(0, 1, 3, 5, 2, 4, 6, 7)
     return x.reshape(n, a // 2, b // 2, c // 2, 8 * f)
 
 
 def _unfold(x: jax.Array) -> jax.Array:
-    """[N, X, Y, Z, 8C] -> [N, 2X, 2Y, 2Z, C]."""
+    """Turn [N, X, Y, Z, 8C] into [N, 2X, 2Y, 2Z, C]."""
     n, a, b, c, f = x.shape
     x = x.reshape(n, a, b, c, 2, 2, 2, f // 8).transpose(0, 1, 4, 2, 5, 3, 6, 7)
     return x.reshape(n, 2 * a, 2 * b, 2 * c, f // 8)
 
 
 def dense(index: jax.Array, features: jax.Array, shape: tuple[int, int]) -> jax.Array:
-    """[N, X, Y, LAYERS, FEATURES + 2] tiles: occupied, height over the floor (in 3 m), then the features.
+    """Return [N, X, Y, LAYERS, FEATURES + 2] tiles: occupied, height over the floor (in 3 m), then the features.
 
-    Args:
-        index: [N, K, 3] int; rows with a negative x are none.
-        features: [N, K, FEATURES] int8.
+    Rows of the index [N, K, 3] with a negative x are none; features are [N, K, FEATURES] int8.
     """
     height = (index[..., 2:] + 0.5) * (VOXEL_M / 3) - BELOW_M / 3
     given = jnp.concatenate([jnp.ones_like(height), height, features.astype(jnp.float32) / 127], axis=-1)
@@ -87,7 +85,7 @@ Scores = Callable[[jax.Array, jax.Array, tuple[int, int]], jax.Array]
 
 
 def make_scores(net: VoxelNet, variables: Any) -> Scores:
-    """A network with weights, compiled once a shape."""
+    """Return a network with weights, compiled once a shape."""
 
     @functools.partial(jax.jit, static_argnums=2)
     def scores(index: jax.Array, features: jax.Array, shape: tuple[int, int]) -> jax.Array:
@@ -99,7 +97,7 @@ def make_scores(net: VoxelNet, variables: Any) -> Scores:
 
 
 def score_voxels(voxels: Voxels, scores: Scores, report: Callable[[float], None] = lambda share: None) -> np.ndarray:
-    """(k, classes) scores of occupied voxels, tile by tile."""
+    """Return (k, classes) scores of occupied voxels, tile by tile."""
     out = np.zeros((len(voxels.index), len(NAMES)), np.float32)
     extent = voxels.index[:, :2].max(axis=0, initial=0) + 1
     side = [min(TILE, int(-(-n // 16) * 16)) for n in extent]
@@ -110,16 +108,16 @@ def score_voxels(voxels: Voxels, scores: Scores, report: Callable[[float], None]
         low = np.array(start) - [MARGIN if n > s else 0 for n, s in zip(extent, side, strict=True)]
         at = voxels.index[:, :2] - low
         near = np.flatnonzero(((at >= 0) & (at < side)).all(axis=1))
-        own = ((voxels.index[near, :2] >= start) & (voxels.index[near, :2] < np.add(start, step))).all(axis=1)
-        if own.any():
-            tiles.append((low, near, near[own]))
+        inner = ((voxels.index[near, :2] >= start) & (voxels.index[near, :2] < np.add(start, step))).all(axis=1)
+        if inner.any():
+            tiles.append((low, near, near[inner]))
     most = max((len(near) for _, near, _ in tiles), default=0)
-    for k, (low, near, own) in enumerate(tiles):
+    for k, (low, near, inner) in enumerate(tiles):
         index, features = np.full((1, most, 3), -1), np.zeros((1, most, FEATURES), np.int8)
         index[0, : len(near)], features[0, : len(near)] = voxels.index[near] - [*low, 0], voxels.features[near]
-        found = scores(jnp.asarray(index), jnp.asarray(features), (side[0], side[1]))[0]
-        x, y, z = (voxels.index[own] - [*low, 0]).T
-        out[own] = np.asarray(found[x, y, z])
+        tile = scores(jnp.asarray(index), jnp.asarray(features), (side[0], side[1]))[0]
+        x, y, z = (voxels.index[inner] - [*low, 0]).T
+        out[inner] = np.asarray(tile[x, y, z])
         report((k + 1) / len(tiles))
     return out
 

@@ -1,4 +1,4 @@
-"""Settings in, a folder with weights out: buildings are generated beside the training, which goes on where it stopped.
+"""Train the network on buildings that are generated beside the training, which continues where it stopped.
 
 OUT/crops/SEED.npz   labelled voxels of a generated building, held_out/SEED.npz of those with other furniture
     checkpoint.msgpack, weights.safetensors, metrics.jsonl   as of the last save
@@ -26,7 +26,8 @@ from converters.segment.network import VoxelNet, dense, save_network
 from converters.segment.samples import Crop, generate_crops, read_crops
 from converters.segment.voxels import FEATURES, NAMES, UNKNOWN, intersection_over_union
 from interactive_nav_common.config import AtLeastOne, Count, Positive, Seed, Settings
-from interactive_nav_common.files import whole_file, write_text
+from interactive_nav_common.files import append_text, whole_file
+from interactive_nav_common.records import METRICS, cut_metrics
 
 HELD_OUT_SEED = 900_000
 State = tuple[Any, Any]
@@ -68,7 +69,7 @@ class SegmentConfig(Settings):
 
 
 def turned(crop: Crop, side: int, quarter: int, mirror: bool) -> Crop:
-    """The crop turned by quarters, counter-clockwise, and then mirrored in x, within its square."""
+    """Return the crop turned by quarters, counter-clockwise, and then mirrored in x, within its square."""
     index, features = crop.index.astype(np.int64), crop.features.copy()
     for _ in range(quarter % 4):
         index = np.stack([side - 1 - index[:, 1], index[:, 0], index[:, 2]], axis=1)
@@ -79,7 +80,7 @@ def turned(crop: Crop, side: int, quarter: int, mirror: bool) -> Crop:
 
 
 def batch_of(crops: Sequence[Crop], config: SegmentConfig, rng: np.random.Generator | None) -> tuple[np.ndarray, ...]:
-    """Index [N, K, 3] i32, features [N, K, FEATURES] i8 and classes [N, K] u8; turned at random with `rng`."""
+    """Return index [N, K, 3] i32, features [N, K, FEATURES] i8 and classes [N, K] u8; turned if `rng`."""
     n, k = len(crops), config.most_voxels
     index, classes = np.full((n, k, 3), -1, np.int32), np.full((n, k), UNKNOWN, np.uint8)
     features = np.zeros((n, k, FEATURES), np.int8)
@@ -101,15 +102,15 @@ def _scores_at(net: VoxelNet, params: Any, index: jax.Array, features: jax.Array
 
 
 def make_step(net: VoxelNet, config: SegmentConfig) -> tuple[Callable[[Any], State], Callable[..., tuple[Any, ...]]]:
-    """Functions: parameters -> state, and (state, learning rate, batch) -> state, loss; rare classes weigh more."""
+    """Return parameters -> state, and (state, learning rate, batch) -> state, loss; rare classes weigh more."""
     rule = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam(), optax.add_decayed_weights(1e-3))
 
     def loss_of(params: Any, index: jax.Array, features: jax.Array, classes: jax.Array) -> jax.Array:
         scores = _scores_at(net, params, index, features, config.side)
-        known = classes != UNKNOWN
-        classes = jnp.where(known, classes, 0)
-        count = jnp.zeros(len(NAMES)).at[classes].add(known)
-        weight = jnp.where(known, ((count.sum() / (count + 1.0)) ** 0.5)[classes], 0.0)
+        labelled = classes != UNKNOWN
+        classes = jnp.where(labelled, classes, 0)
+        count = jnp.zeros(len(NAMES)).at[classes].add(labelled)
+        weight = jnp.where(labelled, ((count.sum() / (count + 1.0)) ** 0.5)[classes], 0.0)
         loss = optax.softmax_cross_entropy_with_integer_labels(scores, classes)
         return (weight * loss).sum() / jnp.maximum(weight.sum(), 1.0)
 
@@ -123,23 +124,19 @@ def make_step(net: VoxelNet, config: SegmentConfig) -> tuple[Callable[[Any], Sta
 
 
 def score_crops(net: VoxelNet, params: Any, crops: Sequence[Crop], config: SegmentConfig) -> dict[str, float]:
-    """Class -> IoU over all voxels of the crops."""
-    truth, found = [], []
+    """Return class -> IoU over all voxels of the crops."""
+    truth, predicted = [], []
     for first in range(0, len(crops), config.batch):
         index, features, classes = batch_of(crops[first : first + config.batch], config, None)
-        found.append(np.asarray(_scores_at(net, params, index, features, config.side).argmax(axis=-1)).ravel())
+        predicted.append(np.asarray(_scores_at(net, params, index, features, config.side).argmax(axis=-1)).ravel())
         truth.append(classes.ravel())
-    return intersection_over_union(np.concatenate(truth), np.concatenate(found)) if crops else {}
+    return intersection_over_union(np.concatenate(truth), np.concatenate(predicted)) if crops else {}
 
 
 def train(out: Path, config: SegmentConfig, report: Callable[[str, float], None], tell: Callable[[str], None]) -> dict:
-    """Trains, or goes on; what was learned is saved whatever ends it.
+    """Train, or continue; save however it ends. Return the IoU by class on held-out crops, and `mean`.
 
-    Args:
-        report: progress, (stage, share).
-
-    Returns:
-        IoU by class on what was held out, and `mean`.
+    `report` takes progress: stage and share.
     """
     tasks = []
     for folder, split, seed, count, crops in (
@@ -164,10 +161,10 @@ def train(out: Path, config: SegmentConfig, report: Callable[[str, float], None]
 
 
 class _Learner:
-    """Network, optimiser, crops and how far they are."""
+    """Hold the network, its optimiser, the crops and how far the training is."""
 
-    def __init__(self, out: Path, config: SegmentConfig, tell: Callable[[str], None], made: Any) -> None:
-        self.out, self.config, self.tell, self.made = out, config, tell, made
+    def __init__(self, out: Path, config: SegmentConfig, tell: Callable[[str], None], paths: Any) -> None:
+        self.out, self.config, self.tell, self.paths = out, config, tell, paths
         self.crops: dict[str, list[Crop]] = {"crops": [], "held_out": []}
         self.net = VoxelNet(config.widths, jnp.bfloat16 if config.half else jnp.float32)
         start, self.step = make_step(self.net, config)
@@ -177,14 +174,15 @@ class _Learner:
         self.loss: Any = float("nan")
         if (out / "checkpoint.msgpack").is_file():
             self.at = flax.serialization.from_bytes(self.at, (out / "checkpoint.msgpack").read_bytes())
+        cut_metrics(out / METRICS, lambda row: row["step"] <= self.at["steps"])
 
     def take(self, wait_s: float | None) -> None:
-        """Reads the next building that is finished."""
-        path = self.made.next(wait_s)
+        """Read the next building that is finished."""
+        path = self.paths.next(wait_s)
         self.crops[path.parent.name] += read_crops(path)
 
     def run(self, report: Callable[[str, float], None]) -> None:
-        """Steps until there were enough."""
+        """Run the steps that are left."""
         at, config, crops = self.at, self.config, self.crops["crops"]
         rng = np.random.default_rng((config.seed, at["steps"]))
         saved = last = time.monotonic()
@@ -206,20 +204,19 @@ class _Learner:
                 saved = last = time.monotonic()
 
     def save(self) -> None:
-        """Writes checkpoint and weights."""
+        """Write checkpoint and weights."""
         if self.at["steps"]:
             with whole_file(self.out / "checkpoint.msgpack") as partial:
                 partial.write_bytes(flax.serialization.to_bytes(jax.device_get(self.at)))
             save_network(self.out / "weights.safetensors", self.net, {"params": self.at["state"][0]})
 
     def score(self, most: int) -> dict[str, float]:
-        """IoU by class of so many held-out crops, and `mean`: one line of metrics.jsonl, and of the console."""
+        """Return IoU by class of so many held-out crops, and `mean`; add a line to metrics.jsonl and the console."""
         scores = score_crops(self.net, self.at["state"][0], self.crops["held_out"][:most], self.config)
         scores["mean"] = float(np.mean(list(scores.values()))) if scores else 0.0
         steps, seconds, loss = self.at["steps"], self.at["seconds"], float(self.loss)
         row = {"step": steps, "seconds": round(seconds, 1), "loss": None if np.isnan(loss) else loss, "iou": scores}
-        path = self.out / "metrics.jsonl"
-        write_text(path, (path.read_text() if path.is_file() else "") + json.dumps(row) + "\n")
+        append_text(self.out / METRICS, json.dumps(row) + "\n")
         self.tell(f"step {steps}, {seconds:.0f} s, {len(self.crops['crops'])} crops: loss {loss:.3f}, "
                   f"held-out mIoU {scores['mean']:.3f}")  # fmt: skip
         return scores

@@ -10,7 +10,7 @@ from docs.studies import rooms as rooms_study
 from interactive_nav.scenes.scene import load_scene
 from topological_nav.__main__ import main
 from topological_nav.commands import progress
-from topological_nav.learn.localise import nearest_node
+from topological_nav.learn.networks import nearest_node
 from topological_nav.maps import build
 from topological_nav.maps.graph import load_map
 from topological_nav.ros.__main__ import main as nodes

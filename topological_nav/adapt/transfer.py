@@ -33,7 +33,7 @@ from topological_nav.data.domains import as_seen, preset
 from topological_nav.data.passages import balanced
 from topological_nav.errors import ALONE, DatasetError, Host, MapError
 from topological_nav.learn.learning import Learner, labelled_epoch, make_learner, over
-from topological_nav.learn.localise import Places, in_words, localisation_scores
+from topological_nav.learn.networks import Places, in_words, localisation_scores
 from topological_nav.learn.runs import claimed, run_epochs, write_results
 from topological_nav.learn.training import (
     Networks,

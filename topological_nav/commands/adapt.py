@@ -17,7 +17,7 @@ from topological_nav.data.domains import as_seen, preset
 from topological_nav.errors import Host
 from topological_nav.figures.maps import save
 from topological_nav.figures.transfer_figures import features_figure, passages_figure
-from topological_nav.learn.localise import in_words
+from topological_nav.learn.networks import in_words
 from topological_nav.weights.packaged import choose
 
 

@@ -25,7 +25,7 @@ from topological_nav.drives.frames import embed_drives
 from topological_nav.drives.imitation import grid_table, train_grid, train_policy
 from topological_nav.figures.drive_figures import drives_figure, policy_figure
 from topological_nav.figures.maps import curves_figure, dataset_figure, save
-from topological_nav.learn.localise import in_words
+from topological_nav.learn.networks import in_words
 from topological_nav.learn.training import train as train_network
 
 

@@ -37,7 +37,7 @@ def build(
 
 
 def keep_map(built: Built, out: Path, ends: Sequence[int] | None = None) -> None:
-    """Writes a map, draws it, with the way between two nodes where it is asked for, and tells of it."""
+    """Write, draw and describe a map, with the path between two nodes if requested."""
     save_map(built.map, out)
     route = None
     if ends:
@@ -58,9 +58,9 @@ def export_runs(arguments: argparse.Namespace) -> None:
     config = overridden(ExportConfig(), arguments.settings)
     with bar() as tell:
         runs = (arguments.localiser, arguments.detector, arguments.policy, arguments.maps)
-        exported = export(*runs, arguments.images, arguments.out, config, tell)
+        sizes, compared = export(*runs, arguments.images, arguments.out, config, tell)
     picture = arguments.picture or arguments.out.with_name(f"{arguments.out.name}.png")
-    save(export_figure(exported, config.limit_mib), picture)
-    for name, value in exported.compared.scores.items():
+    save(export_figure(sizes, compared, config.limit_mib), picture)
+    for name, value in compared.scores.items():
         print(f"{name.replace('_', ' ')}: {value:.3g}")
-    print(f"{arguments.out}: {size_lines(exported.sizes, config.limit_mib)}; drawn in {picture}")
+    print(f"{arguments.out}: {size_lines(sizes, config.limit_mib)}; drawn in {picture}")

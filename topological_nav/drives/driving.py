@@ -68,7 +68,7 @@ def load_policy(
     """Return the policy of a finished run.
 
     `localiser` and `detector` are run folders of the networks that embed its images; None: where they were when it
-    learned, seen from the run folder.
+    learned, relative to the run folder.
     """
     run = Path(run_folder)
     about = read_description(run, "policy", "policy")

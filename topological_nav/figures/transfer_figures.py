@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from topological_nav.figures.maps import curves
-from topological_nav.weights.export import PRECISION, Exported
+from topological_nav.weights.export import PRECISION, Compared
 from train.figures.style import BLUE, ORANGE, RC, VERMILION, panels, plt
 
 _SHOWN = 6
@@ -79,10 +79,9 @@ def _bars(axis: Axes, at: np.ndarray, values: Sequence[float], width: float, col
     axis.bar_label(bars, fmt="%.2f", fontsize=8)
 
 
-def export_figure(made: Exported, limit_mib: float) -> Figure:
-    """Three panels: distances of embeddings, probabilities of passages, sizes."""
+def export_figure(sizes: Mapping[str, int], compared: Compared, limit_mib: float) -> Figure:
+    """Draw three panels: distances of embeddings, probabilities of passages, sizes."""
     figure, ((left, middle, right),) = panels((13, 3.8), 1, 3)
-    compared = made.compared
     rows = [("by precision, localiser", compared.embedding[0]), ("by precision, detector", compared.embedding[1])]
     if (compared.apart > 0).any():
         rows.append(("to the nearest image of another place", compared.apart))
@@ -98,8 +97,8 @@ def export_figure(made: Exported, limit_mib: float) -> Figure:
     middle.plot([0, 1], [0, 1], color="0.7", lw=1)
     middle.scatter(*compared.probability.reshape(2, -1), s=8, alpha=0.6)
     middle.set(xlabel="probability of a passage, the run", ylabel=f"the same, {PRECISION}", aspect="equal")
-    parts = sorted(made.sizes.items(), key=lambda item: item[1])
-    total = sum(made.sizes.values()) / 2**20
+    parts = sorted(sizes.items(), key=lambda item: item[1])
+    total = sum(sizes.values()) / 2**20
     right.barh([name for name, _ in parts] + ["all"], [size / 2**20 for _, size in parts] + [total])
     right.axvline(limit_mib, color=VERMILION, lw=1)
     right.set(xlabel=f"MiB (at most {limit_mib:g}, the line)")

@@ -1,4 +1,4 @@
-"""A dataset and settings in, a run folder out: backbone without labels where asked for, then rooms or passages.
+"""Train a network for rooms or passages on a dataset, its backbone first without labels if configured; load it again.
 
 RUN/config.yaml      settings; a run that is started again with the same ones goes on
     versions.json    packages, device, commit
@@ -23,7 +23,7 @@ from sklearn.metrics import confusion_matrix, f1_score
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import readable
 from topological_nav.config import PITCHES, DataConfig, NetworkTrainConfig
-from topological_nav.data.dataset import PassageImages, RoomImages, load_passages, load_rooms, read_header
+from topological_nav.data.dataset import RoomImages, load_passages, load_rooms, read_header
 from topological_nav.data.passages import logits_at
 from topological_nav.errors import ALONE, Host, RunError
 from topological_nav.learn.learning import (
@@ -36,8 +36,7 @@ from topological_nav.learn.learning import (
     variable_shapes,
     with_backbone,
 )
-from topological_nav.learn.localise import Places, localisation_scores
-from topological_nav.learn.networks import Contrast, Network
+from topological_nav.learn.networks import Contrast, Network, Places, localisation_scores
 from topological_nav.learn.runs import (
     CHECKPOINT,
     DESCRIPTION,
@@ -65,20 +64,20 @@ class Trained:
 
     @property
     def stored(self) -> str:
-        """Names the numbers that it computes with: the run's digest, and the precision of an exported network."""
+        """Return what names its numbers: the run's digest, and the precision of an exported network."""
         return self.about["digest"] + (f"-{self.about['export']['precision']}" if "export" in self.about else "")
 
     def logits(self, images: np.ndarray) -> np.ndarray:
-        """[..., outputs] of images [..., H, W, 3] u8, of the size that it learned from."""
+        """Return [..., outputs] of images [..., H, W, 3] u8, of the size that it learned from."""
         return self._rows(images, "__call__")
 
     def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
-        """Probability that the way ahead is free so far, of images [N, H, W, 3] u8; see `passages.logits_at`."""
+        """Return the probability that the path is free so far, of images [N, H, W, 3] u8; see `passages.logits_at`."""
         logits = self.logits(images).astype(float)
         return 1.0 / (1.0 + np.exp(-logits_at(logits, self.about["lengths_m"], ahead_m)))
 
     def embed(self, images: np.ndarray) -> np.ndarray:
-        """[..., D] localisation embeddings of images [..., H, W, 3] u8; see `Network.embed`."""
+        """Return [..., D] localisation embeddings of images [..., H, W, 3] u8; see `Network.embed`."""
         return self._rows(images, "embed")
 
     def _rows(self, images: np.ndarray, method: str) -> np.ndarray:
@@ -100,28 +99,23 @@ def _applied(network: Network, method: str, variables: Any, images: jax.Array) -
 
 @dataclasses.dataclass(frozen=True)
 class _Work:
-    """What a run learns from and is scored by."""
+    """The images that a run learns from and is scored by."""
 
-    task: str
-    outputs: int
+    rooms: RoomImages
     images: np.ndarray
     """[N, H, W, 3] u8 for learning."""
     labels: np.ndarray
-    """[N] i32; of passages [N, outputs]."""
-    places: np.ndarray
-    """[P, K, H, W, 3] u8, the headings around places of training, for learning without labels."""
+    """[N] i32; of passages [N, L]."""
     held_out: np.ndarray
     """[M, H, W, 3] u8."""
     truth: np.ndarray
-    """[M] i32; of passages [M, outputs]."""
+    """[M] i32; of passages [M, L]."""
     groups: dict[str, np.ndarray]
     """Name -> rows of `held_out` that are scored together."""
-    names: tuple[str, ...]
-    rooms: RoomImages
     lengths_m: tuple[float, ...] = ()
-    """Of the outputs, of passages."""
+    """[L] of passages; empty for rooms."""
     scored: int = 0
-    """Which of them is scored, of passages."""
+    """The index of the length that passages are scored by."""
 
 
 def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host: Host = ALONE) -> dict[str, Any]:
@@ -129,19 +123,29 @@ def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host:
     header, data = read_header(dataset)
     work = _work(task, dataset, config)
     with claimed(out, {"task": task, "dataset": header, **to_dict(config)}):
-        shape = (data.height, data.width)
-        network = Network(task, config.network, config.width, config.hidden, work.outputs)
-        tx = optax.adam(config.learning_rate)
-        learner = make_learner(network, shape, tx, config.seed)
+        outputs, tx = len(work.lengths_m or work.rooms.names), optax.adam(config.learning_rate)
+        network = Network(task, config.network, config.width, config.hidden, outputs)
+        learner = make_learner(network, (data.height, data.width), tx, config.seed)
         if config.init == "selfsup":
-            learner = _learned_without_labels(learner, work.places, out, config, host)
+            learner = _learned_without_labels(learner, work.rooms, out, config, host)
         elif config.init != "scratch":
             learner = _started_from(learner, Path(config.init))
         epoch = labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment, work.scored)
         one = over(epoch, work.images, work.labels)
         learner = run_epochs(out, "labels", learner, one, config.epochs, _key(config, 2), host)
-        trained = save_trained(out, Trained(network, learner.variables, _about(header, work, config, learner)))
-        return write_results(out, _scores(trained, work))
+        about = {
+            "task": task,
+            "backbone": config.network,
+            "width": config.width,
+            "hidden": config.hidden,
+            "outputs": outputs,
+            "names": list(work.rooms.names) if task == "rooms" else ["blocked", "free"],
+            **({"lengths_m": list(work.lengths_m)} if task == "passages" else {}),
+            "data": header["settings"],
+            "fov_deg": header["fov_deg"],
+            "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params))),
+        }
+        return write_results(out, _scores(save_trained(out, Trained(network, learner.variables, about)), work))
 
 
 def _key(config: NetworkTrainConfig, phase: int) -> jax.Array:
@@ -149,33 +153,18 @@ def _key(config: NetworkTrainConfig, phase: int) -> jax.Array:
 
 
 def _learned_without_labels(
-    learner: Learner, places: np.ndarray, out: Path, config: NetworkTrainConfig, host: Host
+    learner: Learner, rooms: RoomImages, out: Path, config: NetworkTrainConfig, host: Host
 ) -> Learner:
     """Return the learner with a backbone that learned from pairs of images."""
     saved = read_checkpoint(out / CHECKPOINT)
     if saved and saved["phase"] != "pairs":
         return learner  # a checkpoint of the later phase holds this one's outcome
+    places = rooms.images[~rooms.test].reshape(-1, *rooms.images.shape[2:])  # the headings of a place and pitch
     contrast, tx = Contrast(config.network, config.width), optax.adam(config.selfsup_learning_rate)
     epoch = over(paired_epoch(contrast, tx, config.selfsup_batch), places, np.zeros(0, np.int32))
     paired = make_learner(contrast, places.shape[2:4], tx, config.seed)
     paired = run_epochs(out, "pairs", paired, epoch, config.selfsup_epochs, _key(config, 1), host)
     return with_backbone(learner, paired.variables)
-
-
-def _about(header: dict[str, Any], work: _Work, config: NetworkTrainConfig, learner: Learner) -> dict[str, Any]:
-    """Content of network.json, but for the digest."""
-    return {
-        "task": work.task,
-        "backbone": config.network,
-        "width": config.width,
-        "hidden": config.hidden,
-        "outputs": work.outputs,
-        "names": list(work.names),
-        **({"lengths_m": list(work.lengths_m)} if work.task == "passages" else {}),
-        "data": header["settings"],
-        "fov_deg": header["fov_deg"],
-        "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params))),
-    }
 
 
 def save_trained(out: Path, trained: Trained) -> Trained:
@@ -186,7 +175,7 @@ def save_trained(out: Path, trained: Trained) -> Trained:
 
 
 def load_trained(run: Path) -> Trained:
-    """The network of a finished run, or of an export of one (`export`): its weights are f32 in memory either way."""
+    """Load the network of a finished run, or of an export of one: its weights are f32 in memory either way."""
     run = Path(run)
     about = read_description(run, "network", "TASK")
     if about["task"] == "passages" and "lengths_m" not in about:
@@ -203,44 +192,30 @@ def load_trained(run: Path) -> Trained:
 def _work(task: str, dataset: Path, config: NetworkTrainConfig) -> _Work:
     rooms = load_rooms(dataset)
     size = rooms.images.shape[3:]
-    around = rooms.images.shape[2]
-    places = rooms.images[~rooms.test].reshape(-1, around, *size)
     if task == "passages":
-        passages: PassageImages = load_passages(dataset)
-        held = passages.test
-        groups = {"all": np.arange(int(held.sum()))}
-        return _Work(
-            task, len(passages.lengths_m), passages.images[~held], passages.free[~held].astype(np.int32), places,
-            passages.images[held], passages.free[held].astype(np.int32), groups, ("blocked", "free"), rooms,
-            passages.lengths_m, passages.scored,
-        )  # fmt: skip
-    pitches = list(range(3)) if config.pitch == "all" else [PITCHES.index(config.pitch)]
-    learned = rooms.images[~rooms.test][:, pitches]
-    label = np.broadcast_to(rooms.label[~rooms.test][:, None, None], learned.shape[:3])
-    held = rooms.images[rooms.test][:, :, ::3]
-    truth = np.broadcast_to(rooms.label[rooms.test][:, None, None], held.shape[:3])
-    pitch = np.broadcast_to(np.arange(3)[None, :, None], held.shape[:3]).ravel()
-    groups = {name: np.flatnonzero(pitch == i) for i, name in enumerate(PITCHES)}
-    if config.pitch == "all":
-        groups["all"] = np.arange(len(pitch))
-    else:
-        groups = {config.pitch: groups[config.pitch]}
-    return _Work(
-        task, len(rooms.names), learned.reshape(-1, *size), label.ravel().astype(np.int32), places,
-        held.reshape(-1, *size), truth.ravel().astype(np.int32), groups, rooms.names, rooms,
-    )  # fmt: skip
+        passages = load_passages(dataset)
+        test, free, groups = passages.test, passages.free.astype(np.int32), {"all": np.arange(int(passages.test.sum()))}
+        sides = passages.images[~test], free[~test], passages.images[test], free[test]
+        return _Work(rooms, *sides, groups, passages.lengths_m, passages.scored)
+    names = PITCHES if config.pitch == "all" else (config.pitch,)
+    learned = rooms.images[~rooms.test][:, [PITCHES.index(name) for name in names]]
+    held_out = rooms.images[rooms.test][:, :, ::3]
+    label, truth = (
+        np.broadcast_to(rooms.label[test][:, None, None], images.shape[:3]).ravel().astype(np.int32)
+        for test, images in ((~rooms.test, learned), (rooms.test, held_out))
+    )
+    pitch = np.broadcast_to(np.arange(3)[None, :, None], held_out.shape[:3]).ravel()
+    groups = {name: np.flatnonzero(pitch == PITCHES.index(name)) for name in names}
+    groups |= {"all": np.arange(len(pitch))} if config.pitch == "all" else {}
+    return _Work(rooms, learned.reshape(-1, *size), label, held_out.reshape(-1, *size), truth, groups)
 
 
 def _scores(trained: Trained, work: _Work) -> dict[str, Any]:
-    """Accuracy and macro F1 of what was held out, and how well the embedding localises."""
-    results: dict[str, Any] = {
-        "task": work.task,
-        "parameters": trained.about["parameters"],
-        "trained_on": len(work.images),
-    }
+    """Return accuracy and macro F1 on held-out images, and how well the embedding localises."""
+    results = {name: trained.about[name] for name in ("task", "parameters")} | {"trained_on": len(work.images)}
     if len(work.held_out):
-        logits, truth = trained.logits(work.held_out), work.truth
-        if work.task == "passages":
+        logits, truth, is_passages = trained.logits(work.held_out), work.truth, bool(work.lengths_m)
+        if is_passages:
             results["lengths"] = length_scores(logits, truth, work.lengths_m)
             chosen, truth = (logits[:, work.scored] > 0).astype(np.int32), truth[:, work.scored]
         else:
@@ -248,14 +223,14 @@ def _scores(trained: Trained, work: _Work) -> dict[str, Any]:
         results["groups"] = {
             name: {"images": len(rows), **class_scores(truth[rows], chosen[rows])} for name, rows in work.groups.items()
         }
-        if work.task == "passages":
+        if is_passages:
             results["confusion"] = confusion_matrix(truth, chosen, labels=[0, 1]).tolist()
     results["localisation"] = localisation(trained, work.rooms)
     return results
 
 
 def class_scores(truth: np.ndarray, chosen: np.ndarray, classes: int = 0) -> dict[str, Any]:
-    """Accuracy and macro F1 of [N] classes; with how many there are also the confusion, a row for each true one."""
+    """Return accuracy and macro F1 of [N] classes; given their number, also the confusion, a row for each true one."""
     out = {
         "accuracy": float((chosen == truth).mean()),
         "macro_f1": float(f1_score(truth, chosen, average="macro")),
@@ -264,7 +239,7 @@ def class_scores(truth: np.ndarray, chosen: np.ndarray, classes: int = 0) -> dic
 
 
 def length_scores(logits: np.ndarray, free: np.ndarray, lengths_m: Sequence[float]) -> list[dict[str, float]]:
-    """For each length the share of images that are free so far, and of those judged right; logits and free [N, L]."""
+    """Return for each length the share of images that are free so far, and of right answers; logits, free [N, L]."""
     return [
         {"ahead_m": length, "free": float(truth.mean()), "accuracy": float(((logit > 0) == truth).mean())}
         for length, logit, truth in zip(lengths_m, logits.T, free.T, strict=True)
@@ -272,21 +247,24 @@ def length_scores(logits: np.ndarray, free: np.ndarray, lengths_m: Sequence[floa
 
 
 def localisation(
-    trained: Trained, rooms: RoomImages, asked_by: Trained | None = None, asked: RoomImages | None = None
+    trained: Trained, rooms: RoomImages, other: Trained | None = None, other_rooms: RoomImages | None = None
 ) -> dict[str, Any]:
     """Score an embedding: training positions as nodes, every third level image of test positions as queries.
 
-    Each scene on its own; `mean` weighs them by queries. See `localise.localisation_scores`. Queries are images of
-    `asked` (None: the same images) that `asked_by` embeds (None: the same network); scenes are those of both, by name.
+    Each scene on its own; `mean` weighs them by queries. See `networks.localisation_scores`. Queries are images of
+    `other_rooms` (default: the same) that `other` embeds (default: the same); scenes are those of both, by name.
     """
-    asked_by, asked = asked_by or trained, asked or rooms
-    level, rows, weights, there = PITCHES.index("level"), {}, [], rows_by_scene(asked)
+    other, other_rooms = other or trained, other_rooms or rooms
+    level, rows, weights, there = PITCHES.index("level"), {}, [], rows_by_scene(other_rooms)
     for name, mine in rows_by_scene(rooms).items():
-        nodes, queries = mine & ~rooms.test, there.get(name, np.zeros_like(asked.test)) & asked.test
+        nodes, queries = mine & ~rooms.test, there.get(name, np.zeros_like(other_rooms.test)) & other_rooms.test
         if nodes.any() and queries.any():
-            looked = asked_by.embed(asked.images[queries][:, level, ::3]), trained.embed(rooms.images[nodes][:, level])
+            looked = (
+                other.embed(other_rooms.images[queries][:, level, ::3]),
+                trained.embed(rooms.images[nodes][:, level]),
+            )
             rows[name] = localisation_scores(
-                Places(looked[0], asked.xy_w[queries], asked.label[queries]),
+                Places(looked[0], other_rooms.xy_w[queries], other_rooms.label[queries]),
                 Places(looked[1], rooms.xy_w[nodes], rooms.label[nodes]),
             )
             weights.append(int(queries.sum()))
@@ -297,7 +275,7 @@ def localisation(
 
 
 def rows_by_scene(rooms: RoomImages) -> dict[str, np.ndarray]:
-    """Scene name -> [P] bool."""
+    """Return scene name -> [P] bool."""
     names = np.array([rooms.names[label].rpartition("/")[0] for label in rooms.label])
     return {str(name): names == name for name in dict.fromkeys(names.tolist())}
 

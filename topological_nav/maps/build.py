@@ -21,7 +21,7 @@ from topological_nav.config import DataConfig, MapConfig
 from topological_nav.data.dataset import headings
 from topological_nav.data.folders import lens_of
 from topological_nav.errors import Progress, SpaceError
-from topological_nav.learn.localise import nearest_turn
+from topological_nav.learn.networks import nearest_turn
 from topological_nav.learn.runs import DESCRIPTION
 from topological_nav.learn.training import Networks, Trained, load_networks
 from topological_nav.maps.graph import TopologicalMap, assemble, lengths
@@ -39,7 +39,7 @@ CPU_SUPERSAMPLE = 2
 
 @dataclasses.dataclass(frozen=True)
 class Built:
-    """A map, and what it was made in and found to be."""
+    """Hold a map, the space it was built in and its scores."""
 
     map: TopologicalMap
     space: FreeSpace
@@ -64,7 +64,7 @@ def build_map(
         localiser_run: run folder of a network whose embedding localises.
         detector_run: run folder of a passage detector.
         config: of the map.
-        progress: told what is drawn, images done and images in all; may raise to stop.
+        progress: called with what is drawn, images done and images in all; may raise to stop.
         parts: folder that drawn images are kept in, so that a map that was stopped goes on; None: they are not.
     """
     networks = load_networks(localiser_run, detector_run)
@@ -87,15 +87,15 @@ def build_map(
     about = {"settings": to_dict(config), "data": to_dict(data)}
     look = along if config.edge_image == "exact" else None
     built = judged_map(scene, space, xy, rooms.of(xy), images, networks, config.edge_m, config.passable, about, look)
-    made = built.map
-    scores = {"nodes a room": " ".join(map(str, np.bincount(made.room))), **built.scores}
+    graph = built.map
+    scores = {"nodes a room": " ".join(map(str, np.bincount(graph.room))), **built.scores}
     scores |= {"lacking": "; ".join(lacking)} if lacking else {}
     if config.check:
         places = space.sample(np.random.default_rng([data.seed, 13]), config.check, config.clearance_m)
         looked = pictures.draw_around(places, around, "check")
         for match in ("aligned", "nearest"):
-            sight = NetworkSight(made, localiser, networks.detector, match)
-            scores |= localisation_check(sight, made, looked, around, places)
+            sight = NetworkSight(graph, localiser, networks.detector, match)
+            scores |= localisation_check(sight, graph, looked, around, places)
     return dataclasses.replace(built, scores=scores)
 
 
@@ -129,17 +129,17 @@ def judged_map(
 
     about = {**about, **networks.digests, "margin_m": margin_m, "points": points}
     embeddings = networks.localiser.embed(images)
-    made = assemble(scene.name, scene.digest, xy_w, room, embeddings, edge_m, probability, about)
-    free = space.segment_free(xy_w[made.edges[:, 0]], xy_w[made.edges[:, 1]], points, margin_m)
-    return Built(made, space, free, edge_scores(made, free, passable))
+    graph = assemble(scene.name, scene.digest, xy_w, room, embeddings, edge_m, probability, about)
+    free = space.segment_free(xy_w[graph.edges[:, 0]], xy_w[graph.edges[:, 1]], points, margin_m)
+    return Built(graph, space, free, edge_scores(graph, free, passable))
 
 
 def localisation_check(
-    sight: Sight, made: TopologicalMap, images: np.ndarray, heading_rad: np.ndarray, xy_w: np.ndarray
+    sight: Sight, graph: TopologicalMap, images: np.ndarray, heading_rad: np.ndarray, xy_w: np.ndarray
 ) -> dict[str, str]:
     """How well a map localises, in words, by all images of a place and by its first alone."""
     each, summed = place_distances(sight, images, heading_rad)
-    away, said = np.linalg.norm(xy_w[:, None] - made.xy_w, axis=-1), {}
+    away, said = np.linalg.norm(xy_w[:, None] - graph.xy_w, axis=-1), {}
     for what, evidence in ((f"{len(heading_rad)} images", summed), ("1 image", each[:, 0])):
         node = evidence.argmin(-1)
         error = away[np.arange(len(node)), node]
@@ -230,16 +230,16 @@ class Pictures:
 def forget(parts: Path) -> None:
     """Removes the images that `build_map` kept, once the map is written."""
     for path in parts.glob("*.npy"):
-        path.unlink(missing_ok=True)  # by another process that made the same map
+        path.unlink(missing_ok=True)  # by another process that built the same map
     with contextlib.suppress(OSError):
         parts.rmdir()
 
 
-def edge_scores(made: TopologicalMap, free: np.ndarray, passable: float) -> dict[str, Any]:
+def edge_scores(graph: TopologicalMap, free: np.ndarray, passable: float) -> dict[str, Any]:
     """How a map's edges compare with the plan, and what open ones join, in words; see `Built`."""
-    open_, parts = made.p >= passable, made.open_parts(passable)
+    open_, parts = graph.p >= passable, graph.open_parts(passable)
     return {
         "edges judged open": f"{int(open_.sum())} of {len(open_)}; free on the plan: {int(free.sum())}",
         "edges judged as on the plan": f"{(open_ == free).mean():.3f}",
-        "nodes that open edges join": f"{len(parts[0])} of {len(made.xy_w)}, in {len(parts)} parts",
+        "nodes that open edges join": f"{len(parts[0])} of {len(graph.xy_w)}, in {len(parts)} parts",
     }

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from topological_nav.errors import MapError
-from topological_nav.learn.localise import nearest_turn, squares_between
+from topological_nav.learn.networks import nearest_turn, squares_between
 from topological_nav.learn.training import Trained
 from topological_nav.maps.graph import TopologicalMap
 from topological_nav.scenes.space import FreeSpace
@@ -49,30 +49,31 @@ def place_distances(sight: Sight, images: np.ndarray, heading_rad: np.ndarray) -
 class NetworkSight:
     """A map, the network that embeds and the one that judges passages."""
 
-    def __init__(self, made: TopologicalMap, localiser: Trained, detector: Trained, match: str = "aligned"):
+    def __init__(self, graph: TopologicalMap, localiser: Trained, detector: Trained, match: str = "aligned"):
         """Checks that the map is of these networks."""
         for name, network in (("localiser", localiser), ("detector", detector)):
-            used, own = made.about.get(name, ""), network.about["digest"]
-            if used != own:
+            used, digest = graph.about.get(name, ""), network.about["digest"]
+            if used != digest:
                 raise MapError(
-                    f"the map of '{made.scene}' was made with {name} {used[:12] or 'unknown'}, this one is {own[:12]}; "
-                    "build the map again with it, or name the runs it was made with"
+                    f"the map of '{graph.scene}' was built with {name} {used[:12] or 'unknown'}, "
+                    f"this one is {digest[:12]}; "
+                    "build the map again with it, or name the runs it was built with"
                 )
-        self._nodes = made.embeddings.astype(float)
+        self._nodes = graph.embeddings.astype(float)
         self._localiser, self._detector, self.summed = localiser, detector, match == "aligned"
 
     def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
         """[n, N] Euclidean distances of embeddings: to the node's image of that heading, or to its nearest."""
-        asked = self._localiser.embed(images).astype(float)
+        queries = self._localiser.embed(images).astype(float)
         nodes, around = self._nodes, self._nodes.shape[1]
         if self.summed:
             turn = nearest_turn(np.asarray(heading_rad), around)
-            out = np.empty((len(asked), len(nodes)))
+            out = np.empty((len(queries), len(nodes)))
             for k in np.unique(turn):
                 rows = turn == k
-                out[rows] = _apart(asked[rows], nodes[:, k])
+                out[rows] = _apart(queries[rows], nodes[:, k])
             return out
-        return _apart(asked, nodes.reshape(-1, nodes.shape[-1])).reshape(len(asked), -1, around).min(-1)
+        return _apart(queries, nodes.reshape(-1, nodes.shape[-1])).reshape(len(queries), -1, around).min(-1)
 
     def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
         """The detector's probability; see `Sight.passage`."""
@@ -84,16 +85,16 @@ class TrueSight:
 
     summed = True
 
-    def __init__(self, made: TopologicalMap, space: FreeSpace, margin_m: float = 0.225):
+    def __init__(self, graph: TopologicalMap, space: FreeSpace, margin_m: float = 0.225):
         """Takes the plan."""
-        self._xy, self._space, self._margin_m = made.xy_w.astype(float), space, margin_m
+        self._xy, self._space, self._margin_m = graph.xy_w.astype(float), space, margin_m
 
     def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
         """[n, N] m to nodes in sight; `OUT_OF_SIGHT_M` more to those that are not."""
         del heading_rad
         here = np.broadcast_to(images[:, None, :2], (len(images), len(self._xy), 2))
-        seen = self._space.segment_free(here, np.broadcast_to(self._xy, here.shape), LINE_POINTS, 0.0)
-        return np.linalg.norm(here - self._xy, axis=-1) + OUT_OF_SIGHT_M * ~seen
+        visible = self._space.segment_free(here, np.broadcast_to(self._xy, here.shape), LINE_POINTS, 0.0)
+        return np.linalg.norm(here - self._xy, axis=-1) + OUT_OF_SIGHT_M * ~visible
 
     def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
         """1 where the way ahead is free, else 0; see `Sight.passage`.

@@ -1,4 +1,4 @@
-"""Finished runs in, a small folder out that carries them: weights in half precision, where they came from, maps.
+"""Export finished runs as a small folder: weights in half precision, where they come from, maps.
 
 OUT/rooms/ passages/ policy/   weights.safetensors.xz, network.json, config.yaml, versions.json, results.json
     maps/SCENE.npz             embeddings in half precision
@@ -6,8 +6,8 @@ OUT/rooms/ passages/ policy/   weights.safetensors.xz, network.json, config.yaml
 
 Everything that reads a run folder reads these. Kernels and matrices are fp16; biases, scales and statistics, one number
 in a hundred, stay f32: a variance may exceed what fp16 holds. `digest` in network.json stays that of the run, so that
-maps and policies made with either belong to both: an export whose predictions differ is refused.
-`export.weights_digest` is that of the tensors in `weights.safetensors.xz`.
+maps and policies of either belong to both: an export whose predictions differ is refused. `export.weights_digest` is
+that of the tensors in `weights.safetensors.xz`.
 """
 
 import dataclasses
@@ -15,7 +15,6 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -27,27 +26,33 @@ from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import whole_folder, write_text
 from interactive_nav_common.records import Reader
-from interactive_nav_common.runs import weights
+from interactive_nav_common.runs.weights import half, read_weights
 from interactive_nav_common.versions import versions
 from topological_nav.config import PITCHES, ExportConfig
 from topological_nav.data.dataset import headings, load_rooms
 from topological_nav.drives.driving import TrainedPolicy, load_policy
 from topological_nav.errors import MapError, Progress, RunError
-from topological_nav.learn.runs import CONFIG, DESCRIPTION, PACKED_WEIGHTS, RESULTS, shown, weights_file
+from topological_nav.learn.runs import (
+    CONFIG,
+    PACKED_WEIGHTS,
+    RESULTS,
+    VERSIONS,
+    read_description,
+    weights_file,
+    write_network,
+)
 from topological_nav.learn.training import SAME, Trained, camera_of, load_pair, load_trained
 from topological_nav.maps.build import Pictures
 from topological_nav.maps.graph import load_map, save_map
 from topological_nav.scenes.space import free_space
 from topological_nav.weights.packaged import ABOUT
 
-FORMAT = 1
-PRECISION = "fp16"
-VERSIONS = "versions.json"
+FORMAT, PRECISION = 1, "fp16"
 
 
 @dataclasses.dataclass(frozen=True)
 class Compared:
-    """What runs and their exports make of the same images: P places, K headings."""
+    """Compare what runs and their exports compute from the same images of P places and K headings."""
 
     embedding: np.ndarray
     """[2, P K] distance between the two embeddings of an image, by the localiser and by the detector."""
@@ -56,22 +61,6 @@ class Compared:
     probability: np.ndarray
     """[2, P K, L] that the way is free for each of the detector's lengths, by the run and by the export."""
     scores: dict[str, float]
-
-
-@dataclasses.dataclass(frozen=True)
-class Exported:
-    """What was written."""
-
-    sizes: dict[str, int]
-    """Part -> bytes."""
-    compared: Compared
-
-
-def _free_place(out: Path) -> Path:
-    out = Path(os.path.abspath(out))
-    if out.exists() and not (out / ABOUT).is_file() and (not out.is_dir() or any(out.iterdir())):
-        raise RunError(f"{out}: is something else than an export; choose another folder (-o)")
-    return out
 
 
 def export(
@@ -83,33 +72,33 @@ def export(
     out: Path,
     config: ExportConfig,
     progress: Progress = lambda *_: None,
-) -> Exported:
-    """Writes an export, whole or not at all; one that stands at `out` is replaced.
+) -> tuple[dict[str, int], Compared]:
+    """Write an export, whole or not at all, in place of one at `out`; return `sizes_of` it and the comparison.
 
-    Args:
-        policy: of a local policy that learned with both, or None.
-        maps: folder of SCENE.npz, all made with both, or None.
+    `policy` is a run that learned with both networks, `maps` a folder of SCENE.npz that were built with both.
     """
-    out = _free_place(out)
-    runs = {"rooms": Path(localiser), "passages": Path(detector)} | ({"policy": Path(policy)} if policy else {})
-    files = sorted(Path(maps).glob("*.npz")) if maps else []
+    out = Path(os.path.abspath(out))
+    if out.exists() and not (out / ABOUT).is_file() and (not out.is_dir() or any(out.iterdir())):
+        raise RunError(f"{out}: is something else than an export; choose another folder (-o)")
+    runs = {"rooms": localiser, "passages": detector} | ({"policy": policy} if policy else {})
+    files = sorted(maps.glob("*.npz")) if maps else []
     if maps and not files:
         raise MapError(f"{maps}: holds no map; make some: python -m topological_nav map SCENE -o {maps}/SCENE.npz")
     networks = load_pair(runs["rooms"], runs["passages"], (*SAME, "headings"))
     driver = load_policy(policy, localiser, detector) if policy else None
     pictures = level_images(images, networks, config.places, progress)
     total = len(runs) + len(files) + 1
-    with whole_folder(out, overwrite=True) as made:
+    with whole_folder(out, overwrite=True) as part:
         about: dict[str, Any] = {"format": FORMAT, "precision": PRECISION, "networks": {}, "maps": {}}
         for done, (task, run) in enumerate(runs.items()):
             progress(task, done, total)
-            about["networks"][task] = _export_run(task, run, made / task, config)
+            about["networks"][task] = _export_run(task, run, part / task, config)
         for done, path in enumerate(files, len(runs)):
             progress(path.stem, done, total)
-            about["maps"][path.stem] = _export_map(path, made / "maps" / path.name, networks)
+            about["maps"][path.stem] = _export_map(path, part / "maps" / path.name, networks)
         progress("comparing", total - 1, total)
-        exported = load_trained(made / "rooms"), load_trained(made / "passages")
-        compared = compare(networks, exported, driver, load_policy(made / "policy") if driver else None, pictures)
+        exported = load_trained(part / "rooms"), load_trained(part / "passages")
+        compared = compare(networks, exported, driver, load_policy(part / "policy") if driver else None, pictures)
         for name in ("largest_embedding_distance", "largest_probability_difference"):
             if not compared.scores[name] <= config.tolerance:
                 raise RunError(
@@ -117,16 +106,16 @@ def export(
                     f"{config.tolerance:g} (tolerance)"
                 )
         about |= {"compared": compared.scores, "exported_by": {"commit": versions()["commit"]}}
-        write_text(made / ABOUT, json.dumps(about, indent=1) + "\n")
-        sizes = sizes_of(made)
+        write_text(part / ABOUT, json.dumps(about, indent=1) + "\n")
+        sizes = sizes_of(part)
         if sum(sizes.values()) > config.limit_mib * 2**20:
             raise RunError(f"{out}: {size_lines(sizes, config.limit_mib)}")
     progress("comparing", total, total)
-    return Exported(sizes, compared)
+    return sizes, compared
 
 
 def sizes_of(folder: Path) -> dict[str, int]:
-    """Bytes of an export by what they are for: weights of each network, maps, descriptions."""
+    """Return the bytes of an export by their use: weights of each network, maps, descriptions."""
     sizes: Counter[str] = Counter()
     for path in sorted(p for p in Path(folder).rglob("*") if p.is_file()):
         part = path.relative_to(folder).parts[0]
@@ -135,17 +124,12 @@ def sizes_of(folder: Path) -> dict[str, int]:
 
 
 def size_lines(sizes: dict[str, int], limit_mib: float) -> str:
-    """In words, the largest first."""
-    parts = sorted(sizes.items(), key=lambda item: -item[1])
-    told = ", ".join(f"{name} {size / 2**20:.2f}" for name, size in parts)
+    """Return the sizes in words, the largest first."""
     total = sum(sizes.values()) / 2**20
-    said = f"{total:.2f} MiB: {told}"
-    if total > limit_mib:
-        said += (
-            f"; expected at most {limit_mib:g} MiB (limit_mib): leave maps out, or train with a smaller width, hidden "
-            "or projection"
-        )
-    return said
+    parts = (f"{name} {size / 2**20:.2f}" for name, size in sorted(sizes.items(), key=lambda item: -item[1]))
+    remedy = "leave maps out, or train with a smaller width, hidden or projection"
+    excess = f"; expected at most {limit_mib:g} MiB (limit_mib): {remedy}" if total > limit_mib else ""
+    return f"{total:.2f} MiB: {', '.join(parts)}{excess}"
 
 
 def compare(
@@ -155,13 +139,7 @@ def compare(
     exported_driver: TrainedPolicy | None,
     images: np.ndarray,
 ) -> Compared:
-    """What runs and exports make of the same images.
-
-    Args:
-        driver: the run's policy, or None.
-        exported_driver: the export's.
-        images: [P, K, H, W, 3] u8; each place's images are also shown to the policies one after the other.
-    """
+    """Compare runs with exports by images [P, K, H, W, 3] u8; policies see each place's images one after the other."""
     places, around = images.shape[:2]
     flat = images.reshape(-1, *images.shape[2:])
     before, after = ([net.embed(flat) for net in pair] for pair in (networks, exported))
@@ -179,16 +157,14 @@ def compare(
     }
     apart = np.zeros(len(flat))
     if places > 1:
-        place, own = np.arange(len(flat)) // around, before[0].astype(float)
-        far = [
-            cdist(one, own) + np.where(place[:, None] == place, np.inf, 0.0) for one in (own, after[0].astype(float))
-        ]
+        place, embedded = np.arange(len(flat)) // around, [one[0].astype(float) for one in (before, after)]
+        far = [np.where(place[:, None] == place, np.inf, cdist(one, embedded[0])) for one in embedded]
         apart = far[0].min(1)
         scores["same_nearest_place"] = float((place[far[0].argmin(1)] == place[far[1].argmin(1)]).mean())
         scores["mean_distance_to_nearest_place"] = float(apart.mean())
     if driver is not None and exported_driver is not None:
-        said = [np.array(list(_driven(one, images))) for one in (driver, exported_driver)]
-        same = (said[0] == said[1]).mean((0, 2))
+        driven = [_driven(one, images) for one in (driver, exported_driver)]
+        same = (driven[0] == driven[1]).mean((0, 2))
         scores |= {"same_linear": float(same[0]), "same_angular": float(same[1])}
     return Compared(embedding, apart, probability, scores)
 
@@ -196,8 +172,7 @@ def compare(
 def level_images(
     source: Path, networks: tuple[Trained, Trained], places: int, progress: Progress = lambda *_: None
 ) -> np.ndarray:
-    """[P, K, H, W, 3] u8: level images around places of a dataset, or of a scene, which is drawn."""
-    source = Path(source)
+    """Return level images [P, K, H, W, 3] u8 around places of a dataset, or of a scene, which is drawn."""
     if (source / "dataset.json").is_file():
         images = load_rooms(source).images[:, PITCHES.index("level")]
         return images[np.unique(np.linspace(0, len(images) - 1, places).round().astype(int))]
@@ -211,57 +186,51 @@ def level_images(
     return Pictures(scene, data, robot, progress).draw_around(xy, headings(data), scene.name)
 
 
-def _driven(policy: TrainedPolicy, images: np.ndarray) -> Iterator[np.ndarray]:
-    """[2, P] velocities at each of K steps."""
-    state = policy.start(len(images))
+def _driven(policy: TrainedPolicy, images: np.ndarray) -> np.ndarray:
+    """Return the velocities [K, 2, P] at K steps."""
+    state, velocities = policy.start(len(images)), []
     for step in range(images.shape[1]):
-        state, linear, angular = policy.act(state, images[:, step])
-        yield np.stack([linear, angular])
+        state, *velocity = policy.act(state, images[:, step])
+        velocities.append(velocity)
+    return np.array(velocities)
 
 
 def _export_run(task: str, run: Path, out: Path, config: ExportConfig) -> dict[str, Any]:
-    """Writes a run's folder and returns where it came from."""
+    """Write a run's folder and return where it comes from."""
     for name in (CONFIG, VERSIONS, RESULTS):
         if not (run / name).is_file():
             raise RunError(f"{run}: has no {name}; finish the run first")
     reader = Reader(RunError, "finish the run first", finite=False)
-    made = reader.typed(reader.json(run / VERSIONS), dict[str, Any], f"{run / VERSIONS}")
-    made["commit"] = made.get("commit") or config.commit
-    made["argv"] = [_without_folder(word) for word in made.get("argv", [])]
-    device = reader.typed(made.get("device", {}), dict[str, Any], f"{run / VERSIONS}: device").get("kind")
-    if not made["commit"] or not device:
-        raise RunError(f"{run}: {VERSIONS} names no {'device' if made['commit'] else 'commit'}; say commit=HASH")
-    about = json.loads((run / DESCRIPTION).read_text())
-    tensors, _ = weights.read_weights(weights_file(run), RunError, "train again")
+    origin = reader.typed(reader.json(run / VERSIONS), dict[str, Any], f"{run / VERSIONS}")
+    origin["commit"] = origin.get("commit") or config.commit
+    origin["argv"] = [_without_folder(word) for word in origin.get("argv", [])]
+    device = reader.typed(origin.get("device", {}), dict[str, Any], f"{run / VERSIONS}: device").get("kind")
+    if not origin["commit"] or not device:
+        raise RunError(f"{run}: {VERSIONS} names no {'device' if origin['commit'] else 'commit'}; say commit=HASH")
+    about = {**read_description(run, "network", task), "commit": origin["commit"]}
     if task == "policy":
         for network, other in zip(about["networks"], ("rooms", "passages"), strict=True):
             network["run"] = f"../{other}"
-    header = {**shown(about), "commit": made["commit"]}
-    header = weights.write_weights(out / PACKED_WEIGHTS, weights.half(tensors), header)
-    about["export"] = {"precision": PRECISION, "weights_digest": header["digest"]}
-    write_text(out / DESCRIPTION, json.dumps(about, indent=1) + "\n")
-    write_text(out / VERSIONS, json.dumps(made, indent=1) + "\n")
+    tensors, _ = read_weights(weights_file(run), RunError, "train again")
+    write_network(out, half(tensors), about, PRECISION)
+    write_text(out / VERSIONS, json.dumps(origin, indent=1) + "\n")
     for name in (CONFIG, RESULTS):
         shutil.copyfile(run / name, out / name)
-    return {
-        "digest": about["digest"],
-        "parameters": about["parameters"],
-        "commit": made["commit"],
-        "device": device,
-        "command": made["argv"],
-    }
+    kept = {name: about[name] for name in ("digest", "parameters", "commit")}
+    return {**kept, "device": device, "command": origin["argv"]}
 
 
 def _export_map(path: Path, out: Path, networks: tuple[Trained, Trained]) -> dict[str, Any]:
-    made = load_map(path)
+    """Write a map with embeddings in half precision and return its facts."""
+    built = load_map(path)
     for name, network in zip(("localiser", "detector"), networks, strict=True):
-        if made.about.get(name) != network.about["digest"]:
-            raise MapError(f"{path}: was made with another {name}; build the map again with the exported one")
-    save_map(dataclasses.replace(made, embeddings=made.embeddings.astype(np.float16)), out)
-    return {"scene_digest": made.digest, "nodes": len(made.xy_w), "edges": len(made.edges)}
+        if built.about.get(name) != network.about["digest"]:
+            raise MapError(f"{path}: was built with another {name}; build the map again with the exported one")
+    save_map(dataclasses.replace(built, embeddings=built.embeddings.astype(np.float16)), out)
+    return {"scene_digest": built.digest, "nodes": len(built.xy_w), "edges": len(built.edges)}
 
 
 def _without_folder(word: str) -> str:
-    """A word of a command line; an absolute path without the folders that it has on one machine alone."""
+    """Return a word of a command line, an absolute path without the folders that it has on one machine alone."""
     key, sign, value = word.rpartition("=")
     return f"{key}{sign}{PurePath(value).name}" if PurePath(value).is_absolute() else word

@@ -37,18 +37,12 @@ GOES_ON = "make room and start again: the run continues from its last checkpoint
 
 
 @dataclasses.dataclass(frozen=True)
-class _Summary:
-    """The fields of summary.json that are read."""
+class _Origin:
+    """The fields of summary.json and versions.json that are read."""
 
     completed: bool = False
     env_steps: Natural | None = None
     wall_s: NotNegative | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class _Versions:
-    """The fields of versions.json that are read."""
-
     device: dict[str, Any] | None = None
     commit: str | None = None
 
@@ -114,10 +108,12 @@ class RunFolder:
 
     def origin(self) -> dict[str, Any]:
         """Return the numbers' origin: env_steps and wall_s so far, device and commit; None where not recorded."""
-        record = {}
-        for path, kind in ((self.summary, _Summary), (self.path / VERSIONS, _Versions)):
-            record |= dataclasses.asdict(RUNS.record(RUNS.json(path, {}), kind, str(path), others=True))
-        return {**record, "device": (record["device"] or {}).get("kind")}
+        origin = _Origin()
+        for path in (self.summary, self.path / VERSIONS):
+            given = RUNS.json(path, {})
+            read = RUNS.record(given, _Origin, str(path), others=True)
+            origin = dataclasses.replace(origin, **{k: v for k, v in vars(read).items() if k in given})
+        return {**vars(origin), "device": (origin.device or {}).get("kind")}
 
     def append_metrics(self, line: dict[str, Any]) -> None:
         """Add one line to metrics.jsonl."""

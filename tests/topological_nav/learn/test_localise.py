@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from topological_nav.learn.localise import Places, localisation_scores, nearest_node
+from topological_nav.learn.networks import Places, localisation_scores, nearest_node
 
 
 def test_the_node_of_the_nearest_image_wins():

@@ -70,9 +70,9 @@ def test_nearest_images_are_compared_with_all(made):
 
 
 def test_a_map_of_other_networks_is_refused(made):
-    with pytest.raises(MapError, match="made with localiser one, this one is three"):
+    with pytest.raises(MapError, match="built with localiser one, this one is three"):
         NetworkSight(made, Fake("three"), Fake("two"))  # type: ignore[arg-type]
-    with pytest.raises(MapError, match="made with detector two, this one is three"):
+    with pytest.raises(MapError, match="built with detector two, this one is three"):
         NetworkSight(made, Fake("one"), Fake("three"))  # type: ignore[arg-type]
 
 

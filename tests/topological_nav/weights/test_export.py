@@ -168,7 +168,7 @@ def test_what_does_not_belong_is_refused(made, tmp_path, capsys):
     own = load_map(made.map)
     save_map(dataclasses.replace(own, about={**own.about, "detector": "0" * 64}), tmp_path / "maps" / "painted.npz")
     out = tmp_path / "out"
-    assert "made with another detector" in told(*words(made, out, "--maps", str(tmp_path / "maps"), "commit=toy"))
+    assert "built with another detector" in told(*words(made, out, "--maps", str(tmp_path / "maps"), "commit=toy"))
     (tmp_path / "none").mkdir()
     assert "holds no map; make some" in told(*words(made, out, "--maps", str(tmp_path / "none"), "commit=toy"))
     assert "is neither a dataset nor a scene" in told(*words(made, out), "--images", str(tmp_path))

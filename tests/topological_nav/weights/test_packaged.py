@@ -154,7 +154,7 @@ def test_a_map_of_own_runs_is_made_but_never_written_over(made, here, capsys):
     words = ["navigate", str(made.scene), "limit_s=2", "backend=native"]
     assert main(words) == 2
     error = capsys.readouterr().err
-    assert f"networks: {RUNS}/rooms and {RUNS}/passages" in error and "was made with detector ffffffffffff" in error
+    assert f"networks: {RUNS}/rooms and {RUNS}/passages" in error and "was built with detector ffffffffffff" in error
     assert load_map(kept).about["detector"] == "f" * 64
     kept.unlink()
     assert main(words) == 0
