@@ -3,17 +3,69 @@
 Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when asked to stop: the same command goes on.
 """
 
+import argparse
 import importlib
 import re
 import signal
 import sys
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
+from interactive_nav_common.config import settings_help
 from interactive_nav_common.errors import reports_errors
-from topological_nav.commands.parser import parser
+from interactive_nav_common.words import Parser, add_words, read_commands
+from topological_nav.adapt.config import AdaptConfig
+from topological_nav.config import (
+    ADAPTED,
+    DATASET,
+    DRIVES,
+    RUNS,
+    TASKS,
+    DataConfig,
+    DriveConfig,
+    EvaluationConfig,
+    ExportConfig,
+    MapConfig,
+    PolicyConfig,
+)
 from topological_nav.errors import Stopped
 
-RUNS = {
+SETTINGS: dict[str, dict[str, Any]] = {
+    "data": {"": DataConfig(), " of drives": DriveConfig()},
+    "train": {"": TASKS["rooms"], " of policy": PolicyConfig()},
+    "map": {"": MapConfig()},
+    "navigate": {"": EvaluationConfig()},
+    "evaluate": {"": EvaluationConfig()},
+    "adapt": {"": AdaptConfig()},
+    "export": {"": ExportConfig()},
+}
+"""Command -> its settings, and of what else it does."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Build the command line's parser; its words are in words.yaml."""
+    root = Parser(
+        prog="python -m topological_nav",
+        description="Navigation by images and a graph. Words key=value change settings: COMMAND --help lists them.",
+    )
+    commands = root.add_subparsers(dest="command", required=True)
+    for name, row in read_commands(Path(__file__).with_name("words.yaml")).items():
+        listed = [
+            f"settings{of or ' (key=default)'}:\n{settings_help(config)}" for of, config in SETTINGS[name].items()
+        ]
+        command = commands.add_parser(
+            name,
+            help=row.help,
+            description=row.help,
+            epilog="\n\n".join(listed),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        add_words(command, row.words, runs=RUNS, dataset=DATASET, drives=DRIVES, adapted=ADAPTED)
+    return root
+
+
+COMMANDS = {
     **{"data": "learning.data", "train": "learning.train", "map": "maps.make_map", "navigate": "episodes.navigate"},
     **{"evaluate": "episodes.evaluate", "adapt": "adapt.run", "export": "maps.export_runs"},
 }
@@ -22,13 +74,13 @@ RUNS = {
 
 @reports_errors("topological_nav")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs a command."""
+    """Run a command."""
     words = list(sys.argv[1:] if argv is None else argv)
     settings = [word for word in words if re.match(r"\w+=", word)]
     arguments = parser().parse_args([word for word in words if word not in settings])
     arguments.settings = settings
     try:
-        module, _, name = RUNS[arguments.command].partition(".")
+        module, _, name = COMMANDS[arguments.command].partition(".")
         getattr(importlib.import_module(f"topological_nav.commands.{module}"), name)(arguments)
     except (Stopped, KeyboardInterrupt) as stopped:  # the latter: before the work began, or at a second Ctrl-C
         print("topological_nav: stopped; the same command goes on", file=sys.stderr)

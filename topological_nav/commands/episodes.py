@@ -18,9 +18,8 @@ from topological_nav.config import PASSAGE_POLICY, RUNS, EvaluationConfig, MapCo
 from topological_nav.evaluate.contest import Contest, contest_scenes
 from topological_nav.evaluate.rows import play_contest, tracks_of
 from topological_nav.evaluate.scores import console_table, differences, markdown, summary, where
-from topological_nav.figures.episode_figures import journeys_figure
 from topological_nav.figures.journey import drive_episode, film
-from topological_nav.figures.maps import save
+from topological_nav.figures.maps import journeys_figure, save
 from topological_nav.weights.packaged import choose, fitting_map
 
 

@@ -12,10 +12,11 @@ drawn. What is decided depends on scenes and settings only. Simulating and drawi
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -30,7 +31,9 @@ from topological_nav.data.shards import numbered, read_arrays, read_shards
 from topological_nav.drives.expert import CONTROL_S, Terrain, way_field
 from topological_nav.drives.fleet import Fleet, Tasks, make_env
 from topological_nav.drives.routes import draw_routes, drivable
-from topological_nav.errors import DatasetError, Progress, SpaceError
+from topological_nav.errors import ALONE, DatasetError, Host, Progress, RunError, SpaceError, Stopped
+from topological_nav.learn.learning import in_batches
+from topological_nav.learn.training import SAME, Trained, load_pair, seen_by
 from topological_nav.maps.nodes import place_nodes
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.rooms import scene_rooms
@@ -255,3 +258,73 @@ def summary(drives: Drives) -> dict[str, float]:
         "m_s": float(drives.command[going, 0].mean()) if going.any() else 0.0,
         "turning": float((np.abs(drives.command[going, 1]) >= 0.125).mean()) if going.any() else 0.0,
     }
+
+
+_TOLD_EVERY = 10
+"""Files of images between two lines about embedding."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Frames:
+    """Drives of a folder and the embeddings of their images."""
+
+    drives: Drives
+    config: DriveConfig
+    header: dict[str, Any]
+    features: np.ndarray
+    """[F or 2 F, D] f16 of all control steps, 0 where nothing was drawn; then the same of mirrored images."""
+    networks: tuple[Trained, Trained]
+    """Of rooms and of passages."""
+    runs: tuple[Path, Path]
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether there are mirrored ones."""
+        return len(self.features) > len(self.drives.command)
+
+
+def embed_drives(folder: Path, localiser_run: Path, detector_run: Path, mirror: bool, host: Host = ALONE) -> Frames:
+    """Embed the images of all kept drives."""
+    header, config = read_drives_header(folder)
+    drives, networks = load_drives(folder), load_pair(localiser_run, detector_run)
+    mine, theirs = {**header["settings"], "fov_deg": header["fov_deg"]}, seen_by(networks[0])
+    for name in SAME:
+        if mine[name] != theirs[name]:
+            raise RunError(
+                f"{folder}: images have {name} = {mine[name]!r}, the networks learned from {theirs[name]!r}; drive "
+                f"again with {name}={theirs[name]}"
+            )
+    count, total, done = len(drives.command), int(drives.steps[drives.kept].sum()), 0
+    features: np.ndarray | None = None
+    embed = _embedder(networks, mirror)
+    for i, (rows, images) in enumerate(drive_images(folder)):
+        at, part = drives.rows(rows), in_batches(embed, images)
+        if features is None:
+            features = np.zeros((part.shape[1] * count, part.shape[2]), np.float16)
+        for side in range(part.shape[1]):
+            features[at + side * count] = part[:, side]
+        done += len(images)
+        if i % _TOLD_EVERY == 0 or done == total:
+            host.tell(f"embedded {done:,} of {total:,} images")
+        if stop := host.signal():
+            raise Stopped(stop)
+    if features is None:
+        raise RunError(f"{folder}: none of {len(drives)} drives was kept; drive more, or in other scenes")
+    return Frames(drives, config, header, features, networks, (Path(localiser_run), Path(detector_run)))
+
+
+def embedded(networks: Sequence[Trained], weights: Any, images: jax.Array) -> jax.Array:
+    """[N, D] embeddings of images [N, H, W, 3] by all networks, one network after the other."""
+    pairs = zip(networks, weights, strict=True)
+    return jnp.concatenate([network.network.apply(w, images, method="embed") for network, w in pairs], -1)  # type: ignore[arg-type]
+
+
+def _embedder(networks: Sequence[Trained], mirror: bool) -> Callable[[jax.Array], jax.Array]:
+    """Compiled: images [N, H, W, 3] to [N, 1 or 2, D] f16, all networks' embeddings, then those of the mirrored."""
+
+    @jax.jit
+    def sides(weights: Any, images: jax.Array) -> jax.Array:
+        shown = (images, images[:, :, ::-1]) if mirror else (images,)
+        return jnp.stack([embedded(networks, weights, side) for side in shown], 1).astype(jnp.float16)
+
+    return functools.partial(sides, [network.variables for network in networks])

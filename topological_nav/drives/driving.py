@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from topological_nav.config import PASSAGE_POLICY, NavigatorConfig
-from topological_nav.drives.frames import embedded
+from topological_nav.drives.dataset import embedded
 from topological_nav.drives.imitation import fresh_params
 from topological_nav.drives.policy import Forward, Policy, standardised
 from topological_nav.errors import RunError

@@ -20,8 +20,15 @@ from topological_nav.data.folders import lens_of
 from topological_nav.drives import driving
 from topological_nav.drives.driving import LocalPolicy
 from topological_nav.errors import RunError
-from topological_nav.evaluate.contenders import Contender, NavigatorPlayer, expert, learned
-from topological_nav.evaluate.episodes import DrivenEpisodes, count_of, draw_episodes
+from topological_nav.evaluate.contenders import (
+    Contender,
+    DrivenEpisodes,
+    NavigatorPlayer,
+    count_of,
+    draw_episodes,
+    expert,
+    learned,
+)
 from topological_nav.learn.training import Networks, load_networks
 from topological_nav.maps.build import drawn_for, renderer_of, true_map
 from topological_nav.maps.graph import TopologicalMap, load_map

@@ -15,8 +15,7 @@ import numpy as np
 from interactive_nav.metrics import path_efficiency
 from interactive_nav_common.rows import column, fresh
 from topological_nav.config import EvaluationConfig
-from topological_nav.evaluate.contenders import Contender
-from topological_nav.evaluate.episodes import DrivenEpisodes
+from topological_nav.evaluate.contenders import Contender, DrivenEpisodes
 from topological_nav.navigate.state import Events
 from topological_nav.scenes.simulation import Seen, Simulator
 

@@ -24,8 +24,8 @@ from interactive_nav_common.rows import Columns, read_rows, write_parquet
 from interactive_nav_common.untrusted.reading import read_npz
 from interactive_nav_common.versions import versions
 from topological_nav.errors import Progress, RunError
+from topological_nav.evaluate.contenders import DrivenEpisodes
 from topological_nav.evaluate.contest import Contest, ContestScene
-from topological_nav.evaluate.episodes import DrivenEpisodes
 from topological_nav.evaluate.evaluation import Played, columns, play
 
 CPU_BATCH = 8

@@ -13,12 +13,10 @@ from PIL import Image, ImageDraw
 from interactive_nav.record import write_mp4
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import whole_file
-from topological_nav.evaluate.contenders import NavigatorPlayer
+from topological_nav.evaluate.contenders import DrivenEpisodes, NavigatorPlayer
 from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
-from topological_nav.evaluate.episodes import DrivenEpisodes
 from topological_nav.evaluate.evaluation import Played, play
-from topological_nav.figures.episode_figures import map_lines, plan_picture
-from topological_nav.figures.maps import floor_plan
+from topological_nav.figures.maps import floor_plan, map_lines, plan_picture
 from topological_nav.maps.graph import TopologicalMap
 from topological_nav.navigate.state import FACE, PHASES, Events, State
 from topological_nav.scenes.simulation import Seen

@@ -23,9 +23,8 @@ from topological_nav.__main__ import main
 from topological_nav.config import EvaluationConfig
 from topological_nav.errors import RunError, SpaceError
 from topological_nav.evaluate import contest as contests
-from topological_nav.evaluate.contenders import learned
+from topological_nav.evaluate.contenders import DrivenEpisodes, count_of, draw_episodes, learned
 from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
-from topological_nav.evaluate.episodes import DrivenEpisodes, count_of, draw_episodes
 from topological_nav.evaluate.evaluation import play
 from topological_nav.evaluate.rows import _stem, play_contest
 from topological_nav.navigate.state import Events

@@ -8,7 +8,7 @@ import pytest
 
 from topological_nav.config import EvaluationConfig
 from topological_nav.evaluate import scores
-from topological_nav.evaluate.episodes import DrivenEpisodes
+from topological_nav.evaluate.contenders import DrivenEpisodes
 from topological_nav.evaluate.evaluation import Played, columns
 
 

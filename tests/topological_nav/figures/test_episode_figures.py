@@ -6,7 +6,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 
 from interactive_nav.scenes.scene import load_scene
-from topological_nav.figures.episode_figures import FEW, LOST, WON, journeys_figure
+from topological_nav.figures.maps import FEW, LOST, WON, journeys_figure
 from topological_nav.scenes.space import free_space
 
 
