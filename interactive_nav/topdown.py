@@ -18,8 +18,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Patch, PathPatch
-from matplotlib.path import Path as Outline
+from matplotlib.patches import Circle, Patch
+from shapely.plotting import patch_from_polygon
 
 from interactive_nav.pictures.camera import COLOURS
 from interactive_nav.pictures.replay import Replay, ReplayError, load_replay
@@ -141,11 +141,15 @@ def _draw_object(axis: Axes, category: str, boxes: np.ndarray, pos: np.ndarray, 
     if not (extent[0] <= centre[0] <= extent[1] and extent[2] <= centre[1] <= extent[3]):
         return  # an object without a place waits outside
     colour = COLOURS[category]
-    axis.add_patch(_patch(after, facecolor=(*colour, 0.75), edgecolor=(*(0.6 * np.array(colour)), 1.0), linewidth=0.6))
+    axis.add_patch(
+        patch_from_polygon(
+            after, facecolor=(*colour, 0.75), edgecolor=(*(0.6 * np.array(colour)), 1.0), linewidth=0.6, zorder=3
+        )
+    )
     if before.hausdorff_distance(after) <= MOVED_M:
         return
     dark = 0.55 * np.array(colour)
-    axis.add_patch(_patch(before, facecolor="none", edgecolor=dark, linewidth=0.9, linestyle=":"))
+    axis.add_patch(patch_from_polygon(before, facecolor="none", edgecolor=dark, linewidth=0.9, linestyle=":", zorder=3))
     there = np.array(after.centroid.coords[0])
     if np.linalg.norm(there - centre) > MOVED_M:
         arrow = {"arrowstyle": "-|>", "color": dark, "lw": 1.0, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 8}
@@ -164,12 +168,6 @@ def _draw_path(axis: Axes, replay: Replay, colour_by: str) -> None:
         names = np.where(replay.touches_movable, "an object", np.where(replay.touches_structure, "a wall", "nothing"))
         lines.set_color([TOUCH_COLOURS[name] for name in names])
     axis.add_collection(lines)
-
-
-def _patch(shape: Any, **style: Any) -> PathPatch:
-    polygons = shape.geoms if hasattr(shape, "geoms") else [shape]
-    rings = [np.asarray(ring.coords) for p in polygons for ring in (p.exterior, *p.interiors)]
-    return PathPatch(Outline.make_compound_path(*(Outline(r, closed=True) for r in rings)), zorder=3, **style)
 
 
 def _files(sources: Sequence[str]) -> list[Path]:

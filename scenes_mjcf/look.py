@@ -143,6 +143,31 @@ def trace(
     return ray, geom.reshape(shape), distance.reshape(shape) / length[..., 0], normal.reshape(ray.shape)
 
 
+def mesh_of(model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Return vertices [n, 3] f32 (m), faces [m, 3] i32 and their texture coordinates [m, 3, 2] of a compiled mesh."""
+    first, face, start = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh], model.mesh_texcoordadr[mesh]
+    rows = slice(face, face + model.mesh_facenum[mesh])
+    uv = model.mesh_texcoord[start + model.mesh_facetexcoord[rows]] if start >= 0 else None
+    return model.mesh_vert[first : first + model.mesh_vertnum[mesh]], model.mesh_face[rows], uv
+
+
+def geom_mesh(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices [n, 3] f64 (m, in the body's frame) and faces [m, 3] i64 of a mesh geom."""
+    (vertices, faces, _), turn = mesh_of(model, model.geom_dataid[geom]), np.zeros(9)
+    mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+    return vertices.astype(float) @ turn.reshape(3, 3).T + model.geom_pos[geom], faces.astype(np.int64)
+
+
+def geom_image(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
+    """Return the texture [h, w, channels] u8 of a geom's material; None where it has none."""
+    material = model.geom_matid[geom]
+    texture = model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB] if material >= 0 else -1
+    if texture < 0:
+        return None
+    shape = model.tex_height[texture], model.tex_width[texture], model.tex_nchannel[texture]
+    return model.tex_data[model.tex_adr[texture] :][: np.prod(shape)].reshape(shape)
+
+
 class GlPainter:
     """Draws one model, one camera after the other; it must stay in the thread that created it."""
 

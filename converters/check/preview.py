@@ -29,7 +29,7 @@ from converters.check.pictures import (
     from_the_south,
     world_surfaces,
 )
-from converters.check.surfaces import geom_mesh, geom_outline
+from converters.check.surfaces import geom_outline
 from converters.geometry.boxes import convex_hull
 from converters.read.obj import in_colour, textured_by_face
 from converters.records.raw import RawScene, ScanMesh
@@ -37,7 +37,7 @@ from converters.records.visual import TexturedMesh
 from converters.structure.cut import cut_furniture
 from interactive_nav_common.files import check_name, whole_file
 from scenes_mjcf.categories import CATEGORIES
-from scenes_mjcf.look import over
+from scenes_mjcf.look import geom_mesh, over
 from scenes_mjcf.schema import SCENES, SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
 
 LEGEND_ENTRY_IN, LEGEND_LINE_IN = 1.25, 0.19

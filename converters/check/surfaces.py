@@ -8,6 +8,7 @@ from scipy.spatial import ConvexHull, KDTree
 
 from converters.geometry.faces import face_areas, sample_faces
 from converters.records.visual import TexturedMesh
+from scenes_mjcf.look import geom_image, geom_mesh, mesh_of
 
 SPACING_M = 0.04
 """Of the points on hulls and visuals."""
@@ -21,25 +22,11 @@ SIDE = 0.7
 """Largest vertical component of the normal of what counts as a side: robots come along the floor."""
 
 
-def geom_mesh(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (n, 3) m in the body's frame and faces (m, 3) of a mesh geom."""
-    mesh, turn = model.geom_dataid[geom], np.zeros(9)
-    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-    vertices = model.mesh_vert[first : first + count].astype(float)
-    faces = model.mesh_face[model.mesh_faceadr[mesh] :][: model.mesh_facenum[mesh]].astype(np.int64)
-    mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-    return vertices @ turn.reshape(3, 3).T + model.geom_pos[geom], faces
-
-
 def geom_surface(model: mujoco.MjModel, geom: int) -> TexturedMesh:
     """Return a textured mesh geom as MuJoCo draws it, in the body's frame."""
-    vertices, faces = geom_mesh(model, geom)
-    mesh, image = model.geom_dataid[geom], model.mat_texid[model.geom_matid[geom]][mujoco.mjtTextureRole.mjTEXROLE_RGB]
-    corners = model.mesh_facetexcoord[model.mesh_faceadr[mesh] :][: len(faces)]
-    uv = model.mesh_texcoord[model.mesh_texcoordadr[mesh] :][corners] * [1.0, -1.0] + [0.0, 1.0]
-    shape = model.tex_height[image], model.tex_width[image], model.tex_nchannel[image]
-    pixels = model.tex_data[model.tex_adr[image] :][: np.prod(shape)].reshape(shape)
-    return TexturedMesh(vertices, faces, uv, pixels[..., :3])
+    uv, image = mesh_of(model, model.geom_dataid[geom])[2], geom_image(model, geom)
+    assert uv is not None and image is not None
+    return TexturedMesh(*geom_mesh(model, geom), uv * [1.0, -1.0] + [0.0, 1.0], image[..., :3])
 
 
 def geom_outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int, axes_w: np.ndarray) -> np.ndarray:
@@ -47,9 +34,7 @@ def geom_outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int, axes_w: 
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
         corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T * model.geom_size[geom]
     else:
-        mesh = model.geom_dataid[geom]
-        first = model.mesh_vertadr[mesh]
-        corners = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+        corners = mesh_of(model, model.geom_dataid[geom])[0]
     points = (corners @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]) @ axes_w[:2].T
     return points[ConvexHull(points).vertices]
 

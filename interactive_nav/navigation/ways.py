@@ -22,6 +22,7 @@ from interactive_nav_common.grids import (
     nearest_cell,
     sampled_clearance,
 )
+from scenes_mjcf.look import mesh_of
 
 CELL_M = 0.05
 MARGIN_M = 0.02
@@ -66,9 +67,7 @@ class Footprints:
         cells = []
         for g in geoms:
             if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH:
-                mesh = model.geom_dataid[g]
-                first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-                local = model.mesh_vert[first : first + count]
+                local = mesh_of(model, model.geom_dataid[g])[0]
             else:
                 local = self._corners * model.geom_size[g]
             points = data.geom_xpos[g] + local @ data.geom_xmat[g].reshape(3, 3).T

@@ -16,6 +16,7 @@ from interactive_nav_common.grids import clearance, largest_component, value_nea
 from interactive_nav_common.rotations import rotate
 from scenes_mjcf.agreement import differences
 from scenes_mjcf.categories import MaskClasses, class_id
+from scenes_mjcf.look import geom_mesh
 from scenes_mjcf.robot_facts import SMALLEST
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
 from scenes_mjcf.sets import PACKAGED, installed, meant
@@ -235,14 +236,6 @@ def _boxes(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
     return np.concatenate([model.geom_pos[geoms], model.geom_quat[geoms], model.geom_size[geoms]], 1)
 
 
-def _hull(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    mesh = model.geom_dataid[geom]
-    start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-    return model.mesh_vert[start : start + count] @ rotation.reshape(3, 3).T + model.geom_pos[geom]
-
-
 def _geoms(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a body's boxes and what of it collides."""
     mine = model.geom_bodyid == body
@@ -285,7 +278,7 @@ def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, fri
         quat_w=model.body_quat[body].copy(),
         friction=friction,
         boxes=_boxes(model, box),
-        hulls=tuple(_hull(model, g) for g in solid if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH),
+        hulls=tuple(geom_mesh(model, g)[0] for g in solid if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH),
         hinge=hinge,
     )
 

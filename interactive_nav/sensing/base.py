@@ -1,4 +1,7 @@
-"""Define what every renderer offers: images of scenes, `qpos` and camera poses, for a batch at once."""
+"""Define what every renderer offers: images of scenes, `qpos` and camera poses, for a batch at once.
+
+Those that draw boxes compute depth, class, normal and colour from the box that each pixel shows.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +10,18 @@ import copy
 import functools
 
 import jax
+import jax.numpy as jnp
 
 from interactive_nav.physics.base import one_of_batch
-from interactive_nav.sensing.boxes import BoxTables
-from interactive_nav.sensing.shading import Look
-from scenes_mjcf.look import CameraPose, Lens
+from interactive_nav.sensing.boxes import BoxTables, apply_axes, box_poses, slab
+from interactive_nav.sensing.shading import Look, lit
+from scenes_mjcf.look import SKY_COLOUR, CameraPose, Lens
 
 NEAR_M = 0.01
 FAR_M = 100.0
 """Near and far plane of the original's renderer (reference benchmark, section 1.3); what is farther is empty."""
+_FLOOR_HALF_M = (1e4, 1e4, 1.0)
+"""The floor as one more box, whose top is z = 0."""
 
 
 class Renderer(abc.ABC):
@@ -72,3 +78,91 @@ class Renderer(abc.ABC):
     def render(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
         """Draw one environment's `render_batch`; under any number of `vmap`s all are drawn in one call."""
         return one_of_batch(self.render_batch, (scene, qpos, camera))
+
+
+class BoxRenderer(Renderer):
+    """Draws the tables' boxes and the floor."""
+
+    @abc.abstractmethod
+    def trace_batch(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
+        """Return which box each pixel shows, from which colours and normals follow.
+
+        Returns:
+            Depth as `render_batch` gives it, and indices [N, H, W] i32 into the tables' boxes, B the floor, -1 nothing.
+        """
+
+    def images_batch(self, names, scene, qpos, camera, look=None):
+        if not set(names) & {"rgb", "normals"}:
+            return dict(zip(("depth", "segmentation"), self.render_batch(scene, qpos, camera), strict=True))
+        _, index = self.trace_batch(scene, qpos, camera)
+        return paint(self.tables, self.lens, scene, qpos, camera, index, look)
+
+
+def paint(
+    tables: BoxTables,
+    lens: Lens,
+    scene: jax.Array,
+    qpos: jax.Array,
+    camera: CameraPose,
+    index: jax.Array,
+    look: Look | None = None,
+) -> dict[str, jax.Array]:
+    """Return images, as `Renderer.images_batch` has them, from the boxes that a renderer has met.
+
+    Each ray meets its box once more, so that depth and face are exact and the same with every renderer. Leading
+    axes are [N]; `index` [N, H, W] is of `BoxRenderer.trace_batch`; a `look` of None leaves things as they are.
+    """
+    n, shape = len(scene), index.shape
+    assert tables.colour is not None
+    centre, axes = box_poses(tables, scene, qpos)
+    boxes = jnp.concatenate([axes.reshape(n, -1, 9), centre, tables.half_m[scene]], -1)
+    floor = jnp.concatenate([jnp.eye(3).ravel(), jnp.asarray([0.0, 0.0, -_FLOOR_HALF_M[2], *_FLOOR_HALF_M])])
+    boxes = jnp.concatenate([boxes, jnp.broadcast_to(floor, (n, 1, 15))], 1)
+    ids = jnp.pad(tables.class_id, ((0, 0), (0, 1)))[scene]
+    place = jnp.where(index < 0, tables.num_boxes, index).reshape(n, -1)
+    met = index >= 0
+
+    def of_pixel(table: jax.Array) -> jax.Array:
+        """Return a table [N, B + 1, k] by pixel, [N, H, W, k]."""
+        return jnp.take_along_axis(table, place[..., None], 1).reshape(*shape, table.shape[-1])
+
+    row = of_pixel(boxes)
+    axes, centre, half = row[..., :9].reshape(*shape, 3, 3), row[..., 9:12], row[..., 12:]
+    inverse = jnp.swapaxes(axes, -1, -2)
+    forward, right, up = (camera.axes_w[:, None, None, :, i] for i in range(3))
+    across, along = jnp.asarray(lens.columns)[None, None, :, None], jnp.asarray(lens.rows)[None, :, None, None]
+    direction = apply_axes(inverse, forward + right * across + up * along)
+    low, _ = slab(apply_axes(inverse, camera.pos_w[:, None, None] - centre), half, direction)
+    outward = -jnp.sign(direction) * jax.nn.one_hot(jnp.argmax(low, -1), 3)
+    normal = apply_axes(axes, outward) * met[..., None]
+    sky = jnp.broadcast_to(jnp.asarray(SKY_COLOUR), (*shape, 3))
+    base = jnp.where(met[..., None], of_pixel(tables.colour[scene]), sky)
+    classes = jnp.where(met, of_pixel(ids[..., None])[..., 0], 0)
+    return {
+        "depth": jnp.where(met, low.max(-1), 0.0),
+        "segmentation": classes,
+        **lit_images(base, normal, camera, met, classes, look),
+    }
+
+
+def lit_images(
+    base: jax.Array,
+    normal_w: jax.Array,
+    camera: CameraPose,
+    shaded: jax.Array,
+    ids: jax.Array,
+    look: Look | None = None,
+) -> dict[str, jax.Array]:
+    """Return images `rgb` and `normals` of `base` colours in [0, 1] and `normal_w`, both [N, H, W, 3], 0 where none.
+
+    Light falls where `shaded`, [N, H, W] bool; else the colours stay. A `look` of None leaves things as they are.
+    """
+    forward, right, up = (camera.axes_w[:, None, None, :, i] for i in range(3))
+    sideways, upward, away = ((normal_w * axis).sum(-1) for axis in (right, up, forward))
+    normals = jnp.stack([sideways, upward, -away], -1)
+    if look is None:
+        return {"normals": normals, "rgb": lit(base, normal_w, forward, shaded, jnp)}
+    flat = ids.reshape(len(ids), -1, 1).astype(jnp.int32)
+    base = jnp.clip(base * jnp.take_along_axis(look.tint, flat, 1).reshape(base.shape), 0.0, 1.0)
+    rgb = lit(base, normal_w, forward, shaded, jnp, look.sun_w[:, None, None])
+    return {"normals": normals, "rgb": jnp.clip(rgb * look.brightness[:, None, None, None], 0.0, 1.0)}

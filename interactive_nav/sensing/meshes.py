@@ -20,14 +20,13 @@ from scipy.spatial import ConvexHull
 
 from interactive_nav.physics.warp_callbacks import held, keep_collector_out
 from interactive_nav.scenes.world import World
-from interactive_nav.sensing.base import FAR_M, NEAR_M, Renderer
+from interactive_nav.sensing.base import FAR_M, NEAR_M, Renderer, lit_images
 from interactive_nav.sensing.boxes import BoxTables, apply_axes, body_poses, geom_box, robot_geoms
 from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, geom_colour, visual_geoms
-from interactive_nav.sensing.surfaces import lit_images
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.agreement import is_lit
 from scenes_mjcf.categories import class_id
-from scenes_mjcf.look import SKY_COLOUR, Lens
+from scenes_mjcf.look import SKY_COLOUR, Lens, geom_image, mesh_of
 
 NEAR, FAR = wp.constant(NEAR_M), wp.constant(FAR_M)
 SKY, FLOOR = wp.constant(wp.vec3(*SKY_COLOUR)), wp.constant(wp.vec3(*FLOOR_COLOUR))
@@ -86,21 +85,14 @@ def _geom_surface(model: mujoco.MjModel, geom: int, slot: int) -> _Surface:
 
 
 def _mesh_surface(model: mujoco.MjModel, geom: int, slot: int, standing: bool) -> _Surface:
-    mesh, texture = model.geom_dataid[geom], -1
-    vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
-    rows = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
+    (vertices, faces, uv), image = mesh_of(model, model.geom_dataid[geom]), geom_image(model, geom)
     points = vertices @ matrix_from_quat(model.geom_quat[geom]).T + model.geom_pos[geom]
     if standing:
         points = points + model.body_pos[model.geom_bodyid[geom]]
-    uv, image = np.zeros((rows.stop - rows.start, 3, 2)), None
-    if model.geom_matid[geom] >= 0:
-        texture = model.mat_texid[model.geom_matid[geom]][mujoco.mjtTextureRole.mjTEXROLE_RGB]
-    if texture >= 0 and model.mesh_texcoordadr[mesh] >= 0:
-        uv = model.mesh_texcoord[model.mesh_texcoordadr[mesh] + model.mesh_facetexcoord[rows]]
-        shape = model.tex_height[texture], model.tex_width[texture], model.tex_nchannel[texture]
-        image = model.tex_data[model.tex_adr[texture] :][: np.prod(shape)].reshape(shape)[..., :3]
+    if uv is None or image is None:
+        uv, image = np.zeros((len(faces), 3, 2)), None
     lit = standing and is_lit(model)
-    return _Surface(slot, points, model.mesh_face[rows], uv, image, geom_colour(model, geom), lit)
+    return _Surface(slot, points, faces, uv, image if image is None else image[..., :3], geom_colour(model, geom), lit)
 
 
 def _surfaces(world: World, s: int, tables: BoxTables) -> tuple[list[_Surface], list[int]]:

@@ -13,9 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from interactive_nav.sensing.base import FAR_M, NEAR_M
+from interactive_nav.sensing.base import FAR_M, NEAR_M, BoxRenderer
 from interactive_nav.sensing.boxes import BoxTables, apply_axes, box_poses, compose, slab
-from interactive_nav.sensing.surfaces import BoxRenderer
 from scenes_mjcf.categories import SEGMENTATIONS
 from scenes_mjcf.look import CameraPose, Lens
 

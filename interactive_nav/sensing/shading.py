@@ -11,7 +11,7 @@ import numpy as np
 from interactive_nav.scenes.objects import VISUAL_GROUP
 from interactive_nav.scenes.scene import Scene
 from scenes_mjcf.categories import SEGMENTATIONS, MaskClasses
-from scenes_mjcf.look import SKY_COLOUR
+from scenes_mjcf.look import SKY_COLOUR, geom_image
 
 FLOOR_COLOUR = (0.56, 0.50, 0.43)
 PALETTES = {
@@ -65,13 +65,10 @@ def lambert(base: Any, normal_w: Any, forward_w: Any, met: Any, xp: Any) -> Any:
 
 def geom_colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
     """Return (3,) in [0, 1]: of the geom, or its texture's mean."""
-    material = model.geom_matid[geom]
-    texture = model.mat_texid[material][mujoco.mjtTextureRole.mjTEXROLE_RGB] if material >= 0 else -1
-    if texture < 0:
+    material, image = model.geom_matid[geom], geom_image(model, geom)
+    if image is None:
         return (model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom])[:3]
-    size = model.tex_height[texture] * model.tex_width[texture]
-    first, channels = model.tex_adr[texture], model.tex_nchannel[texture]
-    pixels = model.tex_data[first : first + size * channels].reshape(size, channels)[:, :3]
+    pixels = image.reshape(-1, image.shape[-1])[:, :3]
     # Atlases are padded with black.
     used = pixels.max(1) > 8
     return pixels[used].mean(0) / 255.0 if used.any() else np.full(3, 0.5)

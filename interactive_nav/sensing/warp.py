@@ -15,10 +15,9 @@ from mujoco import mjx
 
 from interactive_nav.physics.base import uncommitted
 from interactive_nav.physics.warp_callbacks import held, keep_collector_out
-from interactive_nav.sensing.base import FAR_M, NEAR_M
+from interactive_nav.sensing.base import FAR_M, NEAR_M, BoxRenderer
 from interactive_nav.sensing.boxes import BoxTables, box_poses
 from interactive_nav.sensing.rays import camera_boxes, in_view
-from interactive_nav.sensing.surfaces import BoxRenderer
 from scenes_mjcf.look import SKY_COLOUR, CameraPose, Lens
 
 _HIDDEN_W = (0.0, 0.0, -50.0)

@@ -26,6 +26,7 @@ from converters.records.limits import FILES, GEOMS, PIXELS, check_count, check_i
 from converters.records.raw import RawScene
 from interactive_nav_common.rotations import matrix_from_quat, transform
 from scenes_mjcf.categories import CATEGORIES, Category
+from scenes_mjcf.look import mesh_of
 
 NUMBER = re.compile(r"\+?\d+\.?\d*(e\+?\d+)?", re.IGNORECASE)
 FARTHEST_M = 1e4
@@ -300,21 +301,17 @@ def _rgba(model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 
 def _of_mesh(model: mujoco.MjModel, mesh: int, material: int, rgba: np.ndarray) -> TexturedMesh:
-    """A compiled mesh, with its material's texture where both have coordinates."""
-    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-    face, faces_n = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-    vertices = np.array(model.mesh_vert[first : first + count], float)
-    faces = np.array(model.mesh_face[face : face + faces_n], np.int64)
+    """Return a compiled mesh, with its material's texture where both have coordinates."""
+    vertices, faces, uv = mesh_of(model, mesh)
+    vertices, faces = vertices.astype(float), faces.astype(np.int64)
     texture = -1
     if material >= 0:
         texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
-    start = model.mesh_texcoordadr[mesh]
-    if texture < 0 or start < 0 or model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D:
+    if texture < 0 or uv is None or model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D:
         return in_colour(TexturedMesh(vertices, faces, None, None), rgba)
-    uv = np.array(model.mesh_texcoord[start + model.mesh_facetexcoord[face : face + faces_n]], float)
     height, width, channels = (int(v[texture]) for v in (model.tex_height, model.tex_width, model.tex_nchannel))
     at = model.tex_adr[texture]
     image = np.array(model.tex_data[at : at + height * width * channels], np.uint8).reshape(height, width, channels)
     # MuJoCo keeps images with their first row at the top and texture coordinates from there.
     image = np.clip(image[..., :3] * rgba[:3], 0, 255).astype(np.uint8)
-    return TexturedMesh(vertices, faces, uv * [1.0, -1.0] + [0.0, 1.0], image)
+    return TexturedMesh(vertices, faces, uv.astype(float) * [1.0, -1.0] + [0.0, 1.0], image)

@@ -12,10 +12,11 @@ from scipy.spatial import KDTree
 
 from converters.bodies.objects import PlacedObject
 from converters.bodies.physical import physical_properties
-from converters.check.surfaces import geom_mesh, geom_surface
+from converters.check.surfaces import geom_surface
 from converters.geometry.boxes import convex_hull, fit_box
 from converters.records.visual import VisualMesh
 from converters.write.emit import SceneParts, paired, write_obj, write_scene
+from scenes_mjcf.look import geom_mesh
 
 WIDE = np.array([1.1, 0.95, 1.0])
 IMAGE = np.random.default_rng(0).integers(0, 255, (16, 8, 3), np.uint8)
