@@ -168,6 +168,17 @@ def geom_image(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
     return model.tex_data[model.tex_adr[texture] :][: np.prod(shape)].reshape(shape)
 
 
+def geom_colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """Return (3,) in [0, 1]: of the geom, or its texture's mean."""
+    material, image = model.geom_matid[geom], geom_image(model, geom)
+    if image is None:
+        return (model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom])[:3]
+    pixels = image.reshape(-1, image.shape[-1])[:, :3]
+    # Atlases are padded with black.
+    used = pixels.max(1) > 8
+    return pixels[used].mean(0) / 255.0 if used.any() else np.full(3, 0.5)
+
+
 class GlPainter:
     """Draws one model, one camera after the other; it must stay in the thread that created it."""
 

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 
 import interactive_nav
 from interactive_nav.pictures.camera import ENGINES, STREAMS, VIEWS, PictureCamera
-from interactive_nav.sensing.shading import PALETTES
+from interactive_nav.sensing.boxes import PALETTES
 from scenes_mjcf.categories import SEGMENTATIONS
 
 _GAP_PX, _LABEL_PX, _SWATCH_PX = 8, 44, 12

@@ -25,8 +25,7 @@ from interactive_nav.pictures.scene_model import CUT_WALLS, ROBOT, ROBOT_SOLIDS,
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.scenes.scene import Scene
-from interactive_nav.sensing.base import FAR_M
-from interactive_nav.sensing.shading import lambert
+from interactive_nav.sensing.base import FAR_M, lambert
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.rotations import yaw_from_quat
 from scenes_mjcf.categories import SEGMENTATIONS, TABLE, MaskClasses

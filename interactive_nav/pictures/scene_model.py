@@ -15,11 +15,11 @@ from interactive_nav.scenes.objects import VISUAL_GROUP, SmallObject, add_boxes,
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.slots import bodies_by_name
 from interactive_nav.scenes.world import World
-from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, geom_colour
+from interactive_nav.sensing.boxes import FLOOR_COLOUR, PALETTES
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.categories import MaskClasses, class_id
-from scenes_mjcf.look import cast
+from scenes_mjcf.look import cast, geom_colour
 
 THINGS, BUILDING, CUT_WALLS, ROBOT, ROBOT_SOLIDS, HIDDEN = range(6)
 """Geom groups: the floor and what stands on it; walls at full height; walls cut low; the robot; the collision shapes

@@ -1,6 +1,6 @@
 """Define what every renderer offers: images of scenes, `qpos` and camera poses, for a batch at once.
 
-Those that draw boxes compute depth, class, normal and colour from the box that each pixel shows.
+Those that draw boxes compute depth, class, normal and colour from the box that each pixel shows. All are lit alike.
 """
 
 from __future__ import annotations
@@ -8,13 +8,16 @@ from __future__ import annotations
 import abc
 import copy
 import functools
+from typing import Any
 
+import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from interactive_nav.physics.base import one_of_batch
 from interactive_nav.sensing.boxes import BoxTables, apply_axes, box_poses, slab
-from interactive_nav.sensing.shading import Look, lit
+from scenes_mjcf.categories import SEGMENTATIONS, MaskClasses
 from scenes_mjcf.look import SKY_COLOUR, CameraPose, Lens
 
 NEAR_M = 0.01
@@ -22,6 +25,48 @@ FAR_M = 100.0
 """Near and far plane of the original's renderer (reference benchmark, section 1.3); what is farther is empty."""
 _FLOOR_HALF_M = (1e4, 1e4, 1.0)
 """The floor as one more box, whose top is z = 0."""
+_LIGHT_W = np.array([0.35, 0.25, 0.9], np.float32) / np.linalg.norm([0.35, 0.25, 0.9])
+
+
+@flax.struct.dataclass
+class Look:
+    """How an episode looks; leading axes as the caller has them."""
+
+    tint: jax.Array
+    """[..., classes, 3] factors of the colours of each class of the masks; structure and sky are 0."""
+    sun_w: jax.Array
+    """[..., 3] unit vector towards the sun."""
+    brightness: jax.Array
+    """[...] factor of everything."""
+
+
+def draw_look(key: jax.Array, colours: float, light: float, classes: MaskClasses) -> Look:
+    """Draw an episode's look with standard deviations `colours` and `light`.
+
+    `light` is in stops of brightness, and of each component of the vector to the sun before it has length 1.
+    """
+    tint, sun, bright = jax.random.split(key, 3)
+    sun_w = _LIGHT_W + light * jax.random.normal(sun, (3,))
+    # It stays above the floor.
+    sun_w = sun_w.at[2].set(jnp.maximum(jnp.abs(sun_w[2]), 0.1))
+    return Look(
+        jnp.exp(colours * jax.random.normal(tint, (len(SEGMENTATIONS[classes].names), 3))),
+        sun_w / jnp.linalg.norm(sun_w),
+        2.0 ** (light * jax.random.normal(bright)),
+    )
+
+
+def lit(base: Any, normal_w: Any, forward_w: Any, met: Any, xp: Any, sun_w: Any = _LIGHT_W) -> Any:
+    """Return colours [..., 3] in [0, 1] under a sun and a lamp at the camera; what is not `met` keeps its colour."""
+    light_w = xp.broadcast_to(xp.asarray(sun_w), normal_w.shape)
+    sun = xp.maximum((normal_w * light_w).sum(-1), 0.0)
+    lamp = xp.maximum(-(normal_w * forward_w).sum(-1), 0.0)
+    return base * xp.where(met, xp.minimum(0.45 + 0.4 * sun + 0.25 * lamp, 1.0), 1.0)[..., None]
+
+
+def lambert(base: Any, normal_w: Any, forward_w: Any, met: Any, xp: Any) -> Any:
+    """Return `lit` as u8."""
+    return xp.round(255.0 * lit(base, normal_w, forward_w, met, xp)).astype(xp.uint8)
 
 
 class Renderer(abc.ABC):

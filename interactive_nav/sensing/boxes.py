@@ -14,11 +14,18 @@ import mujoco
 import numpy as np
 
 from interactive_nav.scenes.objects import VISUAL_GROUP
+from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import World
-from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, geom_colour, visual_geoms
 from interactive_nav_common.rotations import Array, matrix_from_quat
-from scenes_mjcf.categories import MaskClasses, class_id
+from scenes_mjcf.categories import SEGMENTATIONS, MaskClasses, class_id
+from scenes_mjcf.look import SKY_COLOUR, geom_colour
 
+FLOOR_COLOUR = (0.56, 0.50, 0.43)
+PALETTES = {
+    classes: np.array([*masks.colours, FLOOR_COLOUR, SKY_COLOUR], np.float32)
+    for classes, masks in SEGMENTATIONS.items()
+}
+"""The setting `segmentation_classes` -> colours by class id, then the floor's and the background's."""
 _TINY = np.float32(1e-12)
 HOUSING_M = 0.01
 """What is as near to the robot's camera is its housing."""
@@ -79,6 +86,14 @@ def make_links(model: mujoco.MjModel, bodies: Sequence[int]) -> Links:
         parent = list(bodies).index(model.body_parentid[body])
         rest.append(Link(parent, model.body_pos[body], matrix_from_quat(model.body_quat[body]), tuple(joints)))
     return Links(int(model.jnt_qposadr[model.body_jntadr[bodies[0]]]), tuple(rest))
+
+
+def visual_geoms(scene: Scene) -> tuple[mujoco.MjModel, dict[str, list[int]]]:
+    """Return a scene's model as stored, and the geoms for show by the name of each body that has any."""
+    model, geoms = mujoco.MjModel.from_xml_path(str(scene.path / "scene.xml")), {}
+    for geom in map(int, np.flatnonzero(model.geom_group == VISUAL_GROUP)):
+        geoms.setdefault(model.body(model.geom_bodyid[geom]).name, []).append(geom)
+    return model, geoms
 
 
 def robot_geoms(world: World) -> list[list[int]]:

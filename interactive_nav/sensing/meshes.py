@@ -21,12 +21,20 @@ from scipy.spatial import ConvexHull
 from interactive_nav.physics.warp_callbacks import held, keep_collector_out
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing.base import FAR_M, NEAR_M, Renderer, lit_images
-from interactive_nav.sensing.boxes import BoxTables, apply_axes, body_poses, geom_box, robot_geoms
-from interactive_nav.sensing.shading import FLOOR_COLOUR, PALETTES, geom_colour, visual_geoms
+from interactive_nav.sensing.boxes import (
+    FLOOR_COLOUR,
+    PALETTES,
+    BoxTables,
+    apply_axes,
+    body_poses,
+    geom_box,
+    robot_geoms,
+    visual_geoms,
+)
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.agreement import is_lit
 from scenes_mjcf.categories import class_id
-from scenes_mjcf.look import SKY_COLOUR, Lens, geom_image, mesh_of
+from scenes_mjcf.look import SKY_COLOUR, Lens, geom_colour, geom_image, mesh_of
 
 NEAR, FAR = wp.constant(NEAR_M), wp.constant(FAR_M)
 SKY, FLOOR = wp.constant(wp.vec3(*SKY_COLOUR)), wp.constant(wp.vec3(*FLOOR_COLOUR))

@@ -34,11 +34,11 @@ from interactive_nav.physics.base import PhysicsState
 from interactive_nav.robots.spec import RobotCamera
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing import Renderer, build_boxes, make_renderer
+from interactive_nav.sensing.base import draw_look
 from interactive_nav.sensing.boxes import Links, apply_axes, make_links
 from interactive_nav.sensing.noise import disturbed
 from interactive_nav.sensing.observation import task_observation
 from interactive_nav.sensing.rays import cast_fan
-from interactive_nav.sensing.shading import draw_look
 from interactive_nav.types import NavInfo
 from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from interactive_nav.robots import get_robot
 from interactive_nav.robots.build import stand
 from interactive_nav.robots.spec import RobotSpec
-from interactive_nav.sensing.shading import lambert
+from interactive_nav.sensing.base import lambert
 from interactive_nav_common.errors import UserError
 from scenes_mjcf.look import CameraPose, GlPainter, Lens, look_along, trace
 

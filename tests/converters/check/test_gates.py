@@ -13,7 +13,6 @@ import pytest
 from scipy import ndimage
 
 from converters.__main__ import main
-from converters.check.agreement import wall_values
 from converters.check.gates import (
     LIMITS,
     check_folder,
@@ -25,6 +24,7 @@ from converters.check.gates import (
     judge,
     objects_off,
     physical_values,
+    wall_values,
 )
 from converters.check.settle import settle
 from converters.records.errors import StageFailed

@@ -16,9 +16,9 @@ from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing import build_boxes
+from interactive_nav.sensing.boxes import PALETTES
 from interactive_nav.sensing.rays import RayRenderer
 from interactive_nav.sensing.sensors import Sensors
-from interactive_nav.sensing.shading import PALETTES
 from interactive_nav_common.errors import UserError
 from scenes_mjcf.categories import SEGMENTATIONS
 from tests.toys import write_room

@@ -11,11 +11,10 @@ from interactive_nav.config import NavConfig
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
-from interactive_nav.sensing.boxes import build_boxes
+from interactive_nav.sensing.boxes import FLOOR_COLOUR, build_boxes, visual_geoms
 from interactive_nav.sensing.rays import RayRenderer
-from interactive_nav.sensing.shading import FLOOR_COLOUR, geom_colour, visual_geoms
 from scenes_mjcf.categories import CATEGORIES
-from scenes_mjcf.look import SKY_COLOUR, Lens, look_along
+from scenes_mjcf.look import SKY_COLOUR, Lens, geom_colour, look_along
 
 SUN = np.array([0.35, 0.25, 0.9]) / np.linalg.norm([0.35, 0.25, 0.9])
 
