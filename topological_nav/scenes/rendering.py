@@ -1,10 +1,11 @@
-"""Where a robot stands and looks in, what its camera sees out: a scene as it is, drawn in batches of any size.
+"""Draw what a robot's camera sees of a scene, in batches of any size.
 
 `warp` (MJX-Warp's ray tracer, on a CPU or an NVIDIA GPU) and `gl` (MuJoCo's own renderer, which needs EGL or OSMesa)
 both draw the visual meshes with their textures. Their light differs, so the images of one do not fit networks that
 learned from the other.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -33,7 +34,7 @@ Bodies = tuple[Sequence[str], np.ndarray, np.ndarray]
 
 
 def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pitch_rad: np.ndarray) -> CameraPose:
-    """Where the camera of a robot is that stands on the floor.
+    """Return the pose of the camera of a robot that stands on the floor.
 
     Args:
         xy_w: [..., 2] m, of the base.
@@ -57,7 +58,7 @@ def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pit
 
 
 def need_engine(engine: str) -> None:
-    """Refuses an engine of pictures or physics that is not installed, before any work is done for it."""
+    """Refuse an engine of pictures or physics that is not installed, before any work is done for it."""
     if engine == "warp":
         note = "; networks see by the engine that they learned from, what is drawn anew can have engine=gl"
         optional("warp", missing("engine=warp", "warp-lang", "warp", note))
@@ -69,7 +70,7 @@ class SceneRenderer:
     def __init__(
         self, scene: Scene, lens: Lens, supersample: int = 1, engine: str = "warp", small: Sequence[SmallObject] = ()
     ):
-        """Loads the scene's meshes; the first picture may compile."""
+        """Load the scene's meshes; the first picture may compile."""
         need_engine(engine)
         self._lens, self._by = lens, supersample
         self._large = Lens(lens.width * supersample, lens.height * supersample, lens.fov_deg)
@@ -78,17 +79,14 @@ class SceneRenderer:
         for name in body_names(small):
             self._data.qpos[self._model.joint(f"{name}_joint").qposadr[0] + 2] = -50.0
         mujoco.mj_forward(self._model, self._data)
-        self._painters: dict[int, Painter] = {}
-        """By images a call."""
-        if engine == "warp":
-            self._sizes = batch_sizes(self._large, jax.default_backend())
-            self._painter(self._sizes[0])  # an engine that does not start says so here
-        else:
-            self._sizes = (1,)
-            self._painters[1] = self._gl_painter()
+        self._sizes = batch_sizes(self._large, jax.default_backend()) if engine == "warp" else (1,)
+        self._painter = functools.cache(
+            functools.partial(_painter, engine, self._model, self._data, self._large, supersample)
+        )
+        self._painter(self._sizes[0])  # an engine that does not start says so here
 
     def draw(self, pose: CameraPose, bodies: Bodies | None = None) -> np.ndarray:
-        """[N, H, W, 3] u8 images of cameras with leaves [N, ...]."""
+        """Draw [N, H, W, 3] u8 images of cameras with leaves [N, ...]."""
         pos, axes = np.asarray(pose.pos_w, np.float32), np.asarray(pose.axes_w, np.float32)
         count, first = len(pos), 0
         geoms = self._geoms(count, bodies)
@@ -110,7 +108,7 @@ class SceneRenderer:
         return out
 
     def _geoms(self, count: int, bodies: Bodies | None) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [count, ngeom, 3] and axes [count, ngeom, 3, 3]."""
+        """Return positions [count, ngeom, 3] and axes [count, ngeom, 3, 3]."""
         xpos = np.tile(self._data.geom_xpos.astype(np.float32), (count, 1, 1))
         xmat = np.tile(self._data.geom_xmat.reshape(-1, 3, 3).astype(np.float32), (count, 1, 1, 1))
         names, pos_w, quat_w = bodies or ((), xpos, xpos)
@@ -118,40 +116,29 @@ class SceneRenderer:
             body = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_BODY, name)
             if body > 0:
                 axes_w = matrix_from_quat(quat_w[:, i])
-                own, xpos_own, xmat_own = carried_geoms(self._model, body, pos_w[:, i], axes_w)
-                xpos[:, own], xmat[:, own] = xpos_own, xmat_own
+                geoms, pos, axes = carried_geoms(self._model, body, pos_w[:, i], axes_w)
+                xpos[:, geoms], xmat[:, geoms] = pos, axes
         return xpos, xmat
 
-    def _painter(self, size: int) -> Painter:
-        if size not in self._painters:
-            self._painters[size] = self._warp_painter(size)
-        return self._painters[size]
 
-    def _warp_painter(self, size: int) -> Painter:
+# Not a method: a context holds some 100 MiB, and goes with its renderer, not when cycles are collected.
+def _painter(engine: str, model: mujoco.MjModel, data: mujoco.MjData, lens: Lens, by: int, size: int) -> Painter:
+    if engine == "warp":
         from interactive_nav.sensing.warp import WarpColour
 
-        painter = WarpColour(self._model, self._large, size, list(SCENE))
+        warp = WarpColour(model, lens, size, list(SCENE))
+        return jax.jit(lambda pos, axes, xpos, xmat: shrink(warp.draw(xpos, xmat, CameraPose(pos, axes)), by))
+    gl = GlPainter(model, lens.width, lens.height)
 
-        @jax.jit
-        def paint(pos: jax.Array, axes: jax.Array, xpos: jax.Array, xmat: jax.Array) -> jax.Array:
-            return shrink(painter.draw(xpos, xmat, CameraPose(pos, axes)), self._by)
+    def paint(pos: np.ndarray, axes: np.ndarray, xpos: np.ndarray, xmat: np.ndarray) -> np.ndarray:
+        data.geom_xpos[:], data.geom_xmat[:] = xpos[0], xmat[0].reshape(-1, 9)
+        return shrink(gl.draw(data, CameraPose(pos, axes), lens.fov_deg, SCENE), by)
 
-        return paint
-
-    def _gl_painter(self) -> Painter:
-        data, lens, by = self._data, self._large, self._by
-        painter = GlPainter(self._model, lens.width, lens.height)
-
-        # Without `self`: a context holds some 100 MiB, and goes with its renderer, not when cycles are collected.
-        def paint(pos: np.ndarray, axes: np.ndarray, xpos: np.ndarray, xmat: np.ndarray) -> np.ndarray:
-            data.geom_xpos[:], data.geom_xmat[:] = xpos[0], xmat[0].reshape(-1, 9)
-            return shrink(painter.draw(data, CameraPose(pos, axes), lens.fov_deg, SCENE), by)
-
-        return paint
+    return paint
 
 
 def batch_sizes(lens: Lens, platform: str) -> tuple[int, ...]:
-    """Images a call of the engine, ascending; each is compiled when it is first needed."""
+    """Return the numbers of images a call of the engine, ascending; each is compiled when it is first needed."""
     if platform == "cpu":
         return CPU_IMAGES
     least, most = DEVICE_BATCH
@@ -160,20 +147,22 @@ def batch_sizes(lens: Lens, platform: str) -> tuple[int, ...]:
 
 
 def calls(count: int, sizes: tuple[int, ...]) -> list[int]:
-    """Sizes of the calls that draw `count` images: none in vain where there are calls of one, else as few calls as can
-    be, the last one the least that serves."""
-    made: list[int] = []
+    """Return the sizes of the calls that draw `count` images.
+
+    None are in vain where there are calls of one; else calls are as few as can be, the last the least that serves.
+    """
+    out: list[int] = []
     while count > 0:
         if sizes[0] == 1:
-            made.append(max(n for n in sizes if n <= count))
+            out.append(max(n for n in sizes if n <= count))
         else:
-            made.append(next((n for n in sizes if n >= count), sizes[-1]))
-        count -= made[-1]
-    return made
+            out.append(next((n for n in sizes if n >= count), sizes[-1]))
+        count -= out[-1]
+    return out
 
 
 def shrink(images: Any, by: int) -> Any:
-    """[N, by H, by W, 3] u8 to [N, H, W, 3] u8: means over squares of `by` pixels, halves rounded to even.
+    """Shrink [N, by H, by W, 3] u8 to [N, H, W, 3] u8: means over squares of `by` pixels, halves rounded to even.
 
     In whole numbers, so that NumPy and every device give the same; the result is of the images' own kind of array.
     """
@@ -191,7 +180,7 @@ def shrink(images: Any, by: int) -> Any:
 
 
 def _visual_model(scene: Scene, lens: Lens, small: Sequence[SmallObject]) -> mujoco.MjModel:
-    """The scene's visual meshes and floor; boxes stand for bodies without a mesh."""
+    """Build the scene's visual meshes and floor; boxes stand for bodies without a mesh."""
     spec = picture_spec(scene, small=small)
     if not any(body.joints for body in spec.bodies):
         # MJX-Warp wants at least one degree of freedom.

@@ -109,13 +109,13 @@ def test_calls_by_hand():
 
 def test_each_call_takes_the_least_batch_that_serves(painted, monkeypatch):
     monkeypatch.setattr(rendering, "batch_sizes", lambda *_: (2, 4, 8))
-    asked, make = [], SceneRenderer._warp_painter
+    asked, make = [], rendering._painter
 
-    def noted(self, size):
-        paint = make(self, size)
+    def noted(*key):
+        paint = make(*key)
         return lambda pos, *rest: asked.append(len(pos)) or paint(pos, *rest)
 
-    monkeypatch.setattr(SceneRenderer, "_warp_painter", noted)
+    monkeypatch.setattr(rendering, "_painter", noted)
     scene, lens, robot = load_scene(painted), Lens(16, 12, 60.0), get_robot("ttbot")
     pose = camera_pose(robot, np.array([-1.5, 0.0]), np.linspace(0.0, 6.0, 19), np.zeros(19))
     many = SceneRenderer(scene, lens, supersample=2)
