@@ -31,7 +31,7 @@ mjx_without_warp.hush()
 if TYPE_CHECKING:
     from interactive_nav import geodesic, metrics, reward
     from interactive_nav.config import NavConfig
-    from interactive_nav.robots import get_robot, robot_names
+    from interactive_nav.robots import RobotSpec, get_robot, robot_names
     from interactive_nav.scenes.scene import load_scene
     from interactive_nav.task.env import InteractiveNav
     from interactive_nav.task.terms import Term
@@ -56,11 +56,13 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'interactive_nav' has no attribute {name!r}; it has {', '.join(__all__)}")
 
 
-def make(robot: str, scenes: Sequence[str | Path], terms: Sequence[Term] = (), **settings: Any) -> InteractiveNav:
+def make(
+    robot: str | RobotSpec, scenes: Sequence[str | Path], terms: Sequence[Term] = (), **settings: Any
+) -> InteractiveNav:
     """Build an environment.
 
     Args:
-        robot: a name from `robot_names()`.
+        robot: a name from `robot_names()`, or a spec of `get_robot`.
         scenes: scene folders, or sets of them (`cluttered/train`); each episode draws one.
         terms: reward terms, metrics and observations to add (`interactive_nav.task.terms`).
         **settings: of `NavConfig`'s parts, such as backend, num_objects, observations, k_int, episode_steps; or
@@ -74,7 +76,7 @@ def make(robot: str, scenes: Sequence[str | Path], terms: Sequence[Term] = (), *
             or an unusable scene (`SceneError`).
     """
     from interactive_nav.config import make_config
-    from interactive_nav.robots import get_robot
+    from interactive_nav.robots import RobotSpec, get_robot
     from interactive_nav.scenes.scene import load_scene
     from interactive_nav.task.env import InteractiveNav
     from scenes_mjcf.sets import scene_folders
@@ -82,7 +84,7 @@ def make(robot: str, scenes: Sequence[str | Path], terms: Sequence[Term] = (), *
     if isinstance(scenes, (str, Path)):
         raise ConfigError(f"scenes is {str(scenes)!r}, expected a list of scene folders; write [{str(scenes)!r}]")
     config = make_config(**settings)
-    spec = get_robot(robot, config.rules.control_mode)
+    spec = robot if isinstance(robot, RobotSpec) else get_robot(robot, config.rules.control_mode)
     return InteractiveNav(spec, tuple(load_scene(s) for s in scene_folders(scenes)), config, terms)
 
 

@@ -25,9 +25,8 @@ import jax
 from interactive_nav_common.config import overridden
 from interactive_nav_common.rows import markdown
 from topological_nav.config import EvaluationConfig
-from topological_nav.evaluate.contenders import NavigatorPlayer
 from topological_nav.evaluate.contest import Contest, ContestScene, local_policy
-from topological_nav.evaluate.evaluation import Played, Tell, play
+from topological_nav.evaluate.evaluation import NavigatorPlayer, Played
 from topological_nav.learn.training import load_networks
 from topological_nav.navigate.navigator import Navigator
 from topological_nav.weights.packaged import packaged_weights
@@ -84,12 +83,14 @@ class Clock:
             self.parts[self._open[-1][0]].compiling += duration_secs
 
 
-def measure(contest: Contest, tell: Tell = lambda *_: None) -> tuple[dict[str, Spent], Played, int, float]:
+def measure(
+    contest: Contest, tell: Callable[[int, float], None] = lambda *_: None
+) -> tuple[dict[str, Spent], Played, int, float]:
     """Plays the episodes of the contest's only scene in one batch.
 
     Args:
         contest: with networks; its contenders and folder are not looked at.
-        tell: see `play`.
+        tell: see `Contender.play`.
 
     Returns:
         What each part spent, what came of the episodes, images drawn, and seconds in all.
@@ -106,9 +107,8 @@ def measure(contest: Contest, tell: Tell = lambda *_: None) -> tuple[dict[str, S
     sight: Any = SimpleNamespace(summed=real.summed, distances=distances, passage=passage)
     policy: Any = local_policy(contest, sight, venue.networks)
     policy.act = clock.timed("local policy", policy.act)
-    simulator: Any = venue.simulator
-    for name in ("start", "drive", "act", "seen"):
-        setattr(simulator, name, clock.timed("physics", getattr(simulator, name)))
+    for name in ("_reset_to", "_step"):
+        setattr(venue.player, name, clock.timed("physics", getattr(venue.player, name)))
     draw = clock.timed("drawing", venue.camera)
 
     def camera(xy_w, yaw_rad, qpos):
@@ -117,8 +117,9 @@ def measure(contest: Contest, tell: Tell = lambda *_: None) -> tuple[dict[str, S
         return draw(xy_w, yaw_rad, qpos)
 
     journeys = clock.timed("episodes drawn", lambda: venue.episodes)()
-    player = NavigatorPlayer(Navigator(made, sight, policy, contest.config.navigator), simulator, camera)
-    played = clock.timed(REST, play)(player, simulator, journeys, contest.config, tell)
+    navigator = Navigator(made, sight, policy, contest.config.navigator)
+    player = NavigatorPlayer(venue.player, contest.config, navigator, camera)
+    played = clock.timed(REST, player.play)(journeys, tell)
     return dict(clock.parts), played, images, time.perf_counter() - began
 
 

@@ -5,7 +5,7 @@ import functools
 import operator
 import zlib
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -23,21 +23,43 @@ PolicyFn = Callable[[Any, jax.Array], jax.Array]
 """Pure (observation, key) -> action (A,) in [-1, 1], of one environment."""
 
 
+class MemoryPolicy(Protocol):
+    """A pytree with pure methods of one environment, which remembers, and decides when an episode is over.
+
+    Its memory travels in `state.info["policy"]`, where recorders can read it. The environment's `done` ends nothing.
+    """
+
+    def start(self, state: Any, episode: jax.Array) -> Any:
+        """Return the memory at the start of an episode; `episode` is its number, [] i32."""
+        ...
+
+    def act(self, memory: Any, state: Any, key: jax.Array) -> tuple[jax.Array, Any, jax.Array]:
+        """Return the action (A,), the new memory, and whether the episode was over before this step, [] bool."""
+        ...
+
+
 class HostPolicy:
     """A policy that acts on the host, step by step, for a batch of episodes."""
 
     note = ""
     """A remark to print beside its scores."""
+    observes = True
+    """Whether it reads `state.obs`; without it environments are stepped faster."""
 
-    def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> np.ndarray:
-        """Return the actions [N, A] of one control step.
+    def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> Any:
+        """Return the actions [N, A] of one control step; or a tuple of them and which episodes are over, [N] bool.
+
+        Such an episode was over before this step, and the environment's `done` ends nothing.
 
         Args:
-            state: of the environments, leaves [N, ...].
+            state: of the environments, leaves [N, ...]; on `warp` the step that follows overwrites it.
             episode: [N] number of the episode in each environment.
             running: [N] bool; the actions of the others have no effect.
         """
         raise NotImplementedError
+
+
+Policy = PolicyFn | MemoryPolicy | HostPolicy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +69,10 @@ class Recorder:
     read: Callable[[Any, jax.Array], Any]
     """Pure (states, actions [N, A]) after a control step -> pytree of [N, ...]."""
     at: Literal["start", "end", "step"] = "end"
-    """When its value is kept: before the first step (with actions of 0), in the last one, or in all of them."""
+    """When its value is kept: before the first step (with actions of 0), in the last one, or in all of them.
+
+    Where the policy ends episodes, the last value is that of its last `act`, which was not carried out.
+    """
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,9 +88,10 @@ class Rollout:
     end means nothing."""
 
 
-def episode_keys(seed: int, episodes: int) -> jax.Array:
-    """Return keys [N, 2] of fixed episodes: number i is the same whatever their number and whichever policy plays."""
-    return jax.vmap(functools.partial(jax.random.fold_in, jax.random.PRNGKey(seed)))(jnp.arange(episodes))
+def episode_keys(seed: int, episodes: int | np.ndarray) -> jax.Array:
+    """Return keys [N, 2] of N fixed episodes, or of those with numbers [N]: number i is the same for every policy."""
+    numbers = jnp.arange(episodes) if isinstance(episodes, int) else jnp.asarray(episodes)
+    return jax.vmap(functools.partial(jax.random.fold_in, jax.random.PRNGKey(seed)))(numbers)
 
 
 def policy_key_of(key: jax.Array) -> jax.Array:
@@ -88,12 +114,19 @@ class Player:
         self._reset = jax.jit(jax.vmap(env.reset))
         self._reset_to = jax.jit(jax.vmap(env.reset_to)) if hasattr(env, "reset_to") else None
         self._begin = jax.jit(self._carry)
+        self._remember = jax.jit(lambda policy, *of: jax.vmap(policy.start)(*of))
         self._chunk = jax.jit(self._play_chunk, compiler_options=compiler_options())
-        self._step = jax.jit(self._play_step, compiler_options=compiler_options())
+        # For buffers that have moved MJX-Warp captures its graphs anew: a step writes where the state lay.
+        self._step = jax.jit(
+            self._play_step,
+            static_argnames="observe",
+            donate_argnums=(0,) if env.backend == "warp" else (),
+            compiler_options=compiler_options(),
+        )
 
     def rollout(
         self,
-        policy: PolicyFn | HostPolicy,
+        policy: Policy,
         keys: jax.Array,
         starts: Any = None,
         scene_index: np.ndarray | None = None,
@@ -101,6 +134,7 @@ class Player:
         batch: int | None = None,
         on_progress: Callable[[int, int], None] = lambda finished, step: None,
         on_note: Callable[[str], None] = lambda note: None,
+        fewest: int = FEWEST,
     ) -> Rollout:
         """Play every episode to its end.
 
@@ -111,14 +145,16 @@ class Player:
             record: E of the recorders at each step; None: all.
             batch: episodes played at a time; None: all. Where the device's memory lacks room, half as many are tried.
             on_progress: called with the numbers of finished episodes and of steps.
+            fewest: on the CPU a batch is made no smaller than about this.
         """
         count = len(keys)
         size, record = min(batch or count, count), count if record is None else record
+        options = starts, scene_index, record, fewest, on_progress
         parts: list[Rollout] = []
         done = 0
         while done < count:
             try:
-                parts.append(self._play_batch(policy, keys, done, size, (starts, scene_index, record, on_progress)))
+                parts.append(self._play_batch(policy, keys, done, size, options))
             except jax.errors.JaxRuntimeError as error:
                 if "RESOURCE_EXHAUSTED" not in str(error) or size == 1:
                     raise
@@ -134,7 +170,7 @@ class Player:
 
     def _play_batch(self, policy: Any, keys: jax.Array, done: int, size: int, options: tuple[Any, ...]) -> Rollout:
         """Play the next `size` episodes; the last one, over from the start, fills a batch that is too large."""
-        starts, scenes, record, on_progress = options
+        starts, scenes, record, fewest, on_progress = options
         chosen, count = np.minimum(np.arange(done, done + size), len(keys) - 1), min(size, len(keys) - done)
         keys, starts, scenes = jax.tree.map(operator.itemgetter(chosen), (keys, starts, scenes))
         record = max(0, min(record - done, count))
@@ -144,15 +180,18 @@ class Player:
             assert self._reset_to is not None
             state = self._reset_to(starts, keys)
         policy_keys = jax.vmap(policy_key_of)(keys)
-        first = jax.tree.map(np.asarray, state.info["nav"])
+        first = jax.tree.map(np.array, state.info["nav"])
         episode_of = np.arange(size)  # episode played by each place in the batch
         finished = episode_of >= count
         act: Any = policy  # a pytree argument of the program, so that its numbers are none of its constants
-        if not isinstance(policy, (jax.tree_util.Partial, HostPolicy)):
+        if hasattr(policy, "start"):
+            memory = self._remember(policy, state, jnp.asarray(done + episode_of))
+            state = state.replace(info=state.info | {"policy": memory})
+        elif not isinstance(policy, (jax.tree_util.Partial, HostPolicy)):
             act = jax.tree_util.Partial(policy)
         step, tracks = 0, []
         carry, at_start = self._begin(state, jnp.asarray(finished))
-        ends = jax.tree.map(np.array, carry[2])
+        at_start, ends = jax.tree.map(np.array, (at_start, carry[2]))
         while not finished.all():
             if isinstance(policy, HostPolicy):
                 carry, track = self._play_on_host(policy, carry, done + episode_of, step)
@@ -169,7 +208,7 @@ class Player:
             tracks.append(places)
             on_progress(done + int(finished[:count].sum()), step)
             if self.env.backend == "native":
-                left = going_on(finished[episode_of])
+                left = going_on(finished[episode_of], fewest)
                 if len(left) < len(episode_of):
                     carry, episode_of = jax.tree.map(operator.itemgetter(left), carry), episode_of[left]
         first, at_start, (num_steps, values) = jax.tree.map(lambda x: np.asarray(x[:count]), (first, at_start, ends))
@@ -186,21 +225,35 @@ class Player:
         )
         return (state, ended, (state.info["nav"].step_count, ends)), starts
 
-    def _play_step(self, carry: Any, action: jax.Array) -> tuple[Any, Any]:
-        """Step all environments; what belongs to an episode is frozen at the step that ended it."""
+    def _play_step(self, carry: Any, action: jax.Array, over: Any = None, observe: bool = True) -> tuple[Any, Any]:
+        """Step all environments; what belongs to an episode is frozen at the step that ended it.
+
+        `over` [N] bool: the policy ended these before the step; None: environments end their own.
+        """
         state, ended, kept = carry
-        state = jax.vmap(self.env.step)(state, action)
-        ends = (state.done > 0) & ~ended
+        if over is not None:
+            ended, kept = self._end(state, action, over, ended, kept)
+        state = jax.vmap(self.env.step if observe else self.env.advance)(state, action)
+        if over is None:
+            ended, kept = self._end(state, action, state.done > 0, ended, kept)
+        return (state, ended, kept), {name: read(state, action) for name, read in self._at_step.items()}
+
+    def _end(self, state: Any, action: jax.Array, over: jax.Array, ended: jax.Array, kept: Any) -> tuple[Any, Any]:
+        """Return which episodes are over by now, and what they ended with."""
+        ends = over & ~ended
         new = state.info["nav"].step_count, {name: read(state, action) for name, read in self._at_end.items()}
         kept = jax.tree.map(lambda x, old: jnp.where(ends.reshape(-1, *[1] * (x.ndim - 1)), x, old), new, kept)
-        return (state, ended | ends, kept), {name: read(state, action) for name, read in self._at_step.items()}
+        return ended | ends, kept
 
-    def _play_chunk(self, policy: PolicyFn, carry: Any, keys: jax.Array, step: int) -> tuple[Any, Any]:
+    def _play_chunk(self, policy: Any, carry: Any, keys: jax.Array, step: int) -> tuple[Any, Any]:
         """Play `CHUNK_STEPS` of all environments; return what `_carry` does, and values at steps [T, N, ...]."""
 
         def one_step(carry: Any, t: jax.Array) -> tuple[Any, Any]:
-            action = jax.vmap(policy)(carry[0].obs, jax.vmap(jax.random.fold_in, (0, None))(keys, step + t))
-            return self._play_step(carry, action)
+            state, now = carry[0], jax.vmap(jax.random.fold_in, (0, None))(keys, step + t)
+            if not hasattr(policy, "start"):
+                return self._play_step(carry, jax.vmap(policy)(state.obs, now))
+            action, memory, over = jax.vmap(policy.act)(state.info["policy"], state, now)
+            return self._play_step((state.replace(info=state.info | {"policy": memory}), *carry[1:]), action, over)
 
         return jax.lax.scan(one_step, carry, jnp.arange(CHUNK_STEPS))
 
@@ -211,17 +264,16 @@ class Player:
             running = ~np.asarray(carry[1])
             if not running.any():
                 break
-            actions = policy.act(carry[0], episode_of, running, step + t)
+            acted = policy.act(carry[0], episode_of, running, step + t)
+            actions, over = acted if isinstance(acted, tuple) else (acted, None)
             with signals_wait():
-                carry, track = jax.block_until_ready(self._step(carry, actions))
+                carry, track = jax.block_until_ready(self._step(carry, actions, over, observe=policy.observes))
             tracks.append(jax.tree.map(np.asarray, track))
         tracks += [tracks[-1]] * (CHUNK_STEPS - len(tracks))
         return carry, jax.tree.map(lambda *x: np.stack(x), *tracks)
 
 
-def rollout(
-    env: Any, policy: PolicyFn | HostPolicy, starts: Any, recorders: Mapping[str, Recorder], **options: Any
-) -> Rollout:
+def rollout(env: Any, policy: Policy, starts: Any, recorders: Mapping[str, Recorder], **options: Any) -> Rollout:
     """Play episodes once; see `Player.rollout`, which keeps what it compiles.
 
     Args:
@@ -231,14 +283,14 @@ def rollout(
     return Player(env, recorders).rollout(policy, starts, **options)
 
 
-def going_on(over: np.ndarray) -> np.ndarray:
+def going_on(over: np.ndarray, fewest: int = FEWEST) -> np.ndarray:
     """Return the places of a batch that go on: all that run, then as many others as fill it.
 
     [n] i64, n the smallest of N's sizes (see `FEWEST`) that holds all that run. So all batches of N episodes have the
     same few, and what is compiled for one serves the next.
     """
     size, running = len(over), int((~over).sum())
-    while size > FEWEST and running <= (smaller := -(-size * 3 // 4) if size > MANY else -(-size // 2)):
+    while size > fewest and running <= (smaller := -(-size * 3 // 4) if size > MANY else -(-size // 2)):
         size = smaller
     return np.argsort(over, kind="stable")[:size]
 

@@ -15,8 +15,7 @@ from scenes_mjcf.sets import scene_folders
 from topological_nav.commands.maps import build
 from topological_nav.commands.progress import bar, say
 from topological_nav.config import PASSAGE_POLICY, RUNS, EvaluationConfig, MapConfig, NavigatorConfig
-from topological_nav.evaluate.contest import Contest, contest_scenes
-from topological_nav.evaluate.rows import play_contest, tracks_of
+from topological_nav.evaluate.contest import Contest, contest_scenes, play_contest, tracks_of
 from topological_nav.evaluate.scores import console_table, differences, markdown, summary, where
 from topological_nav.figures.journey import drive_episode, film
 from topological_nav.figures.maps import journeys_figure, save

@@ -20,7 +20,8 @@ from topological_nav.config import (
 )
 from topological_nav.data.dataset import make_dataset
 from topological_nav.data.folders import folder_bytes
-from topological_nav.drives.dataset import draw_drives, embed_drives, simulate_drives, summary
+from topological_nav.drives.dataset import draw_drives, simulate_drives, summary
+from topological_nav.drives.driving import embed_drives
 from topological_nav.drives.imitation import grid_table, train_grid, train_policy
 from topological_nav.figures.drive_figures import drives_figure, policy_figure
 from topological_nav.figures.maps import curves_figure, dataset_figure, save

@@ -12,28 +12,25 @@ drawn. What is decided depends on scenes and settings only. Simulating and drawi
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav.task.rollout import Player
 from interactive_nav_common.files import write_arrays
 from interactive_nav_common.locks import alone_in
 from scenes_mjcf.look import CameraPose
 from topological_nav.config import DataConfig, DriveConfig, MapConfig
 from topological_nav.data.folders import Folder, draw_missing, load_scenes
 from topological_nav.data.shards import numbered, read_arrays, read_shards
-from topological_nav.drives.expert import CONTROL_S, Terrain, way_field
-from topological_nav.drives.fleet import Fleet, Tasks, make_env
-from topological_nav.drives.routes import draw_routes, drivable
-from topological_nav.errors import ALONE, DatasetError, Host, Progress, RunError, SpaceError, Stopped
-from topological_nav.learn.learning import in_batches
-from topological_nav.learn.training import SAME, Trained, load_pair, seen_by
+from topological_nav.drives.expert import CONTROL_S, RECORDERS, Tasks, Terrain, drive, drive_env, way_field
+from topological_nav.errors import DatasetError, Progress, SpaceError
+from topological_nav.maps.graph import angles, near_pairs
 from topological_nav.maps.nodes import place_nodes
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.rooms import scene_rooms
@@ -50,6 +47,8 @@ read_drives_header = DRIVES.read
 AGAIN = "data --drives"
 LIMIT_M = 8.0
 """Fields of the way left reach so far; beyond they rise with the distance."""
+CANDIDATES = 32
+"""Starts tried about a node; the best is taken if none is clear."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,6 +98,91 @@ class Drives:
     def kept(self) -> np.ndarray:
         """[n] bool: reached its last node, touched nothing: drawn and learned from."""
         return self.reached & ~self.broken & ~self.touched
+
+
+@dataclasses.dataclass(frozen=True)
+class Routes:
+    """Drives of one scene; n of them."""
+
+    nodes: np.ndarray
+    """[n, legs + 1] i32 nodes one after the other; the last repeated where a drive is shorter."""
+    legs: np.ndarray
+    """[n] i32 edges driven."""
+    start_xy_w: np.ndarray
+    """[n, 2] m."""
+    start_yaw_rad: np.ndarray
+    """[n]."""
+    test: np.ndarray
+    """[n] bool: for testing only."""
+
+
+def drivable(space: FreeSpace, nodes_w: np.ndarray, to_go_m: np.ndarray, config: DriveConfig) -> np.ndarray:
+    """[E, 2] i32: the ordered pairs of nodes nearer than `edge_m` whose planned way is no long detour.
+
+    Args:
+        nodes_w: [N, 2] m.
+        to_go_m: [N, rows, columns] of `expert.way_field`, one to each node.
+    """
+    edges = near_pairs(nodes_w, config.edge_m)
+    column, row = space.inner_cells(nodes_w).T
+    way = to_go_m[edges[:, 1], row[edges[:, 0]], column[edges[:, 0]]]
+    straight = np.linalg.norm(nodes_w[edges[:, 0]] - nodes_w[edges[:, 1]], axis=1)
+    return edges[way <= config.detour * straight]
+
+
+def draw_routes(
+    space: FreeSpace, nodes_w: np.ndarray, edges: np.ndarray, config: DriveConfig, rng: np.random.Generator
+) -> Routes:
+    """Draws the drives of a scene.
+
+    The first edge is uniform over all that are long enough; from its end a drive goes on by an edge that turns less
+    than `turn_deg`, if there is one, uniform over those. A share of the nodes is held out: drives that begin there are
+    for testing.
+
+    Args:
+        nodes_w: [N, 2] m.
+        edges: [E, 2] of `drivable`.
+    """
+    if not len(edges):
+        raise SpaceError(f"no two of {len(nodes_w)} nodes are joined by a way to drive; use a larger edge_m or detour")
+    heading = angles(nodes_w, edges)
+    length = np.linalg.norm(nodes_w[edges[:, 1]] - nodes_w[edges[:, 0]], axis=1)
+    begins = np.flatnonzero(length >= min(config.least_edge_m, length.max()))
+    out_of = [np.flatnonzero(edges[:, 0] == node) for node in range(len(nodes_w))]
+    begun = np.unique(edges[begins, 0])
+    tests = rng.permutation(begun)[: round(config.test_share * len(begun))]
+    nodes = np.empty((config.drives, config.legs + 1), np.int32)
+    legs, yaw = np.empty(config.drives, np.int32), np.empty(config.drives)
+    start = np.empty((config.drives, 2))
+    for i in range(config.drives):
+        way = [int(rng.choice(begins))]
+        while len(way) < config.legs:
+            onward = out_of[edges[way[-1], 1]]
+            turn = np.abs((heading[onward] - heading[way[-1]] + np.pi) % (2 * np.pi) - np.pi)
+            passed = {int(edges[way[0], 0]), *(int(edges[w, 1]) for w in way)}
+            fresh = np.array([int(edges[e, 1]) not in passed for e in onward], bool)
+            onward = onward[(turn < np.radians(config.turn_deg)) & fresh]
+            if not len(onward):
+                break
+            way.append(int(rng.choice(onward)))
+        legs[i] = len(way)
+        visited = [edges[way[0], 0], *edges[way, 1]]
+        nodes[i] = visited + [visited[-1]] * (config.legs - len(way))
+        start[i] = _start(space, nodes_w[visited[0]], config, rng)
+        off = np.radians(config.start_turn_deg) * rng.uniform(-1.0, 1.0)
+        towards = nodes_w[visited[1]] - start[i]
+        yaw[i] = np.arctan2(towards[1], towards[0]) + off
+    return Routes(nodes, legs, start, (yaw + np.pi) % (2 * np.pi) - np.pi, np.isin(nodes[:, 0], tests))
+
+
+def _start(space: FreeSpace, node_w: np.ndarray, config: DriveConfig, rng: np.random.Generator) -> np.ndarray:
+    """[2] a place near a node: the first of some that is clear, else the clearest."""
+    angle, share = rng.uniform(0, 2 * np.pi, CANDIDATES), np.sqrt(rng.uniform(0, 1, CANDIDATES))
+    offset = config.start_off_m * share[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+    tried = np.concatenate([node_w + offset, node_w[None]])
+    room = space.at(tried)
+    clear = np.flatnonzero(room >= config.start_clear_m)
+    return tried[clear[0] if len(clear) else int(room.argmax())]
 
 
 def plan_drives(scenes: Sequence[Scene], config: DriveConfig) -> tuple[Tasks, np.ndarray, Terrain]:
@@ -159,17 +243,17 @@ def simulate_drives(
             return load_drives(out)
         tasks, test, terrain = plan_drives(scenes, config)
         write_arrays(out / "plan.npz", scene=tasks.scene, test=test, goal_w=tasks.goals_w[:, -1])
-        fleet: Fleet | None = None
+        player: Player | None = None
         for path, mine in files:
             if not path.is_file():
-                fleet = fleet or Fleet(make_env(scene_folders, config), terrain, config)
+                player = player or Player(drive_env(scene_folders, config), RECORDERS)
 
                 def tell(ended: int, mine: np.ndarray = mine) -> None:
                     progress("drives", int(mine[0]) + min(ended, len(mine) - 1), total)  # the padding's are no news
 
                 # Padded by its last drive: one size, one program.
                 rows = np.minimum(mine[0] + np.arange(config.batch), total - 1)
-                _write_batch(path, fleet.drive(tasks.take(rows), tell), len(mine))
+                _write_batch(path, drive(player, terrain, tasks.take(rows), config, tell), len(mine))
             progress("drives", int(mine[-1]) + 1, total)
         return load_drives(out)
 
@@ -258,73 +342,3 @@ def summary(drives: Drives) -> dict[str, float]:
         "m_s": float(drives.command[going, 0].mean()) if going.any() else 0.0,
         "turning": float((np.abs(drives.command[going, 1]) >= 0.125).mean()) if going.any() else 0.0,
     }
-
-
-_TOLD_EVERY = 10
-"""Files of images between two lines about embedding."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Frames:
-    """Drives of a folder and the embeddings of their images."""
-
-    drives: Drives
-    config: DriveConfig
-    header: dict[str, Any]
-    features: np.ndarray
-    """[F or 2 F, D] f16 of all control steps, 0 where nothing was drawn; then the same of mirrored images."""
-    networks: tuple[Trained, Trained]
-    """Of rooms and of passages."""
-    runs: tuple[Path, Path]
-
-    @property
-    def mirrored(self) -> bool:
-        """Whether there are mirrored ones."""
-        return len(self.features) > len(self.drives.command)
-
-
-def embed_drives(folder: Path, localiser_run: Path, detector_run: Path, mirror: bool, host: Host = ALONE) -> Frames:
-    """Embed the images of all kept drives."""
-    header, config = read_drives_header(folder)
-    drives, networks = load_drives(folder), load_pair(localiser_run, detector_run)
-    mine, theirs = {**header["settings"], "fov_deg": header["fov_deg"]}, seen_by(networks[0])
-    for name in SAME:
-        if mine[name] != theirs[name]:
-            raise RunError(
-                f"{folder}: images have {name} = {mine[name]!r}, the networks learned from {theirs[name]!r}; drive "
-                f"again with {name}={theirs[name]}"
-            )
-    count, total, done = len(drives.command), int(drives.steps[drives.kept].sum()), 0
-    features: np.ndarray | None = None
-    embed = _embedder(networks, mirror)
-    for i, (rows, images) in enumerate(drive_images(folder)):
-        at, part = drives.rows(rows), in_batches(embed, images)
-        if features is None:
-            features = np.zeros((part.shape[1] * count, part.shape[2]), np.float16)
-        for side in range(part.shape[1]):
-            features[at + side * count] = part[:, side]
-        done += len(images)
-        if i % _TOLD_EVERY == 0 or done == total:
-            host.tell(f"embedded {done:,} of {total:,} images")
-        if stop := host.signal():
-            raise Stopped(stop)
-    if features is None:
-        raise RunError(f"{folder}: none of {len(drives)} drives was kept; drive more, or in other scenes")
-    return Frames(drives, config, header, features, networks, (Path(localiser_run), Path(detector_run)))
-
-
-def embedded(networks: Sequence[Trained], weights: Any, images: jax.Array) -> jax.Array:
-    """[N, D] embeddings of images [N, H, W, 3] by all networks, one network after the other."""
-    pairs = zip(networks, weights, strict=True)
-    return jnp.concatenate([network.network.apply(w, images, method="embed") for network, w in pairs], -1)  # type: ignore[arg-type]
-
-
-def _embedder(networks: Sequence[Trained], mirror: bool) -> Callable[[jax.Array], jax.Array]:
-    """Compiled: images [N, H, W, 3] to [N, 1 or 2, D] f16, all networks' embeddings, then those of the mirrored."""
-
-    @jax.jit
-    def sides(weights: Any, images: jax.Array) -> jax.Array:
-        shown = (images, images[:, :, ::-1]) if mirror else (images,)
-        return jnp.stack([embedded(networks, weights, side) for side in shown], 1).astype(jnp.float16)
-
-    return functools.partial(sides, [network.variables for network in networks])

@@ -9,7 +9,9 @@ scan sees, in the middle of its way, the robot stops, because no way round is pl
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import flax.struct
 import jax
@@ -18,13 +20,21 @@ import numpy as np
 import scipy.ndimage
 from scipy.sparse.csgraph import dijkstra
 
+from interactive_nav.task.env import InteractiveNav
+from interactive_nav.task.rollout import Player, Recorder
+from interactive_nav_common.errors import UserError
 from interactive_nav_common.grids import MOVES_32, cell_centres, grid_graph, nearest_cell
 from interactive_nav_common.rotations import wrap_angle
-from topological_nav.config import ExpertConfig
+from interactive_nav_common.rows import Rows
+from scenes_mjcf.robot_facts import ROBOTS
+from topological_nav.config import DriveConfig, ExpertConfig
+from topological_nav.scenes.simulation import episode_starts, make_env
 from topological_nav.scenes.space import FreeSpace
 
 CONTROL_S = 0.1
 """Control period."""
+LIDAR_B = {name: facts.lidar_b for name, facts in ROBOTS.items() if facts.lidar_b is not None}
+"""Scanners by robot, m in the base's frame."""
 REFUSED = 100.0
 """Cost of a gap of 0 where `margin_m` is wanted; the least bad velocity wins where none keeps it."""
 _SLOPE_M = 0.1
@@ -230,3 +240,95 @@ def scan_points(ranges_m: jax.Array, config: ExpertConfig, lidar_xy_b: tuple[flo
     angle = jnp.radians(-0.5 * config.lidar_fov_deg + jnp.arange(config.lidar_rays) * step)
     ends = jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1) * ranges_m[:, None] + jnp.asarray(lidar_xy_b)[None]
     return jnp.where((ranges_m < 0.999 * config.lidar_range_m)[:, None], ends, jnp.inf)
+
+
+@flax.struct.dataclass
+class Tasks(Rows):
+    """Drives of one batch over several scenes; B of them."""
+
+    scene: np.ndarray
+    """[B] i32."""
+    goals: np.ndarray
+    """[B, legs] i32 fields of the terrain, one a leg."""
+    goals_w: np.ndarray
+    """[B, legs, 2] m, the nodes they lead to."""
+    legs: np.ndarray
+    """[B] i32."""
+    start_xy_w: np.ndarray
+    """[B, 2] m."""
+    start_yaw_rad: np.ndarray
+    """[B]."""
+
+
+def drive_env(scenes: Sequence[Path], config: DriveConfig) -> InteractiveNav:
+    """Build the environment of the drives: furniture at rest, no small objects."""
+    if config.robot not in LIDAR_B:
+        raise UserError(f"robot is '{config.robot}', expected one with a scanner: {', '.join(LIDAR_B)}")
+    lidar = {name: getattr(config, name) for name in ("lidar_rays", "lidar_fov_deg", "lidar_range_m")}
+    # All that stands in the scene can be met: what MJX's window would leave out would not be felt.
+    window = dict.fromkeys(("active_furniture", "active_small", "active_doors", "active_walls"), 0)
+    lidar |= {"observations": ("lidar",), "lidar_pos_m": LIDAR_B[config.robot]}
+    settings = {"control_dt_s": CONTROL_S, "num_objects": 0, **lidar, **window}
+    return make_env(scenes, config.robot, config.backend, **settings)
+
+
+@flax.struct.dataclass
+class Expert:
+    """Drive each task's legs, until its last node is reached or time runs out: a `rollout.MemoryPolicy`."""
+
+    terrain: Terrain
+    tasks: Tasks
+    env: InteractiveNav = flax.struct.field(pytree_node=False)
+    config: DriveConfig = flax.struct.field(pytree_node=False)
+
+    def start(self, state: Any, episode: jax.Array) -> dict[str, Any]:
+        """Return the task with nothing of it done."""
+        zero, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+        fresh = {"leg": zero, "leg_steps": zero, "reached": no, "broken": no, "gap_m": jnp.zeros(())}
+        fresh |= {"command": jnp.zeros(2), "pose_w": jnp.zeros(3)}
+        return {"task": jax.tree.map(lambda x: x[episode], self.tasks), **fresh}
+
+    def act(self, memory: dict[str, Any], state: Any, key: jax.Array) -> tuple[jax.Array, dict[str, Any], jax.Array]:
+        """Return the wheels' action; the memory says where the robot was and what it was commanded."""
+        config, task, nav, size_m = self.config, memory["task"], state.info["nav"], self.env.robot.size_m
+        assert size_m is not None
+        begun, xy_w = nav.step_count > 0, nav.robot_pos_w[:2]
+        arrived = begun & (jnp.linalg.norm(xy_w - task.goals_w[memory["leg"]], axis=-1) < config.reached_m)
+        lost = (nav.memory["overflow_steps"] > 0) | (nav.memory["left_out_steps"] > 0)
+        broken = (state.metrics["nonfinite"] > 0) | lost
+        reached = arrived & (memory["leg"] + 1 >= task.legs) & ~broken
+        leg = jnp.minimum(memory["leg"] + arrived, task.legs - 1)
+        leg_steps = jnp.where(arrived, 0, memory["leg_steps"] + begun)
+        over = reached | broken | (leg_steps >= round(config.leg_s / CONTROL_S))
+        pose = jnp.concatenate([xy_w, nav.yaw_rad[None]])
+        points = scan_points(state.obs * config.lidar_range_m, config, LIDAR_B[config.robot][:2])
+        half_m = jnp.asarray(size_m[:2], jnp.float32) / 2
+        now = self.terrain, task.scene, task.goals[leg], pose, memory["command"], points, half_m, config
+        velocity, gap = command(*now)
+        memory = {"task": task, "leg": leg, "leg_steps": leg_steps, "reached": reached, "broken": broken, "gap_m": gap}
+        action = self.env.robot.drive(velocity[0], velocity[1], jnp)
+        return action, {**memory, "command": velocity, "pose_w": pose}, over
+
+
+def _remembered(name: str, at: Any) -> Recorder:
+    return Recorder(lambda state, action: state.info["policy"][name], at)
+
+
+RECORDERS = {name: _remembered(name, "step") for name in ("pose_w", "command", "gap_m")}
+RECORDERS |= {name: _remembered(name, "end") for name in ("reached", "broken")}
+RECORDERS |= {"touching": Recorder(lambda state, action: state.info["nav"].memory["touching"], "step")}
+
+
+def drive(
+    player: Player, terrain: Terrain, tasks: Tasks, config: DriveConfig, on_progress: Callable[[int], None]
+) -> dict[str, np.ndarray]:
+    """Drive a batch of tasks to their ends, with a player that has `RECORDERS`.
+
+    Return fields of `dataset.Drives`: those of control steps [B, T, ...], where rows after a drive's `steps` [B] mean
+    nothing; and `reached` and `broken` [B].
+    """
+    starts = episode_starts(tasks.start_xy_w, tasks.start_yaw_rad, tasks.goals_w[:, 0], 0, tasks.scene)
+    policy = Expert(terrain, jax.tree.map(jnp.asarray, tasks), player.env, config)
+    keys = jnp.zeros((len(tasks), 2), jnp.uint32)
+    result = player.rollout(policy, keys, starts, on_progress=lambda ended, step: on_progress(ended))
+    return {"steps": result.num_steps, **result.values}

@@ -24,13 +24,19 @@ from interactive_nav_common.config import to_dict
 from interactive_nav_common.files import write_text
 from interactive_nav_common.rows import Rows, markdown
 from topological_nav.config import PolicyConfig
-from topological_nav.drives.dataset import Drives, Frames
+from topological_nav.drives.dataset import Drives
+from topological_nav.drives.driving import Frames
 from topological_nav.drives.expert import CONTROL_S
-from topological_nav.drives.policy import Forward, Policy, policy_loss, standardised, unrolled
+from topological_nav.drives.policy import Forward, Policy, fresh_params, policy_loss, standardised, unrolled
 from topological_nav.errors import ALONE, Host, RunError
-from topological_nav.learn.learning import Epoch, Learner, descent_epoch, initial, shuffled
+from topological_nav.learn.learning import Epoch, Learner, descent_epoch, shuffled
 from topological_nav.learn.runs import claimed, run_epochs, write_network, write_results
 from topological_nav.learn.training import class_scores
+
+GRID = [(alpha, lam) for alpha in (0.1, 10.0, 50.0) for lam in (0.1, 0.5, 1.0)]
+"""All pairs of the alphas and lambdas in the report's table II, which has three of them."""
+LEAST_SPREAD = 0.3
+"""Features are scaled by their standard deviation, at least this share of the mean one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,12 +121,6 @@ def mirrored(sequences: Sequences, frames: int, config: PolicyConfig) -> Sequenc
     )
 
 
-GRID = [(alpha, lam) for alpha in (0.1, 10.0, 50.0) for lam in (0.1, 0.5, 1.0)]
-"""All pairs of the alphas and lambdas in the report's table II, which has three of them."""
-LEAST_SPREAD = 0.3
-"""Features are scaled by their standard deviation, at least this share of the mean one."""
-
-
 def train_policy(frames: Frames, out: Path, config: PolicyConfig, host: Host = ALONE) -> dict[str, Any]:
     """Train a policy, or continue the run at `out`; return the content of results.json."""
     if config.mirror and not frames.mirrored:
@@ -188,20 +188,6 @@ def _scale(features: np.ndarray) -> dict[str, jax.Array]:
     spread = used.std(0)
     deviation = np.maximum(spread, LEAST_SPREAD * spread.mean() + 1e-6)
     return {"mean": jnp.asarray(used.mean(0)), "deviation": jnp.asarray(deviation)}
-
-
-def fresh_params(policy: Policy, forward: Forward, width: int, seed: int) -> dict[str, Any]:
-    """First weights of policy and forward model for embeddings of `width` numbers; the latter predicts no change."""
-    key, u = jax.random.PRNGKey(0), jax.ShapeDtypeStruct((1, width), jnp.float32)
-    action = jax.ShapeDtypeStruct((1, policy.linear_classes + policy.angular_classes), jnp.float32)
-    shapes = {
-        "policy": jax.eval_shape(lambda k, x: policy.init(k, policy.fresh(1), x), key, u)["params"],
-        "forward": jax.eval_shape(lambda k, x, a: forward.init(k, x, x, a, x[0]), key, u, action)["params"],
-    }
-    params = initial(shapes, seed)
-    last = params["forward"]["Dense_2"]
-    params["forward"]["Dense_2"] = {**last, "kernel": jnp.zeros_like(last["kernel"])}
-    return params
 
 
 def _applied(policy: Policy, forward: Forward, params: Any, scale: Any, u: jax.Array):

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from topological_nav.learn.learning import initial
+
 Memory = tuple[jax.Array, jax.Array]
 """Hidden states [B, H] of the cell for linear and of the one for angular velocity."""
 
@@ -135,3 +137,17 @@ def policy_loss(
     forward, consistency = (mean_over(jnp.square(following - u).sum(-1), truth["followed"]) for u in guesses)
     loss = forward + jointly * (alpha * (cross[1] + cross[0]) + lam * consistency)
     return loss, {"ce_linear": cross[0], "ce_angular": cross[1], "forward": forward, "consistency": consistency}
+
+
+def fresh_params(policy: Policy, forward: Forward, width: int, seed: int) -> dict[str, Any]:
+    """First weights of policy and forward model for embeddings of `width` numbers; the latter predicts no change."""
+    key, u = jax.random.PRNGKey(0), jax.ShapeDtypeStruct((1, width), jnp.float32)
+    action = jax.ShapeDtypeStruct((1, policy.linear_classes + policy.angular_classes), jnp.float32)
+    shapes = {
+        "policy": jax.eval_shape(lambda k, x: policy.init(k, policy.fresh(1), x), key, u)["params"],
+        "forward": jax.eval_shape(lambda k, x, a: forward.init(k, x, x, a, x[0]), key, u, action)["params"],
+    }
+    params = initial(shapes, seed)
+    last = params["forward"]["Dense_2"]
+    params["forward"]["Dense_2"] = {**last, "kernel": jnp.zeros_like(last["kernel"])}
+    return params

@@ -1,29 +1,48 @@
-"""A contest in words, and each of its scenes with what is asked of it: episodes, maps, networks, contenders."""
+"""Play the contenders of a contest in its scenes into a folder of rows; a contest that was stopped goes on.
+
+OUT/rows/<scene>-<contender>-<digest>-<first episode>.parquet   one row an episode (`evaluation.columns`)
+    tracks/<the same>.npz                                       where the robots went
+    <scene>.png, summary.md                                     drawn and told at the end
+
+The digest is of everything that decides the rows: scene, episodes, settings, map, networks, policy. Another question
+adds files; the same one finds its own and plays what is missing.
+"""
 
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Mapping
+import json
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
+import pyarrow as pa
 
-from interactive_nav.robots import get_robot
+from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav.task.rollout import Player
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.files import write_arrays
 from interactive_nav_common.jobs.progress import SafeConsole
+from interactive_nav_common.rows import Columns, read_rows, write_parquet
+from interactive_nav_common.untrusted.reading import read_npz
+from interactive_nav_common.versions import versions
 from topological_nav.config import PASSAGE_POLICY, DataConfig, EvaluationConfig, MapConfig
 from topological_nav.data.domains import as_seen_from, preset
 from topological_nav.data.folders import lens_of
 from topological_nav.drives import driving
 from topological_nav.drives.driving import LocalPolicy
-from topological_nav.errors import RunError
-from topological_nav.evaluate.contenders import (
+from topological_nav.errors import Progress, RunError
+from topological_nav.evaluate.evaluation import (
     Contender,
     DrivenEpisodes,
     NavigatorPlayer,
+    Played,
+    columns,
     count_of,
     draw_episodes,
     expert,
@@ -35,7 +54,7 @@ from topological_nav.maps.graph import TopologicalMap, load_map
 from topological_nav.maps.sight import NetworkSight, Sight, TrueSight
 from topological_nav.navigate.navigator import Navigator
 from topological_nav.scenes.rooms import scene_rooms
-from topological_nav.scenes.simulation import Camera, Simulator, make_env, pose_camera, scene_camera
+from topological_nav.scenes.simulation import CONTROL, Camera, make_env, pose_camera, scene_camera
 from topological_nav.scenes.space import FreeSpace, free_space
 from train.runs import checkpoint
 from train.runs.run_folder import RunFolder
@@ -110,13 +129,13 @@ class ContestScene:
         return draw_episodes(self.scene.digest, self.space, self.rooms, count_of(self.scene, config), config)
 
     @functools.cached_property
-    def simulator(self) -> Simulator:
-        """Of the navigator."""
-        return self._simulator()
+    def player(self) -> Player:
+        """Return what plays episodes with the navigator."""
+        return self._player(get_robot(self.contest.robot, CONTROL))
 
-    def _simulator(self, radius_m: float | None = None) -> Simulator:
-        config = self.contest.config
-        return Simulator(make_env(self.scene, self.contest.robot, config.backend, radius_m, config.objects))
+    def _player(self, robot: RobotSpec) -> Player:
+        settings = {"num_objects": self.contest.config.objects, "observations": ("localisation",)}
+        return Player(make_env([self.scene.path], robot, self.contest.config.backend, **settings), {})
 
     @functools.cached_property
     def map(self) -> TopologicalMap:
@@ -131,7 +150,7 @@ class ContestScene:
         """What the navigator's sight understands."""
         if self.networks is None:
             return pose_camera
-        world = self.simulator.env.world
+        world = self.player.env.world
         plain = scene_camera(renderer_of(self.scene, self.drawn, world.small_objects), self.robot, world)
         domain = preset(self.contest.domain)
         return lambda xy, yaw, qpos=None: as_seen_from(plain(xy, yaw, qpos), domain, xy, yaw)
@@ -163,18 +182,18 @@ class ContestScene:
         sight = self.sight(made)
         return Navigator(made, sight, local_policy(self.contest, sight, self.networks), self.contest.config.navigator)
 
-    def contender(self, name: str) -> tuple[Contender, Simulator]:
-        """Who plays, and in what."""
+    def contender(self, name: str) -> Contender:
+        """Return the contender of a name, with what plays its episodes."""
         config = self.contest.config
         if name == "expert":
             # It plans for half of the robot's width: doorways are narrower than its diagonal.
-            simulator = self._simulator(self.robot.body_width_m / 2)
-            return expert(simulator, config.navigator), simulator
+            robot = get_robot(self.contest.robot, CONTROL)
+            return expert(self._player(dataclasses.replace(robot, footprint_radius_m=robot.body_width_m / 2)), config)
         if name == "ppo":
             assert self.contest.ppo is not None
-            simulator, policy = _learned(self.contest.ppo, self.scene, config)
-            return learned(simulator, policy, config), simulator
-        return NavigatorPlayer(self.navigator(name), self.simulator, self.camera), self.simulator
+            player, policy = _learned(self.contest.ppo, self.scene, config)
+            return learned(player, config, policy)
+        return NavigatorPlayer(self.player, config, self.navigator(name), self.camera)
 
     def asked(self, contender: str) -> dict[str, Any]:
         """Everything that decides the rows of a contender."""
@@ -224,7 +243,7 @@ def _digest_of(policy: str) -> str:
     return hashlib.sha256(b"".join(p.read_bytes() for p in files)).hexdigest()
 
 
-def _learned(run: Path, scene: Scene, config: EvaluationConfig) -> tuple[Simulator, Any]:
+def _learned(run: Path, scene: Scene, config: EvaluationConfig) -> tuple[Player, Any]:
     from train.runs.run import build_env, config_to_play
     from train.scoring.evaluation import load_policy
 
@@ -233,7 +252,7 @@ def _learned(run: Path, scene: Scene, config: EvaluationConfig) -> tuple[Simulat
     made = config_to_play(folder, words, [str(scene.path)], SafeConsole(stderr=True))
     env = build_env(made.env)
     policy, _ = load_policy(folder, made, env, "best", deterministic=False)
-    return Simulator(env), policy
+    return Player(env, {}), policy
 
 
 def contest_scenes(contest: Contest) -> list[ContestScene]:
@@ -241,3 +260,105 @@ def contest_scenes(contest: Contest) -> list[ContestScene]:
     navigates = not contest.truth and {"dense", "sparse"} & set(contest.contenders)
     networks = load_networks(contest.localiser, contest.detector) if navigates else None
     return [ContestScene(folder, contest, networks) for folder in contest.scenes]
+
+
+CPU_BATCH = 8
+"""Episodes played at a time on a CPU unless asked otherwise."""
+
+
+def play_contest(contest: Contest, scenes: Sequence[ContestScene], tell: Progress = lambda *_: None) -> pa.Table:
+    """Plays what is missing, and returns all rows."""
+    # Everything that can be refused is refused before the first episode.
+    plan = [(scene, name, _stem(scene, name)) for scene in scenes for name in contest.contenders]
+    missing = [_missing(contest.out, stem, len(scene.episodes)) for scene, _, stem in plan]
+    total = sum(len(scene.episodes) for scene, _, _ in plan)
+    done = total - sum(map(len, missing))
+    cpu = jax.default_backend() == "cpu"
+    for (scene, name, _), numbers in zip(plan, missing, strict=True):
+        if not len(numbers):
+            continue
+        contender = scene.contender(name)
+        size = contest.config.batch or (CPU_BATCH if cpu else len(numbers))
+        for first in range(0, len(numbers), size):
+            rows = numbers[first : first + size]
+            what, before = f"{scene.scene.name} {name}", done
+
+            def told(over: int, _: float, what: str = what, before: int = before) -> None:
+                tell(what, min(before + over, total - 1), total)
+
+            episodes, began = scene.episodes.take(rows), time.perf_counter()
+            played = contender.play(episodes, told)
+            _write(contest, scene, name, contender.player.env, episodes, played, time.perf_counter() - began)
+            done += len(rows)
+            tell(what, done, total)
+    return pa.concat_tables([_rows(contest.out, stem, len(scene.episodes)) for scene, _, stem in plan])
+
+
+COLUMNS = Columns(
+    text=("contender", "sight", "domain", "policy", "scene", "split"),
+    whole=("episode", "runs", "contact_runs"),
+    numbers=("success", "spl", "within", "contact", "aadc_s", "contact_s", "duration_s", "path_m", "goal_m"),
+)
+
+
+def _stem(scene: ContestScene, contender: str) -> str:
+    asked = json.dumps(scene.asked(contender), sort_keys=True)
+    return f"{scene.scene.name}-{contender}-{hashlib.sha256(asked.encode()).hexdigest()[:8]}"
+
+
+def _files(out: Path, stem: str) -> list[Path]:
+    return sorted((out / "rows").glob(f"{stem}-*.parquet"))
+
+
+def _missing(out: Path, stem: str, count: int) -> np.ndarray:
+    """Numbers of the episodes that no file has."""
+    there = _rows(out, stem, count)["episode"].to_numpy() if _files(out, stem) else np.zeros(0, int)
+    return np.setdiff1d(np.arange(count), there)
+
+
+def _rows(out: Path, stem: str, count: int) -> pa.Table:
+    """Rows of the first `count` episodes: the files may have more, of a time when more were asked for.
+
+    An episode that two commands played at the same time counts as the first of the files has it.
+    """
+    rows = read_rows(_files(out, stem), COLUMNS.check)
+    number, first = np.unique(rows["episode"].to_numpy(), return_index=True)
+    return rows.take(first[number < count])
+
+
+def _write(
+    contest: Contest, scene: ContestScene, name: str, env: Any, episodes: DrivenEpisodes, played: Played, wall_s: float
+) -> None:
+    config, out, here = contest.config, contest.out, versions()
+    navigates = name in ("dense", "sparse")
+    constants = {
+        "contender": name,
+        "sight": ("truth" if scene.networks is None else "networks") if navigates else "none",
+        "domain": scene.contest.domain if navigates else "none",
+        "policy": scene.contest.policy if navigates else name,
+        "scene": scene.scene.name,
+        "split": scene.scene.split,
+        "robot": env.robot.name,
+        "seed": config.seed,
+        "backend": env.backend,
+        "device": here["device"]["kind"],
+        "commit": here["commit"],
+        "wall_s": wall_s,
+    }
+    table = {key: [value] * len(episodes) for key, value in constants.items()}
+    table |= {"episode": episodes.number, **columns(episodes, played, config)}
+    file = f"{_stem(scene, name)}-{episodes.number[0]:04d}"
+    tracks = {str(n): np.asarray(t, np.float32) for n, t in zip(episodes.number, played.track_w, strict=True)}
+    write_arrays(out / "tracks" / f"{file}.npz", **tracks)
+    # Rows last: an episode counts as played once its row is there.
+    notes = {"asked": json.dumps(scene.asked(name)), "versions": json.dumps(here["packages"])}
+    write_parquet(pa.table(table), out / "rows" / f"{file}.parquet", notes)
+
+
+def tracks_of(contest: Contest, scene: ContestScene, contender: str) -> dict[int, np.ndarray]:
+    """Episode number -> [t, 2] m, of what has been played."""
+    found: dict[int, np.ndarray] = {}
+    for path in sorted((contest.out / "tracks").glob(f"{_stem(scene, contender)}-*.npz")):
+        with read_npz(path, RunError, "delete it and evaluate again") as stored:
+            found = {int(number): stored[number] for number in stored.files} | found
+    return found

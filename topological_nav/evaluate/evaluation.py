@@ -1,161 +1,345 @@
-"""DrivenEpisodes of a scene and a contender in, one row an episode out: success, SPL, contacts, duration.
+"""Draw the fixed episodes of a scene, and let a contender play them: success, SPL, contacts and duration.
 
 Contenders: the navigator on a map, dense or thinned, with trained networks or with the truth in their place; an expert
-that has the map and knows where everything stands; a learned policy that is told the goal's position. All play the
+that has the map and the poses of all objects; a learned policy that observes the goal's position. All play the
 same episodes under the same rule: an episode is won when a run of 5 s ends within 1.5 m of the goal, or when the
-navigator finds itself at the goal's node; it is lost after 30 minutes of simulated time.
+navigator localises at the goal's node; it is lost after 30 minutes of simulated time.
 """
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.metrics import path_efficiency
-from interactive_nav_common.rows import column, fresh
+from interactive_nav.navigation.ways import PathGrid
+from interactive_nav.scenes.scene import Scene
+from interactive_nav.task.rollout import HostPolicy, Player, episode_keys
+from interactive_nav_common.grids import label
+from interactive_nav_common.rows import Rows
 from topological_nav.config import EvaluationConfig
-from topological_nav.evaluate.contenders import Contender, DrivenEpisodes
-from topological_nav.navigate.state import Events
-from topological_nav.scenes.simulation import Seen, Simulator
+from topological_nav.errors import SpaceError
+from topological_nav.navigate.navigator import Navigator
+from topological_nav.navigate.state import Events, State
+from topological_nav.scenes.rooms import Rooms
+from topological_nav.scenes.simulation import Camera, Snapshot, episode_starts
+from topological_nav.scenes.space import FreeSpace
+from train.scoring.planners import Planner
+
+CONNECTED_M = 0.25
+"""Start and goal are joined by a way with this clearance: half of TTbot's width and the grid's rounding."""
+LEAST, MOST, PER_M2 = 25, 60, 0.5
+"""Episodes a scene."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DrivenEpisodes(Rows):
+    """Fixed episodes of one scene."""
+
+    number: np.ndarray
+    """[n] i32, theirs in the scene."""
+    start_xy_w: np.ndarray
+    """[n, 2] m."""
+    yaw_rad: np.ndarray
+    """[n] heading at the start."""
+    goal_xy_w: np.ndarray
+    """[n, 2] m."""
+    start_room: np.ndarray
+    goal_room: np.ndarray
+    """[n] i32."""
+    shortest_m: np.ndarray
+    """[n] length of the shortest way round walls and furniture, for half of the robot's width."""
+
+
+def count_of(scene: Scene, config: EvaluationConfig) -> int:
+    """Episodes of a scene: as set, or by its floor's area."""
+    return config.episodes or int(np.clip(round(PER_M2 * scene.manifest.floor_area_m2), LEAST, MOST))
+
+
+def draw_episodes(digest: str, space: FreeSpace, rooms: Rooms, count: int, config: EvaluationConfig) -> DrivenEpisodes:
+    """Draws episodes: number i depends on seed and scene alone, however many there are.
+
+    Start and goal are uniform over free places, in different rooms, farther apart than `min_goal_m`, joined by a way.
+    """
+    parts, _ = label(space.clearance_m >= CONNECTED_M)
+    places = space.centres(config.clearance_m)
+    if len(places) < 2:
+        raise SpaceError(f"{len(places)} places are {config.clearance_m} m from obstacles; ask for less clearance_m")
+    column, row = space.cells(places).T
+    part, room = parts[row, column], rooms.of(places)
+    rng = np.random.default_rng([config.seed, 17, int(digest[:8], 16)])
+    drawn, tries = [], 0
+    while len(drawn) < count:
+        a, b = rng.integers(len(places), size=2)
+        yaw = rng.uniform(-np.pi, np.pi)
+        tries += 1
+        if tries > 2000 * (len(drawn) + 1):
+            raise SpaceError(
+                f"after {tries:,} draws {len(drawn)} of {count} episodes have start and goal in different rooms, more "
+                f"than {config.min_goal_m} m apart and joined by a way; ask for less clearance_m or min_goal_m"
+            )
+        if part[a] != part[b] or not part[a] or room[a] == room[b]:
+            continue
+        if np.linalg.norm(places[a] - places[b]) > config.min_goal_m:
+            drawn.append((a, b, yaw))
+    a, b, yaws = map(np.array, zip(*drawn, strict=True))
+    shortest = _shortest_m(space, places[a], places[b])
+    return DrivenEpisodes(np.arange(count), places[a], yaws, places[b], room[a], room[b], shortest)
+
+
+def _shortest_m(space: FreeSpace, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
+    """[n] m: shortest ways between places [n, 2] over a grid of 16 directions, at most 2.7 % too long."""
+    free = space.clearance_m >= CONNECTED_M
+    grid = PathGrid(free, np.ones(free.shape))
+    ends = zip(space.cells(starts)[:, ::-1], space.cells(goals)[:, ::-1], strict=True)
+    ways = [grid.path(tuple(start), tuple(goal)) for start, goal in ends]
+    return np.array([np.linalg.norm(np.diff(way, axis=0), axis=1).sum() for way in ways]) * space.resolution_m
+
 
 TRACK_S = 0.5
 """Between two points of a recorded path."""
-SHRINK = 4
-"""On the CPU, once only one episode in so many still runs, those go on in a batch of their own."""
+EXPERT_WEIGHT = 1.0
+"""Of path against effort: objects are pushed only where no way is free."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Played:
-    """What came of n episodes."""
+    """The outcome of n episodes."""
 
-    success: np.ndarray = column(False, bool)
+    success: np.ndarray
     """[n] bool."""
-    arrived: np.ndarray = column(False, bool)
-    """[n] bool: ended because the navigator found itself at the goal's node."""
-    goal_m: np.ndarray = column(0.0)
+    arrived: np.ndarray
+    """[n] bool: ended because the navigator localised at the goal's node."""
+    goal_m: np.ndarray
     """[n] distance to the goal at the end."""
-    path_m: np.ndarray = column(0.0)
+    path_m: np.ndarray
     """[n]."""
-    duration_s: np.ndarray = column(0.0)
+    duration_s: np.ndarray
     """[n]."""
-    runs: np.ndarray = column(0, int)
-    """[n] i32 runs driven."""
-    contact_runs: np.ndarray = column(0, int)
-    """[n] i32 of them with a contact."""
-    contact_s: np.ndarray = column(0.0)
+    runs: np.ndarray
+    """[n] int, runs driven."""
+    contact_runs: np.ndarray
+    """[n] int, of them with a contact."""
+    contact_s: np.ndarray
     """[n] seconds of control steps with a contact, turning included."""
-    wall_s: np.ndarray = column(0.0)
+    wall_s: np.ndarray
     """[n] of them with a wall."""
-    localisations: np.ndarray = column(0, int)
-    blocked: np.ndarray = column(0, int)
-    lost: np.ndarray = column(0, int)
-    """[n] i32 such events of the navigator; 0 for others."""
-    broken: np.ndarray = column(False, bool)
+    localisations: np.ndarray
+    blocked: np.ndarray
+    lost: np.ndarray
+    """[n] int, such events of the navigator; 0 for others."""
+    broken: np.ndarray
     """[n] bool: the physics gave up, which ends an episode as failed."""
     track_w: list[np.ndarray]
     """n paths [t, 2], m, a point every `TRACK_S`."""
 
 
-Tell = Callable[[int, float], None]
-"""Told (episodes over, simulated seconds); may raise to stop."""
+class Contender(HostPolicy):
+    """Plays a batch of episodes, by the rule for all, and keeps what their scores need of every step."""
 
+    observes = False
 
-def play(
-    contender: Contender,
-    simulator: Simulator,
-    episodes: DrivenEpisodes,
-    config: EvaluationConfig,
-    tell: Tell = lambda *_: None,
-) -> Played:
-    """Plays episodes to their ends, in one batch."""
-    tally = _Tally(episodes, config, simulator.dt_s)
-    contender.begin(episodes)
-    begin = episodes.start_xy_w, episodes.yaw_rad, episodes.goal_xy_w, episodes.number
-    state = simulator.start(*begin, config.seed, strewn=config.objects > 0)
-    step, seen = 0, simulator.seen(state)
-    while not tally.over.all():
-        before, time = seen, step * simulator.dt_s
-        state, events = contender.step(state, time, tally.over)
-        tally.before(before, events, step)
-        step, seen = step + 1, simulator.seen(state)
-        tally.after(seen)
-        left = np.flatnonzero(~tally.over)
-        tell(len(episodes) - len(left), time)
-        if simulator.env.backend == "native" and 0 < len(left) <= len(tally.over) // SHRINK:
-            state = jax.tree.map(lambda x: x[left], state)  # noqa: B023
-            contender.keep(left)
-            tally.keep(left)
-            seen = simulator.seen(state)
-    return tally.played()
+    def __init__(self, player: Player, config: EvaluationConfig):
+        self.player, self.config = player, config
+        self._strew = jax.jit(jax.vmap(player.env.strew))
 
-
-class _Tally:
-    """What has come of the episodes so far; those over may be left out of the batch."""
-
-    def __init__(self, episodes: DrivenEpisodes, config: EvaluationConfig, dt_s: float):
-        n = len(episodes)
-        self._episodes, self._config, self._dt_s = episodes, config, dt_s
-        self._numbers = fresh(Played, n)
-        self._tracks: list[list[np.ndarray]] = [[] for _ in range(n)]
-        self._at = np.arange(n)
-        """Episode of each row of the batch."""
-        self.over = np.zeros(n, bool)
-        self._in_run, self._touched = np.zeros(n, bool), np.zeros(n, bool)
-
-    def before(self, seen: Seen, events: Events, step: int) -> None:
-        """Counts the moment before a step, which is what the contender speaks of."""
-        at, going = self._at, ~self.over
-        goal_m = np.linalg.norm(seen.xy_w - self._episodes.goal_xy_w[at], axis=-1)
-        if step % max(1, round(TRACK_S / self._dt_s)) == 0:
-            self._track(np.flatnonzero(going), seen)
-        ended = events.run_ended & going
-        self._count_runs(ended)
-        self._in_run = (self._in_run & ~ended) | events.run_started
-        self._touched = self._touched & ~ended & ~events.run_started
-        for name, flag in (("localisations", events.localised), ("blocked", events.blocked), ("lost", events.lost)):
-            self._numbers[name][at[flag & going]] += 1
-        near = ended & (goal_m < self._config.success_m)
-        arrived, broken = events.arrived & going, seen.broken & going
-        ends = near | arrived | broken | (events.timed_out & going)
-        came = {"success": (near | arrived) & ~broken, "arrived": arrived & ~near, "broken": broken}
-        came |= {"goal_m": goal_m, "path_m": seen.path_m, "duration_s": np.full(len(at), step * self._dt_s)}
-        for name, value in came.items():
-            self._numbers[name][at[ends]] = value[ends]
-        # A run that the end of its episode cuts short counts, as the whole run that it is scored as.
-        self._count_runs(ends & self._in_run & ~ended & ~events.run_started)
-        self._track(np.flatnonzero(ends), seen)
-        self.over |= ends
-
-    def _count_runs(self, over: np.ndarray) -> None:
-        self._numbers["runs"][self._at[over]] += 1
-        self._numbers["contact_runs"][self._at[over & self._touched]] += 1
-
-    def _track(self, rows: np.ndarray, seen: Seen) -> None:
-        for row in rows:
-            self._tracks[self._at[row]].append(seen.xy_w[row])
-
-    def after(self, seen: Seen) -> None:
-        """Counts what was touched in a step."""
-        contact = (seen.movable | seen.wall) & ~self.over
-        self._numbers["contact_s"][self._at[contact]] += self._dt_s
-        self._numbers["wall_s"][self._at[seen.wall & ~self.over]] += self._dt_s
-        self._touched |= contact & self._in_run
+    def begin(self, episodes: DrivenEpisodes) -> None:
+        """Start a batch of episodes."""
 
     def keep(self, rows: np.ndarray) -> None:
-        """Only these rows of the batch go on."""
-        self._at, self.over = self._at[rows], self.over[rows]
-        self._in_run, self._touched = self._in_run[rows], self._touched[rows]
+        """Continue with these rows of the batch only."""
 
-    def played(self) -> Played:
-        """All of it."""
-        return Played(**self._numbers, track_w=[np.array(track) for track in self._tracks])
+    def step(self, state: Any, now: Snapshot, running: np.ndarray, step: int) -> tuple[Any, Events]:
+        """Return the actions [B, A] of one control step, and what happened before it."""
+        raise NotImplementedError
+
+    def look(self, state: Any) -> Snapshot:
+        """Return where the robots are."""
+        return Snapshot.of(state)
+
+    def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> tuple[Any, np.ndarray]:
+        """See `HostPolicy`."""
+        number = np.minimum(episode, len(self._episodes) - 1)  # a batch may be padded
+        if step == 0:
+            self._log = self._logs[int(episode[0])] = []
+            self.begin(self._episodes.take(number))
+        elif len(episode) < len(self._batch):
+            self.keep(np.array([np.flatnonzero(self._batch == one)[0] for one in episode]))
+        self._batch, now = episode, self.look(state)
+        actions, events = self.step(state, now, running, step)
+        goal_m = np.linalg.norm(now.xy_w - self._episodes.goal_xy_w[number], axis=-1)
+        near = events.run_ended & (goal_m < self.config.success_m)
+        moment = {"xy_w": now.xy_w.astype(np.float32), "path_m": now.path_m.astype(np.float32), "goal_m": goal_m}
+        moment |= {"running": running, "contact": now.movable | now.wall, "wall": now.wall, "broken": now.broken}
+        self._log.append((episode, {**moment, "near": near, **vars(events)}))
+        return actions, near | events.arrived | now.broken | events.timed_out
+
+    def play(self, episodes: DrivenEpisodes, on_progress: Callable[[int, float], None] = lambda *_: None) -> Played:
+        """Play episodes to their ends, in one batch; noise and small objects depend on their numbers and the seed.
+
+        `on_progress` is called with the numbers of finished episodes and of simulated seconds; it may raise to stop.
+        """
+        env, keys = self.player.env, episode_keys(self.config.seed, episodes.number)
+        begin = episodes.start_xy_w, episodes.yaw_rad, episodes.goal_xy_w
+        starts = episode_starts(*begin, len(env.world.small_objects))
+        if self.config.objects:
+            starts = self._strew(keys, starts)
+        self._episodes = episodes
+        self._logs: dict[int, list[tuple[np.ndarray, dict[str, np.ndarray]]]] = {}
+        self.player.rollout(
+            self, keys, starts, fewest=2, on_progress=lambda over, step: on_progress(over, step * env.dt)
+        )
+        rows = [row for log in self._logs.values() for row in _outcomes(log, env.dt)][: len(episodes)]
+        columns = {name: [row[name] for row in rows] for name in rows[0]}
+        return Played(track_w=columns.pop("track_w"), **{name: np.array(column) for name, column in columns.items()})
+
+
+def _outcomes(log: list[tuple[np.ndarray, dict[str, np.ndarray]]], dt_s: float) -> list[dict[str, Any]]:
+    """Return `Played`'s fields of each episode, by the moments before all steps of a batch."""
+    size, first, moment = len(log[0][0]), log[0][0][0], log[0][1]
+    table = {name: np.zeros((len(log), size, *x.shape[1:]), x.dtype) for name, x in moment.items()}
+    for step, (episode, moment) in enumerate(log):
+        for name, values in moment.items():
+            table[name][step, episode - first] = values
+    steps = table["running"].sum(0)
+    return [_outcome({name: x[: steps[row], row] for name, x in table.items()}, dt_s) for row in range(size)]
+
+
+def _outcome(moments: dict[str, np.ndarray], dt_s: float) -> dict[str, Any]:
+    """Return `Played`'s fields of one episode, by its moments [t]; each shows what the step before it touched."""
+    last, end = {name: values[-1] for name, values in moments.items()}, len(moments["running"]) - 1
+    run, ended = (np.cumsum(moments[name])[:-1] for name in ("run_started", "run_ended"))
+    contact, every = moments["contact"][1:], max(1, round(TRACK_S / dt_s))
+
+    def seconds(flags: np.ndarray) -> float:
+        return float(np.cumsum(dt_s * flags)[-1]) if len(flags) else 0.0
+
+    return {
+        "success": (last["near"] | last["arrived"]) & ~last["broken"],
+        "arrived": last["arrived"] & ~last["near"],
+        "goal_m": last["goal_m"],
+        "path_m": float(last["path_m"]),
+        "duration_s": end * dt_s,
+        # A run that the end of its episode cuts short counts, as the whole run that it is scored as.
+        "runs": run[-1] if end else 0,
+        "contact_runs": len(np.unique(run[contact & (run > ended)])),
+        "contact_s": seconds(contact),
+        "wall_s": seconds(moments["wall"][1:]),
+        "localisations": moments["localised"].sum(),
+        "blocked": moments["blocked"].sum(),
+        "lost": moments["lost"].sum(),
+        "broken": last["broken"],
+        "track_w": moments["xy_w"][[*range(0, end + 1, every), end]].astype(float),
+    }
+
+
+class NavigatorPlayer(Contender):
+    """The navigator, seeing through a camera."""
+
+    def __init__(
+        self,
+        player: Player,
+        config: EvaluationConfig,
+        navigator: Navigator,
+        camera: Camera,
+        watch: Callable[[float, Snapshot, State, Events], None] = lambda *_: None,
+    ):
+        """Take its parts; `watch` is called with time, poses, new state and events of every step."""
+        super().__init__(player, config)
+        self._navigator, self._camera, self._watch = navigator, camera, watch
+        self.state: State | None = None
+
+    def begin(self, episodes: DrivenEpisodes) -> None:
+        """Take the goals' images, of the scene at rest, along as many headings as a localisation's."""
+        count = self._navigator.config.images
+        around = 2 * np.pi * np.arange(count) / count
+        n = len(episodes)
+        images = self._camera(np.repeat(episodes.goal_xy_w, count, 0), np.tile(around, n), None)
+        images = images.reshape(n, count, *images.shape[1:])
+        self.state = self._navigator.start(self._navigator.goal_nodes(images, around))
+        self._images = images[:, 0].copy()
+
+    def keep(self, rows: np.ndarray) -> None:
+        """See `Contender`."""
+        assert self.state is not None
+        self.state, self._images = self.state.take(rows), self._images[rows]
+
+    def step(self, state: Any, now: Snapshot, running: np.ndarray, step: int) -> tuple[Any, Events]:
+        """See `Contender`."""
+        assert self.state is not None
+        time_s, robot = step * self.player.env.dt, self.player.env.robot
+        mind = self._navigator.stop(self.state, ~running)
+        looks = np.flatnonzero(self._navigator.looks(mind, now.yaw_rad, time_s))
+        if len(looks):  # the others keep an old image, which nobody looks at
+            self._images[looks] = self._camera(now.xy_w[looks], now.yaw_rad[looks], now.qpos[looks])
+        self.state, linear, angular, events = self._navigator.step(mind, self._images, now.yaw_rad, time_s)
+        self._watch(time_s, now, self.state, events)
+        return np.asarray(robot.drive(linear, angular, np), np.float32), events
+
+
+Act = Callable[[Any, np.ndarray, np.ndarray, int], Any]
+"""State, episode numbers [B], which of them run [B] and control steps done to actions [B, A]."""
+
+
+class ActionPlayer(Contender):
+    """A policy that acts on the environment's own state: its runs follow each other without a break."""
+
+    def __init__(self, player: Player, config: EvaluationConfig, make_act: Callable[[], Act], observes: bool = False):
+        super().__init__(player, config)
+        self._make_act, self.observes = make_act, observes
+
+    def begin(self, episodes: DrivenEpisodes) -> None:
+        """See `Contender`."""
+        self._number, self._act = episodes.number, self._make_act()
+
+    def keep(self, rows: np.ndarray) -> None:
+        """See `Contender`."""
+        self._number = self._number[rows]
+
+    def step(self, state: Any, now: Snapshot, running: np.ndarray, step: int) -> tuple[Any, Events]:
+        """See `Contender`."""
+        config, dt_s = self.config.navigator, self.player.env.dt
+        edge = running & (step % max(1, round(config.run_s / dt_s)) == 0)
+        none = np.zeros(len(running), bool)
+        events = Events(
+            **dict.fromkeys(("localised", "glanced", "lost", "blocked", "arrived"), none),
+            run_started=edge,
+            run_ended=edge & (step > 0),
+            timed_out=running & (step * dt_s >= config.limit_s - 1e-3),
+        )
+        return self._act(state, self._number, running, step), events
+
+
+def expert(player: Player, config: EvaluationConfig) -> ActionPlayer:
+    """Return the planner of `train.scoring.planners`, which has the map and all poses, and drives round what it can.
+
+    Where its grid leaves no way between an object and a wall, it takes the one through the least of objects: episodes
+    are joined by ways 0.25 m from everything, which is nearer than it otherwise goes.
+    """
+    return ActionPlayer(player, config, lambda: Planner(player.env, EXPERT_WEIGHT).act)
+
+
+def learned(player: Player, config: EvaluationConfig, policy: Any) -> ActionPlayer:
+    """Return a policy of `train`, which observes the goal's position."""
+
+    @jax.jit
+    def chosen(obs: Any, episode: jax.Array, step: jax.Array) -> jax.Array:
+        keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.fold_in(jax.random.PRNGKey(config.seed), i), step))
+        return jax.vmap(policy)(obs, keys(episode))
+
+    def act(state: Any, episode: np.ndarray, _: np.ndarray, step: int) -> Any:
+        return chosen(state.obs, jnp.asarray(episode), jnp.asarray(step))
+
+    return ActionPlayer(player, config, lambda: act, observes=True)
 
 
 def columns(episodes: DrivenEpisodes, played: Played, config: EvaluationConfig) -> dict[str, np.ndarray]:
-    """A row's numbers, an array each; SPL, RC and AADC are means of them (see `scores`)."""
+    """Return the numbers of each row, an array each; SPL, RC and AADC are means of them (see `scores`)."""
 
-    def own(*names: str) -> dict[str, np.ndarray]:
+    def of(*names: str) -> dict[str, np.ndarray]:
         return {name: getattr(played, name) for name in names}
 
     return {
@@ -165,9 +349,9 @@ def columns(episodes: DrivenEpisodes, played: Played, config: EvaluationConfig) 
         "arrived": played.arrived,
         "contact": (played.contact_s > 0).astype(np.float64),
         "aadc_s": played.contact_runs * config.navigator.run_s,
-        **own("contact_s", "wall_s", "duration_s", "path_m"),
+        **of("contact_s", "wall_s", "duration_s", "path_m"),
         "shortest_m": episodes.shortest_m,
-        **own("goal_m", "runs", "contact_runs", "localisations", "blocked", "lost", "broken"),
+        **of("goal_m", "runs", "contact_runs", "localisations", "blocked", "lost", "broken"),
         "start_room": episodes.start_room,
         "goal_room": episodes.goal_room,
         "start_x_w": episodes.start_xy_w[:, 0],

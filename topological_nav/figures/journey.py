@@ -13,13 +13,12 @@ from PIL import Image, ImageDraw
 from interactive_nav.record import write_mp4
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import whole_file
-from topological_nav.evaluate.contenders import DrivenEpisodes, NavigatorPlayer
 from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
-from topological_nav.evaluate.evaluation import Played, play
+from topological_nav.evaluate.evaluation import DrivenEpisodes, NavigatorPlayer, Played
 from topological_nav.figures.maps import floor_plan, map_lines, plan_picture
 from topological_nav.maps.graph import TopologicalMap
 from topological_nav.navigate.state import FACE, PHASES, Events, State
-from topological_nav.scenes.simulation import Seen
+from topological_nav.scenes.simulation import Snapshot
 from train.figures.style import plt
 
 FILM_EVERY_S = 0.5
@@ -124,14 +123,14 @@ def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callabl
     told: list[str] = []
     every = _film_every(venue)
 
-    def watch(time_s: float, seen: Seen, state: State, events: Events) -> None:
+    def watch(time_s: float, seen: Snapshot, state: State, events: Events) -> None:
         if filmed and not contest.truth and len(seen_at) % every == 0:
             views[len(seen_at)] = venue.camera(seen.xy_w[:1], seen.yaw_rad[:1], seen.qpos[:1])[0]
         seen_at.append((time_s, seen.xy_w[0], seen.yaw_rad[0], int(state.phase[0])))
         told.extend(f"{time_s:7.1f} s  {said}" for said in _said(made, state, events))
 
-    player = NavigatorPlayer(navigator, venue.simulator, venue.camera, watch)
-    played = play(player, venue.simulator, journey, contest.config, lambda _, time_s: progress(time_s))
+    player = NavigatorPlayer(venue.player, contest.config, navigator, venue.camera, watch)
+    played = player.play(journey, lambda _, time_s: progress(time_s))
     assert player.state is not None
     time_s, xy, yaw, phase = zip(*seen_at, strict=True)
     columns = (np.array(column) for column in (time_s, xy, yaw, phase))
@@ -162,7 +161,7 @@ def _said(made: TopologicalMap, state: State, events: Events) -> Iterator[str]:
 
 def _film_every(venue: ContestScene) -> int:
     """Return the control steps from one frame to the next."""
-    return max(1, round(FILM_EVERY_S / venue.simulator.dt_s))
+    return max(1, round(FILM_EVERY_S / venue.player.env.dt))
 
 
 def film(driven: Driven, path: Path) -> int:

@@ -18,7 +18,7 @@ from interactive_nav.pictures.camera import PictureCamera
 from interactive_nav.sensing.sensors import LIDAR_NEAR_M
 from interactive_nav_common.errors import UserError
 from scenes_mjcf.look import Lens
-from topological_nav.drives.fleet import LIDAR_B
+from topological_nav.drives.expert import LIDAR_B
 from topological_nav.ros.config import SimulatorConfig
 from topological_nav.scenes.rendering import need_engine, shrink
 from topological_nav.scenes.space import free_space

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -135,3 +136,42 @@ def test_values_and_memories_of_another_shape_are_refused_with_the_terms_name(en
     with pytest.raises(ConfigError, match=words):
         other = env.__class__(env.robot, env.scenes, env.config, (term,))
         jax.eval_shape(lambda key: other.step(other.reset(key), jnp.zeros(2)), jax.random.PRNGKey(0))
+
+
+@flax.struct.dataclass
+class Counted:
+    """Drives ahead and ends episode i before step `limits[i]`; it remembers what it has done."""
+
+    limits: jax.Array
+
+    def start(self, state, episode):
+        return {"limit": self.limits[episode], "steps": jnp.zeros((), jnp.int32)}
+
+    def act(self, memory, state, key):
+        steps = memory["steps"] + 1
+        return jnp.full(2, 0.6), {**memory, "steps": steps}, memory["steps"] >= memory["limit"]
+
+
+def test_policies_end_episodes_themselves_on_the_device_and_on_the_host(env):
+    """Before their step and past the environment's own end, in the same numbers as one that ends them by its clock."""
+    limits, keys = np.array([2, STEPS + 3, 4], np.int32), episode_keys(0, 3)
+
+    class OnHost(HostPolicy):
+        observes = False
+
+        def act(self, state, episode, running, step):
+            return np.full((len(episode), 2), 0.6, np.float32), step >= limits[episode]
+
+    recorders = {"xy": Recorder(lambda state, action: state.info["nav"].robot_pos_w[:, :2], "step"),
+                 "end": Recorder(lambda state, action: state.info["nav"].robot_pos_w[:, :2])}  # fmt: skip
+    steps = {"steps": Recorder(lambda state, action: state.info["policy"]["steps"], "step")}
+    ours = rollout(env, Counted(jnp.asarray(limits)), keys, recorders | steps)
+    host = rollout(env, OnHost(), keys, recorders)
+    usual = rollout(env, lambda obs, key: jnp.full(2, 0.6), keys, recorders)
+    assert ours.num_steps.tolist() == host.num_steps.tolist() == limits.tolist() and usual.num_steps.max() == STEPS
+    assert (ours.values["steps"][1] == np.arange(1, STEPS + 4)).all()
+    for i, limit in enumerate(limits):
+        np.testing.assert_allclose(ours.values["xy"][i, :limit], host.values["xy"][i, :limit], atol=1e-5)
+        np.testing.assert_allclose(ours.values["end"][i], ours.values["xy"][i, limit - 1], atol=0)
+        both = min(limit, STEPS)
+        np.testing.assert_allclose(ours.values["xy"][i, :both], usual.values["xy"][i, :both], atol=1e-5)

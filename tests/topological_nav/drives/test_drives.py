@@ -19,7 +19,7 @@ from topological_nav.config import DriveConfig
 from topological_nav.data.folders import lens_of
 from topological_nav.data.shards import read_shard
 from topological_nav.drives import dataset as driving
-from topological_nav.drives.fleet import make_env
+from topological_nav.drives.expert import drive_env
 from topological_nav.errors import DatasetError
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose
 
@@ -40,6 +40,13 @@ def test_the_expert_arrives_and_touches_nothing(drives):
     ends = np.array([drives.pose_w[drives.rows(k)[-1], :2] for k in np.flatnonzero(drives.reached)])
     # The last pose is of the beginning of the last step, at most 0.05 m before the node's circle.
     assert np.linalg.norm(ends - drives.goal_w[drives.reached], axis=1).max() < CONFIG.reached_m + 0.06
+
+
+def test_the_drives_are_those_of_before(drives):
+    """Golden numbers of the loop that drove before `rollout` did, on C MuJoCo."""
+    assert drives.steps.tolist() == [46, 49, 89, 32, 79, 61, 30, 94, 23, 25]
+    assert np.abs(drives.pose_w).sum(0) == pytest.approx([723.5778, 474.8871, 773.8063], rel=1e-3)
+    assert np.abs(drives.command).sum(0) == pytest.approx([237.3, 110.7], rel=1e-3)
 
 
 def test_the_footprint_keeps_clear_of_what_stands_there(drives):
@@ -127,7 +134,7 @@ def test_other_settings_and_other_folders_are_refused(driven, painted, tmp_path,
 
 def test_a_robot_without_a_scanner_is_refused(painted):
     with pytest.raises(UserError, match="robot is 'turtlebot', expected one with a scanner: ttbot"):
-        make_env([painted], dataclasses.replace(CONFIG, robot="turtlebot"))
+        drive_env([painted], dataclasses.replace(CONFIG, robot="turtlebot"))
 
 
 def test_contacts_and_failures_are_counted_and_left_out():

@@ -15,8 +15,8 @@ from interactive_nav_common.records import read_metrics
 from topological_nav.__main__ import main
 from topological_nav.config import PolicyConfig
 from topological_nav.drives import imitation
-from topological_nav.drives.dataset import drive_images, embed_drives
-from topological_nav.drives.driving import load_policy
+from topological_nav.drives.dataset import drive_images
+from topological_nav.drives.driving import embed_drives, load_policy
 from topological_nav.drives.policy import Forward, Policy
 from topological_nav.errors import Host, RunError, Stopped
 from topological_nav.learn.learning import Learner

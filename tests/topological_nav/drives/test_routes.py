@@ -7,8 +7,8 @@ import pytest
 
 from interactive_nav_common.grids import clearance
 from topological_nav.config import DriveConfig
+from topological_nav.drives.dataset import draw_routes, drivable
 from topological_nav.drives.expert import way_field
-from topological_nav.drives.routes import draw_routes, drivable
 from topological_nav.errors import SpaceError
 from topological_nav.scenes.space import FreeSpace
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from topological_nav.config import PolicyConfig
-from topological_nav.drives import sequences
+from topological_nav.drives import imitation as sequences
 from topological_nav.drives.dataset import Drives
 
 CONFIG = PolicyConfig(steps=5)

@@ -18,10 +18,9 @@ from topological_nav.__main__ import main
 from topological_nav.config import DataConfig, EvaluationConfig
 from topological_nav.data.domains import as_seen_from, preset
 from topological_nav.errors import RunError
-from topological_nav.evaluate import rows
-from topological_nav.evaluate.contenders import NavigatorPlayer
+from topological_nav.evaluate import contest as rows
 from topological_nav.evaluate.contest import Contest, contest_scenes, local_policy
-from topological_nav.evaluate.evaluation import play
+from topological_nav.evaluate.evaluation import NavigatorPlayer
 from topological_nav.learn.runs import WEIGHTS
 from topological_nav.learn.training import load_trained, save_trained
 from topological_nav.maps.build import drawn_for
@@ -80,8 +79,7 @@ def watched(contest):
     def watch(time_s, seen, state, events):
         steps.append((time_s, seen, state, events, len(navigator.policy.calls)))
 
-    player = NavigatorPlayer(navigator, venue.simulator, venue.camera, watch)
-    played = play(player, venue.simulator, venue.episodes, venue.contest.config)
+    played = NavigatorPlayer(venue.player, config, navigator, venue.camera, watch).play(venue.episodes)
     return venue, navigator.policy, steps, played
 
 
@@ -102,7 +100,7 @@ def test_a_trained_policy_starts_every_run_with_a_fresh_memory_and_keeps_it_with
 def test_it_is_shown_level_images_of_where_the_robot_is_and_its_words_are_commands(watched):
     venue, policy, steps, _ = watched
     renderer = SceneRenderer(venue.scene, Lens(32, 32, venue.networks.camera.fov_deg))
-    world = venue.simulator.env.world
+    world = venue.player.env.world
     robot, about = get_robot("ttbot"), policy.policy.about
     acted = [i for i in range(1, len(steps)) if steps[i][4] > steps[i - 1][4]]
     for i in acted[:: max(1, len(acted) // 5)]:
@@ -186,7 +184,7 @@ def test_everything_that_the_navigator_sees_goes_through_the_other_camera(contes
     assert (venue.camera(xy[1:2], yaw[1:2]) == seen[1:2]).all()
     navigator, looked = venue.navigator("dense"), []
     monkeypatch.setattr(navigator, "goal_nodes", lambda images, around: looked.append(images) or np.zeros(2, np.int32))
-    player = NavigatorPlayer(navigator, venue.simulator, venue.camera)
+    player = NavigatorPlayer(venue.player, CONFIG, navigator, venue.camera)
     player.begin(journeys)
     goals = as_seen_from(
         clean.camera(journeys.goal_xy_w, np.zeros(2)), preset("camera"), journeys.goal_xy_w, np.zeros(2)

@@ -5,6 +5,7 @@ import importlib.util
 from pathlib import Path
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
@@ -14,6 +15,7 @@ from scipy.sparse.csgraph import dijkstra
 
 import interactive_nav
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav.task.rollout import Player, episode_keys
 from interactive_nav_common.config import replace
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rows import read_rows
@@ -23,13 +25,11 @@ from topological_nav.__main__ import main
 from topological_nav.config import EvaluationConfig
 from topological_nav.errors import RunError, SpaceError
 from topological_nav.evaluate import contest as contests
-from topological_nav.evaluate.contenders import DrivenEpisodes, count_of, draw_episodes, learned
-from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
-from topological_nav.evaluate.evaluation import play
-from topological_nav.evaluate.rows import _stem, play_contest
+from topological_nav.evaluate.contest import Contest, ContestScene, _stem, contest_scenes, play_contest
+from topological_nav.evaluate.evaluation import Contender, DrivenEpisodes, count_of, draw_episodes, learned
 from topological_nav.navigate.state import Events
 from topological_nav.scenes.rooms import RECORDED, find_rooms
-from topological_nav.scenes.simulation import Seen, Simulator
+from topological_nav.scenes.simulation import Snapshot, episode_starts
 from topological_nav.weights import packaged
 from train.config import EnvConfig, TrainConfig
 from train.config_io import to_yaml
@@ -40,45 +40,45 @@ APARTMENT = "scenes_mjcf/apartment_0"
 
 
 class Rails:
-    """A simulator of robots on a line: each drives 0.2 m a step and touches where it is told to."""
+    """A player of robots on a line: each drives 0.2 m a step and touches where it is told to."""
 
-    dt_s = 0.1
-    env = type("Env", (), {"backend": "warp"})
+    def __init__(self):
+        world = SimpleNamespace(small_objects=())
+        self.env = SimpleNamespace(dt=0.1, world=world, strew=abs)
 
-    def __init__(self, touches):
-        self._touches = touches
+    def rollout(self, policy, keys, starts, fewest, on_progress):
+        episode = np.arange(len(keys))
+        x, over = np.asarray(starts.start_xy_w, float)[:, 0], np.zeros(len(keys), bool)
+        for step in range(1000):
+            if over.all():
+                break
+            ahead, ends = policy.act((x, step, episode), episode, ~over, step)
+            x, over = x + ahead * ~over, over | ends
+            on_progress(int(over.sum()), step)
 
-    def start(self, start_xy_w, yaw_rad, goal_xy_w, number, seed, strewn=False):
-        return np.array(start_xy_w)[:, 0], 0, number
 
-    def seen(self, state):
+class Line(Contender):
+    """Runs of 1 s (ten steps) with a pause of 0.5 s between them, in which it turns on the spot."""
+
+    def __init__(self, config, touches=None, arrives=None):
+        super().__init__(Rails(), config)  # type: ignore[arg-type]
+        self._touches, self._arrives = touches or {}, arrives or {}
+
+    def look(self, state):
         x, step, number = state
         movable = np.array([step in self._touches.get(int(n), ()) for n in number])
         none = np.zeros(len(x), bool)
-        return Seen(np.stack([x, 0 * x], -1), 0 * x, 0.2 * step + 0 * x, movable, none, np.zeros((len(x), 7)), none)
+        return Snapshot(np.stack([x, 0 * x], -1), 0 * x, 0.2 * step + 0 * x, movable, none, np.zeros((len(x), 7)), none)
 
-
-class Line:
-    """Runs of 1 s (ten steps) with a pause of 0.5 s between them, in which it turns on the spot."""
-
-    def __init__(self, arrives=None):
-        self._arrives = arrives or {}
-
-    def begin(self, journeys):
-        self._number = journeys.number
-
-    def keep(self, rows):
-        self._number = self._number[rows]
-
-    def step(self, state, time_s, over):
-        x, step, number = state
+    def step(self, state, now, running, step):
+        x, _, number = state
         at, none = step % 15, np.zeros(len(x), bool)
         arrived = np.array([self._arrives.get(int(n)) == step for n in number])
         events = Events(
             localised=arrived, glanced=none, lost=none, blocked=none, arrived=arrived,
             run_started=none | (at == 0), run_ended=none | (at == 10), timed_out=none | (step >= 60),
         )  # fmt: skip
-        return (x + 0.2 * (at < 10) * ~over, step + 1, number), events
+        return 0.2 * (at < 10), events
 
 
 def line_journeys(goals) -> DrivenEpisodes:
@@ -91,7 +91,7 @@ def line_journeys(goals) -> DrivenEpisodes:
 def test_an_episode_is_won_where_a_run_ends_near_the_goal():
     # Runs end at steps 10, 25, 40, 55, at x = 2, 4, 6, 8.
     config = EvaluationConfig.of(run_s=1.0, success_m=1.5)
-    found = play(Line(), Rails({}), line_journeys([2.0, 3.0, 5.49, 5.51, 30.0]), config)  # type: ignore[arg-type]
+    found = Line(config).play(line_journeys([2.0, 3.0, 5.49, 5.51, 30.0]))
     assert found.success.tolist() == [True, True, True, True, False]
     # 3 m: 1 m away at the end of the first run. 5.49: 1.49 m away after the second; 5.51: only after the third.
     assert found.duration_s.tolist() == pytest.approx([1.0, 1.0, 2.5, 4.0, 6.0])
@@ -105,14 +105,14 @@ def test_an_episode_is_won_where_a_run_ends_near_the_goal():
 def test_contacts_count_by_runs_and_by_seconds():
     # State k is seen after k steps. Run 1: steps 1 to 10, run 2: 16 to 25; 11 to 15 turn on the spot.
     touches = {0: {3, 4, 9}, 1: {12, 13}, 2: {10, 16}, 3: {11}}
-    found = play(Line(), Rails(touches), line_journeys([4.9] * 4), EvaluationConfig.of(run_s=1.0))  # type: ignore[arg-type]
+    found = Line(EvaluationConfig.of(run_s=1.0), touches).play(line_journeys([4.9] * 4))
     assert found.duration_s.tolist() == pytest.approx([2.5] * 4) and found.runs.tolist() == [2] * 4
     assert found.contact_runs.tolist() == [1, 0, 2, 0]
     assert found.contact_s.tolist() == pytest.approx([0.3, 0.2, 0.2, 0.1])
 
 
 def test_a_run_that_its_episode_cuts_short_counts():
-    found = play(Line({0: 4, 1: 12}), Rails({0: {2}}), line_journeys([9.0, 9.0]), EvaluationConfig.of(run_s=1.0))  # type: ignore[arg-type]
+    found = Line(EvaluationConfig.of(run_s=1.0), {0: {2}}, {0: 4, 1: 12}).play(line_journeys([9.0, 9.0]))
     assert found.success.tolist() == [True, True] and found.arrived.tolist() == [True, True]
     assert found.runs.tolist() == [1, 1] and found.contact_runs.tolist() == [1, 0]
     assert found.localisations.tolist() == [1, 1] and found.duration_s.tolist() == pytest.approx([0.4, 1.2])
@@ -217,6 +217,18 @@ def test_with_true_sight_the_navigator_finds_the_other_room(first):
     assert all(r["within"] for r in by["expert"]) and not any(r["broken"] for r in rows.to_pylist())
 
 
+def test_the_contest_is_won_as_before(first):
+    """Golden numbers of the loop that played before `rollout` did, on C MuJoCo."""
+    *_, rows = first
+    by = {name: [r for r in rows.to_pylist() if r["contender"] == name] for name in ("dense", "expert")}
+    assert [r["duration_s"] for r in by["dense"]] == pytest.approx([32.8, 49.7, 35.8, 97.7], abs=0.11)
+    assert [r["path_m"] for r in by["dense"]] == pytest.approx([3.1453, 7.5912, 4.5799, 14.6799], abs=2e-3)
+    assert [r["goal_m"] for r in by["dense"]] == pytest.approx([1.4132, 0.7745, 1.0009, 0.3713], abs=2e-3)
+    assert [(r["runs"], r["localisations"]) for r in by["dense"]] == [(2, 1), (5, 1), (3, 1), (11, 1)]
+    assert [r["path_m"] for r in by["expert"]] == pytest.approx([3.7638, 5.6447, 5.3205, 5.0502], abs=2e-3)
+    assert [(r["runs"], r["duration_s"]) for r in by["expert"]] == [(2, 10.0), (3, 15.0), (3, 15.0), (3, 15.0)]
+
+
 @pytest.mark.heavy
 def test_who_else_is_in_the_batch_does_not_matter_and_a_stopped_contest_goes_on(first, toy, tmp_path):
     contest, scenes, expected = first
@@ -308,8 +320,8 @@ def test_a_policy_that_learned_on_a_gpu_is_played_without_one(toy, tmp_path, mon
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "warp" else usual(name, *a))
     monkeypatch.setattr("train.scoring.evaluation.load_policy", lambda folder, config, *_, **__: (config.env, None))
     scene = load_scene(toy)
-    simulator, env = contests._learned(tmp_path, scene, EvaluationConfig())
-    assert (simulator.env.backend, env.backend, env.scenes) == ("native", "native", (str(scene.path),))
+    player, env = contests._learned(tmp_path, scene, EvaluationConfig())
+    assert (player.env.backend, env.backend, env.scenes) == ("native", "native", (str(scene.path),))
     assert "trained with backend warp, which is not here; played with native" in capsys.readouterr().err
     with pytest.raises(ConfigError, match="backend=warp needs warp-lang"):
         contests._learned(tmp_path, scene, EvaluationConfig.of(backend="warp"))
@@ -341,13 +353,13 @@ def test_a_policy_told_the_goal_plays_the_same_episodes(first, toy):
     """By the baseline that follows waypoints, in an environment with small objects, which stay away."""
     contest, (venue,), _ = first
     env = interactive_nav.make("ttbot", [toy], control_mode="twist", backend="native", num_objects=1)
-    simulator = Simulator(env)
     journeys = venue.episodes
-    found = play(learned(simulator, make_follower(env), contest.config), simulator, journeys, contest.config)
+    found = learned(Player(env, {}), contest.config, make_follower(env)).play(journeys)
     assert found.success.all() and (found.goal_m < 1.5).all() and not found.localisations.any()
     # Runs follow each other: an episode lasts whole runs.
     assert found.duration_s == pytest.approx(5.0 * found.runs)
-    start = simulator.start(journeys.start_xy_w, journeys.yaw_rad, journeys.goal_xy_w, journeys.number, 0)
+    starts = episode_starts(journeys.start_xy_w, journeys.yaw_rad, journeys.goal_xy_w, 1)
+    start = jax.jit(jax.vmap(env.reset_to))(starts, episode_keys(0, journeys.number))
     assert np.abs(np.asarray(start.info["nav"].object_pos_w)[:, 0, 0]).min() > 100.0  # parked
 
 
@@ -368,8 +380,7 @@ def test_one_array_tells_what_the_state_holds():
     pose = {name: nav.pop(name) for name in ("robot_pos_w", "yaw_rad")}
     info, metrics = {"nav": SimpleNamespace(**pose, memory=nav)}, {"nonfinite": jnp.zeros(3)}
     state = SimpleNamespace(info=info, metrics=metrics, pipeline_state=physics)
-    simulator = Simulator(SimpleNamespace(**dict.fromkeys(("reset_to", "advance", "step", "strew"), abs)))
-    seen = simulator.seen(state)
+    seen = Snapshot.of(state)
     assert (seen.xy_w == np.asarray(pose["robot_pos_w"])[:, :2]).all() and seen.xy_w.dtype == float
     assert (seen.yaw_rad == np.asarray(pose["yaw_rad"])).all()
     assert (seen.path_m == np.asarray(nav["robot_path_m"])).all()
@@ -377,7 +388,6 @@ def test_one_array_tells_what_the_state_holds():
     assert seen.wall.tolist() == [False, True, False]
     assert seen.broken.tolist() == [False, True, True]
     assert (seen.qpos == np.asarray(physics.qpos)).all()
-    assert simulator.seen(state) is seen  # the same state is not asked twice
 
 
 @pytest.mark.heavy

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pytest
 
 from interactive_nav_common.rows import write_parquet
-from topological_nav.evaluate import rows
+from topological_nav.evaluate import contest as rows
 
 STEM = "cedar-dense-0123abcd"
 

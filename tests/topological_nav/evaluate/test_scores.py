@@ -8,8 +8,7 @@ import pytest
 
 from topological_nav.config import EvaluationConfig
 from topological_nav.evaluate import scores
-from topological_nav.evaluate.contenders import DrivenEpisodes
-from topological_nav.evaluate.evaluation import Played, columns
+from topological_nav.evaluate.evaluation import DrivenEpisodes, Played, columns
 
 
 def journeys(shortest) -> DrivenEpisodes:

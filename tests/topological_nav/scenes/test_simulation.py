@@ -1,5 +1,6 @@
 """What episodes tell of the physics behind them."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,28 +10,31 @@ from interactive_nav.pictures.scene_model import SCENE, SceneModel, world_poses
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import body_names
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav.task.rollout import episode_keys
 from scenes_mjcf.look import Lens, trace
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose
-from topological_nav.scenes.simulation import Simulator, make_env, scene_camera
+from topological_nav.scenes.simulation import Snapshot, episode_starts, make_env, scene_camera
 
 
 def test_an_episode_with_lost_contacts_or_left_out_bodies_is_broken(room):
-    simulator = Simulator(make_env(load_scene(room), "turtlebot", "native"))
-    state = simulator.start(np.zeros((3, 2)) - 1.0, np.zeros(3), np.ones((3, 2)), np.arange(3), 0)
-    assert simulator.seen(state).broken.tolist() == [False] * 3
+    env = make_env([room], "turtlebot", "native", num_objects=0)
+    starts = episode_starts(np.zeros((3, 2)) - 1.0, np.zeros(3), np.ones((3, 2)), 0)
+    state = jax.jit(jax.vmap(env.reset_to))(starts, episode_keys(0, 3))
+    assert Snapshot.of(state).broken.tolist() == [False] * 3
     for name in ("overflow_steps", "left_out_steps"):
         nav = state.info["nav"]
         lost = nav.replace(memory=nav.memory | {name: jnp.asarray([0, 1, 0], nav.memory[name].dtype)})
-        seen = simulator.seen(state.replace(info={**state.info, "nav": lost}))
+        seen = Snapshot.of(state.replace(info={**state.info, "nav": lost}))
         assert seen.broken.tolist() == [False, True, False]
-        assert seen.xy_w == pytest.approx(simulator.seen(state).xy_w)
+        assert seen.xy_w == pytest.approx(Snapshot.of(state).xy_w)
 
 
 def test_pushed_furniture_and_small_objects_are_seen_where_they_are(room):
     """Against C MuJoCo's rays: nothing but the pixels of what moved differs from the picture of the world at rest."""
     scene, robot, lens = load_scene(room), get_robot("ttbot"), Lens(64, 48, 90.0)
-    env = make_env(scene, "ttbot", "native", objects=3)
-    state = Simulator(env).start(np.full((1, 2), -1.0), np.zeros(1), np.ones((1, 2)), np.zeros(1, int), 0, strewn=True)
+    env = make_env([room], "ttbot", "native", num_objects=3)
+    starts, keys = episode_starts(np.full((1, 2), -1.0), np.zeros(1), np.ones((1, 2)), 3), episode_keys(0, 1)
+    state = jax.jit(jax.vmap(env.reset_to))(jax.vmap(env.strew)(keys, starts), keys)
     model = SceneModel(env.robot, scene, env.world.small_objects)
     xy, yaw, qpos = np.full((2, 2), -1.4), np.full(2, 0.8), np.repeat(np.asarray(state.pipeline_state.qpos), 2, 0)
     names, own, pos_w, _ = world_poses(env.world, 0, qpos)
