@@ -44,7 +44,7 @@ class Footprints:
         self._bodies, self._height_m = bodies, height_m
         self._origin, self._shape = np.asarray(origin_w, float), shape
         self._geoms = [np.flatnonzero((model.geom_bodyid == b) & (model.geom_rbound > 5e-3)) for b in bodies]
-        self._known: dict[Any, np.ndarray] = {}
+        self._covered_at: dict[Any, np.ndarray] = {}
         self._corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, -1).T
 
     def cells(self, qpos: np.ndarray) -> list[np.ndarray]:
@@ -55,11 +55,11 @@ class Footprints:
         for k, geoms in enumerate(self._geoms):
             pose = np.concatenate([self._data.xpos[self._bodies[k]], self._data.xmat[self._bodies[k]]])
             key = (k, *np.round(pose * 200).astype(int).tolist())
-            if key not in self._known:
-                if len(self._known) > 20_000:
-                    self._known.clear()
-                self._known[key] = self._covered(geoms)
-            out.append(self._known[key])
+            if key not in self._covered_at:
+                if len(self._covered_at) > 20_000:
+                    self._covered_at.clear()
+                self._covered_at[key] = self._covered(geoms)
+            out.append(self._covered_at[key])
         return out
 
     def _covered(self, geoms: np.ndarray) -> np.ndarray:

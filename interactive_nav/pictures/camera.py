@@ -22,9 +22,6 @@ from scipy.spatial import cKDTree
 
 from interactive_nav.physics import resolve_backend
 from interactive_nav.pictures.scene_model import CUT_WALLS, ROBOT, ROBOT_SOLIDS, SCENE, THINGS, SceneModel, clear_way
-from interactive_nav.robots import RobotSpec
-from interactive_nav.scenes.objects import SmallObject
-from interactive_nav.scenes.scene import Scene
 from interactive_nav.sensing.base import FAR_M, lambert
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.rotations import yaw_from_quat
@@ -198,10 +195,9 @@ class FloorPaint:
 class SceneView(SceneModel):
     """One scene with a robot and small objects, in the colours of their categories or with textures."""
 
-    def __init__(self, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject], classes: MaskClasses = 4):
-        """Compile the model to look at; see `SceneModel`."""
-        super().__init__(robot, scene, small, classes)
-        self._painter = Painter()
+    @functools.cached_property
+    def _painter(self) -> Painter:
+        return Painter()
 
     @functools.cached_property
     def colour(self) -> np.ndarray:

@@ -83,9 +83,9 @@ class Replay:
     segmentation_classes: MaskClasses = 4
     """As in `NavConfig`."""
     success_distance_m: float | None = None
+    """Of the goal; None, in older files: the robot's width is taken."""
     image_fov_deg: float | None = None
     """Vertical, of the robot's camera as the episode had it; None: the robot's."""
-    """Of the goal; None, in older files: unknown, taken for the robot's width."""
 
     @property
     def small(self) -> tuple[SmallObject, ...]:

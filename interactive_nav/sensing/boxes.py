@@ -223,9 +223,9 @@ def body_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[ja
     pos = jnp.concatenate([pose[..., :3], swung, jnp.zeros((*lead, 1, 3), qpos.dtype)], -2)
     axes = jnp.concatenate([matrix_from_quat(pose[..., 3:]), compose(rest, turned), standing], -3)
     if tables.robot is not None:
-        own_pos, own_axes = zip(*tables.robot.frames(qpos), strict=True)
-        pos = jnp.concatenate([pos, jnp.stack(own_pos, -2)], -2)
-        axes = jnp.concatenate([axes, jnp.stack(own_axes, -3)], -3)
+        robot_pos, robot_axes = zip(*tables.robot.frames(qpos), strict=True)
+        pos = jnp.concatenate([pos, jnp.stack(robot_pos, -2)], -2)
+        axes = jnp.concatenate([axes, jnp.stack(robot_axes, -3)], -3)
     return pos, axes
 
 

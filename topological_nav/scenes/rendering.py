@@ -1,6 +1,6 @@
 """Draw what a robot's camera sees of a scene, in batches of any size.
 
-`warp` (MJX-Warp's ray tracer, on a CPU or an NVIDIA GPU) and `gl` (MuJoCo's own renderer, which needs EGL or OSMesa)
+`warp` (MJX-Warp's ray tracer, on a CPU or an NVIDIA GPU) and `gl` (MuJoCo's renderer, which needs EGL or OSMesa)
 both draw the visual meshes with their textures. Their light differs, so the images of one do not fit networks that
 learned from the other.
 """
@@ -39,7 +39,7 @@ def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pit
     Args:
         xy_w: [..., 2] m, of the base.
         heading_rad: [...], yaw of the base.
-        pitch_rad: [...], how far up the camera looks beside its mount's own pitch.
+        pitch_rad: [...], how far up the camera looks beside its mount's pitch.
     """
     camera = robot.camera
     if camera.body != robot.base_body:
@@ -164,7 +164,7 @@ def calls(count: int, sizes: tuple[int, ...]) -> list[int]:
 def shrink(images: Any, by: int) -> Any:
     """Shrink [N, by H, by W, 3] u8 to [N, H, W, 3] u8: means over squares of `by` pixels, halves rounded to even.
 
-    In whole numbers, so that NumPy and every device give the same; the result is of the images' own kind of array.
+    In whole numbers, so that NumPy and every device give the same; the result is an array of the images' kind.
     """
     if by == 1:
         return images

@@ -11,7 +11,7 @@ import pytest
 
 from interactive_nav.camera_config import KINECT, CameraNoise
 from interactive_nav.config import NavConfig
-from interactive_nav.sensing.noise import blurred, disturbed, noisy_depth
+from interactive_nav.sensing.sensors import blurred, disturbed, noisy_depth
 from interactive_nav_common.errors import ConfigError
 from scenes_mjcf.look import Lens
 
