@@ -238,7 +238,7 @@ def simulation(
             memory.append(_gpu_memory_mib())
     nav, physics = state.info["nav"], env.physics
     tiers = getattr(physics, "tiers", (physics,) if hasattr(physics, "window") else ())
-    rate, clock = statistics.median(rates), env.config.physics
+    rate, clock = statistics.median(rates), env.config
     return {
         "env_steps_per_s": round(rate),
         "physics_steps_per_s": round(rate * round(clock.control_dt_s / clock.sim_dt_s)),

@@ -84,7 +84,7 @@ def make(
     if isinstance(scenes, (str, Path)):
         raise ConfigError(f"scenes is {str(scenes)!r}, expected a list of scene folders; write [{str(scenes)!r}]")
     config = make_config(**settings)
-    spec = robot if isinstance(robot, RobotSpec) else get_robot(robot, config.rules.control_mode)
+    spec = robot if isinstance(robot, RobotSpec) else get_robot(robot, config.control_mode)
     return InteractiveNav(spec, tuple(load_scene(s) for s in scene_folders(scenes)), config, terms)
 
 

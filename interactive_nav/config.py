@@ -15,7 +15,6 @@ from interactive_nav_common.config import (
     Positive,
     Settings,
     Share,
-    flat,
     overlay,
 )
 from interactive_nav_common.errors import ConfigError
@@ -230,7 +229,7 @@ _NOISE = {
 
 
 @dataclasses.dataclass(frozen=True)
-class SensorConfig(Settings):
+class SensorConfig(CameraNoise):
     """What the robot perceives, and with how much noise."""
 
     observations: tuple[str, ...] = OBSERVATIONS
@@ -264,8 +263,6 @@ class SensorConfig(Settings):
     """Share of depth pixels that read 0, drawn anew each step."""
     depth_noise: NotNegative = 0.0
     """Standard deviation of depth, as a share of it."""
-    camera_noise: CameraNoise = flat(CameraNoise)
-    """Errors of cameras."""
     lidar_rays: AtLeastOne = 228
     """Beams of the planar scan, evenly over `lidar_fov_deg` from the right; by default the TurtleBot's Hokuyo."""
     lidar_fov_deg: Annotated[Positive, (0, 360)] = 240.0
@@ -316,18 +313,8 @@ class SensorConfig(Settings):
 
 
 @dataclasses.dataclass(frozen=True)
-class NavConfig(Settings):
-    """Settings of an interactive navigation environment (defaults: reference benchmark, section 11).
-
-    `NavConfig.of(k_int=1.0, backend="native")` takes settings by their plain names, as `interactive_nav.make` does.
-    """
-
-    rules: TaskRules = flat(TaskRules)
-    """The task."""
-    physics: PhysicsConfig = flat(PhysicsConfig)
-    """The simulation."""
-    sensors: SensorConfig = flat(SensorConfig)
-    """What the robot perceives."""
+class NavConfig(SensorConfig, PhysicsConfig, TaskRules):
+    """Settings of an interactive navigation environment (defaults: reference benchmark, section 11)."""
 
 
 def make_config(variant: str = "paper", **settings: Any) -> NavConfig:
@@ -335,7 +322,7 @@ def make_config(variant: str = "paper", **settings: Any) -> NavConfig:
 
     Args:
         variant: `paper`, the defaults, or `code`: where the original's code differs from its paper, the code.
-        **settings: of `NavConfig`'s parts; they go before the variant's.
+        **settings: of `NavConfig`; they take precedence over the variant's.
     """
     if variant not in VARIANTS:
         raise ConfigError(f"variant is {variant!r}, expected one of {', '.join(VARIANTS)}")

@@ -1,8 +1,7 @@
 """Read `key=value` words and plain mappings into a frozen dataclass of settings; each mistake is reported in one line.
 
 A setting's type says what it may be: `Literal` for choices, `Annotated` with `Bounds` (or a plain pair) for ranges. A
-dataclass may be composed of others: in files and on the command line they are sections (`ppo.learning_rate`), or flat,
-their settings among those of the whole (`flat`).
+dataclass may be composed of others: in files and on the command line they are sections (`ppo.learning_rate`).
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import textwrap
 import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar
 
 import yaml
 
@@ -59,57 +58,38 @@ Positive = Annotated[float, Bounds(0, open=True)]
 Share = Annotated[float, (0.0, 1.0)]
 
 
-def flat(kind: Callable[[], Config]) -> Config:
-    """Declare a field that is itself a dataclass of settings, which stand among those of the whole."""
-    return dataclasses.field(default_factory=kind, metadata={"flat": True})
-
-
 class Settings:
     """Base of a frozen dataclass of settings, each with a default, that refuses what their types do not allow.
 
-    Lists become tuples. Settings of flat sections can be read from the whole by their names.
+    Lists become tuples. A class may inherit from several: it then has the settings of all of them.
     """
 
     IDLE: ClassVar[Sequence[tuple[str, str, Callable[[Any], bool]]]] = ()
-    """Settings that change nothing but where something holds: their names, what, and the test of it. Where it does not,
-    they are refused unless they are 0 or their default (of flat sections: 0)."""
+    """Settings that have an effect only under a condition: their names, the condition, and its test. Where it does not
+    hold, they are refused unless they are 0 or their default."""
 
     def __post_init__(self) -> None:
-        for name, (section, hint) in _places(type(self)).items():
-            if not section:
-                if isinstance(value := getattr(self, name), list):
-                    object.__setattr__(self, name, tuple(value))
-                _check(name, getattr(self, name), hint)
-        for names, needs, used in self.IDLE:
+        for name, hint in _hints(type(self)).items():
+            if isinstance(value := getattr(self, name), list):
+                object.__setattr__(self, name, tuple(value))
+            _check(name, getattr(self, name), hint)
+        for names, needs, used in (row for cls in type(self).__mro__ for row in cls.__dict__.get("IDLE", ())):
             for name in () if used(self) else names.split():
                 if (value := getattr(self, name)) not in (0, getattr(type(self), name, 0)):
                     problem = f"{name} is {value!r}, which changes nothing here"
                     raise ConfigError(f"{problem}: expected {needs}; or leave it out")
 
-    if not TYPE_CHECKING:  # the project itself reads settings from their sections, where type checkers see them
-
-        def __getattr__(self, name: str) -> Any:
-            section, _ = _places(type(self)).get(name, ("", None))
-            if not section:
-                raise AttributeError(f"{type(self).__name__} has no setting {name!r}")
-            return getattr(getattr(self, section), name)
-
     @classmethod
     def of(cls, **settings: Any) -> Self:
-        """Return the defaults with these settings replaced, wherever they stand."""
+        """Return the defaults with these settings replaced."""
         return replace(cls(), **settings)
 
 
 @functools.cache
-def _places(config_type: type) -> dict[str, tuple[str, Any]]:
-    """Return, by the name of each setting, the flat section that it is in ('': none) and its type."""
+def _hints(config_type: type) -> dict[str, Any]:
+    """Return the type of each setting by its name."""
     hints = typing.get_type_hints(config_type, include_extras=True)
-    places: dict[str, tuple[str, Any]] = {}
-    for field in dataclasses.fields(config_type):
-        hint = hints[field.name]
-        inner = _places(hint).items() if "flat" in field.metadata else ()
-        places |= {name: (field.name, kind) for name, (_, kind) in inner} or {field.name: ("", hint)}
-    return places
+    return {field.name: hints[field.name] for field in dataclasses.fields(config_type)}
 
 
 def _check(name: str, value: Any, hint: Any) -> None:
@@ -133,17 +113,14 @@ def _check(name: str, value: Any, hint: Any) -> None:
 
 
 def replace(config: Config, **changes: Any) -> Config:
-    """Do as `dataclasses.replace` does, with settings of flat sections by their plain names."""
-    places, direct, inner = _places(type(config)), {}, {}
-    for name, value in changes.items():
-        if name not in places:
-            near = nearest(name, list(places)).removeprefix(", ")
-            available = f"known settings: {', '.join(sorted(places))}"
+    """Do as `dataclasses.replace` does, and name an unknown setting with the nearest known one."""
+    names = list(_hints(type(config)))
+    for name in changes:
+        if name not in names:
+            near = nearest(name, names).removeprefix(", ")
+            available = f"known settings: {', '.join(sorted(names))}"
             raise ConfigError(f"unknown setting {name!r}; {f'{near} ' if near else ''}{available}")
-        section = places[name][0]
-        (inner.setdefault(section, {}) if section else direct)[name] = value
-    direct |= {section: replace(getattr(config, section), **values) for section, values in inner.items()}
-    return dataclasses.replace(config, **direct)  # type: ignore[type-var]
+    return dataclasses.replace(config, **changes)  # type: ignore[type-var]
 
 
 def _walk(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
@@ -151,7 +128,7 @@ def _walk(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if dataclasses.is_dataclass(value):
-            yield from _walk(value, prefix if "flat" in field.metadata else f"{prefix}{field.name}.")
+            yield from _walk(value, f"{prefix}{field.name}.")
         else:
             yield f"{prefix}{field.name}", config, field.name
 
@@ -234,14 +211,14 @@ def overlay(base: Config, plain: Any, where: str, prefix: str = "", elsewhere: S
     if not isinstance(plain, Mapping):
         section = prefix.rstrip(".") or "the file"
         raise ConfigError(f"{where}: {section}: got {_shown(plain)}, expected a mapping of settings")
-    places = _places(type(base))
+    hints = _hints(type(base))
     changes: dict[str, Any] = {}
     for key, value in plain.items():
         name = f"{prefix}{key}"
-        if key not in places:
-            names = [*(f"{prefix}{field}" for field in places), *elsewhere]
+        if key not in hints:
+            names = [*(f"{prefix}{field}" for field in hints), *elsewhere]
             raise ConfigError(f"{where}: unknown key {name!r}{nearest(name, names)} (--help lists them)")
-        hint = places[key][1]
+        hint = hints[key]
         if dataclasses.is_dataclass(hint):
             changes[key] = overlay(getattr(base, key), value, where, f"{name}.", elsewhere)
         else:
@@ -277,7 +254,7 @@ def settings_help(config: Any, notes: Mapping[str, str] | None = None, equals: s
     """Return one line per setting: dotted name, default, meaning, choices, and the note of its name."""
     lines = []
     for dotted, part, name in _walk(config):
-        value, doc, hint = getattr(part, name), field_docs(type(part))[name], _places(type(part))[name][1]
+        value, doc, hint = getattr(part, name), field_docs(type(part))[name], _hints(type(part))[name]
         shown = AUTO if value is None else ",".join(map(str, value)) if isinstance(value, (tuple, Mapping)) else value
         note = " | ".join(map(str, typing.get_args(hint))) if typing.get_origin(hint) is Literal else ""
         note = note or (notes or {}).get(dotted, "")

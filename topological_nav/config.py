@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Literal
 
-from interactive_nav_common.config import Bounds, Count, Seed, Settings, Share, flat
+from interactive_nav_common.config import Bounds, Count, Seed, Settings, Share
 from interactive_nav_common.errors import ConfigError
 
 PITCHES = ("up", "level", "down")
@@ -217,11 +217,9 @@ class NavigatorConfig(Settings):
 
 
 @dataclasses.dataclass(frozen=True)
-class EvaluationConfig(Settings):
-    """Episodes, and how they are scored."""
+class EvaluationConfig(NavigatorConfig):
+    """The navigator, its episodes, and how they are scored."""
 
-    navigator: NavigatorConfig = flat(NavigatorConfig)
-    """Who plays them."""
     seed: Seed = 0
     """Of the episodes."""
     episodes: Annotated[int | None, (1, 10**6)] = None

@@ -148,7 +148,7 @@ def _run(arguments: argparse.Namespace, build_env: Callable[[EnvConfig], Any], k
         raise ConfigError("--out is for one run; several write into a folder: --dataset DIR")
     folders = runs or [None]
     configs = [_wanted(folder, policies, arguments, console) for folder in folders]
-    if arguments.policies is None and not all("waypoints" in c.env.sensors.observations for c in configs):
+    if arguments.policies is None and not all("waypoints" in c.env.observations for c in configs):
         policies = tuple(name for name in policies if name != "follower")  # nobody requested it
     given = arguments.episode_file
     file, digest = _read_episodes(given, arguments.episodes) if given else (None, "")

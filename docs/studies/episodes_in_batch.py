@@ -117,7 +117,7 @@ def measure(
         return draw(xy_w, yaw_rad, qpos)
 
     journeys = clock.timed("episodes drawn", lambda: venue.episodes)()
-    navigator = Navigator(made, sight, policy, contest.config.navigator)
+    navigator = Navigator(made, sight, policy, contest.config)
     player = NavigatorPlayer(venue.player, contest.config, navigator, camera)
     played = clock.timed(REST, player.play)(journeys, tell)
     return dict(clock.parts), played, images, time.perf_counter() - began
@@ -160,7 +160,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         nonlocal told
         if time.monotonic() - told > 5.0:
             told = time.monotonic()
-            most = contest.config.navigator.limit_s
+            most = contest.config.limit_s
             print(f"{over} over, simulated {simulated_s:.0f} s of {most:.0f} s at most", file=sys.stderr, flush=True)
 
     parts, played, images, seconds = measure(contest, tell)

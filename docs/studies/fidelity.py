@@ -172,7 +172,7 @@ def push(scenario: Scenario, source: Scene, settings: dict, tolerance: float | N
     start = time.perf_counter()
     force, path = np.zeros(len(qpos)), []
     q = world.layout.robot_qpos
-    for _ in range(round(SECONDS / config.physics.control_dt_s)):
+    for _ in range(round(SECONDS / config.control_dt_s)):
         state, signals = step(scene, state, command)
         force += np.asarray(signals.force_n)
         path.append(np.asarray(state.qpos[:, q : q + 2]))

@@ -374,10 +374,10 @@ def _masked(values: Mapping[str, jax.Array], mask: np.ndarray) -> dict[str, np.n
 
 def _checked_slot(env: InteractiveNav, slot: int | None) -> jax.Array | None:
     """Return the scene that a single environment keeps; None: each episode draws one."""
-    chosen, count = env.config.rules.scene_choice == "slot", len(env.scenes)
+    chosen, count = env.config.scene_choice == "slot", len(env.scenes)
     if slot is not None and (not chosen or slot < 0):
         raise ConfigError(
-            f"slot is {slot} with scene_choice={env.config.rules.scene_choice!r}, expected 0 or more, with 'slot'"
+            f"slot is {slot} with scene_choice={env.config.scene_choice!r}, expected 0 or more, with 'slot'"
         )
     if chosen and slot is None and count > 1:
         raise ConfigError(

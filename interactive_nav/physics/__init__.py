@@ -57,11 +57,10 @@ def compiler_options() -> dict[str, Any] | None:
 
 def make_physics(world: World, config: NavConfig) -> Physics:
     """Build the backend that the configuration names."""
-    physics = config.physics
-    backend = resolve_backend(physics.backend)
-    if physics.collision == "hulls" and backend != "native":
+    backend = resolve_backend(config.backend)
+    if config.collision == "hulls" and backend != "native":
         raise ConfigError(f"collision='hulls' with backend='{backend}', expected backend='native'; use boxes")
-    if physics.cone == "elliptic" and backend != "native":
+    if config.cone == "elliptic" and backend != "native":
         raise ConfigError(f"cone='elliptic' with backend='{backend}', expected backend='native'; use pyramidal cones")
     if backend == "native":
         from interactive_nav.physics.native import NativePhysics
@@ -70,7 +69,7 @@ def make_physics(world: World, config: NavConfig) -> Physics:
     from interactive_nav.physics.mjx_batch import JaxPhysics, WarpPhysics
 
     engine = WarpPhysics if backend == "warp" else JaxPhysics
-    if physics.windows == ():
+    if config.windows == ():
         return engine(world, config)
     from interactive_nav.physics.tiers import TieredPhysics
 

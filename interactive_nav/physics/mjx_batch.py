@@ -40,15 +40,14 @@ class MjxPhysics(Physics):
 
     def __init__(self, world: World, config: NavConfig, window: PhysicsWindow | None = None):
         self.window = window or PhysicsWindow(world, config)
-        physics = config.physics
-        self._world, self._substeps = world, physics.substeps
+        self._world, self._substeps = world, config.substeps
         self.nv = world.models[0].nv
-        self.contacts_per_env, self.constraints_per_env = physics.contacts_per_env, physics.constraints_per_env
+        self.contacts_per_env, self.constraints_per_env = config.contacts_per_env, config.constraints_per_env
         self._host = self._host_model()
         self._model = uncommitted(mjx.put_model(self._host, impl=self.name))
         layout = self.window.layout
         self._sensors = layout.force_sensors[:, None] + np.arange(3)
-        self._forces = config.rules
+        self._config = config
 
     def _host_model(self) -> mujoco.MjModel:
         return self.window.model
@@ -111,7 +110,7 @@ class MjxPhysics(Physics):
         new, (forces, contacts), failures, missed = jax.vmap(one)(measured, scene, state, command, time_s)
         finite = jnp.isfinite(new.qpos).all(-1) & jnp.isfinite(new.qvel).all(-1)
         return new, StepSignals(
-            **summarise_forces(forces, jnp, contacts, self._forces),
+            **summarise_forces(forces, jnp, contacts, self._config),
             overflow=((failures & _DROPPED) != 0).astype(jnp.int32),
             left_out=missed,
             unconverged=((failures & _UNCONVERGED) != 0).astype(jnp.int32),
@@ -133,7 +132,7 @@ class WarpPhysics(MjxPhysics):
             self.constraints_per_env = self.constraints_per_env or measured[1]
         # Warp prints a line per overflow or unconverged solve: ours are counted instead.
         self._model = self._model.tree_replace({"opt._impl.warn_overflow": 0})
-        self._contacts = sensor_addresses(self._host) if config.rules.needs_contacts else None
+        self._contacts = sensor_addresses(self._host) if config.needs_contacts else None
 
     def _template(self, n):
         return mjx.make_data(
@@ -157,7 +156,7 @@ class WarpPhysics(MjxPhysics):
             data = _engine_step(model, control(data, k) if k else data)
             collected.append(data.sensordata[self._sensors])
             if self._contacts is not None:
-                listed.append(from_sensors(data.sensordata, self._contacts, self._forces.force_part, jnp))
+                listed.append(from_sensors(data.sensordata, self._contacts, self._config.force_part, jnp))
             failures |= data._impl.overflow
         contacts = jax.tree.map(lambda *x: jnp.stack(x), *listed) if listed else None
         return data, (jnp.stack(collected), contacts), failures
@@ -197,7 +196,7 @@ class JaxPhysics(MjxPhysics):
         out = jnp.zeros((len(self._sensors), 3))
         dims, address = np.asarray(contact.dim), np.asarray(contact.efc_address)
         slot, rolls = jnp.asarray(self._slot_of_geom), jnp.asarray(self._rolls)
-        sums = (jnp.zeros(3), jnp.zeros(()), jnp.zeros(())) if self._forces.needs_contacts else None
+        sums = (jnp.zeros(3), jnp.zeros(()), jnp.zeros(())) if self._config.needs_contacts else None
         for dim in np.unique(dims):
             at = np.flatnonzero((dims == dim) & (address >= 0))
             rows = efc[address[at][:, None] + np.arange(1 if dim == 1 else 2 * (dim - 1))]
@@ -218,7 +217,7 @@ class JaxPhysics(MjxPhysics):
             local = jnp.where((target >= 0)[:, None], local, 0.0)
             normal = jnp.where((first == _ROBOT)[:, None], contact.frame[at][:, 0], -contact.frame[at][:, 0])
             rolling = rolls[contact.geom[at]].any(-1)
-            part = self._forces.force_part
+            part = self._config.force_part
             everything = part_of_contacts(local, normal, part, jnp)
             of_body = part_of_contacts(jnp.where(rolling[:, None], 0.0, local), normal, part, jnp)
             chosen = (of_body[0], of_body[1] if part == "normal" else everything[1], of_body[2])

@@ -79,10 +79,9 @@ class NativePhysics(Physics):
 
     def __init__(self, world: World, config: NavConfig):
         self.nq, self.nv = world.models[0].nq, world.models[0].nv
-        self._physics = config.physics
         self._sensors = world.layout.force_sensors[:, None] + np.arange(3)
-        self._forces = config.rules
-        self._contacts = sensor_addresses(world.models[0]) if config.rules.needs_contacts else None
+        self._config = config
+        self._contacts = sensor_addresses(world.models[0]) if config.needs_contacts else None
         self._slots = world.layout.num_slots
         self._robot, self._layout = world.robot, world.layout
         names = [world.models[0].body(body).name for body in world.layout.slot_body]
@@ -91,7 +90,7 @@ class NativePhysics(Physics):
         for model in self._models:
             # A failed state must show, not be silently replaced by the model's default.
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-            if self._physics.sleep:
+            if self._config.sleep:
                 model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
         self._pools: dict[int, list[_Pool]] = {}
         self._lock = threading.Lock()
@@ -133,7 +132,7 @@ class NativePhysics(Physics):
             if free:
                 equal = [np.equal(p.qpos, qpos).all(1).sum() for p in free]
                 return free.pop(int(np.argmax(equal)))
-        return _Pool(self._models, size, self._physics.threads, self._physics.sleep)
+        return _Pool(self._models, size, self._config.threads, self._config.sleep)
 
     def _step_pool(self, pool: _Pool, size: int, scene, state: PhysicsState, qpos, qvel, command, time_s):
         batch = pool.batch
@@ -159,8 +158,8 @@ class NativePhysics(Physics):
         pool.qpos[nonfinite] = np.nan
         contacts = None
         if self._contacts is not None:
-            contacts = from_sensors(sensed, self._contacts, self._forces.force_part, np)
-        forces = summarise_forces(sensed[:, :, self._sensors], np, contacts, self._forces)
+            contacts = from_sensors(sensed, self._contacts, self._config.force_part, np)
+        forces = summarise_forces(sensed[:, :, self._sensors], np, contacts, self._config)
         return (
             PhysicsState(new_qpos.copy(), new_qvel.copy(), pool.state_warm.astype(np.float32)),
             StepSignals(
@@ -174,7 +173,7 @@ class NativePhysics(Physics):
 
     def _advance(self, pool: _Pool, command: np.ndarray, time_s: np.ndarray) -> tuple[Any, Any]:
         """Run the substeps and return sensor readings [N, substeps, ...] and the most solver iterations [N]."""
-        rounds = self._physics.substeps if self._robot.control_every_substep else 1
+        rounds = self._config.substeps if self._robot.control_every_substep else 1
         sensed, layout = [], self._layout
         iterations = np.zeros(len(command), np.int64)
         for k in range(rounds):
@@ -185,7 +184,7 @@ class NativePhysics(Physics):
             )
             pool.state_ctrl[:] = np.nan_to_num(self._robot.controls(command, robot, np))
             record = pool.batch.rollout(
-                self._physics.substeps // rounds, record=("sensordata", "solver_niter", "nisland")
+                self._config.substeps // rounds, record=("sensordata", "solver_niter", "nisland")
             )
             sensed.append(record["sensordata"])
             niter = record["solver_niter"]

@@ -68,7 +68,7 @@ class TieredPhysics(Physics):
         whole = make(world, config)
         self.name, self.nv, self.window = whole.name, whole.nv, whole.window
         self.tells_convergence = whole.tells_convergence
-        words = config.physics.windows
+        words = config.windows
         proposed = propose_tiers(whole.window.needs_at_rest) if words is None else parse_window_tiers(words)
         self.shares = tuple(tier.share for tier in proposed)
         wanted = (dict(zip(KINDS, tier[1:], strict=True)) for tier in proposed)

@@ -76,12 +76,11 @@ class PhysicsWindow:
         self.world = world
         layout = world.layout
         kinds = np.asarray(layout.slot_kind)
-        physics = config.physics
-        limits = {"small": physics.active_small, "free": physics.active_furniture, "hinge": physics.active_doors}
+        limits = {"small": config.active_small, "free": config.active_furniture, "hinge": config.active_doors}
         self._slots = {kind: np.flatnonzero(kinds == kind) for kind in limits}
         self._nearness = Nearness(world)
         self._reach_m = world.robot.footprint_radius_m + REACH_M
-        limits["walls"] = physics.active_walls
+        limits["walls"] = config.active_walls
         measured = widths_at(self.needs_at_rest) if None in limits.values() else {}
         self.widths = {kind: measured[kind] if limit is None else limit for kind, limit in limits.items()}
         """Kind of slot, and `walls` -> how many at a time; 0: all."""

@@ -262,7 +262,7 @@ class ThirdPerson:
     def __init__(self, env: Any, rows: int = 360, columns: int = 480):
         """Prepare nothing before it is needed; `env` is an `InteractiveNav`."""
         self._env, self._lens = env, Lens(columns, rows, 60.0)
-        small, classes = env.world.small_objects, env.config.sensors.segmentation_classes
+        small, classes = env.world.small_objects, env.config.segmentation_classes
         self._view = functools.cache(lambda scene: SceneView(env.robot, env.scenes[scene], small, classes))
 
     def frames(self, state: Any) -> tuple[np.ndarray, ...]:

@@ -160,14 +160,14 @@ def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
     spec.modelname = "interactive_nav"
     spec.compiler.degree = False
     option = spec.option
-    option.timestep = config.physics.sim_dt_s
+    option.timestep = config.sim_dt_s
     option.gravity = [0, 0, -9.81]
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}[
-        config.physics.cone
+        config.cone
     ]
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    option.iterations = config.physics.solver_iterations
+    option.iterations = config.solver_iterations
     option.ls_iterations = 20
     spec.worldbody.add_geom(
         name="floor",
@@ -178,7 +178,7 @@ def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
         conaffinity=_FLOOR,
     )
     robot.add_to(spec)
-    if config.rules.symmetric_actions:
+    if config.symmetric_actions:
         for actuator in spec.actuators:
             low, high = actuator.ctrlrange
             if actuator.ctrllimited and low < 0 < high:
@@ -213,8 +213,8 @@ def build_empty_spec(
     for i, ((name, kind), (_, n_boxes)) in enumerate(zip(named, slots, strict=True)):
         _add_movable(spec, name, None, n_boxes, "hinge" if kind == "hinge" else "free", i, "boxes", padded=True)
     _add_structure(spec, np.zeros((0, 10)), n_walls)
-    _add_sensors(spec, robot, named, config.rules)
-    _soften(spec, robot, config.physics)
+    _add_sensors(spec, robot, named, config)
+    _soften(spec, robot, config)
     model = spec.compile()
     return spec, model, find_layout(model, robot, named)
 
@@ -223,7 +223,7 @@ def build_spec(
     robot: RobotSpec, scene_index: int, scenes: tuple[Scene, ...], slots: Sequence[Slot], config: NavConfig
 ) -> mujoco.MjSpec:
     """Return the padded spec of one scene."""
-    spec, collision = _empty_spec(robot, config), config.physics.collision
+    spec, collision = _empty_spec(robot, config), config.collision
     for i, slot in enumerate(slots):
         body = slot.bodies[scene_index]
         if isinstance(body, SmallObject):
@@ -232,8 +232,8 @@ def build_spec(
         n_boxes = max(len(m.boxes) for m in slot.bodies if m is not None)
         _add_movable(spec, slot.name, body, n_boxes, slot.kind, i, collision, None in slot.bodies)
     _add_structure(spec, scenes[scene_index].walls, max(len(s.walls) for s in scenes))
-    _add_sensors(spec, robot, [(slot.name, slot.kind) for slot in slots], config.rules)
-    _soften(spec, robot, config.physics)
+    _add_sensors(spec, robot, [(slot.name, slot.kind) for slot in slots], config)
+    _soften(spec, robot, config)
     return spec
 
 

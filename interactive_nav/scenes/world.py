@@ -72,12 +72,12 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
     """Compile one padded model per scene and settle its furniture under the environment's physics."""
     if not scenes:
         raise ConfigError("scenes is empty, expected at least one scene folder")
-    if config.physics.collision == "hulls" and len(scenes) > 1:
+    if config.collision == "hulls" and len(scenes) > 1:
         raise ConfigError(
             f"collision='hulls' with {len(scenes)} scenes, expected one: batched scenes collide with boxes; "
             "use collision='boxes'"
         )
-    small = small_objects(config.rules.num_objects, config.rules.small_objects, config.rules.objects)
+    small = small_objects(config.num_objects, config.small_objects, config.objects)
     slots = find_slots(scenes, small)
     specs = [build_spec(robot, i, scenes, slots, config) for i in range(len(scenes))]
     models = [spec.compile() for spec in specs]

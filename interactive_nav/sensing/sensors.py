@@ -131,20 +131,19 @@ class Sensors:
 
     renderer: Renderer | None
 
-    def __init__(self, world: World, settings: NavConfig, backend: str, extra: Mapping[str, int] | None = None):
+    def __init__(self, world: World, config: NavConfig, backend: str, extra: Mapping[str, int] | None = None):
         """Build tables, and the renderer if images are observed.
 
         Args:
             backend: of the physics.
             extra: parts appended to the vector -> their lengths; `observe` is given their values.
         """
-        rules, config = settings.rules, settings.sensors
         self._layout, self._config = world.layout, config
         model = world.models[0]
         self._joints = _robot_joints(model, world)
         self._images = tuple(name for name in IMAGES if name in config.observations)
         meshes = config.image_geometry == "meshes"
-        self._drawn = (*self._images, *(["normals"] if config.camera_noise.depth_grazing_deg else []))
+        self._drawn = (*self._images, *(["normals"] if config.depth_grazing_deg else []))
         coloured = not meshes and bool({"rgb", "normals"} & set(self._drawn))
         self.boxes = build_boxes(world, config.segmentation_classes, coloured)
         shown = build_boxes(world, config.segmentation_classes, coloured, True) if config.robot_visible else self.boxes
@@ -157,7 +156,7 @@ class Sensors:
         beams = [np.cos(np.radians(angles)), np.sin(np.radians(angles)), np.zeros(config.lidar_rays)]
         self._beams_b = np.stack(beams, -1).astype(np.float32)
         sizes = {
-            "waypoints": 2 * rules.num_waypoints,
+            "waypoints": 2 * config.num_waypoints,
             "goal": 3,
             "velocity": 6,
             "localisation": 3,
@@ -207,7 +206,7 @@ class Sensors:
         def key_of(name: str) -> jax.Array:
             return stream(rng, f"{camera.prefix}{name}", nav.step_count)
 
-        noisy = disturbed(config.camera_noise, camera.lens, self.render(physics, nav, camera, rng), key_of)
+        noisy = disturbed(config, camera.lens, self.render(physics, nav, camera, rng), key_of)
         depth = jnp.clip(noisy["depth"] / config.depth_range_m, 0.0, 1.0)
         depth = _noisy(depth, config.depth_noise, config.depth_dropout, 0.0, key_of("depth"))
         ids = noisy["segmentation"].astype(jnp.float32) / SEGMENTATIONS[self.boxes.classes].divisor

@@ -68,14 +68,14 @@ class InteractiveNav(Env):
             ConfigError: settings that do not fit each other or the backend, or two terms of one name.
             SceneError: a scene with no room.
         """
-        robot = robot.symmetric() if config.rules.symmetric_actions else robot
+        robot = robot.symmetric() if config.symmetric_actions else robot
         self.robot, self.scenes, self.config = robot, scenes, config
         self.world = build_world(robot, scenes, config)
-        self.tables = build_tables(self.world, config.rules)
-        limit = config.rules.potential_round
-        self._round = round_tables(self.world, self.tables, config.rules, limit) if limit else None
+        self.tables = build_tables(self.world, config)
+        limit = config.potential_round
+        self._round = round_tables(self.world, self.tables, config, limit) if limit else None
         self.physics = make_physics(self.world, config)
-        observed = config.sensors.observations
+        observed = config.observations
         self.terms = (*(t for t in TERMS if t.kind != "observation" or t.name in observed), *terms)
         keys = [t.key for t in self.terms]
         repeated = [key for key in keys if keys.count(key) > 1]
@@ -86,7 +86,7 @@ class InteractiveNav(Env):
         self.reward_names = tuple(t.key for t in self.terms if t.kind == "reward")
         extra = {t.name: t.size for t in terms if t.kind == "observation"}
         self.sensors = Sensors(self.world, config, self.physics.name, extra)
-        self.success_distance_m = config.rules.success_distance_m or robot.body_width_m
+        self.success_distance_m = config.success_distance_m or robot.body_width_m
         self.score_mass_kg = self._score_mass_kg()
         self._constants = config, self.tables, self.score_mass_kg
         self._small_radius_m = jnp.asarray([o.radius_m for o in self.world.small_objects], jnp.float32)
@@ -111,7 +111,7 @@ class InteractiveNav(Env):
     @property
     def dt(self) -> float:
         """Return the control period, s."""
-        return self.config.physics.control_dt_s
+        return self.config.control_dt_s
 
     def furniture_map(self, scene: int) -> np.ndarray:
         """Return [rows, columns] bool on a scene's map: where furniture stands at rest, below the robot's height."""
@@ -128,10 +128,10 @@ class InteractiveNav(Env):
 
     def draw_start(self, key: jax.Array, scene: jax.Array | None = None) -> EpisodeStart:
         """Return what an episode starts from, as `reset` draws it: `key` is consumed, `scene` [] i32, drawn if None."""
-        rules = self.config.rules
-        distances_m = rules.min_goal_distance_m, rules.max_goal_distance_m
+        config = self.config
+        distances_m = config.min_goal_distance_m, config.max_goal_distance_m
         about = self.tables, self._small_radius_m, self.robot.footprint_radius_m, *distances_m, scene
-        return draw_episode(key, *about, rules.goal_clear, rules.random_object_yaw)
+        return draw_episode(key, *about, config.goal_clear, config.random_object_yaw)
 
     def strew(self, key: jax.Array, start: EpisodeStart) -> EpisodeStart:
         """Return one environment's given episode with its small objects drawn: clear of start, goal and each other."""
@@ -186,7 +186,7 @@ class InteractiveNav(Env):
     def _resumed(self, nav: NavInfo, physics: PhysicsState, again: jax.Array) -> NavInfo:
         """Return `nav`, reset where a wrapper such as Brax's auto-reset has put the first physics back (`again`)."""
         scene, geodesic_m = nav.scene_index, nav.shortest_path_m
-        if self.config.rules.potential == "quantised" or self._round:
+        if self.config.potential == "quantised" or self._round:
             geodesic_m = self._geodesic(scene, nav.goal_field, nav.round_field, self._robot_pose(physics)[0])
         first = self._remember(nav.replace(**self._at_start(scene, physics, geodesic_m)))
         return jax.tree.map(lambda new, old: old if new is old else jnp.where(again, new, old), first, nav)
@@ -211,14 +211,14 @@ class InteractiveNav(Env):
 
     def advance(self, state: State, action: jax.Array) -> State:
         """Do `step` without an observation: `obs` stays what it was until `observe`."""
-        rules, nav = self.config.rules, state.info["nav"]
+        config, nav = self.config, state.info["nav"]
         action = jnp.where(jnp.isfinite(action), action, 0.0)
         command = jnp.asarray(self.robot.command(action, jnp), jnp.float32)
         before: PhysicsState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
         again = before.control_steps < nav.step_count
         nav = self._resumed(nav, before, again)
         over = (state.done > 0) & ~again
-        time_s = nav.step_count * self.config.physics.control_dt_s
+        time_s = nav.step_count * self.config.control_dt_s
         physics, signals = self.physics.step(nav.scene_index, before, command, time_s)
         step = self._measure(nav, physics, signals, state.info["rng"])
         nav = step.nav
@@ -226,10 +226,10 @@ class InteractiveNav(Env):
 
         # Contacts were dropped: what the robot did is no longer certain, and the episode ends here.
         lost = ~step.broken & (signals.overflow > 0)
-        lifted = ~step.broken & ~lost & ~step.success & step.lifted & rules.fail_when_lifted
-        timed_out = ~step.success & ~step.broken & ~lost & ~lifted & (nav.step_count >= rules.episode_steps)
+        lifted = ~step.broken & ~lost & ~step.success & step.lifted & config.fail_when_lifted
+        timed_out = ~step.success & ~step.broken & ~lost & ~lifted & (nav.step_count >= config.episode_steps)
         done = (step.success | timed_out | lifted | step.broken | lost).astype(jnp.float32)
-        truncated = timed_out | lost if rules.bootstrap_at_time_limit else lost
+        truncated = timed_out | lost if config.bootstrap_at_time_limit else lost
         ends = {"truncation": truncated.astype(jnp.float32), "time_out": timed_out.astype(jnp.float32)}
 
         memory = {t.key: t.updated(step.last.memory[t.key], step) for t in self.terms if t.start}
@@ -268,7 +268,7 @@ class InteractiveNav(Env):
         )
         flies = self.robot.kind == "flying"
         goal_w = jnp.concatenate([nav.goal_xy_w, jnp.full(1, self.robot.spawn_height_m if flies else 0.0)])
-        away = (goal_w - pos_w)[: 3 if self.config.rules.success_in_3d or flies else 2]
+        away = (goal_w - pos_w)[: 3 if self.config.success_in_3d or flies else 2]
         near = jnp.linalg.norm(away) < self.success_distance_m
         return Step(
             *self._constants, nav, physics, rotation, last, signals, rng,
@@ -307,14 +307,14 @@ class InteractiveNav(Env):
         """Return m_0 as the scores take it, kg."""
         world = self.world
         total, base = world.robot_mass_kg, float(world.models[0].body_mass[world.layout.robot_bodies[0]])
-        return {"total": total, "links": total - world.robot.root_link_kg, "base": base}[self.config.rules.robot_mass]
+        return {"total": total, "links": total - world.robot.root_link_kg, "base": base}[self.config.robot_mass]
 
     def _geodesic(
         self, scene: jax.Array, goal: GoalField, detour: tuple[GoalField, jax.Array] | None, pos_w: jax.Array
     ) -> jax.Array:
         """Return [] m: the distance from which the potential follows."""
         xy = pos_w[:2]
-        if self.config.rules.potential == "quantised":
+        if self.config.potential == "quantised":
             xy = cell_centre(self.tables, scene, xy)
         plain_m = geodesic_at(self.tables, scene, goal, xy)
         if not (self._round and detour):
@@ -322,9 +322,9 @@ class InteractiveNav(Env):
         return jnp.where(detour[1], geodesic_at(self._round, scene, detour[0], xy), plain_m)
 
     def _waypoints(self, scene: jax.Array, goal: GoalField, pos_w: jax.Array, rotation: jax.Array) -> jax.Array:
-        rules = self.config.rules
-        points_at = grid_waypoints_at if rules.waypoint_style == "grid" else waypoints_at
-        world = points_at(self.tables, scene, goal, pos_w[:2], rules.num_waypoints, rules.waypoint_spacing_m)
+        config = self.config
+        points_at = grid_waypoints_at if config.waypoint_style == "grid" else waypoints_at
+        world = points_at(self.tables, scene, goal, pos_w[:2], config.num_waypoints, config.waypoint_spacing_m)
         return waypoints_in_body(world, pos_w, rotation)
 
 

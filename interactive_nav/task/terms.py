@@ -148,12 +148,12 @@ def _object_path(path_m: jax.Array, step: Step) -> jax.Array:
     pushed = jnp.where(tables.mass_kg[nav.scene_index, 1:] > 0, _moved_m(nav.object_pos_w - last.object_pos_w), 0.0)
     touched = last.memory["object_contact_steps"] + (~step.broken & step.touches) > 0
     settled = last.step_count >= SETTLE_STEPS
-    counts = touched if step.config.rules.kinematic_sum == "touched" else touched | settled
+    counts = touched if step.config.kinematic_sum == "touched" else touched | settled
     return path_m + jnp.where(counts, pushed, 0.0)
 
 
 def _odometry(pose: jax.Array, step: Step) -> jax.Array:
-    nav, last, noise = step.nav, step.last, step.config.sensors.odometry_noise
+    nav, last, noise = step.nav, step.last, step.config.odometry_noise
     slip = jnp.zeros(2)
     if noise:
         slip = noise * jax.random.normal(stream(step.rng, "odometry", last.step_count), (2,))
@@ -171,12 +171,12 @@ def _masses_kg(step: Step) -> jax.Array:
 
 
 def _path_efficiency(memory: Any, step: Step) -> jax.Array:
-    nav, clip = step.nav, step.config.rules.clip_path_efficiency
+    nav, clip = step.nav, step.config.clip_path_efficiency
     return metrics.path_efficiency(step.success, nav.shortest_path_m, nav.memory["robot_path_m"], clip)
 
 
 def _counts(step: Step) -> jax.Array | float:
-    return 1.0 if step.config.rules.effort_on_failure else jnp.asarray(step.success, jnp.float32)
+    return 1.0 if step.config.effort_on_failure else jnp.asarray(step.success, jnp.float32)
 
 
 def _kinematic_effort(memory: Any, step: Step) -> jax.Array:
@@ -185,23 +185,23 @@ def _kinematic_effort(memory: Any, step: Step) -> jax.Array:
 
 
 def _dynamic_effort(memory: Any, step: Step) -> jax.Array:
-    force_n, gravity = step.nav.memory["force_sum_n"], step.config.rules.score_gravity_m_s2
+    force_n, gravity = step.nav.memory["force_sum_n"], step.config.score_gravity_m_s2
     return _counts(step) * metrics.dynamic_effort(step.score_mass_kg, force_n, step.nav.step_count, gravity)
 
 
 def _off_distance(memory: Any, step: Step) -> jax.Array:
-    nav, rules = step.nav, step.config.rules
-    near = jnp.linalg.norm(nav.start_xy_w - nav.goal_xy_w) < rules.min_goal_distance_m - DISTANCE_TOLERANCE_M
-    return near | (nav.shortest_path_m > rules.max_goal_distance_m + DISTANCE_TOLERANCE_M)
+    nav, config = step.nav, step.config
+    near = jnp.linalg.norm(nav.start_xy_w - nav.goal_xy_w) < config.min_goal_distance_m - DISTANCE_TOLERANCE_M
+    return near | (nav.shortest_path_m > config.max_goal_distance_m + DISTANCE_TOLERANCE_M)
 
 
 def _reward(step: Step) -> dict[str, jax.Array]:
-    rules, before_m, after_m = step.config.rules, step.last.geodesic_m, step.nav.geodesic_m
+    config, before_m, after_m = step.config, step.last.geodesic_m, step.nav.geodesic_m
     interacts = jnp.any(step.touches)
-    if rules.interaction_with == "anything":
+    if config.interaction_with == "anything":
         interacts = step.signals.body_force_n > TOUCH_FORCE_N
     success, interacts = step.success.astype(jnp.float32), interacts.astype(jnp.float32)
-    values = success, before_m, after_m, interacts, rules.k_int, rules.success_reward
+    values = success, before_m, after_m, interacts, config.k_int, config.success_reward
     return interactive_navigation_reward(*values)[1]
 
 

@@ -21,7 +21,7 @@ DRAW_SHARE = 16
 
 def scene_of_slot(env: InteractiveNav, slot: jax.Array) -> jax.Array | None:
     """Return the scenes [...] that environments of these numbers keep; None where each episode draws one."""
-    return slot % len(env.scenes) if env.config.rules.scene_choice == "slot" else None
+    return slot % len(env.scenes) if env.config.scene_choice == "slot" else None
 
 
 def reset_all(env: InteractiveNav, keys: jax.Array, slot: jax.Array | None = None) -> State:
@@ -50,7 +50,7 @@ def draw_where(env: InteractiveNav, current: tuple, over: jax.Array) -> tuple:
         current, pending = carry
         index = jnp.nonzero(pending, size=share, fill_value=n)[0]
         nav, rng = (jax.tree.map(lambda x: x[jnp.minimum(index, n - 1)], x) for x in current[-2:])
-        kept = (nav.scene_index,) if env.config.rules.scene_choice == "slot" else ()
+        kept = (nav.scene_index,) if env.config.scene_choice == "slot" else ()
         fresh = jax.vmap(env.draw)(rng, *kept)
         new = (fresh.pipeline_state, fresh.info["nav"], fresh.info["rng"])
         current = jax.tree.map(lambda old, x: old.at[index].set(x, mode="drop"), current, new)
@@ -73,7 +73,7 @@ def wrap_for_brax_training(
     Raises:
         ConfigError: a shorter `episode_length`, a `randomization_fn`, or a wrapper that would be passed over.
     """
-    steps = env.config.rules.episode_steps
+    steps = env.config.episode_steps
     if episode_length is not None and episode_length < steps:
         raise ConfigError(
             f"episode_length is {episode_length}, expected at least the environment's {steps}: "

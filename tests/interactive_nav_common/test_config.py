@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import math
 from typing import Annotated, Literal
 
@@ -14,7 +15,6 @@ from interactive_nav_common.config import (
     Bounds,
     Positive,
     Settings,
-    flat,
     flatten,
     overlay,
     replace,
@@ -39,11 +39,9 @@ class Wheels(Settings):
 
 
 @dataclasses.dataclass(frozen=True)
-class Cart(Settings):
+class Cart(Wheels):
     """Is pushed."""
 
-    wheels: Wheels = flat(Wheels)
-    """Flat."""
     sizes: tuple[AtLeastOne, ...] = (2, 3)
     """Of it."""
     tilt_deg: Annotated[float, Bounds(0, 90, open=True)] = 1.0
@@ -60,20 +58,18 @@ class Train(Settings):
     """Of it."""
 
 
-def test_flat_sections_are_one_with_the_whole():
+def test_inherited_settings_are_among_those_of_the_whole():
     train = Train(cart=Cart.of(radius_m=0.1, sizes=[4]))
-    assert train.cart.wheels == Wheels(radius_m=0.1) and train.cart.radius_m == 0.1
+    assert isinstance(train.cart, Wheels) and train.cart.radius_m == 0.1
     assert list(flatten(train)) == [
         *("cart.radius_m", "cart.kind", "cart.spokes", "cart.sizes", "cart.tilt_deg"),
         "cars",
     ]
     plain = {"cart": {"radius_m": 0.1, "kind": "rubber", "spokes": 3, "sizes": [4], "tilt_deg": 1.0}, "cars": 1}
     assert to_dict(train) == plain and overlay(Train(), plain, "file") == train
-    assert replace(train.cart, kind=4, tilt_deg=2.0) == Cart(Wheels(0.1, 4), (4,), 2.0)
+    assert replace(train.cart, kind=4, tilt_deg=2.0) == Cart(0.1, 4, 3, (4,), 2.0)
     assert "cart.kind=rubber    What they are. [rubber | 4]" in settings_help(Train(), {"cars": "many"})
     assert "cars=1              Of it. [many]" in settings_help(Train(), {"cars": "many"})
-    with pytest.raises(AttributeError, match="Cart has no setting 'radius'"):
-        _ = train.cart.radius
 
 
 @pytest.mark.parametrize(
@@ -98,11 +94,6 @@ def test_what_types_do_not_allow_is_refused_in_words(settings, message):
         assert str(caught.value).startswith(f"file: cart.{message}")
 
 
-def test_no_two_sections_of_the_environment_have_a_setting_of_one_name():
-    def names_of(section):
-        for field in dataclasses.fields(section):
-            value = getattr(section, field.name)
-            yield from names_of(value) if dataclasses.is_dataclass(value) else [field.name]
-
-    names = list(names_of(NavConfig()))
+def test_no_two_parts_of_the_environments_settings_have_one_of_the_same_name():
+    names = [name for part in NavConfig.__mro__[:-2] for name in inspect.get_annotations(part)]
     assert len(set(names)) == len(names) == len(flatten(NavConfig()))

@@ -144,7 +144,7 @@ class ToyEnv(Env):
         after = jnp.linalg.norm(nav.goal_xy_w - pos[:2])
         success = (after < SUCCESS_M).astype(jnp.float32)
         steps = nav.step_count + 1
-        truncation = (steps >= self.config.rules.episode_steps).astype(jnp.float32) * (1.0 - success)
+        truncation = (steps >= self.config.episode_steps).astype(jnp.float32) * (1.0 - success)
         done = jnp.maximum(success, truncation)
         reward = before - after + 10.0 * success
         if self.nan_at_step is not None:

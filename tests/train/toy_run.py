@@ -42,7 +42,7 @@ def toy_config(out_dir: Any, updates: int = 4, **run: Any) -> TrainConfig:
 
 def build_toy(config: EnvConfig) -> Any:
     """The toy for a config."""
-    return ToyEnv(ToyConfig(episode_steps=config.rules.episode_steps, k_int=config.rules.k_int))
+    return ToyEnv(ToyConfig(episode_steps=config.episode_steps, k_int=config.k_int))
 
 
 if __name__ == "__main__":

@@ -76,7 +76,7 @@ def _refuse_unused(arguments: argparse.Namespace, contest: Contest) -> None:
         refuse_unused(arguments, "thinned", who)
     if arguments.truth:
         refuse_unused(arguments, "--maps --localiser --detector match supersample", "with --truth")
-    if not contest.config.navigator.glance:
+    if not contest.config.glance:
         refuse_unused(arguments, "watch_s", "with glance=false")
 
 
@@ -89,7 +89,7 @@ def navigate(arguments: argparse.Namespace) -> None:
     name = Path(arguments.scene).resolve().name
     out = arguments.out or RUNS / "navigate" / f"{name}-{arguments.episode}.png"
     with bar() as tell:
-        limit_s = int(contest.config.navigator.limit_s)
+        limit_s = int(contest.config.limit_s)
         driven = drive_episode(
             contest,
             arguments.episode,
@@ -121,7 +121,7 @@ def evaluate(arguments: argparse.Namespace) -> None:
             made = venue.map_of(name) if name in ("dense", "sparse") else None
             panels[name] = (made, tracks_of(contest, venue, name), {row["episode"]: row for row in mine})
         save(
-            journeys_figure(venue.scene.name, venue.space, panels, contest.config.navigator.passable),
+            journeys_figure(venue.scene.name, venue.space, panels, contest.config.passable),
             contest.out / f"{venue.scene.name}.png",
         )
     lines, compared = summary(rows), differences(rows)

@@ -174,13 +174,13 @@ class ContestScene:
         """Networks, or the truth."""
         if self.networks is None:
             return TrueSight(made, self.space)
-        return NetworkSight(made, self.networks.localiser, self.networks.detector, self.contest.config.navigator.match)
+        return NetworkSight(made, self.networks.localiser, self.networks.detector, self.contest.config.match)
 
     def navigator(self, contender: str) -> Navigator:
         """Of the dense or the sparse map."""
         made = self.map_of(contender)
         sight = self.sight(made)
-        return Navigator(made, sight, local_policy(self.contest, sight, self.networks), self.contest.config.navigator)
+        return Navigator(made, sight, local_policy(self.contest, sight, self.networks), self.contest.config)
 
     def contender(self, name: str) -> Contender:
         """Return the contender of a name, with what plays its episodes."""
@@ -228,7 +228,7 @@ def local_policy(contest: Contest, sight: Sight, networks: Networks | None) -> L
     if contest.truth and contest.policy != PASSAGE_POLICY:
         raise ConfigError(f"--policy {contest.policy} looks at images, --truth has none; leave one of them out")
     seeing = [(contest.localiser, networks.localiser), (contest.detector, networks.detector)] if networks else []
-    return driving.local_policy(contest.policy, sight, contest.config.navigator, *seeing)
+    return driving.local_policy(contest.policy, sight, contest.config, *seeing)
 
 
 def _digest_of(policy: str) -> str:

@@ -301,7 +301,7 @@ class ActionPlayer(Contender):
 
     def step(self, state: Any, now: Snapshot, running: np.ndarray, step: int) -> tuple[Any, Events]:
         """See `Contender`."""
-        config, dt_s = self.config.navigator, self.player.env.dt
+        config, dt_s = self.config, self.player.env.dt
         edge = running & (step % max(1, round(config.run_s / dt_s)) == 0)
         none = np.zeros(len(running), bool)
         events = Events(
@@ -348,7 +348,7 @@ def columns(episodes: DrivenEpisodes, played: Played, config: EvaluationConfig) 
         "within": (played.goal_m < config.success_m).astype(np.float64),
         "arrived": played.arrived,
         "contact": (played.contact_s > 0).astype(np.float64),
-        "aadc_s": played.contact_runs * config.navigator.run_s,
+        "aadc_s": played.contact_runs * config.run_s,
         **of("contact_s", "wall_s", "duration_s", "path_m"),
         "shortest_m": episodes.shortest_m,
         **of("goal_m", "runs", "contact_runs", "localisations", "blocked", "lost", "broken"),

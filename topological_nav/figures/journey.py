@@ -65,7 +65,7 @@ class Driven:
 
     def figure(self) -> Figure:
         """Path over plan and map."""
-        space, passable = self.venue.space, self.venue.contest.config.navigator.passable
+        space, passable = self.venue.space, self.venue.contest.config.passable
         extent = np.ptp(space.centres(0.0), axis=0) + 0.8
         figure, axis = plt.subplots(figsize=(8.0, 0.7 + 6.6 * extent[1] / extent[0]), layout="constrained")
         floor_plan(axis, space)
@@ -166,9 +166,7 @@ def _film_every(venue: ContestScene) -> int:
 
 def film(driven: Driven, path: Path) -> int:
     """Writes a film, the plan beside the camera's images; returns the number of frames."""
-    plan, pixels = plan_picture(
-        driven.venue.space, driven.map, driven.venue.contest.config.navigator.passable, FILM_HEIGHT
-    )
+    plan, pixels = plan_picture(driven.venue.space, driven.map, driven.venue.contest.config.passable, FILM_HEIGHT)
     steps = range(0, len(driven.time_s), _film_every(driven.venue))
     with whole_file(path) as partial:
         return write_mp4((driven.frame(step, plan, pixels) for step in steps), partial, FILM_RATE)

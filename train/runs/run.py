@@ -177,7 +177,7 @@ class FolderCallbacks:
         in between are the short episodes, which succeed: a score is of a whole limit, and of none before the first.
         """
         run = self._config.run
-        limit = num_envs(self._config) * self._config.env.rules.episode_steps
+        limit = num_envs(self._config) * self._config.env.episode_steps
         since = snapshot.env_steps - max(run.checkpoint_every_steps, limit)
         fair = since >= self._began_together + limit
         lines = [line for line in self._folder.read_metrics() if fair and line["env_steps"] > since]
@@ -188,7 +188,7 @@ class FolderCallbacks:
             began_together=self._began_together,
             algorithm=self._config.algorithm,
             robot=robot_name(self._config.env.robot),
-            observations=self._config.env.sensors.observations,
+            observations=self._config.env.observations,
             observation_size=checkpoint.plain_size(self._env.observation_size),
             action_size=int(self._env.action_size),
             scenes=self._scenes,
@@ -277,7 +277,7 @@ def _train_in(
         highlight=False,
         soft_wrap=True,
     )
-    each, limit = config.run.num_timesteps // num_envs(config), config.env.rules.episode_steps
+    each, limit = config.run.num_timesteps // num_envs(config), config.env.episode_steps
     if each < limit:
         note = f"{each:,} steps for each environment, and an episode has up to {limit:,}: none that fails comes to its"
         console.print(f"{note} end; lower env.episode_steps or train longer", style="yellow", soft_wrap=True)
@@ -333,7 +333,7 @@ def summary(config: TrainConfig, folder: RunFolder, result: TrainResult, metrics
         "run": config.run.name,
         "algorithm": config.algorithm,
         "robot": robot_name(config.env.robot),
-        "k_int": config.env.rules.k_int,
+        "k_int": config.env.k_int,
         "seed": config.run.seed,
         "completed": result.completed,
         "env_steps": result.snapshot.env_steps,

@@ -78,7 +78,7 @@ class Tracker:
                 id=kept.read_text().strip(),
                 resume="allow",
                 dir=str(folder),
-                group=f"{robot_name(config.env.robot)}-{config.algorithm}-k_int{config.env.rules.k_int:g}",
+                group=f"{robot_name(config.env.robot)}-{config.algorithm}-k_int{config.env.k_int:g}",
                 config={**flatten(config), "versions": versions},
                 settings=wandb.Settings(console="off", silent=True),
             )

@@ -50,7 +50,7 @@ def describe_env(env: Any) -> PlayedEnv:
         observations=dict(obs) if isinstance(obs, Mapping) else {"state": obs},
         state_parts=dict(zip(env.sensors.sizes, map(slice, ends, ends[1:]), strict=False)),
         action_size=env.action_size,
-        control_dt_s=env.config.physics.control_dt_s,
+        control_dt_s=env.config.control_dt_s,
         max_linear_m_s=twist.max_linear_m_s if twist else np.nan,
         max_angular_rad_s=twist.max_angular_rad_s if twist else np.nan,
         drive=env.robot.drive,

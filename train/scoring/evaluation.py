@@ -162,7 +162,7 @@ def _origin(folder: RunFolder | None, config: TrainConfig, env: Any, request: Ev
         "robot": env.robot.name,
         "algorithm": config.algorithm,
         "policy": None,
-        "k_int": float(config.env.rules.k_int),
+        "k_int": float(config.env.k_int),
         "seed": config.run.seed,
         "checkpoint_steps": None,
         "deterministic": request.deterministic,

@@ -61,12 +61,12 @@ def make_follower(env: Any) -> PolicyFn:
     """Build the baseline that follows the shortest path."""
     config = env.config
     need_twist(env.robot, "policy follower")
-    if "waypoints" not in config.sensors.observations:
+    if "waypoints" not in config.observations:
         raise UserError(
-            f"policy follower: observations are {', '.join(config.sensors.observations)}, "
+            f"policy follower: observations are {', '.join(config.observations)}, "
             "expected waypoints among them; leave it out of --policies"
         )
-    waypoint = min(max(round(LOOK_AHEAD_M / config.rules.waypoint_spacing_m), 1), config.rules.num_waypoints) - 1
+    waypoint = min(max(round(LOOK_AHEAD_M / config.waypoint_spacing_m), 1), config.num_waypoints) - 1
     return functools.partial(waypoint_follower, env.robot, waypoint)
 
 

@@ -163,7 +163,7 @@ class Scheduler:
         """Start what there is room for: training first, then evaluation."""
         for name in self._free("train", states):
             command = words_of_training(self._folder, name, self._programs.train)
-            if self._runs[name].launch.slots > 1 and not self._runs[name].config.env.physics.threads:
+            if self._runs[name].launch.slots > 1 and not self._runs[name].config.env.threads:
                 command = [*command, f"env.threads={_threads(self._runs[name])}"]
             if not self._begin("train", [name], command):
                 return

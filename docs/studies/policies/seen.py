@@ -73,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             break
         state = step(state, act(state.obs, jax.random.fold_in(chances, len(seen) - 1)))
     at = np.linspace(0, len(seen) - 1, min(given.frames, len(seen))).astype(int)
-    dt_s = env.config.physics.control_dt_s
+    dt_s = env.config.control_dt_s
     strip([seen[t] for t in at], [f"{t * dt_s:.1f} s\n{left_m[t]:.1f} m to go" for t in at]).save(
         given.output, quality=90
     )

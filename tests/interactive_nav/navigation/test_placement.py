@@ -25,7 +25,7 @@ CONFIG = NavConfig.of(num_objects=10)
 @pytest.fixture(scope="module")
 def built(two_rooms):
     world = build_world(get_robot("turtlebot"), (load_scene(two_rooms),), CONFIG)
-    return world, build_tables(world, CONFIG.rules)
+    return world, build_tables(world, CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -207,7 +207,7 @@ def test_distances_that_next_to_no_pair_has_are_met(two_rooms, largest_m):
     """From one corner of the room to the other: drawing mostly finds none, so known pairs are taken."""
     config = NavConfig.of(num_objects=0, min_goal_distance_m=5.5, max_goal_distance_m=largest_m)
     world = build_world(get_robot("turtlebot"), (load_scene(two_rooms),), config)
-    tables = build_tables(world, config.rules)
+    tables = build_tables(world, config)
     starts, goals, miss = draw_pairs(tables, 40, 5.5, largest_m)
     assert miss.max() < 1e-5 and len(np.unique(starts, axis=0)) > 8
     assert np.linalg.norm(starts - goals, axis=-1).min() > 5.5 - 1e-5
@@ -221,7 +221,7 @@ def test_distances_that_no_pair_has_are_refused_with_those_that_there_are(two_ro
         config = NavConfig.of(num_objects=0, min_goal_distance_m=least_m, max_goal_distance_m=largest_m)
         world = build_world(get_robot("turtlebot"), (load_scene(two_rooms),), config)
         with pytest.raises(SceneError) as refused:
-            build_tables(world, config.rules)
+            build_tables(world, config)
         return str(refused.value)
 
     # From corner to corner the straight line would be 5.6 m, but the partition's gap is a way round of 5.8 m.

@@ -149,7 +149,7 @@ def run(world, config, backend, cases: Sequence[int] = range(len(CASES))) -> Pus
             scores.append(np.asarray(signals.force_n))
     assert len(seen) == STEPS
     force_w = np.stack(seen)[FROM:]  # [T, N, substeps, robot on (block, structure) and floor on (block, structure), 3]
-    assert force_w.shape[2:] == (config.physics.substeps, 4, 3) and (force_w[..., 1::2, :] == 0).all()
+    assert force_w.shape[2:] == (config.substeps, 4, 3) and (force_w[..., 1::2, :] == 0).all()
     return Push(
         KG[cases],
         FRICTION[cases],

@@ -36,7 +36,7 @@ def test_the_follower_reaches_its_goal(name, room):
     apart = np.linalg.norm(np.asarray(state.info["nav"].goal_xy_w - state.info["nav"].robot_pos_w[:, :2]), axis=1)
     assert (apart > 1.85).all()
     reached = np.zeros(len(keys), bool)
-    for _ in range(env.config.rules.episode_steps):
+    for _ in range(env.config.episode_steps):
         state = step(state, follow(state.obs, keys))
         reached |= np.asarray(state.metrics["success"]) > 0
         if reached.all():

@@ -116,7 +116,7 @@ def test_pixels_and_whole_frames_drop_out():
 
 def test_settings_of_noise_stand_among_the_environments_and_are_checked():
     config = NavConfig.of(observations=("depth",), **KINECT)
-    assert config.sensors.camera_noise == CameraNoise(**KINECT)
+    assert {name: getattr(config, name) for name in KINECT} == KINECT
     for settings, message in (
         ({"rgb_nois": 1.0}, "unknown setting 'rgb_nois'; did you mean 'rgb_noise'"),
         ({"rgb_noise": 0.1, "observations": ("depth",)}, "rgb_noise is 0.1, which changes .* rgb among observations"),

@@ -62,8 +62,12 @@ _RESETS: dict[bool, Any] = {}
 
 def begin(env, goal=(1.6, 0.0), x=-0.7):
     """First state, which only options of waypoints, potential and trail change: the others share a compiled reset."""
-    rules, trail = env.config.rules, "trail" in env.config.sensors.observations
-    special = (rules.waypoint_style, rules.potential, rules.potential_round) != ("ahead", "continuous", None) or trail
+    config, trail = env.config, "trail" in env.config.observations
+    special = (config.waypoint_style, config.potential, config.potential_round) != (
+        "ahead",
+        "continuous",
+        None,
+    ) or trail
     if special or False not in _RESETS:
         reset = jax.jit(jax.vmap(env.reset_to))
         _RESETS[special] = reset

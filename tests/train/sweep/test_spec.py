@@ -142,7 +142,7 @@ def test_every_sweep_of_the_package_can_be_run(monkeypatch):
         assert spec.load_sweep(name).runs
     sweep = spec.load_sweep("cluttered")
     assert {len(run.config.env.scenes) for run in sweep.runs} == {2} and len(sweep.runs) == 54
-    assert {run.config.env.rules.num_objects for run in sweep.runs} == {4}
+    assert {run.config.env.num_objects for run in sweep.runs} == {4}
 
 
 def test_fixed_episodes_of_each_run_s_robot_are_played(monkeypatch):
