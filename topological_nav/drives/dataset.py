@@ -248,12 +248,12 @@ def simulate_drives(
             if not path.is_file():
                 player = player or Player(drive_env(scene_folders, config), RECORDERS)
 
-                def tell(ended: int, mine: np.ndarray = mine) -> None:
+                def report(ended: int, mine: np.ndarray = mine) -> None:
                     progress("drives", int(mine[0]) + min(ended, len(mine) - 1), total)  # the padding's are no news
 
                 # Padded by its last drive: one size, one program.
                 rows = np.minimum(mine[0] + np.arange(config.batch), total - 1)
-                _write_batch(path, drive(player, terrain, tasks.take(rows), config, tell), len(mine))
+                _write_batch(path, drive(player, terrain, tasks.take(rows), config, report), len(mine))
             progress("drives", int(mine[-1]) + 1, total)
         return load_drives(out)
 

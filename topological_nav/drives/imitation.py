@@ -25,9 +25,8 @@ from interactive_nav_common.files import write_text
 from interactive_nav_common.rows import Rows, markdown
 from topological_nav.config import PolicyConfig
 from topological_nav.drives.dataset import Drives
-from topological_nav.drives.driving import Frames
+from topological_nav.drives.driving import Forward, Frames, Policy, fresh_params, policy_loss, standardised, unrolled
 from topological_nav.drives.expert import CONTROL_S
-from topological_nav.drives.policy import Forward, Policy, fresh_params, policy_loss, standardised, unrolled
 from topological_nav.errors import ALONE, Host, RunError
 from topological_nav.learn.learning import Epoch, Learner, descent_epoch, shuffled
 from topological_nav.learn.runs import claimed, run_epochs, write_network, write_results
@@ -95,9 +94,13 @@ def make_sequences(
             ends.append(begin + steps)
     at, end = np.array(rows, int).reshape(-1, window + 1), np.array(ends, int)[:, None]
     capped = np.minimum(at, end - 1).astype(np.int32)
-    asked = drives.command[capped[:, :-1]]
+    command = drives.command[capped[:, :-1]]
     return Sequences(
-        capped, at[:, :-1] < end, at[:, 1:] < end, classes(asked[..., 0], values[0]), classes(asked[..., 1], values[1])
+        capped,
+        at[:, :-1] < end,
+        at[:, 1:] < end,
+        classes(command[..., 0], values[0]),
+        classes(command[..., 1], values[1]),
     )
 
 
@@ -167,7 +170,7 @@ class _Split:
     every: Sequences
     """Of those to learn from."""
     learned: Sequences
-    """Of them those that are learned from: thinned, and mirrored where asked for."""
+    """Of them those that are learned from: thinned, and mirrored where set."""
     held_out: Sequences
 
 
@@ -292,7 +295,7 @@ def _scores(
 
 
 def train_grid(frames: Frames, out: Path, config: PolicyConfig, host: Host = ALONE) -> list[dict[str, Any]]:
-    """Train a policy for every alpha and lambda of the report, each in a folder of its own under `out`.
+    """Train a policy for every alpha and lambda of the report, each in a separate folder under `out`.
 
     Return the results, also written to grid.json and, as a table, to grid.md.
     """

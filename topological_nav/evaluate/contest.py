@@ -2,10 +2,10 @@
 
 OUT/rows/<scene>-<contender>-<digest>-<first episode>.parquet   one row an episode (`evaluation.columns`)
     tracks/<the same>.npz                                       where the robots went
-    <scene>.png, summary.md                                     drawn and told at the end
+    <scene>.png, summary.md                                     written at the end
 
 The digest is of everything that decides the rows: scene, episodes, settings, map, networks, policy. Another question
-adds files; the same one finds its own and plays what is missing.
+adds files; the same one reads its files and plays what is missing.
 """
 
 import dataclasses
@@ -60,9 +60,9 @@ from train.runs import checkpoint
 from train.runs.run_folder import RunFolder
 
 CONTENDERS = ("dense", "sparse", "expert", "ppo")
-"""The navigator on its map, and on the same thinned out; an expert with the plan; a learned policy told the goal."""
-NOT_ASKED = ("batch", "episodes", "supersample")
-"""Settings that decide no row, or of which it is told otherwise."""
+"""The navigator on its map, and on the same thinned out; an expert with the plan; a policy that observes the goal."""
+UNDECIDING = ("batch", "episodes", "supersample")
+"""Settings that decide no row, or that enter the digest in another way."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Contest:
     out: Path
     config: EvaluationConfig
     truth: bool = False
-    """Maps made from the plan, and the truth in the place of localiser and passage detector."""
+    """Maps built from the plan, and the truth in the place of localiser and passage detector."""
     maps: Path = Path()
     """Folder of the scenes' maps, unless `truth`."""
     map_files: Mapping[str, Path] = dataclasses.field(default_factory=dict)
@@ -105,7 +105,7 @@ class Contest:
 
 
 class ContestScene:
-    """One scene of a contest; what is costly is made when it is first asked for."""
+    """One scene of a contest; what is costly is built when it is first needed."""
 
     def __init__(self, folder: Path, contest: Contest, networks: Networks | None):
         self.contest, self.networks = contest, networks
@@ -170,17 +170,17 @@ class ContestScene:
             return self.map
         return self.map.thinned(self.contest.config.thinned, self.contest.config.seed)
 
-    def sight(self, made: TopologicalMap) -> Sight:
+    def sight(self, graph: TopologicalMap) -> Sight:
         """Networks, or the truth."""
         if self.networks is None:
-            return TrueSight(made, self.space)
-        return NetworkSight(made, self.networks.localiser, self.networks.detector, self.contest.config.match)
+            return TrueSight(graph, self.space)
+        return NetworkSight(graph, self.networks.localiser, self.networks.detector, self.contest.config.match)
 
     def navigator(self, contender: str) -> Navigator:
         """Of the dense or the sparse map."""
-        made = self.map_of(contender)
-        sight = self.sight(made)
-        return Navigator(made, sight, local_policy(self.contest, sight, self.networks), self.contest.config)
+        graph = self.map_of(contender)
+        sight = self.sight(graph)
+        return Navigator(graph, sight, local_policy(self.contest, sight, self.networks), self.contest.config)
 
     def contender(self, name: str) -> Contender:
         """Return the contender of a name, with what plays its episodes."""
@@ -195,32 +195,32 @@ class ContestScene:
             return learned(player, config, policy)
         return NavigatorPlayer(self.player, config, self.navigator(name), self.camera)
 
-    def asked(self, contender: str) -> dict[str, Any]:
+    def request(self, contender: str) -> dict[str, Any]:
         """Everything that decides the rows of a contender."""
-        config = {k: v for k, v in to_dict(self.contest.config).items() if k not in NOT_ASKED}
-        asked = {"scene": self.scene.digest, "robot": self.contest.robot, "contender": contender, "settings": config}
+        config = {k: v for k, v in to_dict(self.contest.config).items() if k not in UNDECIDING}
+        request = {"scene": self.scene.digest, "robot": self.contest.robot, "contender": contender, "settings": config}
         if contender == "ppo":
             assert self.contest.ppo is not None
             path, meta = checkpoint.find(RunFolder(self.contest.ppo).checkpoints, "best")
             weights = checkpoint.weights_digest(path)
-            return {**asked, "robot": meta.robot, "checkpoint": [meta.env_steps, weights]}
+            return {**request, "robot": meta.robot, "checkpoint": [meta.env_steps, weights]}
         if contender == "expert":
-            return asked
-        made = self.map
-        parts = [made.xy_w, made.embeddings, made.edges, made.p, made.angle_rad]
-        asked["map"] = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()
+            return request
+        graph = self.map
+        parts = [graph.xy_w, graph.embeddings, graph.edges, graph.p, graph.angle_rad]
+        request["map"] = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()
         if self.networks is not None:
-            asked["detector"] = self.networks.detector.stored
+            request["detector"] = self.networks.detector.stored
             if "export" in self.networks.localiser.about:
-                asked["localiser"] = self.networks.localiser.stored
+                request["localiser"] = self.networks.localiser.stored
             if self.contest.domain != "clean":
-                asked["domain"] = to_dict(preset(self.contest.domain))
+                request["domain"] = to_dict(preset(self.contest.domain))
             drawn, learned_from = self.drawn, self.networks.camera
             if drawn != learned_from:
-                # The size only where it differs, so that rows of before it could be chosen are found.
+                # The size only where it differs, so that older rows still count.
                 size = [drawn.supersample] if drawn.supersample != learned_from.supersample else []
-                asked["drawn"] = [drawn.engine, drawn.fov_deg, *size]
-        return {**asked, "policy": self.contest.policy, "weights": _digest_of(self.contest.policy)}
+                request["drawn"] = [drawn.engine, drawn.fov_deg, *size]
+        return {**request, "policy": self.contest.policy, "weights": _digest_of(self.contest.policy)}
 
 
 def local_policy(contest: Contest, sight: Sight, networks: Networks | None) -> LocalPolicy:
@@ -249,9 +249,9 @@ def _learned(run: Path, scene: Scene, config: EvaluationConfig) -> tuple[Player,
 
     folder, words = RunFolder(run), [f"env.backend={config.backend}"] if config.backend != "auto" else []
     words += [f"env.num_objects={config.objects}"] if config.objects else []
-    made = config_to_play(folder, words, [str(scene.path)], SafeConsole(stderr=True))
-    env = build_env(made.env)
-    policy, _ = load_policy(folder, made, env, "best", deterministic=False)
+    played = config_to_play(folder, words, [str(scene.path)], SafeConsole(stderr=True))
+    env = build_env(played.env)
+    policy, _ = load_policy(folder, played, env, "best", deterministic=False)
     return Player(env, {}), policy
 
 
@@ -263,10 +263,10 @@ def contest_scenes(contest: Contest) -> list[ContestScene]:
 
 
 CPU_BATCH = 8
-"""Episodes played at a time on a CPU unless asked otherwise."""
+"""Episodes played at a time on a CPU by default."""
 
 
-def play_contest(contest: Contest, scenes: Sequence[ContestScene], tell: Progress = lambda *_: None) -> pa.Table:
+def play_contest(contest: Contest, scenes: Sequence[ContestScene], on_progress: Progress = lambda *_: None) -> pa.Table:
     """Plays what is missing, and returns all rows."""
     # Everything that can be refused is refused before the first episode.
     plan = [(scene, name, _stem(scene, name)) for scene in scenes for name in contest.contenders]
@@ -283,14 +283,14 @@ def play_contest(contest: Contest, scenes: Sequence[ContestScene], tell: Progres
             rows = numbers[first : first + size]
             what, before = f"{scene.scene.name} {name}", done
 
-            def told(over: int, _: float, what: str = what, before: int = before) -> None:
-                tell(what, min(before + over, total - 1), total)
+            def report(over: int, _: float, what: str = what, before: int = before) -> None:
+                on_progress(what, min(before + over, total - 1), total)
 
             episodes, began = scene.episodes.take(rows), time.perf_counter()
-            played = contender.play(episodes, told)
+            played = contender.play(episodes, report)
             _write(contest, scene, name, contender.player.env, episodes, played, time.perf_counter() - began)
             done += len(rows)
-            tell(what, done, total)
+            on_progress(what, done, total)
     return pa.concat_tables([_rows(contest.out, stem, len(scene.episodes)) for scene, _, stem in plan])
 
 
@@ -302,8 +302,8 @@ COLUMNS = Columns(
 
 
 def _stem(scene: ContestScene, contender: str) -> str:
-    asked = json.dumps(scene.asked(contender), sort_keys=True)
-    return f"{scene.scene.name}-{contender}-{hashlib.sha256(asked.encode()).hexdigest()[:8]}"
+    request = json.dumps(scene.request(contender), sort_keys=True)
+    return f"{scene.scene.name}-{contender}-{hashlib.sha256(request.encode()).hexdigest()[:8]}"
 
 
 def _files(out: Path, stem: str) -> list[Path]:
@@ -317,7 +317,7 @@ def _missing(out: Path, stem: str, count: int) -> np.ndarray:
 
 
 def _rows(out: Path, stem: str, count: int) -> pa.Table:
-    """Rows of the first `count` episodes: the files may have more, of a time when more were asked for.
+    """Rows of the first `count` episodes: the files may have more, of a time when more were requested.
 
     An episode that two commands played at the same time counts as the first of the files has it.
     """
@@ -351,14 +351,14 @@ def _write(
     tracks = {str(n): np.asarray(t, np.float32) for n, t in zip(episodes.number, played.track_w, strict=True)}
     write_arrays(out / "tracks" / f"{file}.npz", **tracks)
     # Rows last: an episode counts as played once its row is there.
-    notes = {"asked": json.dumps(scene.asked(name)), "versions": json.dumps(here["packages"])}
+    notes = {"asked": json.dumps(scene.request(name)), "versions": json.dumps(here["packages"])}
     write_parquet(pa.table(table), out / "rows" / f"{file}.parquet", notes)
 
 
 def tracks_of(contest: Contest, scene: ContestScene, contender: str) -> dict[int, np.ndarray]:
     """Episode number -> [t, 2] m, of what has been played."""
-    found: dict[int, np.ndarray] = {}
+    tracks: dict[int, np.ndarray] = {}
     for path in sorted((contest.out / "tracks").glob(f"{_stem(scene, contender)}-*.npz")):
         with read_npz(path, RunError, "delete it and evaluate again") as stored:
-            found = {int(number): stored[number] for number in stored.files} | found
-    return found
+            tracks = {int(number): stored[number] for number in stored.files} | tracks
+    return tracks

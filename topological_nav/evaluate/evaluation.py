@@ -285,7 +285,7 @@ Act = Callable[[Any, np.ndarray, np.ndarray, int], Any]
 
 
 class ActionPlayer(Contender):
-    """A policy that acts on the environment's own state: its runs follow each other without a break."""
+    """A policy that acts on the environment's state: its runs follow each other without a break."""
 
     def __init__(self, player: Player, config: EvaluationConfig, make_act: Callable[[], Act], observes: bool = False):
         super().__init__(player, config)

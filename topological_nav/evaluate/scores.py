@@ -121,7 +121,7 @@ class Difference:
 
 def differences(rows: pa.Table) -> list[Difference]:
     """Dense minus sparse map on the same episodes, scene by scene; unseen minus seen scenes, Welch's test."""
-    found = []
+    results = []
     contenders = _in_order(rows, "contender")
     for name in ("success", "spl"):
         if {"dense", "sparse"} <= set(contenders):
@@ -129,7 +129,7 @@ def differences(rows: pa.Table) -> list[Difference]:
             both = dense.join(sparse, EPISODE, join_type="inner", right_suffix="_sparse")
             both = both.append_column("gap", pc.subtract(both[name], both[f"{name}_sparse"]))
             gaps = both.group_by("scene").aggregate([("gap", "mean")])["gap_mean"]
-            found.append(Difference("dense minus sparse map", name, Score.over(gaps.to_pylist())))
+            results.append(Difference("dense minus sparse map", name, Score.over(gaps.to_pylist())))
         for contender in contenders:
             mine = where(rows, contender=contender)
             sides = [
@@ -137,26 +137,26 @@ def differences(rows: pa.Table) -> list[Difference]:
                 for part in (where(mine, split="test"), where(mine, split="train"))
             ]
             if all(map(len, sides)):
-                found.append(Difference(f"{contender}: unseen minus seen", name, welch(*sides)))
-    return found
+                results.append(Difference(f"{contender}: unseen minus seen", name, welch(*sides)))
+    return results
 
 
 def console_table(lines: Sequence[Line]) -> Table:
     """For a terminal."""
-    made = Table(caption="mean [95 % interval]; RC, AADC and duration of successes")
+    table = Table(caption="mean [95 % interval]; RC, AADC and duration of successes")
     for heading in HEADER:
-        made.add_column(heading, justify="right" if heading in SCORES.values() else "left")
+        table.add_column(heading, justify="right" if heading in SCORES.values() else "left")
     for line in lines:
-        made.add_row(*_cells(line))
-    return made
+        table.add_row(*_cells(line))
+    return table
 
 
 def markdown(lines: Sequence[Line], compared: Sequence[Difference]) -> str:
     """For a file: the summary and the comparisons."""
     text = tables.markdown(HEADER, map(_cells, lines))
     header = ("Compared", "Score", "Difference [95 % interval]")
-    told = [(d.compared, SCORES[d.score], d.result) for d in compared]
-    return text + ("\n" + tables.markdown(header, told) if told else "")
+    lines_compared = [(d.compared, SCORES[d.score], d.result) for d in compared]
+    return text + ("\n" + tables.markdown(header, lines_compared) if lines_compared else "")
 
 
 def _cells(line: Line) -> list[str]:

@@ -1,1 +1,1 @@
-"""Topological maps: built, planned on, asked where an image is."""
+"""Build topological maps, plan on them, and localise images in them."""

@@ -1,4 +1,4 @@
-"""Nodes, passage probabilities and angles in, a topological map out: planned on, asked where an image is, one file.
+"""Nodes, passage probabilities and angles in, a topological map out: planned on, localised in, one file.
 
 A node is a position with the embeddings of the images around it. An edge leads from a node to each one nearer than
 `edge_m`; its weight is -log p, p the probability that the way is free, so that the shortest way is the one most likely
@@ -60,7 +60,7 @@ class TopologicalMap:
     angle_rad: np.ndarray
     """[E] f32 heading from the first node to the second, world frame."""
     about: dict[str, Any]
-    """Settings, and the networks that made it."""
+    """Settings, and the networks that built it."""
     metre_cost: float = 0.0
     """Added to the weight of an edge for each of its metres; belongs to who plans, not to the file."""
 
@@ -198,10 +198,10 @@ _ARRAYS = {"xy_w": _F32, "room": _I32, "embeddings": _F32, "edges": _I32, "p": _
 """Array of a map's file -> its type."""
 
 
-def save_map(made: TopologicalMap, path: Path) -> None:
+def save_map(nav_map: TopologicalMap, path: Path) -> None:
     """Writes a map as one npz file, whole or not at all."""
-    header = {"format": FORMAT, "scene": made.scene, "digest": made.digest, "about": made.about}
-    arrays = {name: getattr(made, name) for name in _ARRAYS}
+    header = {"format": FORMAT, "scene": nav_map.scene, "digest": nav_map.digest, "about": nav_map.about}
+    arrays = {name: getattr(nav_map, name) for name in _ARRAYS}
     write_arrays(path, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
 
 
@@ -216,12 +216,12 @@ def load_map(path: Path, digest: str | None = None) -> TopologicalMap:
         header = json.loads(stored["header"].tobytes())
         arrays = {name: stored[name] for name in _ARRAYS}
         arrays["embeddings"] = arrays["embeddings"].astype(np.float32)  # exported maps hold them in half precision
-        version, scene, own, about = (header[k] for k in ("format", "scene", "digest", "about"))
+        version, scene, built_in, about = (header[k] for k in ("format", "scene", "digest", "about"))
     if version != FORMAT:
         raise MapError(f"{path}: format {version}, expected {FORMAT}; build the map again")
-    if digest is not None and own != digest:
+    if digest is not None and built_in != digest:
         raise MapError(
-            f"{path}: made in scene '{scene}' with digest {own[:12]}, the scene here has {digest[:12]}; "
+            f"{path}: made in scene '{scene}' with digest {built_in[:12]}, the scene here has {digest[:12]}; "
             "build the map of this scene"
         )
-    return TopologicalMap(scene, own, **arrays, about=about)
+    return TopologicalMap(scene, built_in, **arrays, about=about)

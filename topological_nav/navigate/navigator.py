@@ -6,7 +6,7 @@
        |      whether the way is free for as long as the edge is; agrees: DRIVE; else
     SWING     the same at headings left and right of it, wider and wider
        |      none agrees: the edge costs more from now on; another one: FACE, else all round; still none:
-    LEAN      turn to the most open of the headings asked, and drive all the same
+    LEAN      turn to the most open of the headings tried, and drive all the same
     DRIVE     the local policy, in runs of 5 s, or until the edge's head is passed; after twelve: LOCALISE. After each
               a glance tells by the image ahead whether the robot is still at its node or at a neighbour of it. An
               edge that was driven in vain costs more from now on. Plan anew from there: FACE
@@ -54,26 +54,26 @@ SLACK_S = 1e-3
 class Navigator:
     """A map, eyes and a local policy."""
 
-    def __init__(self, made: TopologicalMap, sight: Sight, policy: LocalPolicy, config: NavigatorConfig):
+    def __init__(self, nav_map: TopologicalMap, sight: Sight, policy: LocalPolicy, config: NavigatorConfig):
         """Takes what it needs.
 
         Args:
-            made: the map; positions of its nodes are not used.
+            nav_map: the map; positions of its nodes are not used.
             sight: judges images.
             policy: drives along an edge. A member `period` says that it looks at every so manieth image only.
             config: settings.
         """
-        around = made.embeddings.shape[1]
+        around = nav_map.embeddings.shape[1]
         if config.match == "aligned" and around % config.images:
             raise ConfigError(f"images is {config.images}, expected a divisor of {around}, the map's images a node")
-        self.map = dataclasses.replace(made, metre_cost=config.metre_cost)
+        self.map = dataclasses.replace(nav_map, metre_cost=config.metre_cost)
         self.sight, self.policy, self.config = sight, policy, config
         self._tolerance = np.deg2rad(config.tolerance_deg)
         self._period = int(getattr(policy, "period", 1))
-        self._near = np.eye(len(made.xy_w), dtype=bool)
+        self._near = np.eye(len(nav_map.xy_w), dtype=bool)
         self._all_round = int(np.ceil(360.0 / config.swing_deg)) - 1
-        self._near[made.edges[:, 0], made.edges[:, 1]] = True
-        self._ask_m = _asked_m(made.length_m, config)
+        self._near[nav_map.edges[:, 0], nav_map.edges[:, 1]] = True
+        self._ask_m = _judged_m(nav_map.length_m, config)
 
     def goal_nodes(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
         """[B] i32: the nodes nearest to goals, by the images [B, K, ...] taken there along headings [K]."""
@@ -176,13 +176,13 @@ class Navigator:
         s.target_rad[rows] = wrap_angle(s.base_rad[rows] + s.looks[rows] * 2 * np.pi / self.config.images)
         s.restart_pid(rows)
         done = rows[s.looks[rows] >= self.config.images]
-        self._found(s, done, s.evidence[done].argmin(-1).astype(np.int32))
+        self._located(s, done, s.evidence[done].argmin(-1).astype(np.int32))
         s.localised[done] = True
         there = done[s.node[done] == s.goal[done]]
         s.phase[there], s.arrived[there] = ARRIVED, True
         self._plan(s, done[s.node[done] != s.goal[done]], heading)
 
-    def _found(self, s: Work, rows: np.ndarray, node: np.ndarray) -> None:
+    def _located(self, s: Work, rows: np.ndarray, node: np.ndarray) -> None:
         """Where the robots are; an edge that was driven and did not lead nearer to its head costs more."""
         s.node[rows] = node
         edge = s.driven[rows]
@@ -234,8 +234,8 @@ class Navigator:
                 if self.map.next_edge(int(s.node[i]), int(s.goal[i]), s.penalty[i]) != old:
                     self._plan(s, np.array([i]), heading)
         # Without another way it goes on swinging, all round.
-        asked = rows[(s.phase[rows] == SWING) & (s.swing[rows] > max(2 * self.config.swings, self._all_round))]
-        s.phase[asked], s.target_rad[asked] = LEAN, s.best_rad[asked]
+        tried = rows[(s.phase[rows] == SWING) & (s.swing[rows] > max(2 * self.config.swings, self._all_round))]
+        s.phase[tried], s.target_rad[tried] = LEAN, s.best_rad[tried]
 
     def _begin_drive(self, s: Work, rows: np.ndarray, time: np.ndarray) -> None:
         s.phase[rows], s.driven[rows] = DRIVE, s.edge[rows]
@@ -259,12 +259,12 @@ class Navigator:
             ended = ended[~tired]
             if self.config.glance and len(ended):
                 away = self.sight.distances(images[ended], heading[ended])
-                found = np.where(self._near[s.node[ended]], away, np.inf).argmin(-1).astype(np.int32)
-                new = found != s.node[ended]
+                nearest = np.where(self._near[s.node[ended]], away, np.inf).argmin(-1).astype(np.int32)
+                new = nearest != s.node[ended]
                 s.glanced[ended[new]] = True
-                self._found(s, ended, found)
+                self._located(s, ended, nearest)
                 # A glance is no proof of having arrived: that takes a look about.
-                there = new & (found == s.goal[ended])
+                there = new & (nearest == s.goal[ended])
                 self._begin_localise(s, ended[there])
                 # Where the map has no way, on along the heading that was chosen.
                 on = ~new & (s.edge[ended] < 0)
@@ -317,10 +317,10 @@ class Navigator:
         s.error_rad[rows] = error
 
 
-def _asked_m(length_m: np.ndarray, config: NavigatorConfig) -> np.ndarray:
+def _judged_m(length_m: np.ndarray, config: NavigatorConfig) -> np.ndarray:
     """[E + 1] m: how far the way must be free to drive along each edge of lengths [E], and, last, along none."""
-    asked = np.minimum(length_m - np.minimum(config.slack_m, 0.5 * length_m), config.ahead_m)
-    return np.append(asked, config.clear_m)
+    ahead = np.minimum(length_m - np.minimum(config.slack_m, 0.5 * length_m), config.ahead_m)
+    return np.append(ahead, config.clear_m)
 
 
 def _any_of(phase: np.ndarray, phases: tuple[int, ...]) -> np.ndarray:

@@ -39,14 +39,14 @@ class State:
     target_rad: np.ndarray = column(np.nan)
     """Heading to reach."""
     swing: np.ndarray = column(0, np.int32)
-    """i32 headings asked since the edge was planned."""
+    """i32 headings tried since the edge was planned."""
     best_p: np.ndarray = column(-1.0)
     best_rad: np.ndarray = column(0.0)
     """The most open of them, for `NavigatorConfig.clear_m`."""
     penalty: np.ndarray
     """[B, E] added to the edges' weights."""
     driven: np.ndarray = column(-1, np.int32)
-    """i32 edge that was driven since the robot was last found, -1: none."""
+    """i32 edge that was driven since the robot last localised, -1: none."""
     times_lost: np.ndarray = column(0, np.int32)
     """i32 times that the map had no way."""
     integral: np.ndarray = column(0.0)
@@ -86,7 +86,7 @@ jax.tree_util.register_dataclass(State, [f.name for f in dataclasses.fields(Stat
 
 @dataclasses.dataclass(frozen=True)
 class Events:
-    """What happened in a step, [B] bool each; whose run ended may be told to stop by those who know better."""
+    """What happened in a step, [B] bool each; a caller may stop an episode whose run ended."""
 
     localised: np.ndarray
     """Turned about, and `State.node` is new."""

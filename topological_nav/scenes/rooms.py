@@ -35,7 +35,7 @@ RECORDED: dict[str, tuple[tuple[float, ...], ...]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Rooms:
-    """Rooms of a scene, told by the nearest of many labelled positions."""
+    """Rooms of a scene, given by the nearest of many labelled positions."""
 
     points_w: np.ndarray
     """[n, 2] m."""

@@ -16,8 +16,7 @@ from topological_nav.__main__ import main
 from topological_nav.config import PolicyConfig
 from topological_nav.drives import imitation
 from topological_nav.drives.dataset import drive_images
-from topological_nav.drives.driving import embed_drives, load_policy
-from topological_nav.drives.policy import Forward, Policy
+from topological_nav.drives.driving import Forward, Policy, embed_drives, load_policy
 from topological_nav.errors import Host, RunError, Stopped
 from topological_nav.learn.learning import Learner
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from topological_nav.drives.policy import Forward, Policy, fresh_params, mean_over, policy_loss, unrolled
+from topological_nav.drives.driving import Forward, Policy, fresh_params, mean_over, policy_loss, unrolled
 
 WIDTH, HIDDEN = 7, 4
 

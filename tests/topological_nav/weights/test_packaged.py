@@ -174,7 +174,7 @@ def test_rows_of_exported_networks_are_not_those_of_the_runs(made, exported):
             (made.scene,), ("dense",), made.map, EvaluationConfig(), map_files=files,
             localiser=home / "rooms", detector=home / "passages",
         )  # fmt: skip
-        asked.append(contest_scenes(contest)[0].asked("dense"))
+        asked.append(contest_scenes(contest)[0].request("dense"))
     assert asked[0]["map"] == asked[1]["map"] and "localiser" not in asked[0]
     assert asked[1]["detector"] == f"{asked[0]['detector']}-fp16" and asked[1]["localiser"].endswith("-fp16")
 
