@@ -26,7 +26,7 @@ from interactive_nav.sensing.base import FAR_M, lambert
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.rotations import yaw_from_quat
 from scenes_mjcf.categories import SEGMENTATIONS, TABLE, MaskClasses
-from scenes_mjcf.look import SKY_COLOUR, CameraPose, GlPainter, Lens, look_along, straight_down, trace
+from scenes_mjcf.look import SKY_COLOUR, CameraPose, GlPainter, Lens, cast, look_along, straight_down, trace
 
 STREAMS = ("rgb", "normals", "depth", "segmentation")
 VIEWS = ("robot", "top", "follow")
@@ -211,9 +211,22 @@ class SceneView(SceneModel):
     def render(
         self, pose: CameraPose, lens: Lens, groups: Sequence[int] = OUTSIDE, paint: FloorPaint | None = None
     ) -> dict[str, np.ndarray]:
-        """Return the streams of `by_rays`, with `paint` on a chequered floor."""
+        """Return the streams of `by_rays`, with `paint` on a chequered floor, and from outside with shadows."""
         out = by_rays(self, pose, lens, groups)
-        return out | {"rgb": _painted(out["rgb"], out["depth"], pose, lens, paint or FloorPaint(), 0.96)}
+        rgb = _painted(out["rgb"], out["depth"], pose, lens, paint or FloorPaint(), 0.96)
+        if CUT_WALLS in groups:
+            rgb = np.clip(rgb * self._light(out["depth"], pose, lens, groups)[..., None], 0, 255).astype(np.uint8)
+        return out | {"rgb": rgb}
+
+    def _light(self, depth_m: np.ndarray, pose: CameraPose, lens: Lens, groups: Sequence[int]) -> np.ndarray:
+        """Return [rows, columns] brightness by a lamp high above the middle of the view, which casts shadows."""
+        light, met = np.ones(depth_m.shape), depth_m > 0
+        points = pose.pos_w + (lens.rays(pose) * depth_m[..., None])[met]
+        lamp = np.array([*points[:, :2].mean(0) - [2.0, 3.0], 9.0]) if len(points) else np.zeros(3)
+        far = np.linalg.norm(points - lamp, axis=1)
+        _, distance, _ = cast(self.model, self.data, lamp, (points - lamp) / far[:, None], groups)
+        light[met] = np.where((distance < 0) | (distance > far - 0.02), 1.13, 0.83)
+        return light
 
     def textured(
         self, pose: CameraPose, lens: Lens, groups: Sequence[int], paint: FloorPaint | None = None

@@ -150,6 +150,17 @@ def test_the_robot_is_seen_from_outside_only(view):
     assert (view.render(*above, OUTSIDE)["segmentation"] == index).sum() > 20
 
 
+def test_views_from_outside_have_shadows(view):
+    """A lamp at 9 m, 2 m and 3 m off the middle, sees the cube of 0.4 m at (0.7, 0): its shadow is 0.14 m long in y."""
+    view.place(("chair_0",), np.array([[0.7, 0.0, 0.2]]), np.array([IDENTITY]))
+    down = look_along(np.array([0.7, 0.0, 3.0]), np.array([0.0, 0.0, -1.0])), Lens(101, 101, math.degrees(0.3))
+    middle = view.render(*down, OUTSIDE)["rgb"].mean(-1)[50]
+    pixel_m = 2 * 3.0 * math.tan(0.15) / 101
+    # The middle row lies along y (a camera that looks straight down has -y on its right).
+    beside = [middle[50 + side * round(0.23 / pixel_m)] for side in (-1, 1)]
+    assert min(beside) / max(beside) == pytest.approx(0.83 / 1.13, rel=0.06)
+
+
 def test_goal_and_path_are_painted_on_the_floor(view):
     down = look_along(np.array([-1.2, 0.0, 3.0]), np.array([1e-3, 0, -1.0])), Lens(41, 41, math.degrees(0.3))
     paint = FloorPaint(np.array([-1.2, 0.0]), 0.2, np.array([[-1.2, 0.3]]))
