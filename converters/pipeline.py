@@ -26,7 +26,7 @@ from converters.geometry.simplify import simplify_open, simplify_parts
 from converters.propose.report import floor_of, with_retrieved
 from converters.read.homes.parts import built_in
 from converters.read.source import read_source
-from converters.read.storeys import split_storeys
+from converters.read.surfaces import split_storeys
 from converters.records.cache import NOT_HASHED, StageCache
 from converters.records.errors import SceneRejected
 from converters.records.gate import Gate

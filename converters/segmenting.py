@@ -56,7 +56,7 @@ def propose_unproposed(arguments: argparse.Namespace, console: Console) -> Path 
     from converters.propose.proposals import as_scan2cad
     from converters.propose.report import given_up, retrieve_sure
     from converters.read.gibson import ALIGNMENTS
-    from converters.read.storeys import split_storeys
+    from converters.read.surfaces import split_storeys
     from converters.segment.voxels import NAMES, classes_of
 
     source, target = arguments.source, _beside(arguments.source, "proposals.json")

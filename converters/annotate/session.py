@@ -24,9 +24,8 @@ from converters.bodies.alignment import (
 )
 from converters.propose.proposals import Proposal, scan2cad_list, scan2cad_model
 from converters.propose.retrieval import read_library
-from converters.read.annotations import inside_scan, parse_annotations
+from converters.read.annotations import ANNOTATION, inside_scan, parse_annotations
 from converters.read.files import SourceFolder, read_json
-from converters.read.scan2cad import ANNOTATION
 from converters.records.errors import SceneRejected
 from converters.records.raw import SYNSETS, CadModel, RawScene
 from interactive_nav_common.errors import FileError

@@ -235,7 +235,7 @@ def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) ->
     `floor_height_m`: of the scene's floor in the scan's frame: which one is drawn of several.
     """
     from converters.read import source as sources
-    from converters.read.storeys import split_storeys
+    from converters.read.surfaces import split_storeys
 
     raw = sources.read_source(source)
     expected = manifest.source.get("sha256", {})

@@ -1,9 +1,10 @@
-"""Scan2CAD's annotation list (also Gibson's `alignments.json`) in, `Annotation` records out.
+"""Read a ScanNet scan with Scan2CAD's annotation, and the same list of annotations as Gibson's `alignments.json`.
 
 Frames of the file (Avetisyan et al. 2019): an annotation world, y up; the scan's `trs` leads scan -> world,
 each model's `trs` CAD -> world, and both keypoint sets stand in that world (the CAD's after its `trs`).
 """
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +12,23 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from converters.read.files import SourceFolder
+from converters.read.cad import read_cad
+from converters.read.files import SourceFolder, read_json, read_mesh
+from converters.read.surfaces import check_upright
 from converters.records.errors import SceneRejected
-from converters.records.raw import Annotation, CadModel, ScannedHinge, category_of_id
+from converters.records.raw import Annotation, CadModel, RawScene, ScanMesh, ScannedHinge, category_of_id
 from interactive_nav_common.files import check_name
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, transformed
 
+ANNOTATION = "full_annotations.json"
+LICENCE = "ScanNet terms of use and ShapeNet terms of use: research only, no redistribution"
 OUTSIDE_M = 0.5
 """An object this far from everything scanned stands outside the scan."""
 TURNS = 20
 
 
 def trs_matrix(trs: dict[str, Any]) -> np.ndarray:
-    """(4, 4) matrix that scales, then turns (quaternion w x y z), then moves."""
+    """Return the (4, 4) matrix that scales, then turns (quaternion w x y z), then moves."""
     w, x, y, z = (float(v) for v in trs["rotation"])
     turn = Rotation.from_quat([x, y, z, w]).as_matrix() * np.asarray(trs["scale"], float)
     matrix = transform(turn, np.asarray(trs["translation"], float))
@@ -63,10 +68,7 @@ def _confidence(model: dict[str, Any]) -> float | None:
 
 
 def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Annotation], ...]]:
-    """Turns the decoded list of one scan into records.
-
-    Returns the scan id, and for each object its synset id and annotation.
-    """
+    """Return the scan id of a decoded list of one scan, and for each object its synset id and annotation."""
     if not isinstance(data, list) or len(data) != 1:
         got = f"a list of {len(data)}" if isinstance(data, list) else type(data).__name__
         raise SceneRejected(f"{path}: got {got}, expected a list with the annotation of one scan; cut it to one scan")
@@ -110,7 +112,7 @@ def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Anno
 
 
 def gap_to_scan(annotation: Annotation, cad_vertices: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Distance from an object's upright bounding box to the scan's surface, m; 0 where it reaches into the box.
+    """Return the distance from an object's upright bounding box to the scan's surface, m; 0 where that reaches in.
 
     The box and each triangle are convex: projecting from one to the other by turns leads to their nearest points.
     """
@@ -138,7 +140,7 @@ def inside_scan(
     vertices: np.ndarray,
     faces: np.ndarray,
 ) -> tuple[Annotation, ...]:
-    """The annotations whose objects stand in the scan; the others are left out with a warning each."""
+    """Return the annotations whose objects stand in the scan; leave the others out with a warning each."""
     gaps = [gap_to_scan(a, cads[a.cad_id].vertices, vertices, faces) for a in annotations]
     outside = [i for i, gap in enumerate(gaps) if gap > OUTSIDE_M]
     if 2 * len(outside) > len(annotations):
@@ -152,3 +154,35 @@ def inside_scan(
             "the scan; it is left out"
         )
     return tuple(a for i, a in enumerate(annotations) if i not in outside)
+
+
+def read_scan2cad(root: Path, strict: bool = False) -> RawScene:
+    """Read `full_annotations.json`, `scan/<id>_vh_clean_2.ply`, its `.labels.ply` and `cad/`."""
+    source = SourceFolder(root, strict)
+    path = source.use(ANNOTATION, "expected Scan2CAD's annotation of one scan beside scan/ and cad/")
+    scan_id, records = parse_annotations(read_json(path), path)
+    check_name(scan_id, f"{path}: id_scan", SceneRejected)
+    stem = f"scan/{scan_id}_vh_clean_2"
+    mesh = read_mesh(source.use(f"{stem}.ply", f"expected ScanNet's reconstruction of {scan_id}"))
+    label_path = source.use(f"{stem}.labels.ply", f"expected ScanNet's per-vertex labels of {scan_id}")
+    try:
+        labels = read_mesh(label_path).metadata["_ply_raw"]["vertex"]["data"]["label"]
+    except (KeyError, IndexError, ValueError) as error:
+        raise SceneRejected(f"{label_path}: its vertices have no property 'label', expected NYU40 ids") from error
+    labels = np.asarray(labels).reshape(-1).astype(np.int64)
+    if len(labels) != len(mesh.vertices):
+        raise SceneRejected(
+            f"{label_path}: {len(labels)} labels for the {len(mesh.vertices)} vertices of {stem}.ply, expected one a "
+            "vertex; take both files from the same ScanNet release"
+        )
+    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+    colours = np.full((len(vertices), 3), 170, np.uint8)
+    painted = getattr(mesh.visual, "vertex_colors", None)
+    if painted is not None and len(painted) == len(vertices):
+        colours = np.asarray(painted, np.uint8)[:, :3]
+    check_upright(f"{root / stem}.ply", vertices, faces, labels, 0.0)
+    cads = {a.cad_id: read_cad(source, synset, a.cad_id) for synset, a in records}
+    annotations = inside_scan(source, ANNOTATION, tuple(a for _, a in records), cads, vertices, faces)
+    scan, kept = ScanMesh(vertices, faces, labels, colours), {a.cad_id: cads[a.cad_id] for a in annotations}
+    raw = source.scene("scan2cad", scan, cads=kept, annotations=annotations, licence=LICENCE)
+    return dataclasses.replace(raw, name=scan_id)

@@ -155,14 +155,6 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     return mesh
 
 
-def vertex_colours(mesh: trimesh.Trimesh) -> np.ndarray:
-    """(n, 3) uint8 colour of each vertex; grey where the file has none."""
-    colours = getattr(mesh.visual, "vertex_colors", None)
-    if colours is None or len(colours) != len(mesh.vertices):
-        return np.full((len(mesh.vertices), 3), 170, np.uint8)
-    return np.asarray(colours, np.uint8)[:, :3]
-
-
 def check_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
     """Refuses what no stage can use."""
     if len(vertices) == 0 or len(faces) == 0:

@@ -13,8 +13,7 @@ from converters.read.annotations import inside_scan, parse_annotations
 from converters.read.cad import read_cad
 from converters.read.files import SourceFolder, read_image, read_json, read_labels, read_npz
 from converters.read.obj import TexturedMesh, read_scan_obj, scan_of
-from converters.read.storeys import label_storeys
-from converters.read.surfaces import check_upright, labelled, with_own_corners
+from converters.read.surfaces import check_upright, label_storeys, labelled, with_split_corners
 from converters.records.errors import SceneRejected
 from converters.records.raw import ATTRIBUTION, FLOOR, WINDOWS, GivenMap, RawScene, Storey, Window
 from interactive_nav_common.errors import readable
@@ -45,7 +44,7 @@ def read_gibson(root: Path, strict: bool = False) -> RawScene:
     check_upright(str(root / MESH), mesh.vertices, mesh.faces, labels, heights[0])
     if labels is None:
         source.note(f"{LABELS} is absent: floor, walls and ceiling are told by shape")
-        mesh = with_own_corners(mesh)
+        mesh = with_split_corners(mesh)
         labels = label_storeys(mesh.vertices, mesh.faces, heights)
     cads, annotations = {}, ()
     if source.has(ALIGNMENTS):

@@ -20,8 +20,7 @@ from converters.read.files import SourceFolder
 from converters.read.gibson import building, read_floors, read_traversable
 from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh, join_meshes, read_scan_obj
-from converters.read.storeys import label_storeys
-from converters.read.surfaces import check_extent, check_upright, with_own_corners
+from converters.read.surfaces import check_extent, check_upright, label_storeys, with_split_corners
 from converters.read.urdf import read_urdf
 from converters.records.errors import SceneRejected
 from converters.records.raw import (
@@ -68,7 +67,7 @@ def read_interactive_gibson(root: Path, strict: bool = False) -> RawScene:
     mesh = read_scan_obj(source, MESH, "expected the scan without its furniture")
     heights = read_floors(source)
     check_upright(str(root / MESH), mesh.vertices, mesh.faces, None, heights[0])
-    mesh = with_own_corners(mesh)
+    mesh = with_split_corners(mesh)
     labels = label_storeys(mesh.vertices, mesh.faces, heights)
     for k, height in enumerate(heights):
         mesh, labels = _with_plane(source, k, height, mesh, labels)

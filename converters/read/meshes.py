@@ -1,7 +1,7 @@
-"""A mesh file of any kind that trimesh knows in, a `TexturedMesh` in metres and z up out.
+"""Read a mesh file of any kind that trimesh reads, as a `TexturedMesh` in metres and z up.
 
 trimesh reads the files that a model names through `SourceResolver`: within the source folder, hashed, and with a
-word about what is missing. A COLLADA file states its unit and up axis; the other formats do not.
+report of what is missing. A COLLADA file states its unit and up axis; the other formats do not.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import trimesh
 from PIL import Image
-from trimesh.resolvers import Resolver
 from trimesh.visual import ColorVisuals
 
 from converters.geometry.upright import AXES, UNITS_M, faces_away, find_unit, find_up, turn_upright
@@ -32,8 +31,7 @@ from converters.read.obj import (
     textured_by_face,
     use_found,
 )
-from converters.read.storeys import label_storeys
-from converters.read.surfaces import check_extent, floor_level, labelled, welded, with_own_corners
+from converters.read.surfaces import check_extent, floor_level, label_storeys, labelled, welded, with_split_corners
 from converters.records.errors import SceneRejected
 from converters.records.raw import RawScene
 from interactive_nav_common.errors import readable
@@ -71,24 +69,23 @@ def beside(path: Path, ending: str) -> Path:
     return short if short.is_file() and not full.is_file() and len(meshes) == 1 else full
 
 
-class SourceResolver(Resolver):
-    """Gives trimesh the files that a model names."""
+class SourceResolver:
+    """Give trimesh the files that a model names, and nothing else."""
 
     def __init__(self, source: SourceFolder, model: Path) -> None:
-        """Resolves names in `model`, a path inside of `source`."""
-        self.source = source
-        self.model = model
+        """Resolve names in `model`, a path inside of `source`."""
+        self.source, self.model = source, model
         self.refusal: SceneRejected | None = None
-        """What trimesh's loaders swallowed: they go on without a file, whatever the reason."""
+        """The first error that trimesh's loaders swallowed: they go on without a file, whatever the reason."""
 
     def get(self, key: str) -> bytes:
-        """Content of a named file."""
+        """Return the content of a named file."""
         try:
-            if Path(key).suffix.lower() in Image.registered_extensions():
-                found = read_texture(self.source, self.model, key) is not None
-            else:
-                found = True
-            path = use_found(self.source, self.model.parent, key, self.model.name) if found else None
+            path = None
+            if Path(key).suffix.lower() not in Image.registered_extensions() or (
+                read_texture(self.source, self.model, key) is not None
+            ):
+                path = use_found(self.source, self.model.parent, key, self.model.name)
         except SceneRejected as refusal:
             self.refusal = self.refusal or refusal
             raise
@@ -96,21 +93,9 @@ class SourceResolver(Resolver):
             raise FileNotFoundError(key)
         return path.read_bytes()
 
-    def keys(self) -> list[str]:
-        """Nothing is listed: a model's own words alone say what is read."""
-        return []
-
-    def write(self, name: str, data: Any) -> None:
-        """Refused: a source is only read."""
-        raise NotImplementedError(name)
-
-    def namespaced(self, namespace: str) -> SourceResolver:
-        """Resolves names in a folder beside the model."""
-        return SourceResolver(self.source, self.model.parent / namespace / self.model.name)
-
 
 def read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedMesh:
-    """Reads a mesh file of any kind that trimesh knows, with its textures or colours, once for every source."""
+    """Read a mesh file of any kind, with its textures or colours, once for every source."""
     if relative not in source.surfaces:
         source.surfaces[relative] = _read_surface(source, relative, remedy)
     return source.surfaces[relative]
@@ -120,23 +105,26 @@ def _read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedM
     if relative.lower().endswith(".obj"):
         return read_scan_obj(source, relative, remedy)
     path = source.use(relative, remedy)
-    resolver = SourceResolver(source, path)
+    resolver: Any = SourceResolver(source, path)
     try:
         with readable(path, SceneRejected, "expected OBJ, PLY, STL, GLB or DAE", " as a mesh"), path.open("rb") as file:
             if path.suffix.lower() in (".glb", ".gltf"):
-                return _joined(path, read_gltf(source, path))
-            loaded = trimesh.load(file, path.suffix[1:].lower(), resolver=resolver, process=False, force="scene")
-            assert isinstance(loaded, trimesh.Scene)
-            parts = [p for p in loaded.dump() if isinstance(p, trimesh.Trimesh) and len(p.faces)]
-            turn = _collada_turn(path) if path.suffix.lower() == ".dae" else np.eye(3)
+                parts = read_gltf(source, path)
+            else:
+                loaded = trimesh.load(file, path.suffix[1:].lower(), resolver=resolver, process=False, force="scene")
+                assert isinstance(loaded, trimesh.Scene)
+                meshes = [p for p in loaded.dump() if isinstance(p, trimesh.Trimesh) and len(p.faces)]
+                turn = _collada_turn(path) if path.suffix.lower() == ".dae" else np.eye(3)
+                parts = [_painted(path, mesh, turn) for mesh in meshes]
     except SceneRejected:
         if resolver.refusal is None:
             raise
-        raise resolver.refusal from None
     if resolver.refusal is not None:
-        raise resolver.refusal
+        raise resolver.refusal from None
     source.note_counts(f"{relative}: not used:", _unused(path), " ")
-    return _joined(path, [_painted(path, part, turn) for part in parts])
+    if not parts:
+        raise SceneRejected(f"{path}: holds no triangle mesh; export it as OBJ, PLY, STL or GLB")
+    return join_meshes(*parts)
 
 
 def _unused(path: Path) -> dict[str, int]:
@@ -163,15 +151,9 @@ def _unused(path: Path) -> dict[str, int]:
         rows = [line.partition("#")[0].split() for line in content.decode("latin-1").splitlines()]
         body = [row for row in rows if row][1:]
         coloured = [row for row in body if row[0].isdigit() and len(row) > int(row[0]) + 1 > 3]
-        found = {"colours of faces": len(coloured), "colours of vertices": int(content.lstrip()[:1] == b"C")}
-        return {what: count for what, count in found.items() if count}
+        counts = {"colours of faces": len(coloured), "colours of vertices": int(content.lstrip()[:1] == b"C")}
+        return {what: count for what, count in counts.items() if count}
     return {}
-
-
-def _joined(path: Path, parts: list[TexturedMesh]) -> TexturedMesh:
-    if not parts:
-        raise SceneRejected(f"{path}: holds no triangle mesh; export it as OBJ, PLY, STL or GLB")
-    return join_meshes(*parts)
 
 
 def read_single_mesh(
@@ -208,7 +190,7 @@ def read_single_mesh(
         given = source.use(source.inside(beside_it), "")
         mesh, labels = labelled(mesh, read_labels(given), given)
     else:
-        mesh = with_own_corners(welded(mesh))
+        mesh = with_split_corners(welded(mesh))
         labels = label_storeys(mesh.vertices, mesh.faces, (floor_m,))
         source.note(f"{path.name}: has no labels: floor, walls and ceiling are told by shape, all else is part of them")
     licence = "unknown: a mesh file says none"
@@ -217,56 +199,49 @@ def read_single_mesh(
 
 
 def _painted(path: Path, part: trimesh.Trimesh, turn: np.ndarray) -> TexturedMesh:
+    """Return a mesh of trimesh with its texture, or its colours of faces, vertices or material; grey without any."""
     vertices, faces = np.asarray(part.vertices, float), np.asarray(part.faces, np.int64)
     check_mesh(path, vertices, faces)
     vertices = vertices @ turn.T
-    image = material_image(getattr(part.visual, "material", None))
-    uv = getattr(part.visual, "uv", None)
+    material, uv = getattr(part.visual, "material", None), getattr(part.visual, "uv", None)
+    image = _first(material, "image", "baseColorTexture")
     if image is not None and uv is not None and len(uv) == len(vertices):
         uv = np.where(np.isfinite(uv), uv, 0.0)
         return TexturedMesh(vertices, faces, uv[faces], np.asarray(image.convert("RGB")))
-    return textured_by_face(vertices, faces, face_colours(part))
+    if isinstance(part.visual, ColorVisuals) and part.visual.defined:
+        colours = np.asarray(part.visual.face_colors, np.uint8)[:, :3]
+    else:
+        plain = _first(material, "diffuse", "main_color")
+        colours = np.tile(np.asarray((160, 160, 160) if plain is None else plain, np.uint8)[:3], (len(faces), 1))
+    return textured_by_face(vertices, faces, colours)
+
+
+def _first(item: Any, *names: str) -> Any:
+    """Return the first of some attributes that is there; None without any."""
+    return next((value for name in names if (value := getattr(item, name, None)) is not None), None)
+
+
+def collada_frame(path: Path) -> tuple[str, str]:
+    """Return the word for the up axis, and the unit in m, of a COLLADA file; by its standard a silent one is y up."""
+    root = ElementTree.parse(path).getroot()
+    unit = root.find("{*}asset/{*}unit")
+    axis = (root.findtext("{*}asset/{*}up_axis") or "Y_UP").strip()
+    return axis, "1" if unit is None else unit.get("meter", "1")
 
 
 def _collada_turn(path: Path) -> np.ndarray:
-    """(3, 3) from a COLLADA file's frame to metres and z up; by its standard a silent file is in metres, y up."""
-    asset = ElementTree.parse(path).getroot().find("{*}asset")
-    unit = None if asset is None else asset.find("{*}unit")
-    axis = (None if asset is None else asset.findtext("{*}up_axis")) or "Y_UP"
-    text = "1" if unit is None else unit.get("meter", "1")
-    try:
-        meter = float(text)
-    except ValueError:
-        meter = math.nan
-    if not 0.0 < meter < math.inf or axis.strip() not in UP_AXES:
+    """Return (3, 3) from a COLLADA file's frame to metres and z up."""
+    axis, unit = collada_frame(path)
+    if not 0.0 < as_number(unit) < math.inf or axis not in UP_AXES:
         raise SceneRejected(
-            f"{path}: its unit is '{text}' m and its up axis '{axis}', expected a positive number and one of "
+            f"{path}: its unit is '{unit}' m and its up axis '{axis}', expected a positive number and one of "
             f"{', '.join(UP_AXES)}; export it again"
         )
-    return meter * UP_AXES[axis.strip()]
-
-
-def material_image(material: Any) -> Image.Image | None:
-    """Texture of a trimesh material: of a plain one, or the base colour of a glTF's."""
-    image = getattr(material, "image", None)
-    return getattr(material, "baseColorTexture", None) if image is None else image
-
-
-def face_colours(mesh: trimesh.Trimesh) -> np.ndarray:
-    """(m, 3) uint8 colour of every face: its own or its vertices', else the material's; grey without any."""
-    count = len(mesh.faces)
-    if isinstance(mesh.visual, ColorVisuals) and mesh.visual.defined:
-        return np.asarray(mesh.visual.face_colors, np.uint8)[:, :3]
-    material = getattr(mesh.visual, "material", None)
-    diffuse = getattr(material, "diffuse", None)
-    diffuse = getattr(material, "main_color", None) if diffuse is None else diffuse
-    if diffuse is not None:
-        return np.tile(np.asarray(diffuse, np.uint8)[:3], (count, 1))
-    return np.full((count, 3), 160, np.uint8)
+    return as_number(unit) * UP_AXES[axis]
 
 
 def colours_of_faces(mesh: TexturedMesh) -> np.ndarray:
-    """(m, 3) uint8: the texture at the middle of each face, grey without one."""
+    """Return (m, 3) uint8: the texture at the middle of each face, grey without one."""
     if mesh.texture is None or mesh.corner_uv is None:
         return np.full((len(mesh.faces), 3), 170, np.uint8)
     return texels(mesh.texture, mesh.corner_uv.mean(axis=1))

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from converters.read import gibson, interactive_gibson, meshes, scan2cad
+from converters.read import annotations, gibson, interactive_gibson, meshes
 from converters.read.datasets import scanned
 from converters.read.homes import habitat, mjcf, sdf, sh3d
 from converters.records.errors import SceneRejected
@@ -14,7 +14,7 @@ from converters.records.raw import RawScene
 READERS = {
     "interactive-gibson": (interactive_gibson.looks_like, interactive_gibson.read_interactive_gibson),
     "gibson": (lambda root: (root / gibson.MESH).is_file(), gibson.read_gibson),
-    "scan2cad": (lambda root: (root / scan2cad.ANNOTATION).is_file(), scan2cad.read_scan2cad),
+    "scan2cad": (lambda root: (root / annotations.ANNOTATION).is_file(), annotations.read_scan2cad),
     "sdf": (sdf.worlds_of, sdf.read_sdf),
     "habitat": (habitat.scenes_of, habitat.read_habitat),
     "mjcf": (mjcf.mains_of, mjcf.read_mjcf),
@@ -42,7 +42,7 @@ def detect_format(source: Path) -> str:
         raise SceneRejected(f"{source}: no such file or folder; give the raw scene")
     raise SceneRejected(
         f"{source}: no known layout; expected {gibson.MESH} (gibson), {interactive_gibson.MESH} with furniture URDFs "
-        f"(interactive-gibson), {scan2cad.ANNOTATION} (scan2cad), worlds/*.world (sdf), "
+        f"(interactive-gibson), {annotations.ANNOTATION} (scan2cad), worlds/*.world (sdf), "
         f"*{habitat.SCENE} (habitat), scene.xml (mjcf) or *{sh3d.ENDING} (sh3d) in it, "
         f"or one scene of {', '.join(scanned.COLLECTIONS)}"
     )

@@ -1,20 +1,20 @@
-"""A scan without semantic labels in; floor, wall and ceiling told by shape out. Also: which way is the floor?"""
+"""Label floor, wall and ceiling of a scan by shape, check which way its floor faces, and split it by storeys."""
 
 import dataclasses
 from pathlib import Path
 
 import numpy as np
 
-from converters.geometry.faces import face_vectors, sample_faces, vertex_vectors, weld
+from converters.geometry.faces import compacted, face_vectors, sample_faces, vertex_vectors, weld
 from converters.read.obj import TexturedMesh
 from converters.records.errors import SceneRejected
 from converters.records.limits import EXTENT_M
-from converters.records.raw import CEILING, FLOOR, UNLABELLED, WALL
+from converters.records.raw import CEILING, FLOOR, UNLABELLED, WALL, RawScene
 
 NEAR_FLOOR_M = 0.15
 """Faces this close to the floor's height may be floor."""
 WALL_REACH_M = (0.2, 1.8)
-"""A wall is seen at most heights between these."""
+"""A wall shows at most heights between these."""
 WALL_CELL_M = 0.10
 WALL_SHARE = 0.6
 """Of the height bins of a cell that must show a steep surface."""
@@ -24,10 +24,14 @@ FLOOR_SHARE = 0.05
 FLOOR_BIN_M, LEVEL_SHARE = 0.05, 0.2
 LONG_M, FINE_M = 0.5, 0.1
 """A face with an edge longer than the first is wall or not as a whole, by points so far apart on it as the second."""
+BELOW_FLOOR_M = 0.25
+"""What lies this far below a floor still belongs to it (thresholds, waves); deeper is the storey below."""
+STANDS_ABOVE_M = 0.5
+"""An object's base may lie this far below its floor: annotations are off by centimetres, not by half a metre."""
 
 
 def long_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(m,) bool: faces with an edge longer than `LONG_M`. Scans have none, rooms that were modelled do."""
+    """Return (m,) bool: faces with an edge longer than `LONG_M`. Scans have none, modelled rooms do."""
     corners = vertices[faces]
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1) > LONG_M
 
@@ -35,7 +39,7 @@ def long_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def welded(mesh: TexturedMesh) -> TexturedMesh:
     """Return the mesh with vertices at equal positions joined; texture coordinates belong to corners and stay.
 
-    Files split a surface at its texture seams, or give every triangle vertices of its own. Shapes are recognised by
+    Files split a surface at its texture seams, or give every triangle separate vertices. Shapes are recognised by
     normals and neighbours, which must not depend on that.
     """
     first, group = weld(mesh.vertices)
@@ -43,8 +47,8 @@ def welded(mesh: TexturedMesh) -> TexturedMesh:
     return dataclasses.replace(mesh, vertices=mesh.vertices[first[order]], faces=np.argsort(order)[group[mesh.faces]])
 
 
-def with_own_corners(mesh: TexturedMesh) -> TexturedMesh:
-    """The mesh with corners of their own for long faces, after its vertices.
+def with_split_corners(mesh: TexturedMesh) -> TexturedMesh:
+    """Return the mesh with separate corners for its long faces, after its vertices.
 
     Labels stand at vertices, and the corners of a modelled room belong to its floor and to two walls.
     """
@@ -57,19 +61,19 @@ def with_own_corners(mesh: TexturedMesh) -> TexturedMesh:
 
 
 def labelled(mesh: TexturedMesh, labels: np.ndarray, where: Path) -> tuple[TexturedMesh, np.ndarray]:
-    """Return a mesh and its labels: one for each vertex, or for each that `with_own_corners` gives, `welded` or not."""
-    choices = (mesh, with_own_corners(mesh), with_own_corners(welded(mesh)))
-    own = next((choice for choice in choices if len(choice.vertices) == len(labels)), None)
-    if own is None:
+    """Return a mesh and its labels: one for each vertex, of the mesh or `with_split_corners`, `welded` or not."""
+    choices = (mesh, with_split_corners(mesh), with_split_corners(welded(mesh)))
+    match = next((choice for choice in choices if len(choice.vertices) == len(labels)), None)
+    if match is None:
         raise SceneRejected(
             f"{where}: {len(labels)} labels for the {len(mesh.vertices)} vertices of the mesh, "
             "expected one for each; label the same mesh again"
         )
-    return own, labels
+    return match, labels
 
 
 def check_extent(where: str, vertices: np.ndarray) -> None:
-    """Refuses scans of several buildings, in another unit, or with stray vertices."""
+    """Refuse scans of several buildings, in another unit, or with stray vertices."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     if not (high - low).max() <= EXTENT_M:
         raise SceneRejected(
@@ -79,7 +83,7 @@ def check_extent(where: str, vertices: np.ndarray) -> None:
 
 
 def floor_level(vertices: np.ndarray, faces: np.ndarray, where: str) -> float:
-    """Height of the lowest level that has a fifth of the largest level's area, m; faces that look up count."""
+    """Return the height (m) of the lowest level that has a fifth of the largest one's area, facing up."""
     check_extent(where, vertices)
     area = face_vectors(vertices, faces) / 2
     level = area[:, 2] > 0.95 * np.maximum(np.linalg.norm(area, axis=1), 1e-12)
@@ -96,18 +100,11 @@ def floor_level(vertices: np.ndarray, faces: np.ndarray, where: str) -> float:
 
 
 def structure_labels(vertices: np.ndarray, faces: np.ndarray, floor_height_m: float) -> np.ndarray:
-    """NYU40 labels by shape, for scans that come without: floor, wall, ceiling; everything else stays unlabelled.
+    """Return (n,) NYU40 labels of z-up vertices (n, 3) m by shape: floor, wall, ceiling; the rest stays unlabelled.
 
     Floor is level, faces up and lies at the floor's height; ceiling faces down, 1.8 m above it or more; wall is
     steep in a column that shows steep surface over most of 0.2 to 1.8 m (furniture is lower). A long face, whose
-    corners must be its own (`with_own_corners`), is wall if most of it is.
-
-    Args:
-        vertices: (n, 3) m, z up.
-        faces: (m, 3).
-
-    Returns:
-        (n,) int64.
+    corners must be separate (`with_split_corners`), is wall if most of it is.
     """
     normal, area = vertex_vectors(vertices, faces), face_vectors(vertices, faces)
     length = np.linalg.norm(normal, axis=1)
@@ -130,7 +127,7 @@ def structure_labels(vertices: np.ndarray, faces: np.ndarray, floor_height_m: fl
 
 
 def _in_wall_columns(vertices: np.ndarray, z: np.ndarray, steep: np.ndarray) -> np.ndarray:
-    """(n,) bool: vertices in columns whose steep surface reaches from near the floor to man's height."""
+    """Return (n,) bool: vertices in columns whose steep surface reaches from near the floor to man's height."""
     low, high = WALL_REACH_M
     bins = round((high - low) / 0.2)
     cell = np.floor((vertices[:, :2] - vertices[:, :2].min(axis=0)) / WALL_CELL_M).astype(np.int64)
@@ -151,67 +148,123 @@ def _in_wall_columns(vertices: np.ndarray, z: np.ndarray, steep: np.ndarray) -> 
 
 
 def check_upright(
-    where: str, vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray | None, height_m: float | None
-):
-    """Refuses meshes that are not z up, or whose floor faces down, by the floor that they show.
+    where: str, vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray | None, height_m: float
+) -> None:
+    """Refuse meshes that are not z up, or whose floor faces down.
 
-    Args:
-        vertices: (n, 3) m.
-        faces: (m, 3).
-        labels: (n,) NYU40, or None: then the level faces at `height_m` are taken for floor.
+    The floor is what the NYU40 `labels` (n,) say, or without any the level faces at `height_m`.
     """
     check_extent(where, vertices)
-    area = face_vectors(vertices, faces) / 2
+    area, axis, shows = face_vectors(vertices, faces) / 2, None, "the floor"
     if labels is not None:
         is_floor = (labels[faces] == FLOOR).all(axis=1)
-        seen = np.abs(area[is_floor]).sum(axis=0)
-        if not is_floor.any() or not seen.sum():
-            return  # no floor label at all is another error, told where the floor is needed
-        if seen[2] < max(seen[0], seen[1]):
-            axis = "xy"[int(np.argmax(seen[:2]))]
-            raise SceneRejected(f"{where}: the floor lies across the {axis} axis: {_turn(axis)}")
-        up = float(area[is_floor, 2].sum())
-        _refuse_face_down(where, max(up, 0.0), max(-up, 0.0))
-        return
-    assert height_m is not None
-    footprint = float(np.prod(np.ptp(vertices[:, :2], axis=0)))
-    middle = vertices[faces].mean(axis=1)
-    up, down = _level_area(area, middle, 2, height_m)
-    if up + down >= FLOOR_SHARE * footprint:
-        _refuse_face_down(where, up, down)
-        return
-    for axis in (1, 0):
-        side = float(np.prod(np.delete(np.ptp(vertices, axis=0), axis)))
-        if max(sum(_level_area(area, middle, axis, s * height_m)) for s in (1, -1)) >= FLOOR_SHARE * side:
-            raise SceneRejected(
-                f"{where}: nothing lies level at the floor's height of {height_m:g} m, but a floor lies across the "
-                f"{'xy'[axis]} axis: {_turn('xy'[axis])}"
-            )
-    raise SceneRejected(
-        f"{where}: {up + down:.2f} m2 lie level at the floor's height of {height_m:g} m, expected at least "
-        f"{FLOOR_SHARE * footprint:.2f} m2; check floors.txt, the mesh's axes (z up) and its unit (m)"
-    )
-
-
-def _turn(axis: str) -> str:
-    return (
-        "the mesh is y up, expected z up; turn it: (x, y, z) becomes (x, -z, y)"
-        if axis == "y"
-        else "the mesh is x up, expected z up; turn it"
-    )
+        across = np.abs(area[is_floor]).sum(axis=0)
+        if not is_floor.any() or not across.sum():
+            return  # the stage that needs a floor reports that no face has its label
+        axis = int(np.argmax(across[:2])) if across[2] < max(across[0], across[1]) else None
+        sum_m2 = float(area[is_floor, 2].sum())
+        up, down = max(sum_m2, 0.0), max(-sum_m2, 0.0)
+    else:
+        middle, spans = vertices[faces].mean(axis=1), np.ptp(vertices, axis=0)
+        least = [FLOOR_SHARE * float(np.prod(np.delete(spans, k))) for k in range(3)]
+        up, down = _level_area(area, middle, 2, height_m)
+        if up + down < least[2]:
+            shows = f"nothing lies level at the floor's height of {height_m:g} m, but a floor"
+            sides = ((k, sum(_level_area(area, middle, k, sign * height_m))) for k in (1, 0) for sign in (1, -1))
+            axis = next((k for k, size in sides if size >= least[k]), None)
+            if axis is None:
+                raise SceneRejected(
+                    f"{where}: {up + down:.2f} m2 lie level at the floor's height of {height_m:g} m, expected at least "
+                    f"{least[2]:.2f} m2; check floors.txt, the mesh's axes (z up) and its unit (m)"
+                )
+    if axis is not None:
+        raise SceneRejected(
+            f"{where}: {shows} lies across the {'xy'[axis]} axis: the mesh is {'xy'[axis]} up, expected z up; turn it"
+            + ": (x, y, z) becomes (x, -z, y)" * axis
+        )
+    if down > 2 * up:
+        raise SceneRejected(
+            f"{where}: the floor faces down ({down:.1f} m2 down, {up:.1f} m2 up): the mesh is left-handed (mirrored) "
+            "or inside out; mirror one axis back, or turn the order of each face's corners if only that is wrong"
+        )
 
 
 def _level_area(area: np.ndarray, middle: np.ndarray, axis: int, height_m: float) -> tuple[float, float]:
-    """Area (m2) of the faces square to an axis near a height that face along it, and against it."""
+    """Return the area (m2) of the faces square to an axis near a height that face along it, and against it."""
     size = np.linalg.norm(area, axis=1)
     level = (np.abs(area[:, axis]) > 0.9 * size) & (np.abs(middle[:, axis] - height_m) < NEAR_FLOOR_M)
     along = area[level, axis]
     return float(along[along > 0].sum()), float(-along[along < 0].sum())
 
 
-def _refuse_face_down(where: str, up: float, down: float) -> None:
-    if down > 2 * up:
-        raise SceneRejected(
-            f"{where}: the floor faces down ({down:.1f} m2 down, {up:.1f} m2 up): the mesh is left-handed (mirrored) "
-            "or inside out; mirror one axis back, or turn the order of each face's corners if only that is wrong"
+def storey_of(z: np.ndarray, heights_m: tuple[float, ...], below_m: float = BELOW_FLOOR_M) -> np.ndarray:
+    """Return the number of the storey that each height lies in; all below the lowest floor belongs to the first."""
+    return np.searchsorted(np.array(heights_m[1:]) - below_m, z, side="right")
+
+
+def label_storeys(vertices: np.ndarray, faces: np.ndarray, heights_m: tuple[float, ...]) -> np.ndarray:
+    """Return (n,) labels by shape (`structure_labels`) of a building, each storey by its own floor."""
+    of_vertex = storey_of(vertices[:, 2], heights_m)
+    of_face = storey_of(vertices[faces, 2].mean(axis=1), heights_m)
+    long = long_faces(vertices, faces)
+    of_vertex[faces[long]] = of_face[long, None]
+    labels = np.zeros(len(vertices), np.int64)
+    for k, height in enumerate(heights_m):
+        mine = of_vertex == k
+        labels[mine] = structure_labels(vertices, faces[of_face == k], height)[mine]
+    return labels
+
+
+def split_storeys(raw: RawScene) -> tuple[RawScene, ...]:
+    """Return one scene a floor, from the lowest up; a building with one floor as it is.
+
+    A face belongs to the storey that its middle lies in, a long one to all that it reaches into, an object to the
+    highest floor that its base is not half a metre below. Frames stay the building's own.
+    """
+    if len(raw.storeys) < 2:
+        return (raw,)
+    heights, scan = tuple(s.height_m for s in raw.storeys), raw.scan
+    placed = [(raw.cads[a.cad_id].vertices, a.pose) for a in raw.annotations]
+    base = [float((vertices @ pose[2, :3]).min() + pose[2, 3]) for vertices, pose in placed]
+    of_object = storey_of(np.array(base), heights, STANDS_ABOVE_M)
+    parts = [(scan.vertices, scan.faces), *raw.picture]
+    within = [_on_storeys(vertices, faces, heights) for vertices, faces in parts]
+    scenes = []
+    for k, storey in enumerate(raw.storeys):
+        mine, *drawn = (np.flatnonzero(on[k]) for on in within)
+        used, faces = np.unique(scan.faces[mine], return_inverse=True)
+        annotations = tuple(a for a, of in zip(raw.annotations, of_object, strict=True) if of == k)
+        scenes.append(
+            dataclasses.replace(
+                raw,
+                name=f"{raw.name}_{k}",
+                scan=dataclasses.replace(
+                    scan,
+                    vertices=scan.vertices[used],
+                    faces=faces.reshape(-1, 3),
+                    labels=scan.labels[used],
+                    vertex_colours=None if scan.vertex_colours is None else scan.vertex_colours[used],
+                    corner_uv=None if scan.corner_uv is None else scan.corner_uv[mine],
+                ),
+                annotations=annotations,
+                cads={a.cad_id: raw.cads[a.cad_id] for a in annotations},
+                floor_height_m=storey.height_m,
+                given_map=storey.given_map,
+                storeys=(),
+                lamps=tuple(p for p in raw.lamps if storey_of(p.at[2], heights, 0.0) == k),
+                windows=tuple(w for w in raw.windows if storey_of(w.middle[2], heights, 0.0) == k),
+                picture=tuple(compacted(v, f[on]) for (v, f), on in zip(raw.picture, drawn, strict=True) if len(on)),
+                warnings=(
+                    *raw.warnings,
+                    f"floor {k} of {len(heights)}, at {storey.height_m:g} m of the building's frame",
+                ),
+            )
         )
+    return tuple(scenes)
+
+
+def _on_storeys(vertices: np.ndarray, faces: np.ndarray, heights_m: tuple[float, ...]) -> np.ndarray:
+    """Return [storey, m] bool: the faces that belong to each storey."""
+    z, number = vertices[faces, 2], np.arange(len(heights_m))[:, None]
+    low, of, high = (storey_of(some, heights_m) for some in (z.min(axis=1), z.mean(axis=1), z.max(axis=1)))
+    return (of == number) | (long_faces(vertices, faces) & (low <= number) & (number <= high))

@@ -178,7 +178,7 @@ class RawScene:
     """Of the scan frame, the lowest of several; None: the pipeline finds it from the floor labels."""
     given_map: GivenMap | None = None
     storeys: tuple[Storey, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
-    """From the lowest up, where there are several; `converters.read.storeys.split_storeys` takes them apart."""
+    """From the lowest up, where there are several; `converters.read.surfaces.split_storeys` takes them apart."""
     picture: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
     """Vertices (n, 3) and faces (m, 3) of the parts that a modelled structure is drawn with, in place of the scan."""
     lamps: tuple[Lamp, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)

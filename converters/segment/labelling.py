@@ -10,8 +10,7 @@ import numpy as np
 from converters.generate import GenerationError
 from converters.propose.proposals import bounds, box_iou, propose_instances
 from converters.propose.report import annotated_vertices
-from converters.read.storeys import storey_of
-from converters.read.surfaces import floor_level
+from converters.read.surfaces import floor_level, storey_of
 from converters.records.raw import UNLABELLED, RawScene, ScanMesh
 from converters.segment.network import WEIGHTS, Scores, load_network, make_scores, score_voxels
 from converters.segment.samples import TIERS, building_surface

@@ -11,7 +11,7 @@ import pytest
 
 from converters.geometry.boxes import OrientedBox
 from converters.pipeline import ConvertConfig, convert
-from converters.read.scan2cad import read_scan2cad
+from converters.read.annotations import read_scan2cad
 from converters.records.raw import at_origin
 from converters.write.emit import SceneParts, write_scene
 from interactive_nav.scenes.scene import load_scene

@@ -18,8 +18,7 @@ from converters.read.files import SourceFolder
 from converters.read.gibson import read_licence
 from converters.read.homes.parts import category_of
 from converters.read.obj import TexturedMesh, scan_of
-from converters.read.storeys import label_storeys
-from converters.read.surfaces import floor_level
+from converters.read.surfaces import floor_level, label_storeys
 from converters.records.errors import SceneRejected
 from converters.records.raw import STRUCTURE_LABELS, UNLABELLED, RawScene
 from interactive_nav_common.errors import missing, optional, readable

@@ -1,12 +1,13 @@
-"""A scene of a Habitat dataset (ReplicaCAD, HSSD) in, `RawScene` out.
+"""Read a scene of a Habitat dataset (ReplicaCAD, HSSD).
 
-Layout: one or several `*.scene_instance.json` anywhere; stages, objects and articulated objects are found by the
-names of their `*.stage_config.json`, `*.object_config.json` and URDFs, or are mesh files themselves. Habitat's world
-has y up. Objects that a class lexicon numbers (`*semantic_lexicon.json`; HSSD names its objects by hashes) take the
+Layout: one or several `*.scene_instance.json` anywhere; stages, objects and articulated objects have the
+names of their `*.stage_config.json`, `*.object_config.json` and URDFs, or are mesh files themselves. Habitat's world is
+y up. Objects that a class lexicon numbers (`*semantic_lexicon.json`; HSSD names its objects by hashes) take the
 names of their classes.
 """
 
 import collections
+import contextlib
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
@@ -39,23 +40,23 @@ KEYS = {
 }
 """The keys that are read, or that change neither place, size nor colour."""
 DEFAULT_MASS_KG = 1.0
-"""Habitat's own for what says nothing."""
+"""Habitat's default."""
 
 
 def scenes_of(root: Path) -> list[Path]:
-    """Scene files of a folder."""
+    """Return the scene files of a folder."""
     return sorted(root.rglob(f"*{SCENE}"))
 
 
 def root_of(scene: Path) -> Path:
-    """The folder of the dataset that a scene file belongs to: the nearest one with a dataset's config, if any."""
+    """Return the folder of a scene file's dataset: the nearest one with a dataset's config, if any."""
     near = scene.resolve().parents[:4]
-    own = near[1] if near[0].name == "scenes" else near[0]
-    return next((folder for folder in near if any(folder.glob("*.scene_dataset_config.json"))), own)
+    default = near[1] if near[0].name == "scenes" else near[0]
+    return next((folder for folder in near if any(folder.glob("*.scene_dataset_config.json"))), default)
 
 
 def read_habitat(root: Path, strict: bool = False, chosen: Path | None = None) -> RawScene:
-    """Reads the only scene of a folder, or the chosen one."""
+    """Read the only scene of a folder, or the chosen one."""
     source = SourceFolder(root, strict)
     scene = chosen or only_file(root, scenes_of(root), "scenes", ending=SCENE)
     reader = _Reader(source)
@@ -66,19 +67,19 @@ def read_habitat(root: Path, strict: bool = False, chosen: Path | None = None) -
 
 @dataclasses.dataclass(frozen=True)
 class _Asset:
-    """A stage or an object, in its own frame with y up, m."""
+    """Hold a stage or an object, in its local frame with y up, m."""
 
     surface: TexturedMesh
     collision: TexturedMesh | None
     origin: np.ndarray
-    """[3] what Habitat takes for its centre of mass: given, or the middle of its box."""
+    """(3,) that Habitat takes for its centre of mass: given, or the middle of its box."""
     name: str
     mass_kg: float | None
     friction: float | None
 
 
 class _Reader:
-    """Finds and reads what a scene names; counts what it drops."""
+    """Find and read the files that a scene names; count what is dropped."""
 
     def __init__(self, source: SourceFolder) -> None:
         self.source = source
@@ -91,16 +92,20 @@ class _Reader:
         self._assets: dict[tuple[str, str], _Asset] = {}
 
     def parts(self, path: Path) -> Iterator[Part]:
-        """The stage, rigid and articulated objects of a scene."""
+        """Yield the stage, rigid and articulated objects of a scene."""
         scene = self._table(path)
-        local = _word(scene, "translation_origin", path) == "asset_local"
-        stage = _table_in(scene, "stage_instance", path)
-        instances = [(stage, STAGE)]
-        for key, kind in (("object_instances", OBJECT), ("articulated_object_instances", ARTICULATED)):
-            found = scene.get(key, [])
-            if not isinstance(found, list) or not all(isinstance(i, dict) for i in found):
-                raise SceneRejected(f"{path}: {key} is {_short(found)}, expected a list of objects")
-            instances += [(instance, kind) for instance in found]
+        local = _value(scene, "translation_origin", "", path).lower() == "asset_local"
+        if "stage_instance" not in scene:
+            raise SceneRejected(f"{path}: has no stage_instance; expected a Habitat scene")
+        instances = []
+        kinds = {"stage_instance": STAGE, "object_instances": OBJECT, "articulated_object_instances": ARTICULATED}
+        for key, kind in kinds.items():
+            value = scene.get(key, [])
+            listed = [value] if kind == STAGE else value
+            if not isinstance(listed, list) or not all(isinstance(i, dict) for i in listed):
+                what = "an object of keys and values" if kind == STAGE else "a list of objects"
+                raise SceneRejected(f"{path}: {key} is {_short(value)}, expected {what}")
+            instances += [(instance, kind) for instance in listed]
         check_count(path, len(instances), PARTS, "instances")
         self._count(scene, "scene")
         for instance, kind in instances:
@@ -112,24 +117,23 @@ class _Reader:
 
     def _part(self, instance: dict[str, Any], kind: str, local: bool, path: Path) -> Part:
         self._count(instance, "instance")
-        name = _word(instance, "template_name", path)
+        name = _value(instance, "template_name", "", path)
         if not name:
             raise SceneRejected(f"{path}: an instance has no template_name, expected the name of a stage or an object")
         asset = self._asset(name, kind, path)
-        scale = _numbers(instance, "non_uniform_scale", (1.0, 1.0, 1.0), path) * _number(
-            instance, "uniform_scale", 1.0, path
-        )
-        quat = _numbers(instance, "rotation", (1.0, 0.0, 0.0, 0.0), path)
+        scale = _value(instance, "non_uniform_scale", (1.0, 1.0, 1.0), path)
+        scale = scale * _value(instance, "uniform_scale", 1.0, path)
+        quat = _value(instance, "rotation", (1.0, 0.0, 0.0, 0.0), path)
         length = float(np.linalg.norm(quat))
         if length < 1e-6 or not (np.abs(scale) > 1e-6).all():
             raise SceneRejected(f"{path}: '{name}' has no usable rotation or scale ({quat.tolist()}, {scale.tolist()})")
-        pose = transform(matrix_from_quat(quat / length), _numbers(instance, "translation", (0.0, 0.0, 0.0), path))
-        origin = _word(instance, "translation_origin", path)
+        pose = transform(matrix_from_quat(quat / length), _value(instance, "translation", (0.0, 0.0, 0.0), path))
+        origin = _value(instance, "translation_origin", "", path).lower()
         if kind == OBJECT and not (origin == "asset_local" or (local and origin != "com")):
             pose[:3, 3] -= pose[:3, :3] @ (asset.origin * scale)
         turn = transform(Y_UP_TO_Z_UP)
         upright = turn @ np.diag([*scale, 1.0])  # The part's frame has z up as well.
-        motion = _word(instance, "motion_type", path) or ("static" if kind != OBJECT else "dynamic")
+        motion = _value(instance, "motion_type", "", path).lower() or ("static" if kind != OBJECT else "dynamic")
         return Part(
             asset.name,
             turn @ pose @ turn.T,
@@ -163,24 +167,22 @@ class _Reader:
         corners = [render.vertices.min(axis=0), render.vertices.max(axis=0)]
         origin = np.mean(corners, axis=0)
         if "COM" in about:
-            origin = _numbers(about, "COM", (0.0, 0.0, 0.0), config)
-        mass = _number(about, "mass", DEFAULT_MASS_KG, config) if kind == OBJECT else None
-        friction = _number(about, "friction_coefficient", 0.0, config)
+            origin = _value(about, "COM", (0.0, 0.0, 0.0), config)
+        mass = _value(about, "mass", DEFAULT_MASS_KG, config) if kind == OBJECT else None
+        friction = _value(about, "friction_coefficient", 0.0, config)
         number = about.get("semantic_id") if kind == OBJECT else None
         if not isinstance(number, int | None):
             raise SceneRejected(f"{config}: semantic_id is {_short(number)}, expected a whole number")
         label = self._classes.get(number, "")
-        own = Path(name).name
-        return _Asset(
-            render, collision, origin, f"{own}_{label}" if label else own, mass, friction if 0 < friction <= 2 else None
-        )
+        title = Path(name).name + (f"_{label}" if label else "")
+        return _Asset(render, collision, origin, title, mass, friction if 0 < friction <= 2 else None)
 
     def _articulated(self, name: str, kind: str, path: Path) -> _Asset:
-        """A URDF with its joints where they are at 0."""
+        """Read a URDF with its joints where they are at 0."""
         urdf = self._find(name, (".urdf",))
         config = self._find(name, (kind,))
         if urdf is None and config is not None:
-            urdf = config.parent / _word(self._table(config), "urdf_filepath", config)
+            urdf = config.parent / _value(self._table(config), "urdf_filepath", "", config)
         if urdf is None or not urdf.is_file():
             raise SceneRejected(f"{path}: names '{name}', whose URDF is not in {self.source.root}; copy it there")
         self.dropped["articulated object (its joints are held at 0)"] += 1
@@ -190,41 +192,43 @@ class _Reader:
         return _Asset(body.surface, solid, np.zeros(3), Path(name).name, body.mass_kg, body.friction)
 
     def _mesh(self, about: dict[str, Any], key: str, config: Path) -> TexturedMesh | None:
-        name = _word(about, key, config)
+        name = _value(about, key, "", config)
         if not name:
             return None
         target = config.parent / name
         if self.source.relative(target) is None or not target.is_file():
-            found = self._files.get(Path(name).name, [])
-            if key == "collision_asset" and not found:
-                self.source.note(f"{config.name}: its {key} '{name}' is not there; what is seen is decomposed")
+            elsewhere = self._files.get(Path(name).name, [])
+            if key == "collision_asset" and not elsewhere:
+                self.source.note(f"{config.name}: its {key} '{name}' is not there; the visual mesh is decomposed")
                 return None
-            if not found:
+            if not elsewhere:
                 raise SceneRejected(f"{config}: names '{name}', which is not in {self.source.root}; copy it there")
-            target = found[0]
+            target = elsewhere[0]
         mesh = read_surface(self.source, self.source.inside(target), "")
         frame = _frame(about, config)
-        size = _numbers(about, "scale", (1.0, 1.0, 1.0), config) * _number(about, "units_to_meters", 1.0, config)
+        size = _value(about, "scale", (1.0, 1.0, 1.0), config) * _value(about, "units_to_meters", 1.0, config)
         matrix = transform(frame @ np.diag(size))
         if abs(np.linalg.det(matrix)) < 1e-12:
             raise SceneRejected(f"{config}: scale {size.tolist()} leaves nothing; expected positive numbers")
         return placed(mesh, matrix)
 
     def _find(self, name: str, endings: tuple[str, ...]) -> Path | None:
-        """The file that a template name means: its end, with or without the ending; the longest common path wins."""
+        """Return the file that a template name ends in, with or without its ending; the longest common path wins."""
         base = Path(name).name
-        found = [p for end in ("", *endings) for p in self._files.get(base + end, []) if p.name.endswith(endings)]
+        paths = [p for end in ("", *endings) for p in self._files.get(base + end, []) if p.name.endswith(endings)]
         folders = Path(name).parent.parts
-        found.sort(key=lambda p: -sum(part in p.parts for part in folders))
-        return found[0] if found else None
+        return max(paths, key=lambda p: sum(part in p.parts for part in folders), default=None)
 
     def _table(self, path: Path) -> dict[str, Any]:
-        return _table(read_json(self.source.use(self.source.inside(path), "")), path)
+        value = read_json(self.source.use(self.source.inside(path), ""))
+        if not isinstance(value, dict):
+            raise SceneRejected(f"{path}: holds {_short(value)}, expected an object of keys and values")
+        return value
 
     def _lexicon(self) -> dict[Any, str]:
-        """Class number -> name."""
+        """Return class number -> name."""
         names: dict[Any, str] = {}
-        for path in (p for found in self._files.values() for p in found if p.name.endswith(LEXICON)):
+        for path in (p for same in self._files.values() for p in same if p.name.endswith(LEXICON)):
             classes = self._table(path).get("classes", [])
             if not isinstance(classes, list):
                 raise SceneRejected(f"{path}: classes is {_short(classes)}, expected a list")
@@ -235,9 +239,9 @@ class _Reader:
 
 
 def _frame(about: dict[str, Any], path: Path) -> np.ndarray:
-    """(3, 3) an asset's own frame -> y up, looking along -z."""
-    up = _numbers(about, "up", (0.0, 1.0, 0.0), path)
-    front = _numbers(about, "front", (0.0, 0.0, -1.0), path)
+    """Return (3, 3) an asset's local frame -> y up, looking along -z."""
+    up = _value(about, "up", (0.0, 1.0, 0.0), path)
+    front = _value(about, "front", (0.0, 0.0, -1.0), path)
     lengths = np.linalg.norm(up), np.linalg.norm(front)
     if min(lengths) < 1e-6 or abs(up @ front) > 1e-3 * lengths[0] * lengths[1]:
         raise SceneRejected(f"{path}: up {up.tolist()} and front {front.tolist()} are not at right angles")
@@ -250,39 +254,20 @@ def _short(value: Any) -> str:
     return text if len(text) < 60 else f"{text[:57]}..."
 
 
-def _table(value: Any, path: Path) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise SceneRejected(f"{path}: holds {_short(value)}, expected an object of keys and values")
+def _value(parent: dict[str, Any], key: str, default: Any, path: Path) -> Any:
+    """Return a text, a number, or as many numbers as the default has."""
+    value = parent.get(key, default)
+    if isinstance(default, str):
+        fits, expected = isinstance(value, str), "text"
+    elif isinstance(default, float):
+        fits = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e6
+        value, expected = float(value) if fits else value, "a number below 1e6"
+    else:
+        numbers, expected = np.full(1, np.nan), f"{len(default)} usable numbers"
+        with contextlib.suppress(TypeError, ValueError, OverflowError):
+            numbers = np.array(value, float)
+        fits = numbers.shape == np.shape(default) and (np.abs(numbers) <= 1e6).all()
+        value = numbers if fits else value
+    if not fits:
+        raise SceneRejected(f"{path}: {key} is {_short(value)}, expected {expected}")
     return value
-
-
-def _table_in(parent: dict[str, Any], key: str, path: Path) -> dict[str, Any]:
-    if key not in parent:
-        raise SceneRejected(f"{path}: has no {key}; expected a Habitat scene")
-    return _table(parent[key], path)
-
-
-def _word(parent: dict[str, Any], key: str, path: Path) -> str:
-    """A word, in small letters where it is one of Habitat's own; empty where there is none."""
-    value = parent.get(key, "")
-    if not isinstance(value, str):
-        raise SceneRejected(f"{path}: {key} is {_short(value)}, expected text")
-    return value.lower() if key in ("translation_origin", "motion_type") else value
-
-
-def _number(parent: dict[str, Any], key: str, default: float, path: Path) -> float:
-    value = parent.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e6:
-        raise SceneRejected(f"{path}: {key} is {_short(value)}, expected a number below 1e6")
-    return float(value)
-
-
-def _numbers(parent: dict[str, Any], key: str, default: tuple[float, ...], path: Path) -> np.ndarray:
-    value = parent.get(key, default)
-    try:
-        found = np.array(value, float)
-    except (TypeError, ValueError, OverflowError):
-        found = np.full(1, np.nan)
-    if found.shape != np.shape(default) or not np.isfinite(found).all() or np.abs(found).max() > 1e6:
-        raise SceneRejected(f"{path}: {key} is {_short(value)}, expected {len(default)} usable numbers")
-    return found

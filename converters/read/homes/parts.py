@@ -24,8 +24,7 @@ from converters.read.homes.solids import flat
 from converters.read.interactive_gibson import SHOWN_M, assume_hinge, leaf_turn
 from converters.read.meshes import colours_of_faces, textured_by_face
 from converters.read.obj import TexturedMesh, at_most, join_meshes, scan_of
-from converters.read.storeys import label_storeys, storey_of
-from converters.read.surfaces import check_extent, floor_level, with_own_corners
+from converters.read.surfaces import check_extent, floor_level, label_storeys, storey_of, with_split_corners
 from converters.read.urdf import joined, placed
 from converters.records.errors import SceneRejected
 from converters.records.limits import MOVABLES, check_count
@@ -127,7 +126,7 @@ def home(source: SourceFolder, layout: str, parts: list[Part], floors_m: tuple[f
     shells = [placed(_small(p.surface), p.pose) for p in structure]
     mesh = joined(shells)
     assert mesh is not None
-    mesh = with_own_corners(mesh)
+    mesh = with_split_corners(mesh)
     labels = label_storeys(mesh.vertices, mesh.faces, floors_m)
     labels[labels == UNLABELLED] = OTHER_STRUCTURE
     low = np.repeat([part.low for part in structure], [len(shell.faces) for shell in shells])
@@ -168,7 +167,7 @@ def built_in(raw: RawScene, beside: Mapping[int, str]) -> RawScene:
         surface = raw.cads[raw.annotations[k].cad_id].surface
         assert surface is not None
         shells.append(placed(_small(surface), raw.annotations[k].pose))
-    mesh = with_own_corners(join_meshes(*shells))
+    mesh = with_split_corners(join_meshes(*shells))
     whole = join_meshes(TexturedMesh(raw.scan.vertices, raw.scan.faces, raw.scan.corner_uv, texture), mesh)
     fresh = len(whole.vertices) - len(raw.scan.vertices)
     labels = np.concatenate([raw.scan.labels, np.full(fresh, OTHER_STRUCTURE)])

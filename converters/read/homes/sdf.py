@@ -21,7 +21,7 @@ from converters.geometry.faces import face_vectors
 from converters.read.files import SourceFolder, only_file, read_image
 from converters.read.homes.parts import LEVEL, Part, home
 from converters.read.homes.solids import height_field, rectangle
-from converters.read.meshes import UP_AXES, read_surface
+from converters.read.meshes import UP_AXES, collada_frame, read_surface
 from converters.read.obj import GREY, TexturedMesh, find_file, in_colour
 from converters.read.urdf import count_unread, joined, numbers, parse_xml, placed, primitive, report_unread
 from converters.records.errors import SceneRejected
@@ -126,7 +126,6 @@ HEIGHTS = 256
 TABLES = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, dict[str, str]])
 FUEL = re.compile(r"https?://.*/models/([^/]+)(?:/(?:\d+|tip))?(?:/files)?(/.*)?")
 """The address of a model, or of a file of one, on Gazebo's server."""
-UP_AXIS = re.compile(rb"<up_axis>\s*([XYZ]_UP)")
 GAZEBOS_OWN = {
     "sun": ElementTree.fromstring("<sdf><light/></sdf>"),
     "groundplane": ElementTree.fromstring(
@@ -301,8 +300,7 @@ class _Reader:
                 matrix = np.diag([*numbers(shape.findtext("scale"), (1.0, 1.0, 1.0)), 1.0])
                 mesh = read_surface(self.source, file, "")
                 if file.lower().endswith(".dae"):  # Gazebo does not read the axis that points up
-                    axis = UP_AXIS.search(self.source.use(file, "").read_bytes())
-                    matrix[:3, :3] @= UP_AXES[axis[1].decode() if axis else "Y_UP"].T
+                    matrix[:3, :3] @= UP_AXES[collada_frame(self.source.root / file)[0]].T
                 return placed(mesh, matrix)
             at, size_m = numbers(shape.findtext("pos"), (0.0, 0.0, 0.0)), numbers(size, (1.0, 1.0, 1.0))
             grey = read_image(self.source.use(file, ""), "L")[::-1].astype(float)

@@ -38,8 +38,7 @@ from converters.read.homes.sh3d_walls import (
 )
 from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh
-from converters.read.storeys import storey_of
-from converters.read.surfaces import check_extent
+from converters.read.surfaces import check_extent, storey_of
 from converters.read.urdf import count_unread, report_unread
 from converters.records.errors import SceneRejected
 from converters.records.limits import DRAWN, UNPACKED, check_count

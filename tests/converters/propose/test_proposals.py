@@ -18,8 +18,7 @@ from converters.generate.models.cad import cad_model
 from converters.generate.surface.write import write_cad
 from converters.propose.proposals import Proposal, as_scan2cad, bounds, box_iou, propose_instances
 from converters.propose.retrieval import fit_model, read_library, retrieve, without_annotation
-from converters.read.annotations import parse_annotations
-from converters.read.scan2cad import read_scan2cad
+from converters.read.annotations import parse_annotations, read_scan2cad
 from converters.records.errors import SceneRejected
 from converters.records.raw import CadModel, ScanMesh
 from interactive_nav_common.rotations import wrap_angle, yaw_matrix

@@ -11,10 +11,9 @@ import trimesh
 
 from converters.geometry.faces import merge_vertices
 from converters.pipeline import ConvertConfig, convert
-from converters.read.annotations import parse_annotations, trs_matrix
+from converters.read.annotations import parse_annotations, read_scan2cad, trs_matrix
 from converters.read.files import SourceFolder
 from converters.read.gibson import read_gibson
-from converters.read.scan2cad import read_scan2cad
 from converters.read.source import FILES, READERS, detect_format, read_source
 from converters.records.errors import SceneRejected
 from converters.records.raw import CEILING, FLOOR, WALL, ScanMesh

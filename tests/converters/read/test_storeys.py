@@ -10,7 +10,7 @@ from PIL import Image
 
 from converters.pipeline import ConvertConfig, convert, convert_building
 from converters.read.gibson import read_gibson
-from converters.read.storeys import split_storeys, storey_of
+from converters.read.surfaces import split_storeys, storey_of
 from converters.records.errors import SceneRejected
 from interactive_nav_common.errors import FileError
 from scenes_mjcf.schema import load_manifest, load_maps

@@ -10,7 +10,7 @@ from converters.geometry.faces import face_areas, face_labels
 from converters.read.annotations import gap_to_scan
 from converters.read.gibson import read_gibson
 from converters.read.obj import TexturedMesh
-from converters.read.surfaces import check_upright, floor_level, structure_labels, with_own_corners
+from converters.read.surfaces import check_upright, floor_level, structure_labels, with_split_corners
 from converters.records.errors import SceneRejected
 from converters.records.raw import CEILING, FLOOR, WALL, Annotation
 from tests.converters import tiny_raw
@@ -40,7 +40,7 @@ def test_floor_and_walls_are_told_by_shape(room):
 
 def test_a_right_mesh_passes_with_and_without_labels(room):
     vertices, faces, labels = room
-    check_upright("scan", vertices, faces, labels, None)
+    check_upright("scan", vertices, faces, labels, 0.0)
     check_upright("scan", vertices, faces, None, tiny_raw.FLOOR_M)
 
 
@@ -82,7 +82,7 @@ def large_room(size=(6.0, 5.0, 2.6)) -> TexturedMesh:
 
 def test_large_faces_are_floor_or_wall_as_a_whole():
     mesh = large_room()
-    own = with_own_corners(mesh)
+    own = with_split_corners(mesh)
     assert len(own.vertices) == 8 + 36 and own.corner_uv is mesh.corner_uv
     np.testing.assert_array_equal(own.vertices[own.faces], mesh.vertices[mesh.faces])
     found = face_labels(structure_labels(own.vertices, own.faces, 0.0), own.faces)
@@ -91,7 +91,7 @@ def test_large_faces_are_floor_or_wall_as_a_whole():
     assert area[found == WALL].sum() == pytest.approx(2 * (6 + 5) * 2.6)
     assert floor_level(own.vertices, own.faces, "scan") == 0.0
     low = trimesh.creation.box((2.0, 1.0, 1.0)).apply_translation((0, 0, 0.5))  # no wall
-    table = with_own_corners(TexturedMesh(np.asarray(low.vertices), np.asarray(low.faces), None, None))
+    table = with_split_corners(TexturedMesh(np.asarray(low.vertices), np.asarray(low.faces), None, None))
     assert WALL not in structure_labels(table.vertices, table.faces, 0.0)
 
 

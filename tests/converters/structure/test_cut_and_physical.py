@@ -11,7 +11,7 @@ from converters.bodies.physical import MATERIALS, physical_properties
 from converters.bodies.placement import upright
 from converters.geometry.boxes import Hull, convex_hull
 from converters.geometry.faces import face_labels, loose_parts
-from converters.read.scan2cad import read_scan2cad
+from converters.read.annotations import read_scan2cad
 from converters.records.raw import WALL
 from converters.structure.cut import cut_furniture, depth_in_hulls
 from tests.converters import tiny_raw

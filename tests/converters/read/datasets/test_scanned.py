@@ -178,7 +178,7 @@ def test_scenezoo_itself_reads_the_layout(tmp_path, name, write):
 
 def test_scenezoo_reads_the_sample_scan_as_our_own_reader_does(sample_data, tmp_path):
     pytest.importorskip("scenezoo", reason="scenezoo is not installed (pip install 'interactive-nav[datasets]')")
-    from converters.read.scan2cad import read_scan2cad
+    from converters.read.annotations import read_scan2cad
 
     ours = read_scan2cad(sample_data / "scan2cad_scene0470_00")
     (scan,) = (sample_data / "scan2cad_scene0470_00" / "scan").glob("*_vh_clean_2.ply")

@@ -14,7 +14,7 @@ import pytest
 import interactive_nav
 from converters.pipeline import convert
 from converters.read.homes.sh3d import LAMPS, read_sh3d
-from converters.read.storeys import split_storeys
+from converters.read.surfaces import split_storeys
 from tests.converters.read.homes.test_drawn_pieces import SMALL
 from tests.converters.read.homes.test_sh3d import HOME, piece, write_home
 from tests.gl_program import drawn, need_gl

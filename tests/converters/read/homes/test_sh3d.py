@@ -23,7 +23,7 @@ from converters.read.homes.sh3d_archive import outline
 from converters.read.meshes import colours_of_faces
 from converters.read.obj import texels
 from converters.read.source import detect_format, read_source
-from converters.read.storeys import split_storeys
+from converters.read.surfaces import split_storeys
 from converters.records.errors import SceneRejected
 from converters.records.raw import FLOOR, WALL, RawScene
 
