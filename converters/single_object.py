@@ -24,9 +24,8 @@ from converters.check.settle import settle
 from converters.geometry.boxes import Hull, convex_hull, fit_box
 from converters.geometry.faces import merge_vertices
 from converters.geometry.simplify import simplify_to
-from converters.read.cad import clean_surface
 from converters.read.files import SourceFolder
-from converters.read.meshes import colours_of_faces, read_surface
+from converters.read.meshes import clean_surface, colours_of_faces, read_surface
 from converters.read.obj import TexturedMesh
 from converters.read.urdf import RigidObject, read_urdf
 from converters.records.errors import SceneRejected

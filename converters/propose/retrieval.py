@@ -20,7 +20,7 @@ from converters.bodies.placement import PoseDifference, pose_difference, upright
 from converters.library.store import read_index, read_shape
 from converters.propose.pieces import SIZES_M
 from converters.propose.proposals import Proposal, bounds, box_iou
-from converters.read.cad import read_cad
+from converters.read.annotations import read_cad
 from converters.read.files import SourceFolder
 from converters.read.obj import texels
 from converters.records.errors import SceneRejected

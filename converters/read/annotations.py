@@ -12,8 +12,11 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from converters.read.cad import read_cad
-from converters.read.files import SourceFolder, read_json, read_mesh
+from converters.geometry.faces import merge_vertices
+from converters.geometry.pieces import convex_pieces
+from converters.read.files import SourceFolder, read_json, read_mesh, read_obj
+from converters.read.meshes import clean_surface
+from converters.read.obj import GREY, TexturedMesh, join_textures, read_painted_obj, texels
 from converters.read.surfaces import check_upright
 from converters.records.errors import SceneRejected
 from converters.records.raw import Annotation, CadModel, RawScene, ScanMesh, ScannedHinge, category_of_id
@@ -22,6 +25,12 @@ from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, transforme
 
 ANNOTATION = "full_annotations.json"
 LICENCE = "ScanNet terms of use and ShapeNet terms of use: research only, no redistribution"
+COLLISION = "collision.obj"
+"""Beside a model: its collision mesh, made of convex pieces that share no vertex."""
+MOST_PIECES = 10
+"""Convex pieces of a model that has a `collision.obj`."""
+SLACK = 0.007
+"""Share of the model's bounding box that joining two of them may add: slats become a back, legs stay legs."""
 OUTSIDE_M = 0.5
 """An object this far from everything scanned stands outside the scan."""
 TURNS = 20
@@ -154,6 +163,41 @@ def inside_scan(
             "the scan; it is left out"
         )
     return tuple(a for i, a in enumerate(annotations) if i not in outside)
+
+
+def read_cad(source: SourceFolder, synset: str, cad_id: str) -> CadModel:
+    """Read `cad/<synset>/<id>/models/model_normalized.obj` and turns it to z up.
+
+    A `collision.obj` beside it, of convex pieces, saves the decomposition.
+    """
+    category = category_of_id(synset, f"{source.root}: CAD model {cad_id} has category id")
+    relative = f"cad/{synset}/{cad_id}/models/model_normalized.obj"
+    mesh, image, images = read_painted_obj(
+        source,
+        relative,
+        f"an annotation names CAD model {cad_id} of category {synset} ({category}); "
+        "put the model there or remove the annotation",
+    )
+    colours = np.full((len(mesh.faces), 3), GREY, np.uint8)
+    uv = np.zeros((len(mesh.faces), 3, 2)) if mesh.corner_uv is None else mesh.corner_uv
+    for k, texture in enumerate(images):
+        colours[image == k] = texels(texture, uv[image == k].mean(axis=1))
+    # By material, the last first: decompositions depend on the order of the faces, and stored ones have this.
+    order = np.argsort(-image, kind="stable")
+    used, faces = np.unique(mesh.faces[order], return_inverse=True)
+    vertices, faces, keep = merge_vertices(mesh.vertices[used], faces.reshape(-1, 3))
+    vertices, faces, colours = clean_surface(source, relative, vertices, faces, colours[order][keep])
+    pieces, collision = None, f"cad/{synset}/{cad_id}/models/{COLLISION}"
+    if source.has(collision):
+        hard = read_obj(source.use(collision, ""))
+        pieces = convex_pieces(hard.vertices @ Y_UP_TO_Z_UP.T, hard.faces, MOST_PIECES, SLACK)
+        if pieces is None:
+            source.repaired(f"{collision}: has a piece that is not convex; the model is decomposed")
+    surface = None
+    if images:
+        surface = TexturedMesh(mesh.vertices @ Y_UP_TO_Z_UP.T, mesh.faces, *join_textures(uv, image, images))
+    turned = vertices @ Y_UP_TO_Z_UP.T
+    return CadModel(category, cad_id, turned, faces, colours, pieces, surface=surface)
 
 
 def read_scan2cad(root: Path, strict: bool = False) -> RawScene:

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.read.annotations import inside_scan, parse_annotations
-from converters.read.cad import read_cad
+from converters.read.annotations import inside_scan, parse_annotations, read_cad
 from converters.read.files import SourceFolder, read_image, read_json, read_labels, read_npz
 from converters.read.obj import TexturedMesh, read_scan_obj, scan_of
 from converters.read.surfaces import check_upright, label_storeys, labelled, with_split_corners

@@ -15,10 +15,9 @@ import numpy as np
 from converters.geometry.boxes import upright_box
 from converters.geometry.faces import merge_vertices, sample_faces
 from converters.read.annotations import inside_scan
-from converters.read.cad import clean_surface
 from converters.read.files import SourceFolder
 from converters.read.gibson import building, read_floors, read_traversable
-from converters.read.meshes import colours_of_faces
+from converters.read.meshes import clean_surface, colours_of_faces
 from converters.read.obj import TexturedMesh, join_meshes, read_scan_obj
 from converters.read.surfaces import check_extent, check_upright, label_storeys, with_split_corners
 from converters.read.urdf import read_urdf

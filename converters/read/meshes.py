@@ -245,3 +245,37 @@ def colours_of_faces(mesh: TexturedMesh) -> np.ndarray:
     if mesh.texture is None or mesh.corner_uv is None:
         return np.full((len(mesh.faces), 3), 170, np.uint8)
     return texels(mesh.texture, mesh.corner_uv.mean(axis=1))
+
+
+def clean_surface(
+    source: SourceFolder, where: str, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Drop faces without area and report what else is wrong; open and non-manifold surfaces are left as they are.
+
+    Decomposition rebuilds such surfaces as closed ones (coacd's manifold preprocessing), so that they need no repair
+    here; their hulls are a voxel thicker.
+
+    `vertices`: (n, 3), equal positions joined.
+    `faces`: (m, 3).
+    `colours`: (m, 3) of the faces.
+    """
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    extent = np.ptp(vertices, axis=0)
+    longest = np.max([np.linalg.norm(b - a, axis=1), np.linalg.norm(c - b, axis=1), np.linalg.norm(a - c, axis=1)], 0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    good = area > 1e-9 * np.maximum(longest, 1e-12) ** 2
+    if not good.any() or (extent > 1e-6 * max(float(extent.max()), 1e-12)).sum() < 2:
+        raise SceneRejected(f"{source.root / where}: its {len(faces)} faces enclose no area; fetch the model again")
+    if not good.all():
+        source.note(f"{where}: {int((~good).sum())} of {len(faces)} faces have no area; they are dropped")
+        faces, colours = faces[good], colours[good]
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    count = np.unique(edges, axis=0, return_counts=True)[1]
+    open_edges, busy_edges = int((count == 1).sum()), int((count > 2).sum())
+    if busy_edges:
+        source.note(
+            f"{where}: is not manifold ({busy_edges} edges with three faces or more); collision uses closed hulls"
+        )
+    elif open_edges:
+        source.note(f"{where}: is not watertight ({open_edges} open edges); collision uses closed hulls")
+    return vertices, faces, colours

@@ -25,6 +25,7 @@ from converters.records.visual import TexturedMesh
 
 GREY = (170, 170, 170)
 """Colour of what has none."""
+GREYS = np.array(GREY, np.uint8).reshape(1, 1, 3)
 MAX_TEXTURE_PX = 8192
 """Textures of several materials are joined in an image of at most this width; wider ones are shrunk."""
 UNUSED = ("ke", "map_ke", "map_ka", "map_d", "map_tr", "d", "tr")
@@ -223,17 +224,16 @@ def read_painted_obj(
         return mesh, np.zeros(len(mesh.faces), np.int64), []
     no_file = not mesh.libraries and (builtin is not None or mesh.colours is not None)
     images, placings = ({}, {}) if no_file else read_materials(source, path, mesh.libraries)
-    grey = np.array(GREY, np.uint8).reshape(1, 1, 3)
-    chosen = [images[name] if name in images else grey if builtin is None else builtin(name) for name in mesh.materials]
+    default = builtin or (lambda _: GREYS)
+    chosen = [images[name] if name in images else default(name) for name in mesh.materials]
     absent = sorted({n for n in mesh.materials if n not in images})
     if images and absent and builtin is None:
         source.repaired(f"{relative}: material '{absent[0]}' is in no material file; it stays grey")
     number = mesh.material.copy()
     if (number < 0).any():
         # Faces before any `usemtl`: with one material in the file they mean that one.
-        only = next(iter(images.values())) if len(images) == 1 else grey if builtin is None else builtin("")
         number[number < 0] = len(chosen)
-        chosen.append(only)
+        chosen.append(next(iter(images.values())) if len(images) == 1 else default(""))
     uv = np.zeros((len(mesh.faces), 3, 2)) if mesh.corner_uv is None else mesh.corner_uv.copy()
     for k, name in enumerate(mesh.materials):
         of = mesh.material == k
@@ -350,13 +350,14 @@ def join_meshes(*meshes: TexturedMesh) -> TexturedMesh:
     vertices, faces = stacked((m.vertices, m.faces) for m in meshes)
     if all(m.texture is None for m in meshes):
         return TexturedMesh(vertices, faces, None, None)
-    grey = np.array(GREY, np.uint8).reshape(1, 1, 3)
     uv = np.vstack([m.corner_uv if m.corner_uv is not None else np.zeros((len(m.faces), 3, 2)) for m in meshes])
-    images: dict[object, np.ndarray] = {}
-    names = []
-    for image in (m.texture if m.texture is not None else grey for m in meshes):
-        names.append((image.shape, image.tobytes()) if image.size < SMALL_IMAGE else id(image))
-        images[names[-1]] = image
-    place = {name: k for k, name in enumerate(images)}
-    number = np.repeat([place[name] for name in names], [len(m.faces) for m in meshes])
-    return TexturedMesh(vertices, faces, *join_textures(uv, number, list(images.values())))
+    of, images = distinct([m.texture if m.texture is not None else GREYS for m in meshes])
+    return TexturedMesh(vertices, faces, *join_textures(uv, np.repeat(of, [len(m.faces) for m in meshes]), images))
+
+
+def distinct(images: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return the number of each image (n,) among those that differ, and these."""
+    names = [(i.shape, i.tobytes()) if i.size < SMALL_IMAGE else id(i) for i in images]
+    different: dict[object, np.ndarray] = dict(zip(names, images, strict=True))
+    place = {name: k for k, name in enumerate(different)}
+    return np.array([place[name] for name in names]), list(different.values())

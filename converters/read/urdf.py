@@ -105,12 +105,12 @@ def numbers(text: str | None, default: tuple[float, ...]) -> np.ndarray:
     return values
 
 
-def parse_xml(path: Path, kind: str) -> ElementTree.Element:
+def parse_xml(path: Path, kind: str, remedy: str = "fetch the file again") -> ElementTree.Element:
     """Return the root of an XML file."""
     try:
         return ElementTree.parse(path).getroot()
     except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise SceneRejected(f"{path}: not readable as {kind} ({error}); fetch the file again") from error
+        raise SceneRejected(f"{path}: not readable as {kind} ({error}); {remedy}") from error
 
 
 def count_unread(root: ElementTree.Element, table: dict[str, str], unread: Counter[str]) -> None:
@@ -251,6 +251,25 @@ def solid(kind: str, size: np.ndarray) -> TexturedMesh:
     """Build an uncoloured shape of `SHAPES` from the numbers that are its size, m."""
     mesh = SHAPES[kind][1](size)
     return TexturedMesh(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64), None, None)
+
+
+def height_field(height_m: np.ndarray, half_m: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices and faces of a surface over the plane around the origin.
+
+    `height_m`: [rows along y, columns along x].
+    """
+    rows, columns = height_m.shape
+    x, y = np.meshgrid(np.linspace(-half_m[0], half_m[0], columns), np.linspace(-half_m[1], half_m[1], rows))
+    number = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
+    faces = np.vstack([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    return np.column_stack([x.ravel(), y.ravel(), height_m.ravel()]), faces
+
+
+def rectangle(x_m: float, y_m: float) -> TexturedMesh:
+    """Return an uncoloured rectangle around the origin that looks up, from its half sides."""
+    corners = np.array([(-x_m, -y_m, 0), (x_m, -y_m, 0), (x_m, y_m, 0), (-x_m, y_m, 0)], float)
+    return TexturedMesh(corners, np.array([(0, 1, 2), (0, 2, 3)]), None, None)
 
 
 def placed(mesh: TexturedMesh, matrix: np.ndarray) -> TexturedMesh:

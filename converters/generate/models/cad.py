@@ -20,7 +20,7 @@ from converters.generate.models.parts import MATERIALS, Part, on_floor
 from converters.geometry.faces import stacked
 from converters.geometry.pieces import convex_pieces
 from converters.library.store import read_index, read_shape
-from converters.read.cad import MOST_OWN, OWN_SLACK
+from converters.read.annotations import MOST_PIECES, SLACK
 from converters.records.visual import VisualMesh
 from interactive_nav_common.records import read_packaged
 from scenes_mjcf.categories import CATEGORIES
@@ -101,7 +101,7 @@ def _library_parts(name: str) -> list[Part]:
     shape = read_shape(name)
     colour = shape.visual.image.reshape(-1, 3).mean(axis=0) / 255
     material = min(MATERIALS, key=lambda m: float(np.abs(np.array(MATERIALS[m]) - colour).sum()))
-    pieces = convex_pieces(*stacked((h.vertices, h.faces) for h in shape.hulls), MOST_OWN, OWN_SLACK)
+    pieces = convex_pieces(*stacked((h.vertices, h.faces) for h in shape.hulls), MOST_PIECES, SLACK)
     assert pieces is not None, f"{name}: a hull is not convex"
     return [Part(v, f, material) for v, f in pieces]
 

@@ -65,19 +65,6 @@ def read_habitat(root: Path, strict: bool = False, chosen: Path | None = None) -
     return home(source, "habitat", parts)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Asset:
-    """Hold a stage or an object, in its local frame with y up, m."""
-
-    surface: TexturedMesh
-    collision: TexturedMesh | None
-    origin: np.ndarray
-    """(3,) that Habitat takes for its centre of mass: given, or the middle of its box."""
-    name: str
-    mass_kg: float | None
-    friction: float | None
-
-
 class _Reader:
     """Find and read the files that a scene names; count what is dropped."""
 
@@ -89,7 +76,7 @@ class _Reader:
             if path.suffix.lower() in (*SUFFIXES, ".json", ".urdf"):
                 self._files[path.name].append(path)
         self._classes = self._lexicon()
-        self._assets: dict[tuple[str, str], _Asset] = {}
+        self._assets: dict[tuple[str, str], Part] = {}
 
     def parts(self, path: Path) -> Iterator[Part]:
         """Yield the stage, rigid and articulated objects of a scene."""
@@ -130,27 +117,24 @@ class _Reader:
         pose = transform(matrix_from_quat(quat / length), _value(instance, "translation", (0.0, 0.0, 0.0), path))
         origin = _value(instance, "translation_origin", "", path).lower()
         if kind == OBJECT and not (origin == "asset_local" or (local and origin != "com")):
-            pose[:3, 3] -= pose[:3, :3] @ (asset.origin * scale)
+            pose[:3, 3] -= pose[:3, :3] @ (asset.pose[:3, 3] * scale)
         turn = transform(Y_UP_TO_Z_UP)
         upright = turn @ np.diag([*scale, 1.0])  # The part's frame has z up as well.
         motion = _value(instance, "motion_type", "", path).lower() or ("static" if kind != OBJECT else "dynamic")
-        return Part(
-            asset.name,
-            turn @ pose @ turn.T,
-            placed(asset.surface, upright),
-            None if asset.collision is None else placed(asset.collision, upright),
-            kind == STAGE or motion == "static" or instance.get("fixed_base") is True,
-            asset.mass_kg,
-            asset.friction,
+        solid = None if asset.collision is None else placed(asset.collision, upright)
+        static = kind == STAGE or motion == "static" or instance.get("fixed_base") is True
+        return dataclasses.replace(
+            asset, pose=turn @ pose @ turn.T, surface=placed(asset.surface, upright), collision=solid, static=static
         )
 
-    def _asset(self, name: str, kind: str, path: Path) -> _Asset:
+    def _asset(self, name: str, kind: str, path: Path) -> Part:
+        """Return a stage or an object with y up, at its centre of mass: the file's, or the middle of its box."""
         if (name, kind) not in self._assets:
             read = self._articulated if kind == ARTICULATED else self._rigid
             self._assets[name, kind] = read(name, kind, path)
         return self._assets[name, kind]
 
-    def _rigid(self, name: str, kind: str, path: Path) -> _Asset:
+    def _rigid(self, name: str, kind: str, path: Path) -> Part:
         config = self._find(name, (kind,))
         if config is None:
             model = self._find(name, SUFFIXES)
@@ -175,9 +159,10 @@ class _Reader:
             raise SceneRejected(f"{config}: semantic_id is {_short(number)}, expected a whole number")
         label = self._classes.get(number, "")
         title = Path(name).name + (f"_{label}" if label else "")
-        return _Asset(render, collision, origin, title, mass, friction if 0 < friction <= 2 else None)
+        friction = friction if 0 < friction <= 2 else None
+        return Part(title, transform(np.eye(3), origin), render, collision, False, mass, friction)
 
-    def _articulated(self, name: str, kind: str, path: Path) -> _Asset:
+    def _articulated(self, name: str, kind: str, path: Path) -> Part:
         """Read a URDF with its joints where they are at 0."""
         urdf = self._find(name, (".urdf",))
         config = self._find(name, (kind,))
@@ -189,7 +174,7 @@ class _Reader:
         body = read_urdf(self.source, self.source.inside(urdf), "", hold=True)
         solid = TexturedMesh(*body.collision, None, None)
         # read_urdf keeps the file's frame, and Habitat's URDFs have y up as its other assets have.
-        return _Asset(body.surface, solid, np.zeros(3), Path(name).name, body.mass_kg, body.friction)
+        return Part(Path(name).name, np.eye(4), body.surface, solid, False, body.mass_kg, body.friction)
 
     def _mesh(self, about: dict[str, Any], key: str, config: Path) -> TexturedMesh | None:
         name = _value(about, key, "", config)

@@ -18,9 +18,8 @@ import numpy as np
 
 from converters.read.files import SourceFolder, only_file
 from converters.read.homes.parts import LEVEL, Part, category_of, home
-from converters.read.homes.solids import height_field, rectangle
 from converters.read.obj import TexturedMesh, in_colour
-from converters.read.urdf import SHAPES, joined, parse_xml, placed, solid
+from converters.read.urdf import SHAPES, height_field, joined, parse_xml, placed, rectangle, solid
 from converters.records.errors import SceneRejected
 from converters.records.limits import FILES, GEOMS, PIXELS, check_count, check_image
 from converters.records.raw import RawScene

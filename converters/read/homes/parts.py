@@ -11,18 +11,17 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
 
 from converters.geometry.faces import face_vectors, merge_vertices, sample_faces
 from converters.geometry.pieces import MAX_PIECES, convex_pieces
-from converters.read.cad import clean_surface
 from converters.read.files import SourceFolder
 from converters.read.gibson import read_attribution, read_licence
-from converters.read.homes.solids import flat
 from converters.read.interactive_gibson import SHOWN_M, assume_hinge, leaf_turn
-from converters.read.meshes import colours_of_faces, textured_by_face
+from converters.read.meshes import clean_surface, colours_of_faces, textured_by_face
 from converters.read.obj import TexturedMesh, at_most, join_meshes, scan_of
 from converters.read.surfaces import check_extent, floor_level, label_storeys, storey_of, with_split_corners
 from converters.read.urdf import joined, placed
@@ -253,12 +252,21 @@ def _on_floors(
     covers = np.zeros((0, 3, 3)) if fixed is None else fixed.vertices[_shown(fixed.vertices, fixed.faces)]
     off = covers[..., 2].mean(axis=1) - ground_m
     covers = shapely.polygons(covers[(off > -TOUCH_M) & (off < SLAB_M)][..., :2])
-    vertices, faces = flat(shapely.difference(shapely.box(*low, *high), shapely.union_all(covers)))
-    if len(faces):
+    ground = shapely.get_parts(shapely.difference(shapely.box(*low, *high), shapely.union_all(covers)))
+    corners = [t for p in ground if shapely.get_type_id(p) == 3 and shapely.area(p) > 1e-6 for t in triangles(p)]
+    if corners:
+        vertices = np.column_stack([np.reshape(corners, (-1, 2)), np.zeros(3 * len(corners))])
+        faces = np.arange(len(vertices)).reshape(-1, 3)
         colour = np.tile(colours_of_faces(plane.surface)[:1], (len(faces), 1))
         place = transform(np.eye(3), (0.0, 0.0, ground_m))
         rest = [*rest, dataclasses.replace(plane, pose=place, surface=textured_by_face(vertices, faces, colour))]
     return rest, (floor_m,)
+
+
+def triangles(polygon: Any) -> list[np.ndarray]:
+    """Return the triangles (3, 2) of a polygon in plan, counter-clockwise."""
+    parts = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
+    return [shapely.get_coordinates(shapely.orient_polygons(t))[:3] for t in parts if shapely.area(t) > 1e-9]
 
 
 def _by_size(source: SourceFolder, parts: list[Part], weighed: bool) -> list[Part]:

@@ -20,10 +20,19 @@ import trimesh
 from converters.geometry.faces import face_vectors
 from converters.read.files import SourceFolder, only_file, read_image
 from converters.read.homes.parts import LEVEL, Part, home
-from converters.read.homes.solids import height_field, rectangle
 from converters.read.meshes import UP_AXES, collada_frame, read_surface
 from converters.read.obj import GREY, TexturedMesh, find_file, in_colour
-from converters.read.urdf import count_unread, joined, numbers, parse_xml, placed, primitive, report_unread
+from converters.read.urdf import (
+    count_unread,
+    height_field,
+    joined,
+    numbers,
+    parse_xml,
+    placed,
+    primitive,
+    rectangle,
+    report_unread,
+)
 from converters.records.errors import SceneRejected
 from converters.records.limits import PARTS, check_count
 from converters.records.raw import RawScene

@@ -21,11 +21,10 @@ import shapely
 
 from converters.geometry.boxes import convex_hull
 from converters.geometry.faces import compacted
-from converters.read.files import SourceFolder
+from converters.read.files import SourceFolder, only_file
 from converters.read.homes.parts import Part, category_of, home
 from converters.read.homes.sh3d_archive import called, colour, metres, number, point, read_xml, unpack
-from converters.read.homes.sh3d_models import LEAF, Models, yaw_pose
-from converters.read.homes.sh3d_sheet import WHITE
+from converters.read.homes.sh3d_models import LEAF, WHITE, Models, mean_colour, yaw_pose
 from converters.read.homes.sh3d_walls import (
     HEIGHT_M,
     LOW_M,
@@ -77,12 +76,8 @@ FOREIGN = {word: category for category, words in _TABLES["words"].items() for wo
 
 def read_sh3d(root: Path, strict: bool = False, chosen: Path | None = None) -> RawScene:
     """Reads the only drawing of a folder, or the chosen one."""
-    files = [chosen] if chosen else [root] if root.is_file() else sorted(root.glob(f"*{ENDING}"))
-    if len(files) != 1 or not files[0].is_file():
-        raise SceneRejected(
-            f"{root}: drawings are {', '.join(p.name for p in files) or 'none'}, expected one; give a file"
-        )
-    path = files[0]
+    files = [root] if root.is_file() else [p for p in sorted(root.glob(f"*{ENDING}")) if p.is_file()]
+    path = chosen or only_file(root, files, "drawings")
     with tempfile.TemporaryDirectory(prefix="sh3d-") as scratch:
         folder = Path(scratch).resolve() / path.stem
         folder.mkdir()
@@ -156,9 +151,7 @@ class _Drawing:
         for wall in walls:
             e = wall.element
             looks = {side: self.models.look(e, f"{side}SideColor", f"{side}SideTexture") for side in ("left", "right")}
-            looks["top"] = self.models.look(
-                e, "topColor", "", looks["right"][0].mean(axis=(0, 1)).astype(np.uint8).reshape(1, 1, 3)
-            )
+            looks["top"] = self.models.look(e, "topColor", "", mean_colour(looks["right"][0]))
             boards = {}
             for board in e.findall("baseboard"):
                 side = (board.get("attribute") or "").removesuffix("SideBaseboard")

@@ -4,25 +4,36 @@ Models are y up, front along +z. A piece's own frame is z up, front along -y, th
 """
 
 import dataclasses
+import math
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import shapely
 import trimesh
 
 from converters.geometry.faces import compacted
 from converters.read.files import SourceFolder, read_image, read_obj
-from converters.read.homes.sh3d_archive import called, colour, metres, model_path, number
-from converters.read.homes.sh3d_sheet import WHITE, Look
+from converters.read.homes.parts import Part, triangles
+from converters.read.homes.sh3d_archive import called, colour, metres, model_path, number, parsed
 from converters.read.meshes import read_surface
-from converters.read.obj import GREY, TexturedMesh, join_textures, read_painted_obj
-from converters.read.urdf import placed
+from converters.read.obj import GREYS, TexturedMesh, distinct, join_textures, read_painted_obj
+from converters.read.urdf import placed, solid
 from converters.records.errors import SceneRejected
 from converters.records.limits import EXTENT_M, GEOMS, check_count
 from interactive_nav_common.records import read_packaged
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, yaw_matrix
 
+WHITE = np.array([235, 235, 230], np.uint8).reshape(1, 1, 3)
+"""Of sides and rooms that have no colour."""
+MOST_TILES = 400
+"""Copies of a texture on one side or room; more become its mean colour."""
+
+Look = tuple[np.ndarray, np.ndarray | None]
+"""Image (h, w, 3), and size (2,) of one copy of it, m; None: a plain colour."""
 BUILT_IN = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, str])
 """Colours of the materials that models name without a file: those of the first OBJ viewers, diffuse."""
 PANE = "sweethome3d_window_pane"
@@ -58,27 +69,32 @@ class Models:
     def __init__(self, source: SourceFolder, budget: list[int]) -> None:
         """Of the unpacked drawing `source`; `budget` bounds what archives within it may take."""
         self.source, self.budget = source, budget
-        self.known: dict[str, Model | None] = {}
+        self.models: dict[str, Model | None] = {}
         self.images: dict[str, np.ndarray | None] = {}
         self.faces = 0
 
     def model(self, element: ElementTree.Element) -> Model | None:
         """The model of a piece; None and a word where it cannot be read."""
         name = element.get("model") or ""
-        if name not in self.known:
-            self.known[name] = None
-            try:
-                path = model_path(self.source.root, name, self.budget)
-                if path is None:
-                    raise SceneRejected("is not in the file")
-                self.known[name] = self._read(path)
-            except SceneRejected as error:
-                reason = str(error).replace(f"{self.source.root}/", "")
-                self.source.repaired(f"{called(element)}: its model {name[:60]!r} {reason}; a box stands for it")
-        found = self.known[name]
-        self.faces += 12 if found is None else len(found.faces)
+        if name not in self.models:
+            self.models[name] = self._attempt(element, "model", name, self._read, "a box stands for it")
+        model = self.models[name]
+        self.faces += 12 if model is None else len(model.faces)
         check_count(self.source.root, self.faces, MOST_FACES, "faces in its furniture", "leave the finest models out")
-        return found
+        return model
+
+    def _attempt(
+        self, element: ElementTree.Element, kind: str, name: str, read: Callable[[str], Any], instead: str
+    ) -> Any:
+        """Read a file that an element names; return None and report it where that fails."""
+        try:
+            path = model_path(self.source.root, name, self.budget)
+            if path is None:
+                raise SceneRejected("is not in the file")
+            return read(path)
+        except SceneRejected as error:
+            reason = str(error).replace(f"{self.source.root}/", "")
+            self.source.repaired(f"{called(element)}: its {kind} {name[:60]!r} {reason}; {instead}")
 
     def _read(self, path: str) -> Model:
         ending = Path(path).suffix.lower()
@@ -99,6 +115,9 @@ class Models:
         names, groups = (*mesh.materials, "", "")[: len(images)], np.array((*mesh.groups, ""))
         return Model(mesh.vertices, mesh.faces, mesh.corner_uv, number, images, names, groups[mesh.group])
 
+    def _image(self, path: str) -> np.ndarray:
+        return read_image(self.source.use(path, ""), "RGB")
+
     def look(self, element: ElementTree.Element, colour_key: str, texture: str, default: np.ndarray = WHITE) -> Look:
         """Colour of an element, or its texture: the child `<texture attribute=...>`."""
         plain = colour(element.get(colour_key), default)
@@ -107,16 +126,7 @@ class Models:
             if child.get("attribute", "texture") != texture:
                 continue
             if name not in self.images:
-                path, self.images[name] = model_path(self.source.root, name, self.budget), None
-                try:
-                    if path is None:
-                        raise SceneRejected("is not in the file")
-                    self.images[name] = read_image(self.source.use(path, ""), "RGB")
-                except SceneRejected as error:
-                    reason = str(error).replace(f"{self.source.root}/", "")
-                    self.source.repaired(
-                        f"{called(element)}: its texture {name[:60]!r} {reason}; a plain colour is taken"
-                    )
+                self.images[name] = self._attempt(element, "texture", name, self._image, "a plain colour is taken")
             size = metres(child, "width", "height") * number(child, "scale", 1.0)
             if (image := self.images[name]) is not None and (size > 1e-3).all():
                 return image, size
@@ -130,10 +140,10 @@ class Models:
         size = np.maximum(size, 1e-3)
         model = self.model(element)
         if model is None:
-            box = trimesh.creation.box(size)
-            none = np.zeros(len(box.faces), np.int64)
-            vertices, faces, group = np.asarray(box.vertices), np.asarray(box.faces, np.int64), np.full(len(none), "")
-            uv, numbers, images = np.zeros((len(faces), 3, 2)), none, [colour(element.get("color"), GREYS)]
+            box = solid("box", size)
+            vertices, faces, group = box.vertices, box.faces, np.full(len(box.faces), "")
+            uv, numbers = np.zeros((len(faces), 3, 2)), np.zeros(len(faces), np.int64)
+            images = [colour(element.get("color"), GREYS)]
         else:
             vertices, faces = self._deformed(element, model)
             (vertices, faces), group = compacted(vertices, faces), model.group
@@ -181,7 +191,8 @@ class Models:
         vertices, faces = model.vertices, model.faces
         for child in element.findall("transformation"):
             name = (child.get("name") or "?")[:60]
-            matrix = _numbers(element, "transformation", child.get("matrix") or "")
+            words = (child.get("matrix") or "").split()
+            matrix = np.array([parsed(element, "transformation", word) for word in words])
             if len(matrix) != 12 or not np.linalg.det(matrix.reshape(3, 4)[:, :3]) > 0:
                 raise SceneRejected(f"{called(element)}: transformation is no matrix; mend the drawing")
             word = re.compile(rf"({re.escape(name)}|.*_on_{re.escape(name.removeprefix('sweethome3d_'))})(?!\d)")
@@ -216,9 +227,6 @@ class Models:
         return uv, numbers, [*images, GLASS]
 
 
-GREYS = np.array(GREY, np.uint8).reshape(1, 1, 3)
-
-
 def _by_place(model: Model, element: ElementTree.Element, faces: np.ndarray, size: np.ndarray) -> np.ndarray:
     """(k, 3, 2) of faces without coordinates of their own: by place across the face's main axis."""
     span = np.maximum(np.ptp(model.vertices, axis=0), 1e-9)
@@ -230,21 +238,79 @@ def _by_place(model: Model, element: ElementTree.Element, faces: np.ndarray, siz
 
 def _rotation(element: ElementTree.Element) -> np.ndarray:
     """(3, 3) that turns the model's own axes upright; the identity where it is not given."""
-    turn = _numbers(element, "modelRotation", element.get("modelRotation") or "1 0 0 0 1 0 0 0 1")
+    words = (element.get("modelRotation") or "1 0 0 0 1 0 0 0 1").split()
+    turn = np.array([parsed(element, "modelRotation", word) for word in words])
     turn = turn.reshape(3, 3) if len(turn) == 9 else np.zeros((3, 3))
     if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-2):
         raise SceneRejected(f"{called(element)}: modelRotation is no rotation; mend the drawing")
     return turn
 
 
-def _numbers(element: ElementTree.Element, what: str, text: str) -> np.ndarray:
-    """(n,) numbers of a list."""
-    name = element.get("name") or element.get("id") or "?"
-    return np.array(
-        [number(ElementTree.Element(element.tag, {"name": name, what: word}), what) for word in text.split()]
-    )
-
-
 def yaw_pose(at: np.ndarray, yaw: float) -> np.ndarray:
     """Return the (4, 4) of an upright piece at (3,) m, turned by `yaw` rad."""
     return transform(yaw_matrix(yaw), at)
+
+
+@dataclasses.dataclass
+class Sheet:
+    """Collect triangles with their images."""
+
+    corners: list[np.ndarray] = dataclasses.field(default_factory=list)
+    """(3, 3) each."""
+    uv: list[np.ndarray] = dataclasses.field(default_factory=list)
+    look: list[np.ndarray] = dataclasses.field(default_factory=list)
+
+    def add(self, region: Any, place: Callable[[np.ndarray], np.ndarray], look: Look, turned: bool = False) -> None:
+        """Add a flat region with holes; `place` turns its points (n, 2) into (n, 3)."""
+        image, size = look
+        for tile, low in _tiles(region, size):
+            for flat in triangles(tile):
+                flat = flat[::-1] if turned else flat
+                self.corners.append(place(flat))
+                self.uv.append(np.zeros((3, 2)) if size is None else np.clip((flat - low) / size, 0, 1))
+                self.look.append(image)
+
+    def quad(self, corners: np.ndarray, look: Look) -> None:
+        """Add a plain patch, (4, 3) corners counter-clockwise."""
+        image = mean_colour(look[0])
+        for some in ((0, 1, 2), (0, 2, 3)):
+            self.corners.append(corners[list(some)])
+            self.uv.append(np.zeros((3, 2)))
+            self.look.append(image)
+
+    def part(self, name: str) -> Part | None:
+        """Return all of it as a built-in part; None of nothing."""
+        if not self.corners:
+            return None
+        mesh = TexturedMesh(
+            np.vstack(self.corners),
+            np.arange(3 * len(self.corners)).reshape(-1, 3),
+            *join_textures(np.array(self.uv), *distinct(self.look)),
+        )
+        return Part(name, np.eye(4), mesh, None, True, held=True)
+
+
+def _tiles(region: Any, size: np.ndarray | None) -> Iterator[tuple[Any, np.ndarray]]:
+    """Yield the polygons of a region, cut along the copies of a texture, with the corner of each copy."""
+    whole = shapely.get_parts(region)
+    boxes = [np.zeros(2)]
+    if size is not None and not shapely.is_empty(region):
+        x0, y0, x1, y1 = shapely.bounds(region)
+        steps = [np.arange(math.floor(a / s), math.ceil(b / s)) for a, b, s in ((x0, x1, size[0]), (y0, y1, size[1]))]
+        boxes = [size * [i, j] for i in steps[0] for j in steps[1]]
+    for low in boxes:
+        box = None if size is None else shapely.box(low[0], low[1], low[0] + size[0], low[1] + size[1])
+        for piece in shapely.get_parts(whole if box is None else shapely.intersection(whole, box)):
+            if shapely.get_type_id(piece) == 3 and shapely.area(piece) > 1e-8:
+                yield piece, low
+
+
+def fitted(look: Look, area_m2: float) -> Look:
+    """Return the look, or its mean colour where it would repeat too often."""
+    image, size = look
+    return (mean_colour(image), None) if size is None or area_m2 / float(np.prod(size)) > MOST_TILES else look
+
+
+def mean_colour(image: np.ndarray) -> np.ndarray:
+    """Return an image of one pixel."""
+    return image.mean(axis=(0, 1)).astype(np.uint8).reshape(1, 1, 3)

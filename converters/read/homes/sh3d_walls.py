@@ -15,7 +15,7 @@ import shapely
 
 from converters.read.homes.parts import Part
 from converters.read.homes.sh3d_archive import called, metres, number, outline, point
-from converters.read.homes.sh3d_sheet import WHITE, Look, Sheet, fitted
+from converters.read.homes.sh3d_models import WHITE, Look, Sheet, fitted
 from converters.records.errors import SceneRejected
 from converters.records.limits import EXTENT_M
 from converters.records.raw import Window
@@ -193,11 +193,7 @@ class Opening:
 def wall_part(
     wall: Wall, openings: list[Opening], looks: dict[str, Look], boards: dict[str, tuple[float, float, Look]]
 ) -> Part | None:
-    """A wall without its openings, with its baseboards.
-
-    Args:
-        boards: side -> thickness and height, m, and look.
-    """
+    """Return a wall without its openings, with its `boards`: side -> thickness and height, m, and look."""
     sheet = Sheet()
     ends = np.array([0.0, wall.length_m])
     outer = shapely.Polygon([(0, 0), (ends[1], 0), (ends[1], wall.height_m[1]), (0, wall.height_m[0])])
@@ -269,15 +265,9 @@ def read_room(element: ElementTree.Element, look: Callable[[ElementTree.Element,
         return None
     if max(np.ptp(points, axis=0)) > EXTENT_M:
         raise SceneRejected(f"{called(element)}: is larger than {EXTENT_M:g} m; mend the drawing")
-    seen = [element.get(f"{what}Visible", "true") == "true" for what in ("floor", "ceiling")]
-    floor, ceiling = look(element, "floorColor", "floorTexture"), look(element, "ceilingColor", "ceilingTexture")
-    return Room(
-        element.get("name") or "room",
-        element.get("level"),
-        plan,
-        floor if seen[0] else None,
-        ceiling if seen[1] else None,
-    )
+    looks = {what: look(element, f"{what}Color", f"{what}Texture") for what in ("floor", "ceiling")}
+    shown = [a if element.get(f"{what}Visible", "true") == "true" else None for what, a in looks.items()]
+    return Room(element.get("name") or "room", element.get("level"), plan, *shown)
 
 
 def enclosed(walls: list[Wall], rooms: list[Room]) -> list[Room]:

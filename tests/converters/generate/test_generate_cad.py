@@ -24,7 +24,7 @@ from converters.generate.surface.scan import Scan, building_solids
 from converters.generate.surface.texture import pack_rows, paint
 from converters.generate.surface.volume import Volume, fuse, solid_from_box, solid_from_mesh, surface_nets
 from converters.generate.surface.write import write_cad
-from converters.read.cad import read_cad
+from converters.read.annotations import read_cad
 from converters.read.files import SourceFolder
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP
 from scenes_mjcf.categories import CATEGORIES

@@ -40,7 +40,7 @@ from converters.generate.models.parts import (
 )  # fmt: skip
 from converters.geometry.boxes import convex_hull
 from converters.geometry.pieces import merge_pieces
-from converters.read.cad import MOST_OWN, OWN_SLACK
+from converters.read.annotations import MOST_PIECES, SLACK
 from scenes_mjcf.categories import CATEGORIES, OBJECT_CATEGORIES
 
 PACKAGED = sorted(name for name in LIBRARY if "/" in name)
@@ -109,8 +109,8 @@ def solids(parts) -> tuple[np.ndarray, np.ndarray]:
 def stance(name: str) -> tuple[float, float]:
     """How far the centre of mass of what collides lies inside the edge of what it stands on, and how high, m."""
     vertices = np.concatenate([p.vertices for p in parts_m(name)])
-    slack_m3 = OWN_SLACK * float(np.ptp(vertices, axis=0).prod())
-    joined = merge_pieces([p.vertices for p in parts_m(name)], MOST_OWN, slack_m3)
+    slack_m3 = SLACK * float(np.ptp(vertices, axis=0).prod())
+    joined = merge_pieces([p.vertices for p in parts_m(name)], MOST_PIECES, slack_m3)
     volume, centre = solids([convex_hull(points) for points in joined])
     x, y, z = (volume[:, None] * centre).sum(axis=0) / volume.sum()
     low_m = FOOT_M if name in PACKAGED else 0.006  # the converter brings feet of a packaged model down to the floor

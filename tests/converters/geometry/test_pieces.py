@@ -9,7 +9,7 @@ import trimesh
 from converters.generate.models.cad import cad_model
 from converters.generate.surface.write import write_cad
 from converters.geometry.pieces import convex_pieces, hull_volume, merge_pieces
-from converters.read.cad import MOST_OWN, read_cad
+from converters.read.annotations import MOST_PIECES, read_cad
 from converters.read.files import SourceFolder
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP
 
@@ -46,7 +46,7 @@ def test_a_model_with_a_collision_mesh_comes_with_its_pieces(tmp_path, name):
     write_cad(tmp_path / "cad", model, pieces=True)
     source = SourceFolder(tmp_path)
     read = read_cad(source, model.catid, model.id_cad)
-    assert read.pieces is not None and 1 < len(read.pieces) <= MOST_OWN
+    assert read.pieces is not None and 1 < len(read.pieces) <= MOST_PIECES
     parts = [p.vertices @ Y_UP_TO_Z_UP.T for p in model.parts]
     everything = np.concatenate(parts)
     own = np.concatenate([v for v, _ in read.pieces])

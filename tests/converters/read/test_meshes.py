@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from converters.read.cad import read_cad
+from converters.read.annotations import read_cad
 from converters.read.files import SourceFolder
 from converters.read.meshes import colours_of_faces, read_surface
 from converters.records.errors import SceneRejected
