@@ -1,14 +1,20 @@
-"""Take parts of records of arrays and join them; write tables of rows as Parquet files, whole or not at all."""
+"""Write tables of rows as Parquet files, read and show them; take parts of records of arrays and join them."""
 
 import dataclasses
+import functools
+import hashlib
 import inspect
+import json
+import operator
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from rich.table import Table
 
 from interactive_nav_common.errors import FileError, readable
 from interactive_nav_common.files import whole_file
@@ -25,6 +31,27 @@ def markdown(header: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
     """Return a table for people."""
     rows = [list(header), ["---"] * len(header), *([str(cell) for cell in line] for line in lines)]
     return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
+
+
+def console_table(header: Sequence[str], lines: Iterable[Sequence[str]], left: int = 1, **look: Any) -> Table:
+    """Return a table for a terminal, its first columns to the left and the others to the right."""
+    table = Table(**look)
+    for place, heading in enumerate(header):
+        table.add_column(heading, justify="left" if place < left else "right")
+    for line in lines:
+        table.add_row(*line)
+    return table
+
+
+def where(rows: pa.Table, **wanted: Any) -> pa.Table:
+    """Return the rows whose columns have these values; None: any."""
+    tests = [pc.field(name) == value for name, value in wanted.items() if value is not None]
+    return rows.filter(functools.reduce(operator.and_, tests)) if tests else rows
+
+
+def digest_of(request: Any, digits: int = 8) -> str:
+    """Return hexadecimal digits that tell requests apart which differ as JSON; they name files of rows."""
+    return hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()[:digits]
 
 
 def write_parquet(table: pa.Table, path: Path, notes: dict[str, str] | None = None, small: bool = False) -> None:

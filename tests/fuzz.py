@@ -274,12 +274,13 @@ def given() -> dict[str, Target]:
 
     from interactive_nav.robots import get_robot
     from interactive_nav.robots.reference import _LOADED
+    from interactive_nav_common.figures import plt
     from tests.interactive_nav.robots.test_add_a_robot import _cart
     from tests.interactive_nav.robots.urdf import cart
     from tests.train.synthetic import baseline_rows, run_rows
     from tests.train.toy_run import toy_config
     from train import config_io
-    from train.figures import style, tables
+    from train.figures import tables
     from train.figures.cli import Results, chosen_split, figures_of
     from train.scoring.rows import BY_CATEGORY
     from train.sweep import spec
@@ -303,7 +304,7 @@ def given() -> dict[str, Target]:
             tables.document(found.rows, chosen_split(found.rows, "auto"))
         for _, draw in figures_of(root):
             draw()
-            style.plt.close("all")
+            plt.close("all")
 
     def robots(root: Path) -> None:
         motor, velocity = '<motor name="old" joint="fl"/>', '<velocity joint="fl" kv="1" ctrlrange="-8 8"/>'

@@ -17,7 +17,7 @@ from interactive_nav.config import WINDOW
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.records import PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_rows
-from topological_nav.evaluate.scores import differences, markdown, summary
+from topological_nav.evaluate.scores import differences, markdown, summary, text
 from train.figures import tables
 from train.runs.run import config_to_play
 from train.runs.run_folder import RunFolder
@@ -155,7 +155,7 @@ def test_the_further_topological_tables_are_those_of_their_rows(name):
     told, found = (ROOT / "docs" / "topological-results.md").read_text(), summary(played)
     scenes = [line for line in found if line.group not in ("seen", "unseen", "all")]
     for line in scenes if len(scenes) == 2 else found[-1:]:
-        assert " | ".join(str(line.scores[score]) for score in ("success", "spl", "rc")) in told, line
+        assert " | ".join(text(line.scores[score]) for score in ("success", "spl", "rc")) in told, line
 
 
 def test_the_topological_results_name_no_folder_of_a_machine():

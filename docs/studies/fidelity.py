@@ -46,7 +46,7 @@ CHOSEN = "20 ms, 10 it., pyramidal, 50 ms contacts"
 SHOWN_PERCENT = 60
 """Longer bars are cut, and what they are is written beside them, from the lowest bar up."""
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00")
-"""Of the scenarios: those of `train/figures/style.py`."""
+"""Of the scenarios: those of `interactive_nav_common.figures`."""
 
 
 @dataclasses.dataclass(frozen=True)

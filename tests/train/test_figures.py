@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from interactive_nav_common.figures import BLUE, GREEN
 from interactive_nav_common.rows import write_parquet
 from tests.train.synthetic import baseline_rows, paper_like, run_rows, write_results
 from train import figures
@@ -290,7 +291,7 @@ def test_a_users_policies_are_drawn_in_colours_that_no_other_has():
     names = ["follower", "mine", "avoider", "yours", "learned"]
     colours = style.policy_colours(names)
     assert set(colours) == set(names) and len(set(colours.values())) == 5
-    assert colours["follower"] == style.GREEN and colours["learned"] == style.BLUE
+    assert colours["follower"] == GREEN and colours["learned"] == BLUE
 
 
 def test_looks_keep_apart():

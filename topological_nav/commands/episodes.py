@@ -11,12 +11,13 @@ from interactive_nav_common.config import overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import write_text
 from interactive_nav_common.jobs.progress import SafeConsole
+from interactive_nav_common.rows import where
 from scenes_mjcf.sets import scene_folders
 from topological_nav.commands.maps import build
 from topological_nav.commands.progress import bar, say
 from topological_nav.config import PASSAGE_POLICY, RUNS, EvaluationConfig, MapConfig, NavigatorConfig
 from topological_nav.evaluate.contest import Contest, contest_scenes, play_contest, tracks_of
-from topological_nav.evaluate.scores import console_table, differences, markdown, summary, where
+from topological_nav.evaluate.scores import console_table, differences, markdown, summary
 from topological_nav.figures.journey import drive_episode, film
 from topological_nav.figures.maps import journeys_figure, save
 from topological_nav.weights.packaged import choose, fitting_map
@@ -128,5 +129,5 @@ def evaluate(arguments: argparse.Namespace) -> None:
     write_text(contest.out / "summary.md", markdown(lines, compared))
     SafeConsole(width=None if sys.stdout.isatty() else 160).print(console_table(lines))
     for difference in compared:
-        print(f"{difference.compared}, {difference.score}: {difference.result}")
+        print(difference)
     print(f"{contest.out}: {len(rows)} episodes; tables in summary.md, a picture a scene")

@@ -1,4 +1,4 @@
-"""Drives and policies in, pictures out."""
+"""Draw drives and policies."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.figures import BLUE, RC, VERMILION, curves, panels, parts, plt, scene_axes
 from topological_nav.drives.dataset import drive_images, load_drives, read_drives_header
-from topological_nav.figures.maps import curves, floor_plan, scene_axes
+from topological_nav.figures.maps import floor_plan
 from topological_nav.scenes.space import free_space
-from train.figures.style import BLUE, RC, VERMILION, panels, plt
 
 SHOWN = 4
 """Drives whose images are shown."""
@@ -30,16 +30,16 @@ def drives_figure(scene_folders: Sequence[Path], folder: Path) -> Figure:
     drives, robot = load_drives(folder), get_robot(config.robot)
     lines = -(-len(scene_folders) // min(4, len(scene_folders)))
     picked = _some(folder, SHOWN)
-    figure: Any = plt.figure(figsize=(8, 3.8 * lines + 1.2 * len(picked) + 2.4), layout="constrained")
-    above, middle, below = figure.subfigures(3, 1, height_ratios=[3.8 * lines, 1.2 * len(picked) + 0.01, 2.4])
+    heights = [3.8 * lines, 1.2 * len(picked) + 0.01, 2.4]
+    figure, (above, middle, below) = parts((8, 3.8 * lines + 1.2 * len(picked) + 2.4), heights)
     axes, shade = scene_axes(above, len(scene_folders)), None
     for index, (about, scene_folder) in enumerate(zip(header["scenes"], scene_folders, strict=True)):
-        axis, mine = axes[index], np.flatnonzero(drives.scene == index)
+        axis, there = axes[index], np.flatnonzero(drives.scene == index)
         floor_plan(axis, free_space(load_scene(scene_folder), robot.height_m))
-        for k in mine[~drives.kept[mine]]:
+        for k in there[~drives.kept[there]]:
             axis.plot(*drives.pose_w[drives.rows(k), :2].T, color="0.35", linewidth=0.8, ls=":")
         pieces, turns = [], []
-        for k in mine[drives.kept[mine]]:
+        for k in there[drives.kept[there]]:
             xy = drives.pose_w[drives.rows(k), :2]
             pieces.append(np.stack([xy[:-1], xy[1:]], 1))
             turns.append(drives.command[drives.rows(k)[:-1], 1])
@@ -48,12 +48,12 @@ def drives_figure(scene_folders: Sequence[Path], folder: Path) -> Figure:
             shade.set_array(np.concatenate(turns))
             shade.set_clim(-config.angular_rad_s, config.angular_rad_s)
             axis.add_collection(shade)
-        hits = drives.rows(mine)
+        hits = drives.rows(there)
         hits = hits[drives.touching[hits].any(1)]
         axis.scatter(*drives.pose_w[hits, :2].T, s=6, color="k", marker="x", zorder=4)
         axis.set_title(
-            f"{about['name']}: {int(drives.kept[mine].sum())} of {len(mine)} drives kept\n"
-            f"(reached {drives.reached[mine].mean():.2f}, in contact {drives.touched[mine].mean():.2f})"
+            f"{about['name']}: {int(drives.kept[there].sum())} of {len(there)} drives kept\n"
+            f"(reached {drives.reached[there].mean():.2f}, in contact {drives.touched[there].mean():.2f})"
         )
     if shade is not None:
         above.colorbar(shade, ax=list(axes), label="turning, rad/s (left +)", shrink=0.6, pad=0.01)
@@ -62,8 +62,8 @@ def drives_figure(scene_folders: Sequence[Path], folder: Path) -> Figure:
         for axis, (k, images) in zip(grid, picked, strict=True):
             at = np.linspace(0, len(images) - 1, FRAMES).astype(int)
             axis.imshow(np.concatenate(list(images[at]), 1))
-            said = [f"{v:.1f}, {w:+.1f}" for v, w in drives.command[drives.first[k] + at]]
-            axis.set_xticks((np.arange(FRAMES) + 0.5) * images.shape[2], said, fontsize=8)
+            labels = [f"{v:.1f}, {w:+.1f}" for v, w in drives.command[drives.first[k] + at]]
+            axis.set_xticks((np.arange(FRAMES) + 0.5) * images.shape[2], labels, fontsize=8)
             axis.set(yticks=[], frame_on=False)
             axis.tick_params(length=0, grid_linewidth=0)
             axis.set_title(f"drive {k} in {header['scenes'][drives.scene[k]]['name']}: m/s, rad/s (left +)", loc="left")
@@ -72,7 +72,7 @@ def drives_figure(scene_folders: Sequence[Path], folder: Path) -> Figure:
 
 
 def _some(folder: Path, count: int) -> list[tuple[int, np.ndarray]]:
-    """A few drives with their images, from files all over the folder."""
+    """Return a few drives with their images, from files all over the folder."""
     files = [(int(rows[len(rows) // 2]), rows, images) for rows, images in _thin(drive_images(folder), count)]
     drives, out = load_drives(folder), []
     for k, rows, images in files:
@@ -83,7 +83,7 @@ def _some(folder: Path, count: int) -> list[tuple[int, np.ndarray]]:
 
 
 def _thin(files, count: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """`count` of an iterable, evenly; it is gone through once and a few are held."""
+    """Return `count` of an iterable, evenly; it is gone through once and a few are held."""
     held, every = [], 1
     for i, item in enumerate(files):
         if i % every == 0:
@@ -106,7 +106,7 @@ def _shares(axes: Any, drives: Any) -> None:
 
 
 def policy_figure(lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) -> Figure:
-    """Curves of a policy's run, and how its commands on held-out drives compare with the expert's."""
+    """Draw the curves of a policy's run, and how its commands on held-out drives compare with the expert's."""
     figure, (axes,) = panels((15, 3.6), 1, 4)
     curves(axes[0], lines, {"forward": "forward", "consistency": "consistency"})
     axes[0].set_yscale("log")

@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw
 
 from interactive_nav.record import write_mp4
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.figures import plt
 from interactive_nav_common.files import whole_file
 from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
 from topological_nav.evaluate.evaluation import DrivenEpisodes, NavigatorPlayer, Played
@@ -19,7 +20,6 @@ from topological_nav.figures.maps import floor_plan, map_lines, plan_picture
 from topological_nav.maps.graph import TopologicalMap
 from topological_nav.navigate.state import FACE, PHASES, Events, State
 from topological_nav.scenes.simulation import Snapshot
-from train.figures.style import plt
 
 FILM_EVERY_S = 0.5
 FILM_RATE = 20.0

@@ -13,12 +13,24 @@ from matplotlib.colors import LinearSegmentedColormap, ListedColormap
 from matplotlib.figure import Figure
 from PIL import Image
 
+from interactive_nav_common import figures
+from interactive_nav_common.figures import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PINK,
+    SKY,
+    VERMILION,
+    curves,
+    panels,
+    parts,
+    plt,
+    scene_axes,
+)
 from topological_nav.data.dataset import load_plan, load_rooms, read_header
 from topological_nav.maps.build import Built
 from topological_nav.maps.graph import Route, TopologicalMap
 from topological_nav.scenes.space import FreeSpace
-from train.figures import style
-from train.figures.style import BLUE, VERMILION, panels, plt
 
 WON, LOST = BLUE, VERMILION
 FEW = 100
@@ -28,7 +40,7 @@ INK = 40.0
 
 
 def map_lines(axis: Axes, made: TopologicalMap, passable: float) -> None:
-    """Draws a map in the background: its nodes, and the edges that count as open."""
+    """Draw a map in the background: its nodes, and the edges that count as open."""
     open_ = made.p >= passable
     ways = np.stack([made.xy_w[made.edges[open_, 0]], made.xy_w[made.edges[open_, 1]]], 1)
     axis.add_collection(LineCollection(list(ways), colors="0.6", linewidths=0.5, zorder=1))
@@ -41,7 +53,7 @@ def journeys_figure(
     panels: Mapping[str, tuple[TopologicalMap | None, Mapping[int, np.ndarray], Mapping[int, Mapping[str, Any]]]],
     passable: float,
 ) -> Figure:
-    """Where contenders went in a scene, a panel each."""
+    """Draw where contenders went in a scene, a panel each."""
     extent = np.ptp(space.centres(0.0), axis=0) + 0.8
     columns = len(panels) if extent[1] >= extent[0] or len(panels) == 1 else min(2, len(panels))
     lines = -(-len(panels) // columns)
@@ -74,7 +86,7 @@ def journeys_figure(
 
 
 def plan_picture(space: FreeSpace, made: TopologicalMap, passable: float, height: int) -> tuple[np.ndarray, Any]:
-    """[height, W, 3] u8 picture of plan and map, W even, and a function from world points [..., 2] to its pixels."""
+    """Return a picture [height, W, 3] u8 of plan and map, W even, and a function from world points to its pixels."""
     extent = np.ptp(space.centres(0.0), axis=0) + 0.8
     width = int(round(height * extent[0] / extent[1] / 2)) * 2
     figure = plt.figure(figsize=(width / 100, height / 100), dpi=100)
@@ -95,33 +107,15 @@ def plan_picture(space: FreeSpace, made: TopologicalMap, passable: float, height
     return picture, pixels
 
 
-PALETTE = (style.BLUE, style.ORANGE, style.GREEN, style.PINK, style.SKY, style.VERMILION, "#f0e442", "#332288", "0.3")
+PALETTE = (BLUE, ORANGE, GREEN, PINK, SKY, VERMILION, "#f0e442", "#332288", "0.3")
 """Colours of rooms; after nine they repeat."""
-FREE = LinearSegmentedColormap.from_list("free", (style.VERMILION, "0.88", style.BLUE))
+FREE = LinearSegmentedColormap.from_list("free", (VERMILION, "0.88", BLUE))
 """Colours of probabilities, from blocked to free, for colour-blind readers too."""
-save = functools.partial(style.save, dpi=130)
-
-
-def curves(axis: Axes, lines: Sequence[Mapping[str, Any]], labels: Mapping[str, str], **style: Any) -> None:
-    """Draws metrics (name -> label) of a run's lines over its epochs."""
-    for name, label in labels.items():
-        axis.plot([line["epoch"] for line in lines], [line[name] for line in lines], label=label, **style)
-    axis.set_xlabel("epoch")
-    axis.grid(alpha=0.3)
-    axis.legend(fontsize=8)
-
-
-def scene_axes(part: Any, count: int, columns: int = 4) -> np.ndarray:
-    """[count] axes of a figure or a part of one, at most so many in a line."""
-    columns = min(columns, count)
-    axes = part.subplots(-(-count // columns), columns, squeeze=False).ravel()
-    for axis in axes[count:]:
-        axis.set_axis_off()
-    return axes[:count]
+save = functools.partial(figures.save, dpi=130)
 
 
 def floor_plan(axis: Axes, space: FreeSpace) -> None:
-    """Draws free space white and obstacles grey, cut to where there is free space, with a bar of 2 m below."""
+    """Draw free space white and obstacles grey, cut to where there is free space, with a bar of 2 m below."""
     rows, columns = space.clearance_m.shape
     (x0, y0), step = space.origin_w, space.resolution_m
     axis.imshow(
@@ -140,20 +134,19 @@ def floor_plan(axis: Axes, space: FreeSpace) -> None:
 
 
 def room_points(axis: Axes, points_w: np.ndarray, labels: np.ndarray, **style: Any) -> None:
-    """Draws points in their rooms' colours."""
+    """Draw points in their rooms' colours."""
     axis.scatter(*points_w.T, c=[PALETTE[k % len(PALETTE)] for k in labels], **style)
 
 
 def dataset_figure(folder: Path) -> Figure:
-    """Where a dataset's images were taken, a panel a scene, and level images of some positions below."""
+    """Draw where a dataset's images were taken, a panel a scene, and level images of some positions below."""
     header, config = read_header(folder)
     scenes = [(s["name"], load_plan(folder, s["name"])) for s in header["scenes"]]
     rooms = load_rooms(folder)
     shown = np.linspace(0, len(rooms.xy_w) - 1, min(6, len(rooms.xy_w))).astype(int)
     lines = -(-len(scenes) // min(4, len(scenes)))
-    figure = plt.figure(figsize=(12, 3.4 * lines + 1.25 * len(shown)), layout="constrained")
-    parts: Any = figure.subfigures(2, 1, height_ratios=[3.4 * lines, 1.25 * len(shown)])
-    above, below = parts
+    heights = [3.4 * lines, 1.25 * len(shown)]
+    figure, (above, below) = parts((12, sum(heights)), heights)
     for axis, (name, plan) in zip(scene_axes(above, len(scenes)), scenes, strict=True):
         axis.scatter(*plan.rooms.points_w.T, s=1, c="0.85", linewidths=0)
         for held, marker in ((False, "o"), (True, "^")):
@@ -180,7 +173,7 @@ def dataset_figure(folder: Path) -> Figure:
 
 
 def curves_figure(lines: Sequence[Mapping[str, Any]]) -> Figure:
-    """Loss and accuracy over epochs, from lines of a run's metrics.jsonl, a column a phase."""
+    """Draw loss and accuracy over epochs, from lines of a run's metrics.jsonl, a column a phase."""
     names = {"pairs": "without labels (VICReg)", "labels": "with labels"}
     phases = list(dict.fromkeys(line["phase"] for line in lines))
     figure, grid = panels((4.6 * len(phases), 3.2), 1, len(phases))
@@ -194,7 +187,7 @@ def curves_figure(lines: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def map_figure(built: Built, route: Route | None = None) -> Figure:
-    """A map over the floor plan, a route on top: edges from blocked to free, each direction on its own half."""
+    """Draw a map over the floor plan, a route on top: edges from blocked to free, each direction on its own half."""
     made = built.map
     extent = np.ptp(built.space.centres(0.0), axis=0)
     figure, axis = plt.subplots(figsize=(7.2, 1.2 + 7.0 * extent[1] / extent[0]), layout="constrained")

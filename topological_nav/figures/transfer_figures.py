@@ -1,4 +1,4 @@
-"""Runs of transfer and exports in, pictures out: domains side by side, learning, scores; an export beside its runs."""
+"""Draw runs of transfer and exports: domains side by side, learning, scores; an export beside its runs."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,9 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from topological_nav.figures.maps import curves
+from interactive_nav_common.figures import BLUE, ORANGE, RC, VERMILION, curves, panels, parts, plt
 from topological_nav.weights.export import PRECISION, Compared
-from train.figures.style import BLUE, ORANGE, RC, VERMILION, panels, plt
 
 _SHOWN = 6
 """Pairs of images."""
@@ -20,11 +19,7 @@ _STAGES = {"before": "0.6", "statistics": ORANGE, "after": BLUE}
 def features_figure(
     source: np.ndarray, target: np.ndarray, lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
 ) -> Figure:
-    """Images of both domains, the game's course, and localisation before and after.
-
-    Args:
-        source: [n, H, W, 3] u8.
-    """
+    """Draw images [n, H, W, 3] u8 of both domains, the game's course, and localisation before and after."""
     figure, course, scores = _domains(source, target)
     course.axhline(0.5, color="0.5", linewidth=0.8, zorder=0, label="accuracy by chance")
     labels = {"loss": "extractor's loss", "critic_loss": "critic's loss", "critic_accuracy": "critic's accuracy"}
@@ -47,7 +42,7 @@ def features_figure(
 def passages_figure(
     source: np.ndarray, target: np.ndarray, lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
 ) -> Figure:
-    """Images of both domains, fine-tuning, and accuracy of the four configurations; see `features_figure`."""
+    """Draw images of both domains, fine-tuning, and accuracy of the four configurations; see `features_figure`."""
     figure, course, scores = _domains(source, target)
     for name, label in (("B", "B: fresh weights"), ("D", "D: the source's")):
         curves(course, [line for line in lines if line["phase"] == name], {"accuracy": label}, marker=".")
@@ -61,9 +56,8 @@ def passages_figure(
 
 
 def _domains(source: np.ndarray, target: np.ndarray) -> tuple[Figure, Axes, Axes]:
-    """A figure with images of both domains, and its axes for the course of learning and for the scores."""
-    figure: Any = plt.figure(figsize=(8, 5.6), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=[1.0, 1.15])
+    """Return a figure with images of both domains, and its axes for the course of learning and for the scores."""
+    figure, (above, below) = parts((8, 5.6), [1.0, 1.15])
     grid = above.subplots(2, _SHOWN, squeeze=False)
     for line, images, name in zip(grid, (source, target), ("as rendered", "target"), strict=True):
         rows = np.linspace(0, len(images) - 1, _SHOWN).astype(int)

@@ -1,4 +1,4 @@
-"""Lines of metrics.jsonl in; learning curves out."""
+"""Draw learning curves of lines of metrics.jsonl."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from interactive_nav_common.figures import draw_means, legend, panels
 from interactive_nav_common.statistics import estimate
 from train.figures import style
 
@@ -25,12 +26,12 @@ SMOOTHED = 40
 
 
 def learning_curves(runs: Mapping[str, list[dict[str, Any]]]) -> Figure:
-    """Success, INS_0.5 and reward of training episodes over environment steps, a line a run."""
-    figure, (axes,) = style.panels((4 * len(CURVES), 3.2), 1, len(CURVES))
+    """Draw success, INS_0.5 and reward of training episodes over environment steps, a line a run."""
+    figure, (axes,) = panels((4 * len(CURVES), 3.2), 1, len(CURVES))
     for axis, (key, label) in zip(axes, CURVES, strict=True):
         for name, lines in runs.items():
-            seen = [(line["env_steps"], line[key]) for line in lines if key in line]
-            axis.plot(*np.array(seen).reshape(-1, 2).T, label=name, marker="." if len(seen) < 30 else None)
+            points = _points(lines, key)
+            axis.plot(*points.T, label=name, marker="." if len(points) < 30 else None)
         _label(axis, key, label)
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8)
@@ -39,7 +40,7 @@ def learning_curves(runs: Mapping[str, list[dict[str, Any]]]) -> Figure:
 
 
 def with_goal_rate(lines: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Lines of metrics with `GOALS` where episodes ended: of the steps since the line before, the first since 0."""
+    """Return lines with `GOALS` where episodes ended: of the steps since the line before, the first since 0."""
     out, before = [], 0.0
     for line in lines:
         steps, before = line["env_steps"] - before, line["env_steps"]
@@ -49,16 +50,8 @@ def with_goal_rate(lines: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def common_curve(runs: Sequence[Sequence[Mapping[str, Any]]], key: str) -> tuple[np.ndarray, np.ndarray]:
-    """Curves of several runs at the same steps.
-
-    Returns:
-        steps [T] that all runs have reached, values [runs, T], linear between logged points.
-    """
-    curves = []
-    for lines in runs:
-        points = np.array([(line["env_steps"], line[key]) for line in lines if key in line], float).reshape(-1, 2)
-        if len(points):
-            curves.append(points)
+    """Return the steps [T] that all runs have reached, and their values [runs, T], linear between logged points."""
+    curves = [points for lines in runs if len(points := _points(lines, key))]
     if not curves:
         return np.zeros(0), np.zeros((0, 0))
     low, high = max(c[0, 0] for c in curves), min(c[-1, 0] for c in curves)
@@ -67,8 +60,13 @@ def common_curve(runs: Sequence[Sequence[Mapping[str, Any]]], key: str) -> tuple
     return steps, np.stack([np.interp(steps, *c.T) for c in curves])
 
 
+def _points(lines: Sequence[Mapping[str, Any]], key: str) -> np.ndarray:
+    """Return [n, 2] env steps and values of the lines that have them."""
+    return np.array([(line["env_steps"], line[key]) for line in lines if key in line], float).reshape(-1, 2)
+
+
 def running_mean(values: np.ndarray, width: int) -> np.ndarray:
-    """Centred means over up to `width` points along the last axis, fewer at the ends."""
+    """Return centred means over up to `width` points along the last axis, fewer at the ends."""
     if width <= 1:
         return values
     sums = np.cumsum(np.concatenate([np.zeros((*values.shape[:-1], 1)), values], -1), -1)
@@ -78,9 +76,9 @@ def running_mean(values: np.ndarray, width: int) -> np.ndarray:
 
 
 def cell_curves(cells: Mapping[style.Cell, Sequence[Sequence[Mapping[str, Any]]]]) -> Figure:
-    """Goals that training reached over env steps, a panel a robot: a line a cell, with its seeds' interval."""
+    """Draw the goals that training reached over env steps, a panel a robot: a line a cell, with its seeds' interval."""
     looks = style.Looks(cells)
-    figure, (axes,) = style.panels((3.6 * len(looks.robots), 3.6), 1, len(looks.robots), sharey=True)
+    figure, (axes,) = panels((3.6 * len(looks.robots), 3.6), 1, len(looks.robots), sharey=True)
     seeds = set()
     for (robot, algorithm, k_int), runs in sorted(cells.items()):
         steps, values = common_curve([with_goal_rate(lines) for lines in runs], GOALS)
@@ -91,17 +89,17 @@ def cell_curves(cells: Mapping[style.Cell, Sequence[Sequence[Mapping[str, Any]]]
         look = {**looks.algorithm(algorithm), "markersize": 4, **looks.k_int(k_int)}
         look |= {"markevery": max(1, len(steps) // 6), "linewidth": 1.2}
         points = [estimate(column) for column in values.T]
-        style.draw_means(axes[looks.robots.index(robot)], steps, points, (0.0, np.inf), **look)
+        draw_means(axes[looks.robots.index(robot)], steps, points, (0.0, np.inf), **look)
     for axis, robot in zip(axes, looks.robots, strict=True):
         _label(axis, GOALS, GOALS_LABEL if axis is axes[0] else "")
         axis.set_title(style.robot_name(robot))
-    style.legend(figure, [*looks.algorithm_handles(markersize=4), *looks.k_int_handles(markersize=4)], 3)
+    legend(figure, [*looks.algorithm_handles(markersize=4), *looks.k_int_handles(markersize=4)], 3)
     figure.suptitle(f"exploring policy, mean of {style.seeds_text(seeds)}, 95 % t interval", fontsize=9)
     return figure
 
 
 def _label(axis: Any, key: str, label: str) -> None:
-    """Axes of a metric over environment steps."""
+    """Label the axes of a metric over environment steps."""
     if key == GOALS:
         axis.set_ylim(bottom=0.0)
     elif key in SHARES:

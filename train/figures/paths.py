@@ -1,4 +1,4 @@
-"""Recorded paths in; top views of where robots went and what they moved out (paper, figures 7 and 8)."""
+"""Draw recorded paths: top views of where robots went and what they moved (paper, figures 7 and 8)."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from train.figures import style
+from interactive_nav_common.figures import handle, legend, panels
 from train.figures.style import policy_colours
 
 FURNITURE_COLOUR = "#ecd9b8"
@@ -23,11 +23,7 @@ LINES = ("-", (0, (4, 1.5)), (0, (1, 1)), "-.")
 
 
 def trajectories(paths: Mapping[str, np.ndarray], most: int = 6, episodes: Sequence[int] | None = None) -> Figure:
-    """Top views: where each policy's robot went in the same episodes, and what it moved.
-
-    Args:
-        episodes: which; the first ones where None.
-    """
+    """Draw where each policy's robot went in the same episodes (None: the first ones), and what it moved."""
     policies = [str(name) for name in paths["policies"]]
     count = len(paths[f"{policies[0]}/goal_xy_w"])
     chosen = list(range(min(most, count))) if episodes is None else list(episodes)
@@ -37,27 +33,27 @@ def trajectories(paths: Mapping[str, np.ndarray], most: int = 6, episodes: Seque
     aspects = [_aspect(paths, policies[0], i) for i in chosen]
     heights = [2.2 * max(aspects[k : k + columns]) + 0.7 for k in range(0, count, columns)]
     size = (2.4 * columns, sum(heights) + 1.0)
-    figure, grid = style.panels(size, len(heights), columns, height_ratios=heights)
+    figure, grid = panels(size, len(heights), columns, height_ratios=heights)
     for axis in grid.flat[count:]:
         axis.set_axis_off()
     for axis, i in zip(grid.flat, chosen, strict=False):
         _draw_episode(axis, paths, policies, i)
     grey: dict[str, Any] = {"color": "0.35", "linestyle": ""}
     handles = [
-        *(style.handle(policy, **pen) for policy, pen in _pens(policies).items()),
-        style.handle("start", marker="o", markerfacecolor="w", markersize=8, **grey),
-        style.handle("goal", marker="*", markersize=11, **grey),
-        style.handle("not reached", marker="x", **grey),
-        style.handle("object at start", marker="s", markerfacecolor="none", markersize=5, **grey),
-        style.handle("object at end, coloured by who moved it", marker="s", markersize=5, **grey),
+        *(handle(policy, **pen) for policy, pen in _pens(policies).items()),
+        handle("start", marker="o", markerfacecolor="w", markersize=8, **grey),
+        handle("goal", marker="*", markersize=11, **grey),
+        handle("not reached", marker="x", **grey),
+        handle("object at start", marker="s", markerfacecolor="none", markersize=5, **grey),
+        handle("object at end, coloured by who moved it", marker="s", markersize=5, **grey),
         Patch(color=FURNITURE_COLOUR, label="furniture at start"),
     ]
-    style.legend(figure, handles, columns, fontsize=8, frameon=False)
+    legend(figure, handles, columns, fontsize=8, frameon=False)
     return figure
 
 
 def _pens(policies: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """How each policy is drawn: random walks, which go everywhere, thin and grey."""
+    """Return how each policy is drawn: random walks, which go everywhere, thin and grey."""
     colours = policy_colours(policies)
     pens: dict[str, dict[str, Any]] = {
         policy: {"color": colours[policy], "linestyle": LINES[k % len(LINES)], "linewidth": 1.6}
@@ -97,11 +93,10 @@ def _draw_episode(axis: Axes, paths: Mapping[str, np.ndarray], policies: list[st
     axis.plot(*start, marker="o", markerfacecolor="w", markeredgecolor="k", markersize=6, zorder=5)
     axis.plot(*goal, marker="*", color="#e69f00", markeredgecolor="k", markersize=11, zorder=5)
     reached, missed = ([p for p in policies if bool(paths[f"{p}/success"][i]) is well] for well in (True, False))
-    told = (
-        f"missed by {', '.join(missed)}" if len(missed) < len(reached) else f"reached by {', '.join(reached) or 'none'}"
-    )
-    told = textwrap.fill(told, TITLE_WIDTH) if missed else "all reach it"
-    axis.set_title(f"{paths[f'scene/{scene}/name']}, episode {i}\n{told}", fontsize=8)
+    fewer = f"missed by {', '.join(missed)}"
+    fewer = fewer if len(missed) < len(reached) else f"reached by {', '.join(reached) or 'none'}"
+    outcome = textwrap.fill(fewer, TITLE_WIDTH) if missed else "all reach it"
+    axis.set_title(f"{paths[f'scene/{scene}/name']}, episode {i}\n{outcome}", fontsize=8)
     axis.set_aspect("equal")
     axis.grid(visible=False)
     axis.spines[:].set_visible(False)
@@ -116,13 +111,9 @@ def _aspect(paths: Mapping[str, np.ndarray], policy: str, episode: int) -> float
 
 
 def side_by_side(records: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Paths of several runs in the same episodes as paths of one record.
+    """Join what `train.evaluate` recorded of several runs into one record, as `trajectories` takes it.
 
-    Args:
-        records: label -> arrays that `train.evaluate` recorded of a run; the first one's scenes are kept.
-
-    Returns:
-        What `trajectories` takes, a policy a label; only episodes that begin alike in all of them.
+    A label becomes a policy; only episodes that start alike in all of them are left, in the first one's scenes.
     """
     first = next(iter(records.values()))
     count = min(len(record["learned/goal_xy_w"]) for record in records.values())
@@ -141,7 +132,7 @@ def side_by_side(records: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, n
 
 
 def spread_episodes(paths: Mapping[str, np.ndarray], most: int) -> Sequence[int]:
-    """Episodes to draw: those in which most was moved come first, from as many scenes as there are."""
+    """Return the episodes to draw: those in which most was moved come first, from as many scenes as there are."""
     policies = [str(name) for name in paths["policies"]]
     scene = paths[f"{policies[0]}/scene_index"]
     moved = np.zeros(len(scene))
@@ -149,8 +140,8 @@ def spread_episodes(paths: Mapping[str, np.ndarray], most: int) -> Sequence[int]
         begin, end = paths[f"{policy}/object_start_w"], paths[f"{policy}/object_end_w"]
         moved = np.maximum(moved, np.linalg.norm(end - begin, axis=-1).clip(max=5.0).sum(-1))
     order = np.argsort(-moved, kind="stable")
-    seen: dict[int, int] = {}
+    count: dict[int, int] = {}
     rank = {}
     for i in order:
-        rank[i] = seen[int(scene[i])] = seen.get(int(scene[i]), -1) + 1
+        rank[i] = count[int(scene[i])] = count.get(int(scene[i]), -1) + 1
     return sorted(sorted(order, key=lambda i: rank[i])[:most])

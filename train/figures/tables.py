@@ -1,4 +1,4 @@
-"""Rows of a sweep in; Markdown tables of scores, claims and provenance out."""
+"""Write Markdown tables of scores, claims and provenance of the rows of a sweep."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -7,59 +7,55 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from interactive_nav_common.rows import markdown
-from interactive_nav_common.statistics import estimate, mean_text
+from interactive_nav_common.rows import markdown, where
+from interactive_nav_common.statistics import estimate, over_episodes
 from train.figures import style
 from train.scoring.claims import Finding, claims
-from train.scoring.statistics import cells, learned_rows, run_means, things_moved
+from train.scoring.statistics import cells, learned_rows, objects_moved, run_means
 
 SPLITS = {"train": "seen", "test": "unseen"}
 COLUMNS = ("success", "P_eff = SPL = INS_1", "E_eff = INS_0", "INS_0.5")
 NAMES = ("success", "path_efficiency", "effort_efficiency", "ins_0.5")
 MOVED = ("touched", "displacement_m")
-"""Of `by_category`, what is told for each object that was there."""
+"""Of `by_category`, the sums that are shown per object."""
 
 
 def score_cells(rows: pa.Table) -> str:
-    """Scores of every cell on seen and unseen scenes: mean over seeds and half of the 95 % t interval."""
+    """Return the scores of every cell on seen and unseen scenes: mean over seeds and half of the 95 % t interval."""
     lines = []
     for split, name in SPLITS.items():
         for (robot, algorithm, k_int), runs in cells(run_means(rows, split)).items():
             scores = [estimate(run.scores[score] for run in runs) for score in NAMES]
             episodes = sum(run.episodes for run in runs)
-            where = (style.robot_name(robot), style.name_of(algorithm), f"{k_int:g}", name)
-            lines.append((*where, len(runs), f"{episodes:,}", *scores))
+            cell = (style.robot_name(robot), algorithm.upper(), f"{k_int:g}", name)
+            lines.append((*cell, len(runs), f"{episodes:,}", *scores))
     lines.sort(key=lambda line: (line[0], line[1], line[2]))
     return markdown(("robot", "algorithm", "k_int", "scenes", "runs", "episodes", *COLUMNS), lines)
 
 
 def baselines(rows: pa.Table) -> str:
-    """Scores of policies that never learned: mean over episodes and their 95 % interval; empty where there are none."""
-    policy = np.asarray(rows["policy"].to_pylist())
-    keys = sorted({key for key in zip(rows["robot"].to_pylist(), policy, rows["split"].to_pylist(), strict=True)})
-    robots, splits = np.asarray(rows["robot"].to_pylist()), np.asarray(rows["split"].to_pylist())
-    lines = []
-    for robot, name, split in keys:
-        if name == "learned":
-            continue
-        at = (robots == robot) & (policy == name) & (splits == split)
-        scores = (mean_text(score, rows[score].to_numpy()[at]) for score in NAMES)
-        lines.append((style.robot_name(robot), name, SPLITS.get(split, split), f"{int(at.sum()):,}", *scores))
+    """Return the scores of policies that never learned, means over episodes; empty where there are none."""
+    names, lines = ("robot", "policy", "split"), []
+    for robot, policy, split in sorted(set(zip(*(rows[name].to_pylist() for name in names), strict=True))):
+        if policy != "learned":
+            part = where(rows, robot=robot, policy=policy, split=split)
+            scores = (over_episodes(score, part[score].to_numpy()).with_ends() for score in NAMES)
+            lines.append((style.robot_name(robot), policy, SPLITS.get(split, split), f"{len(part):,}", *scores))
     return markdown(("robot", "policy", "scenes", "episodes", *COLUMNS), lines) if lines else ""
 
 
 def claim_lines(findings: Iterable[Finding]) -> str:
-    """The paper's claims and what the runs say to them."""
+    """Return the paper's claims and what the runs say to them."""
     return markdown(("claim", "compared", "difference [95 % interval], p", "here"), map(dataclasses.astuple, findings))
 
 
 def without_walls(rows: pa.Table) -> pa.Table:
-    """Episodes in which the robot touched no wall; all where rows do not tell."""
+    """Return episodes in which the robot touched no wall; all where rows do not have the column."""
     return rows.filter(pc.field("structure_steps") == 0) if "structure_steps" in rows.column_names else rows
 
 
 def effort_lines(rows: pa.Table, split: str | None) -> str:
-    """What the claims on effort come to without walls; empty where no episode touched one."""
+    """Return the claims on effort without episodes that touched a wall; empty where none did."""
     free = without_walls(rows)
     if len(free) == len(rows):
         return ""
@@ -69,23 +65,23 @@ def effort_lines(rows: pa.Table, split: str | None) -> str:
 
 
 def need_lines(rows: pa.Table) -> str:
-    """Success by whether the goal can be reached without touching anything: as the episodes' file says, or as the
-    avoider did; empty where neither is known."""
+    """Return success by whether the goal can be reached without touching anything: as the episodes' file says, or as
+    the avoider did; empty where neither is there."""
     names = ("policy", "robot", "scene", "episode", "k_int", "success")
     if not set(names) <= set(rows.column_names):
         return ""
     every = list(zip(*(rows[name].to_pylist() for name in names), strict=True))
     avoidable = {tuple(task): success > 0 for policy, *task, _, success in every if policy == "avoider"}
     if "push_needed" in rows.column_names:
-        told = zip(every, rows["push_needed"].to_pylist(), strict=True)
-        avoidable |= {tuple(task): not needed for (_, *task, _, _), needed in told if needed is not None}
-    found: dict[tuple[str, float], dict[bool, list[float]]] = {}
+        noted = zip(every, rows["push_needed"].to_pylist(), strict=True)
+        avoidable |= {tuple(task): not needed for (_, *task, _, _), needed in noted if needed is not None}
+    by_cell: dict[tuple[str, float], dict[bool, list[float]]] = {}
     for policy, *task, k_int, success in every:
         if policy == "learned" and tuple(task) in avoidable:
-            cell = found.setdefault((task[0], k_int), {True: [], False: []})
+            cell = by_cell.setdefault((task[0], k_int), {True: [], False: []})
             cell[avoidable[tuple(task)]].append(success)
     lines = []
-    for (robot, k_int), cell in sorted(found.items()):
+    for (robot, k_int), cell in sorted(by_cell.items()):
         scores = [f"{np.mean(cell[free]):.3f} ({len(cell[free]):,})" if cell[free] else "-" for free in (True, False)]
         lines.append((style.robot_name(robot), f"{k_int:g}", *scores))
     header = ("robot", "k_int", "success where no push is needed (episodes)", "where one is")
@@ -93,21 +89,21 @@ def need_lines(rows: pa.Table) -> str:
 
 
 def category_lines(rows: pa.Table, split: str | None) -> str:
-    """How often and how far each policy moved things of each category; empty where rows do not tell."""
-    rows = rows if split is None else rows.filter(pc.field("split") == split)
+    """Return how often and how far each policy moved objects of each category; empty without such columns."""
+    rows = where(rows, split=split)
     if not len(rows):
         return ""
     policy = [
         name if name != "learned" else f"k_int = {k_int:g}"
         for name, k_int in zip(rows["policy"].to_pylist(), rows["k_int"].to_pylist(), strict=True)
     ]
-    found = things_moved(rows.append_column("of", pa.array(policy, pa.string())), ["robot", "of"])
-    policies = sorted({of for _, of, _ in found}, key=lambda of: (not of.startswith("k_int"), of))
+    moved = objects_moved(rows.append_column("of", pa.array(policy, pa.string())), ["robot", "of"])
+    policies = sorted({of for _, of, _ in moved}, key=lambda of: (not of.startswith("k_int"), of))
     lines = []
-    for robot, category in sorted({key[::2] for key in found}):
+    for robot, category in sorted({key[::2] for key in moved}):
         shown = []
         for of in policies:
-            if sums := found.get((robot, of, category)):
+            if sums := moved.get((robot, of, category)):
                 share, moved_m = (sums[name] / sums["objects"] for name in MOVED)
                 shown.append(f"{share:.1%}, {100 * moved_m:.1f}")
             else:
@@ -117,70 +113,66 @@ def category_lines(rows: pa.Table, split: str | None) -> str:
 
 
 def provenance(rows: pa.Table) -> str:
-    """Env steps, wall-clock, device and commit of every run."""
+    """Return env steps, wall-clock, device and commit of every run."""
     names = ("run", "train_env_steps", "checkpoint_steps", "train_wall_s", "train_device", "train_commit", "device")
     if not set(names) <= set(rows.column_names):
         return ""
-    found = learned_rows(rows).group_by(list(names)).aggregate([("episode", "count")]).to_pylist()
+    runs = learned_rows(rows).group_by(list(names)).aggregate([("episode", "count")]).to_pylist()
     lines = [
         (
             row["run"],
-            _number(row["train_env_steps"]),
-            _number(row["checkpoint_steps"]),
+            *("-" if row[name] is None else f"{row[name]:,}" for name in names[1:3]),
             "-" if row["train_wall_s"] is None else f"{row['train_wall_s'] / 60:.1f}",
             row["train_device"] or "-",
             (row["train_commit"] or "-")[:10],
             row["device"],
         )
-        for row in sorted(found, key=lambda row: (row["run"], row["device"]))
+        for row in sorted(runs, key=lambda row: (row["run"], row["device"]))
     ]
     header = ("run", "env steps", "evaluated at", "wall-clock [min]", "trained on", "commit", "evaluated on")
     return markdown(header, lines) if lines else ""
 
 
-def _number(value: int | None) -> str:
-    return "-" if value is None else f"{value:,}"
-
-
 def document(rows: pa.Table, split: str | None) -> str:
-    """All tables, with what the numbers mean; without learned runs, those of the others."""
+    """Return all tables, with what the numbers mean; without learned runs, those of the others."""
     shown = {"train": "training", "test": "unseen", None: "all"}[split]
     learned = bool(len(learned_rows(rows)))
-    parts = [
-        "## Scores",
-        "Mean over runs ± half of the 95 % t interval over seeds; a run's score is the mean over its fixed episodes.",
-        score_cells(rows),
-        "## The paper's claims",
-        f"On {shown} scenes unless the line says otherwise. Two-sided Welch t tests over seeds, each seed's score the "
-        "mean over the settings that both sides have; level 5 %, not corrected for the number of tests. "
-        "Cells with fewer runs than others are not compared. "
-        "`undecided` says that these runs cannot tell, not that there is no difference.",
-        claim_lines(claims(rows, split)),
-    ] if learned else []  # fmt: skip
-    if learned and (effort := effort_lines(rows, split)):
-        parts += [
-            "## Effort without walls",
+    sections = [
+        (
+            "Scores",
+            "Mean over runs ± half of the 95 % t interval over seeds; a run's score is the mean over its fixed "
+            "episodes.",
+            score_cells(rows) if learned else "",
+        ),
+        (
+            "The paper's claims",
+            f"On {shown} scenes unless the line says otherwise. Two-sided Welch t tests over seeds, each seed's score "
+            "the mean over the settings that both sides have; level 5 %, not corrected for the number of tests. "
+            "Cells with fewer runs than others are not compared. "
+            "`undecided` says that these runs cannot tell, not that there is no difference.",
+            claim_lines(claims(rows, split)) if learned else "",
+        ),
+        (
+            "Effort without walls",
             "The same comparisons over the episodes that touched no wall. The dynamic term of E_eff counts forces on "
             "walls, the penalty counts movable objects only. Which episodes these are depends on the policy.",
-            effort,
-        ]
-    if need := need_lines(rows):
-        parts += [
-            "## Where touching is needed",
+            effort_lines(rows, split) if learned else "",
+        ),
+        (
+            "Where touching is needed",
             "All scenes and algorithms, the episodes of which it is known: their file says so, or the avoider played "
             "them too. It knows where everything stands and touches nothing; where it does not arrive, it found no way "
             "wide enough.",
-            need,
-        ]
-    if moved := category_lines(rows, split):
-        parts += [
-            "## What was touched and moved",
+            need_lines(rows),
+        ),
+        (
+            "What was touched and moved",
             "By category, over all algorithms: the share of the objects there that were touched in an episode, and how "
             "far each of them was moved on average, in centimetres of its centre's path.",
-            moved,
-        ]
-    if known := baselines(rows):
-        parts += ["## Policies that never learned", "Mean over episodes [95 % interval].", known]
-    if runs := provenance(rows):
-        parts += ["## Runs", runs]
+            category_lines(rows, split),
+        ),
+        ("Policies that never learned", "Mean over episodes [95 % interval].", baselines(rows)),
+        ("Runs", "", provenance(rows)),
+    ]
+    parts = (part for heading, words, table in sections if table for part in (f"## {heading}", words, table) if part)
     return "\n\n".join(part.rstrip() for part in parts) + "\n"

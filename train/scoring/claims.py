@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from interactive_nav_common.statistics import Contrast, estimate, welch
-from train.scoring.statistics import RunMean, cells, contrast, correlation, run_means, train_test_contrast
+from interactive_nav_common.statistics import Contrast, correlation, estimate, welch
+from train.scoring.statistics import RunMean, cells, contrast, run_means, train_test_contrast
 
 ALPHAS = tuple(k / 10 for k in range(11))
 LARGE = ("sofa", "table", "desk", "bed", "sideboard", "dresser", "bookcase")
@@ -37,15 +37,22 @@ def _verdict(test: Contrast, expected: str) -> str:
     return {expected: "holds", "undecided": "undecided"}.get(test.verdict, f"does not hold: {test.verdict}")
 
 
+def _tested(
+    claim: str, what: str, expected: str, test: Contrast | None, missing: str = "no runs to compare"
+) -> Finding:
+    """Judge a claim by a test; None: there are no runs."""
+    if test is None or math.isnan(test.difference):
+        return Finding(claim, what, "-", missing)
+    return Finding(claim, what, str(test), _verdict(test, expected))
+
+
 def _compared(
-    means: Sequence[RunMean], claim: str, what: str, expected: str, alpha: float, *sides: Any, **where: Any
+    means: Sequence[RunMean], claim: str, what: str, expected: str, alpha: float, *sides: Any, **fixed: Any
 ) -> Finding:
     """Test a claim about INS_alpha (0: E_eff, 1: P_eff) of two values of an axis; see `contrast`."""
     axis, left, right = sides
-    test = contrast(means, axis, left, right, lambda run: run.ins(alpha), **where)
-    if test is None:
-        return Finding(claim, what, "-", f"no runs of {left} and {right} to compare")
-    return Finding(claim, what, str(test), _verdict(test, expected))
+    test = contrast(means, axis, left, right, lambda run: run.ins(alpha), **fixed)
+    return _tested(claim, what, expected, test, f"no runs of {left} and {right} to compare")
 
 
 def _of_sac(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
@@ -80,37 +87,31 @@ def _best_verdict(of_robot: Cells, is_there: bool, holds: bool) -> str:
     return "holds" if holds else "does not hold"
 
 
-def _of_things(means: Sequence[RunMean]) -> Iterator[Finding]:
+def _of_objects(means: Sequence[RunMean]) -> Iterator[Finding]:
     """Compare what is pushed and what is avoided; nothing where rows have no categories."""
-
-    def compared(claim: str, what: str, expected: str, test: Contrast | None) -> Finding:
-        if test is None or math.isnan(test.difference):
-            return Finding(claim, what, "-", "no runs to compare")
-        return Finding(claim, what, str(test), _verdict(test, expected))
-
-    if not any(run.things for run in means):
+    if not any(run.objects for run in means):
         return
     claim = "Depending on the penalty a TurtleBot avoids large, medium or small things"
     free = [run for run in means if (run.robot, run.k_int) == ("turtlebot", 0.0)]
     share = [
-        [np.mean([run.of_things("touched", kinds) for run in free if run.seed == seed]) for seed in seeds]
+        [np.mean([run.of_objects("touched", kinds) for run in free if run.seed == seed]) for seed in seeds]
         for seeds in [sorted({run.seed for run in free})]
         for kinds in (LARGE, SMALL)
     ]
     what = "turtlebot: share of large less share of small things that are touched, k_int = 0, mean over algorithms"
-    yield compared(claim, what, "lower", welch(*map(np.asarray, share)) if free else None)
+    yield _tested(claim, what, "lower", welch(*map(np.asarray, share)) if free else None)
     for kinds, name, high, low in ((MEDIUM, "medium", 0.1, 0.0), (SMALL, "small", 1.0, 0.1)):
         what = f"turtlebot: share of {name} things that are touched, k_int = {high:g} minus {low:g}"
         test = contrast(
-            means, "k_int", high, low, lambda run, kinds=kinds: run.of_things("touched", kinds), robot="turtlebot"
+            means, "k_int", high, low, lambda run, kinds=kinds: run.of_objects("touched", kinds), robot="turtlebot"
         )
-        yield compared(claim, f"{what}, mean over algorithms", "lower", test)
+        yield _tested(claim, f"{what}, mean over algorithms", "lower", test)
     for kinds, name in ((("table", "coffee_table"), "tables"), (("sofa", "armchair"), "sofas")):
         test = contrast(
-            means, "robot", "fetch", "turtlebot", lambda run, kinds=kinds: run.of_things("displacement_m", kinds)
+            means, "robot", "fetch", "turtlebot", lambda run, kinds=kinds: run.of_objects("displacement_m", kinds)
         )
         what = f"metres that each of the {name} is moved, Fetch minus TurtleBot, mean over algorithms and k_int"
-        yield compared("Fetch moves tables and sofas", what, "higher", test)
+        yield _tested("Fetch moves tables and sofas", what, "higher", test)
 
 
 def _of_penalties(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
@@ -136,11 +137,8 @@ def _of_splits(rows: pa.Table) -> Finding:
     """Compare train with test scenes."""
     pairs, test = train_test_contrast(rows)
     what = f"INS_0.5, unseen minus seen scenes, one-sample t test over {len(pairs)} runs"
-    result, verdict = "-", "no runs with rows of train and of test scenes"
-    if test is not None:
-        result = str(test)
-        verdict = "too few runs to test" if math.isnan(test.p_value) else _verdict(test, "same")
-    return Finding("Seen and unseen scenes do not differ", what, result, verdict)
+    claim, missing = "Seen and unseen scenes do not differ", "no runs with rows of train and of test scenes"
+    return _tested(claim, what, "same", test, missing)
 
 
 def _of_whole_cells(means: Sequence[RunMean]) -> list[RunMean]:
@@ -152,10 +150,8 @@ def _of_whole_cells(means: Sequence[RunMean]) -> list[RunMean]:
 def claims(rows: pa.Table, split: str | None) -> list[Finding]:
     """Return the paper's claims, one comparison a line; those whose runs are missing say so.
 
-    Cells with fewer runs than others are not compared: of a sweep that goes on they are not finished.
-
-    Args:
-        split: of the scenes for all but the train and test claim; None: all.
+    Cells with fewer runs than others are not compared: of a sweep that goes on they are not finished. All but the claim
+    about train and test scenes are about one `split` of the scenes; None: all.
     """
     runs = run_means(rows, split)
     means = _of_whole_cells(runs)
@@ -165,7 +161,7 @@ def claims(rows: pa.Table, split: str | None) -> list[Finding]:
         findings += _of_sac(means, robot)
     for robot in robots:
         findings += _of_penalties(means, robot)
-    findings += _of_things(means)
+    findings += _of_objects(means)
     for alpha, name, expected in ((0.0, "E_eff", "higher"), (1.0, "P_eff", "same")) if len(robots) > 1 else ():
         claim = "Fetch is more effort-efficient than TurtleBot at the same path efficiency"
         what = f"{name}, Fetch minus TurtleBot, mean over algorithms and k_int"

@@ -14,8 +14,8 @@ from rich.table import Table
 
 from interactive_nav.types import OF_OBJECTS
 from interactive_nav_common.errors import FileError
-from interactive_nav_common.rows import Columns
-from interactive_nav_common.statistics import RESAMPLES, mean_text
+from interactive_nav_common.rows import Columns, console_table, where
+from interactive_nav_common.statistics import RESAMPLES, over_episodes
 
 if TYPE_CHECKING:
     from train.scoring.rollout import PlayedEpisodes
@@ -115,14 +115,10 @@ def _by_category(episodes: PlayedEpisodes, episode: int, categories: Sequence[st
 
 def score_table(rows: pa.Table, title: str) -> Table:
     """Return a table of each policy's success, P_eff, E_eff and INS_0.5, with intervals."""
-    table = Table(
-        title=title, caption=f"mean [95 % interval]: Wilson for success, bootstrap ({RESAMPLES:,} resamples) elsewhere"
-    )
-    table.add_column("policy")
-    for label in (*SCORES.values(), "episodes"):
-        table.add_column(label, justify="right")
-    policies = np.asarray(rows["policy"].to_pylist())
-    for policy in dict.fromkeys(policies):
-        cells = (mean_text(name, rows[name].to_numpy()[policies == policy]) for name in SCORES)
-        table.add_row(policy, *cells, str(int((policies == policy).sum())))
-    return table
+    caption = f"mean [95 % interval]: Wilson for success, bootstrap ({RESAMPLES:,} resamples) elsewhere"
+    lines = []
+    for policy in rows["policy"].unique().to_pylist():
+        part = where(rows, policy=policy)
+        scores = (over_episodes(name, part[name].to_numpy()).with_ends() for name in SCORES)
+        lines.append((policy, *scores, str(len(part))))
+    return console_table(("policy", *SCORES.values(), "episodes"), lines, title=title, caption=caption)

@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from scipy import stats
 
-from interactive_nav_common.statistics import CONFIDENCE, LEVEL, Contrast, _constant, p_text, welch
+from interactive_nav_common.rows import where
+from interactive_nav_common.statistics import Contrast, paired_test, welch
 
 SCORES = ("success", "path_efficiency", "effort_efficiency", "kinematic_effort", "dynamic_effort", "ins_0.5")
 
-
-Things = Mapping[str, float]
+Sums = Mapping[str, float]
 """Sums over episodes of the numbers of `by_category` (`train.scoring.rows`)."""
 
 
@@ -34,8 +33,8 @@ class RunMean:
     seed: int
     episodes: int
     scores: Mapping[str, float]
-    things: Mapping[str, Things]
-    """By category; empty where rows do not tell."""
+    objects: Mapping[str, Sums]
+    """By category; empty where rows do not have them."""
 
     @property
     def cell(self) -> tuple[str, str, float]:
@@ -46,21 +45,19 @@ class RunMean:
         """Return the interactive navigation score: alpha P_eff + (1 - alpha) E_eff."""
         return alpha * self.scores["path_efficiency"] + (1.0 - alpha) * self.scores["effort_efficiency"]
 
-    def of_things(self, what: str, categories: Iterable[str]) -> float:
-        """Return `touched` or `displacement_m` of `by_category` for each object of some categories that was there; NaN
-        for none."""
-        matching = [self.things[name] for name in categories if name in self.things]
-        there = sum(things["objects"] for things in matching)
-        return sum(things[what] for things in matching) / there if there else math.nan
+    def of_objects(self, what: str, categories: Iterable[str]) -> float:
+        """Return `touched` or `displacement_m` of `by_category` per object of some categories; NaN without any."""
+        matching = [self.objects[name] for name in categories if name in self.objects]
+        there = sum(sums["objects"] for sums in matching)
+        return sum(sums[what] for sums in matching) / there if there else math.nan
 
 
 def learned_rows(rows: pa.Table, split: str | None = None) -> pa.Table:
     """Return the rows of learned policies, in one part of the scenes or all."""
-    kept = pc.field("policy") == "learned"
-    return rows.filter(kept if split is None else kept & (pc.field("split") == split))
+    return where(rows, policy="learned", split=split)
 
 
-def things_moved(rows: pa.Table, keys: list[str]) -> dict[tuple[Any, ...], Things]:
+def objects_moved(rows: pa.Table, keys: list[str]) -> dict[tuple[Any, ...], Sums]:
     """Return (value of each key, category) -> sums over episodes of `by_category`; empty without that column."""
     if "by_category" not in rows.column_names:
         return {}
@@ -77,12 +74,9 @@ def things_moved(rows: pa.Table, keys: list[str]) -> dict[tuple[Any, ...], Thing
 
 
 def run_means(rows: pa.Table, split: str | None = None) -> list[RunMean]:
-    """Return the means of each learned run over its episodes.
-
-    `split`: train or test scenes; None: all.
-    """
+    """Return the means of each learned run over its episodes in train or test scenes; None: all."""
     chosen = learned_rows(rows, split)
-    things = things_moved(chosen, ["run"])
+    objects = objects_moved(chosen, ["run"])
     names = [name for name in SCORES if name in chosen.column_names]
     keys = ["run", "robot", "algorithm", "k_int", "seed"]
     means = chosen.group_by(keys).aggregate([(name, "mean") for name in names] + [("episode", "count")]).to_pylist()
@@ -91,7 +85,7 @@ def run_means(rows: pa.Table, split: str | None = None) -> list[RunMean]:
             *(row[key] for key in keys),
             episodes=row["episode_count"],
             scores={name: row[f"{name}_mean"] for name in names},
-            things={category: sums for (run, category), sums in things.items() if run == row["run"]},
+            objects={category: sums for (run, category), sums in objects.items() if run == row["run"]},
         )
         for row in means
     ]
@@ -107,16 +101,13 @@ def cells(means: Sequence[RunMean]) -> dict[tuple[str, str, float], list[RunMean
 
 
 def contrast(
-    means: Sequence[RunMean], axis: str, left: Any, right: Any, score: Callable[[RunMean], float], **where: Any
+    means: Sequence[RunMean], axis: str, left: Any, right: Any, score: Callable[[RunMean], float], **fixed: Any
 ) -> Contrast | None:
-    """Compare two values of an axis.
+    """Compare two values of an axis; return None where a side has no runs.
 
     Each seed counts once: its score is the mean over the settings of the other axes that both sides have.
-
-    Returns:
-        None where a side has no runs.
     """
-    chosen = [run for run in means if all(getattr(run, name) == value for name, value in where.items())]
+    chosen = [run for run in means if all(getattr(run, name) == value for name, value in fixed.items())]
     others = [name for name in ("robot", "algorithm", "k_int") if name != axis]
 
     def by_setting(value: Any) -> dict[tuple[Any, ...], dict[int, float]]:
@@ -135,10 +126,8 @@ def contrast(
         seeds = set.intersection(*(set(side[setting]) for setting in common))
         return np.array([np.mean([side[setting][seed] for setting in common]) for seed in sorted(seeds)])
 
-    a, b = per_seed(sides[0]), per_seed(sides[1])
-    if not len(a) or not len(b):
-        return None
-    return welch(a, b)
+    a, b = map(per_seed, sides)
+    return welch(a, b) if len(a) and len(b) else None
 
 
 def train_test_contrast(rows: pa.Table) -> tuple[list[tuple[RunMean, RunMean]], Contrast | None]:
@@ -148,45 +137,4 @@ def train_test_contrast(rows: pa.Table) -> tuple[list[tuple[RunMean, RunMean]], 
     pairs = [(run, unseen[run.run]) for run in run_means(rows, "train") if run.run in unseen]
     if not pairs:
         return [], None
-    differences = np.array([test.ins(0.5) - train.ins(0.5) for train, test in pairs])
-    mean = float(differences.mean())
-    if len(differences) < 2 or _constant(differences):
-        return pairs, Contrast(mean, math.nan, math.nan, math.nan, len(pairs), len(pairs))
-    test = stats.ttest_1samp(differences, 0.0)
-    interval = test.confidence_interval(CONFIDENCE)
-    return pairs, Contrast(mean, float(interval.low), float(interval.high), float(test.pvalue), len(pairs), len(pairs))
-
-
-@dataclasses.dataclass(frozen=True)
-class Correlation:
-    """Pearson's r with its 95 % interval (Fisher's z) and p-value."""
-
-    r: float
-    low: float
-    high: float
-    p_value: float
-    count: int
-
-    @property
-    def verdict(self) -> str:
-        """Return whether they are correlated, at the 5 % level."""
-        if math.isnan(self.r):
-            return "too few runs to test"
-        if self.p_value >= LEVEL:
-            return "undecided"
-        return "holds" if self.r > 0 else "does not hold: negative"
-
-    def __str__(self) -> str:
-        if math.isnan(self.r):
-            return f"not defined ({self.count} points)"
-        return f"{self.r:.2f} [{self.low:.2f}, {self.high:.2f}], p {p_text(self.p_value)}, n = {self.count:,}"
-
-
-def correlation(x: Iterable[float], y: Iterable[float]) -> Correlation:
-    """Return Pearson's correlation; NaN for fewer than four points or where one does not vary."""
-    a, b = np.asarray(list(x), float), np.asarray(list(y), float)
-    if len(a) < 4 or _constant(a) or _constant(b):
-        return Correlation(math.nan, math.nan, math.nan, math.nan, len(a))
-    test = stats.pearsonr(a, b)
-    interval = test.confidence_interval(CONFIDENCE)
-    return Correlation(float(test.statistic), float(interval.low), float(interval.high), float(test.pvalue), len(a))
+    return pairs, paired_test(np.array([test.ins(0.5) - train.ins(0.5) for train, test in pairs]))

@@ -76,7 +76,7 @@ def test_scores_by_hand():
 
 def test_without_success_contacts_have_no_score():
     rows = table(shortest=[4.0], success=[False], path_m=[9.0], contact_s=[3.0], contact_runs=[2])
-    assert scores.score(rows, "rc") == scores.NOTHING and str(scores.score(rows, "rc")) == "-"
+    assert scores.score(rows, "rc") == scores.NOTHING and scores.text(scores.NOTHING) == "-"
     assert scores.score(rows, "success").mean == 0.0
 
 

@@ -16,7 +16,7 @@ from interactive_nav.task import rollout
 from interactive_nav.task.rollout import HostPolicy, episode_keys
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.rows import read_notes, read_rows, write_parquet
-from interactive_nav_common.statistics import interval
+from interactive_nav_common.statistics import Estimate, over_episodes
 from tests.train.toy_env import ToyConfig, ToyEnv
 from train.scoring.policies import make_follower, make_random
 from train.scoring.rollout import BatchPlayer, Paths, PlayedEpisodes
@@ -161,19 +161,21 @@ def test_wilson_interval_by_hand():
     z2 = 1.959963985**2
     centre = (0.8 + z2 / 20) / (1 + z2 / 10)
     half = math.sqrt(z2) * math.sqrt(0.8 * 0.2 / 10 + z2 / 400) / (1 + z2 / 10)
-    low, high = interval("success", np.array([1.0] * 8 + [0.0] * 2))
+    share = over_episodes("success", np.array([1.0] * 8 + [0.0] * 2))
+    low, high = share.low, share.high
     assert (low, high) == pytest.approx((centre - half, centre + half), abs=1e-6)
     assert (low, high) == pytest.approx((0.4902, 0.9433), abs=1e-4)
-    assert interval("success", np.ones(10))[1] == 1.0
+    assert over_episodes("success", np.ones(10)).high == 1.0
 
 
 def test_bootstrap_interval_is_near_the_normal_one():
     """400 standard normal draws: mean +- 1.96 / 20."""
     values = np.random.default_rng(0).normal(size=400)
-    low, high = interval("ins_0.5", values)
+    mean = over_episodes("ins_0.5", values)
+    low, high = mean.low, mean.high
     half = 1.96 * values.std() / 20
     assert (low, high) == pytest.approx((values.mean() - half, values.mean() + half), abs=0.01)
-    assert interval("ins_0.5", np.full(5, 0.25)) == (0.25, 0.25)
+    assert over_episodes("ins_0.5", np.full(5, 0.25)) == Estimate(0.25, 0.25, 0.25, 5)
 
 
 def test_rows_and_file(tmp_path):

@@ -9,11 +9,11 @@ import pyarrow as pa
 import pyarrow.compute
 import pytest
 
-from interactive_nav_common.statistics import estimate, p_text, welch
+from interactive_nav_common.statistics import correlation, estimate, p_text, paired_difference, welch
 from tests.train.synthetic import K_INTS, baseline_rows, paper_like, run_rows
 from train.scoring.claims import LARGE, MEDIUM, SMALL, claims
 from train.scoring.rows import BY_CATEGORY
-from train.scoring.statistics import contrast, correlation, run_means, train_test_contrast
+from train.scoring.statistics import contrast, run_means, train_test_contrast
 
 
 def test_a_run_counts_once_whatever_its_episodes():
@@ -78,6 +78,18 @@ def test_seen_against_unseen():
     assert test.p_value == pytest.approx(1.0 - t / math.sqrt(t * t + 2.0), abs=1e-6)
     only_train = [table.filter(pa.compute.equal(table["split"], "train")) for table in tables]
     assert train_test_contrast(pa.concat_tables(only_train)) == ([], None)
+
+
+def test_paired_differences_by_hand():
+    """0, 0, 3: a resample has k threes with k of three draws at 1 / 3: P(0) = 8 / 27 and P(3) = 1 / 27 exceed 2.5 %."""
+    ahead = paired_difference([1.0, 2.0, 5.0], [1.0, 2.0, 2.0])
+    assert (ahead.mean, ahead.low, ahead.high, ahead.runs) == (1.0, 0.0, 3.0, 3)
+    assert ahead.with_ends() == "1.000 [0.000, 3.000]" and ahead.with_ends(0) == "1 [0, 3]"
+    same = paired_difference([0.5, 0.75], [0.25, 0.5])
+    assert (same.mean, same.low, same.high) == (0.25, 0.25, 0.25)
+    # Of a hundred the mean of differences has nearly a normal distribution, of standard error 0.5 / 10.
+    many = paired_difference(np.arange(100) % 2, np.zeros(100))
+    assert many.mean == 0.5 and (many.low, many.high) == pytest.approx((0.5 - 0.098, 0.5 + 0.098), abs=0.006)
 
 
 def test_correlation_by_hand():
