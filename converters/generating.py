@@ -1,4 +1,4 @@
-"""Commands of `python -m converters` that generate, and of the furniture for it; their words are in words.yaml."""
+"""Run the commands of `python -m converters` that generate scenes and prepare furniture; words.yaml has their words."""
 
 import argparse
 import dataclasses

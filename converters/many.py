@@ -1,7 +1,7 @@
-"""Raw folders in, a scene folder and a row of `conversions.parquet` for each out: side by side, resumable.
+"""Convert raw folders side by side, resumable, to a scene folder and a row of `conversions.parquet` each.
 
-Each source is converted by a process of its own (`python -m converters.many JSON`), which writes its own row: one that
-fails or is killed costs no other.
+Each source has a process (`python -m converters.many JSON`), which writes the source's row: one that fails or is killed
+costs no other.
 """
 
 import contextlib
@@ -48,13 +48,13 @@ SCHEMA = pa.schema(
 
 
 def digest_of(source: Path, config: ConvertConfig, scenes: Sequence[Path] = ()) -> str:
-    """Of the options that a conversion's result depends on, and of the names, sizes and times of its input files."""
+    """Return a digest of the options that a result depends on, and of the names, sizes and times of its input files."""
     roots = [root for root in (source, config.library) if root is not None]
     paths = [(root, path) for root in roots for path in (root, *sorted(root.rglob("*"))) if path.is_file()]
     if source.is_file():
         root, named = root_of(source), set()
         for scene in scenes:
-            with contextlib.suppress(SceneError):  # a damaged one has no digest of before, so it is made again
+            with contextlib.suppress(SceneError):  # a damaged one has no digest of before, so it is converted again
                 named |= set(load_manifest(scene).source.get("sha256", {}))
         paths += [(root, root / name) for name in sorted(named) if (root / name).is_file()]
     files = [(os.path.relpath(p, root), p.stat().st_size, p.stat().st_mtime_ns) for root, p in paths]
@@ -66,10 +66,9 @@ def convert_many(
     sources: Sequence[Path], into: Path, config: ConvertConfig, launcher: Launcher, side_by_side: int,
     report: Callable[[str, float], None], tell: Callable[[str], None],
 ) -> list[str]:  # fmt: skip
-    """Converts what has not been converted with these options; the row of each is written as it ends.
+    """Convert what has not been converted with these options; the row of each is written as it ends.
 
-    Returns:
-        Names of the sources without a scene, or with a gate that fails, whether tried now or before.
+    Return the names of the sources without a scene, or with a gate that fails, whether tried now or before.
     """
     named = _named(sources)
     path = into / ROWS
@@ -80,9 +79,9 @@ def convert_many(
     with tempfile.TemporaryDirectory(dir=into, prefix=".rows-") as folder:
         for name, source in named.items():
             old = rows.get(name)
-            made = [Path(into, scene) for scene in (old and old["scenes"]) or ()]
-            ours = bool(made) and all(scene.is_dir() for scene in made)
-            digests[name] = digest_of(source, config, made)
+            scenes = [Path(into, scene) for scene in (old and old["scenes"]) or ()]
+            ours = bool(scenes) and all(scene.is_dir() for scene in scenes)
+            digests[name] = digest_of(source, config, scenes)
             same = old and ours and old["digest"] == digests[name] and old["exit_code"] in (0, 1)
             if old and same and not config.overwrite:
                 tell(f"{name}: is there, kept")
@@ -93,24 +92,21 @@ def convert_many(
             commands[name] = [sys.executable, "-m", "converters.many", json.dumps(task, default=str)]
 
         def ended(name: str, code: int, printed: str) -> str:
-            made = Path(folder, name)
-            row = json.loads(made.read_text(encoding="utf-8")) if made.is_file() else {}
-            if not row:
-                told = f"killed by signal {-code}" if code < -1 else f"exit code {code}, {printed[-200:].strip()}"
-                row["error"] = told
-            known = {"name": name, "source": str(named[name]), "exit_code": code}
+            report_path = Path(folder, name)
+            killed = f"killed by signal {-code}" if code < -1 else f"exit code {code}, {printed[-200:].strip()}"
+            row = json.loads(report_path.read_text(encoding="utf-8")) if report_path.is_file() else {"error": killed}
             scenes = (rows.get(name) or {}).get("scenes")  # of before: they still stand
-            rows[name] = {"scenes": scenes, **known, **row}
-            made_now = [Path(into, scene) for scene in row.get("scenes") or ()]
-            rows[name]["digest"] = digest_of(named[name], config, made_now) if made_now else digests[name]
+            rows[name] = {"scenes": scenes, "name": name, "source": str(named[name]), "exit_code": code, **row}
+            new = [Path(into, scene) for scene in row.get("scenes") or ()]
+            rows[name]["digest"] = digest_of(named[name], config, new) if new else digests[name]
             write_parquet(pa.Table.from_pylist(list(rows.values()), SCHEMA), path)
-            return _told(rows[name])
+            return _line(rows[name])
 
         return bad + run_side_by_side(commands, launcher, into, report, tell, ended, "sources")
 
 
-def _told(row: Mapping[str, Any]) -> str:
-    """A conversion's row in one line."""
+def _line(row: Mapping[str, Any]) -> str:
+    """Return a conversion's row as one line."""
     if row.get("error") is not None:
         return f"{row['name']}: {row['error']}"
     gates = ", ".join(row["gates_failed"])
@@ -138,7 +134,7 @@ def _rows(path: Path) -> list[dict[str, Any]]:
 
 
 def measured(results: Sequence[Converted], seconds: float) -> dict[str, Any]:
-    """What a row says of a conversion that was done in this process; gates carry the scene's name where several are."""
+    """Return the row of a conversion in this process; gates carry the scene's name where there are several scenes."""
     gates = [(g.name if len(results) == 1 else f"{r.folder.name}/{g.name}", g.passed) for r in results for g in r.gates]
     return {
         "scenes": [r.folder.name for r in results],
@@ -156,18 +152,18 @@ def measured(results: Sequence[Converted], seconds: float) -> dict[str, Any]:
 
 @interrupts_heard()  # so that what is unfinished is removed
 def main(task: str) -> int:
-    """Converts one source and writes its row; the exit code is that of `python -m converters convert`."""
-    told, began, code = json.loads(task), time.monotonic(), 2
-    config = told["config"]
+    """Convert one source and write its row; return the exit code of `python -m converters convert`."""
+    words, start_s, code = json.loads(task), time.monotonic(), 2
+    config = words["config"]
     places = {word: Path(config[word]) if config[word] else None for word in ("library", "root")}
     config = ConvertConfig(**{**config, **places})
     try:
-        results = convert_building(Path(told["source"]), Path(told["target"]), config)
-        row = measured(results, time.monotonic() - began)
+        results = convert_building(Path(words["source"]), Path(words["target"]), config)
+        row = measured(results, time.monotonic() - start_s)
         code = 1 if row["gates_failed"] else 0
     except (UserError, StageFailed, OSError) as error:
-        row = {"error": " ".join(str(error).split()), "seconds": time.monotonic() - began}
-    write_text(told["row"], json.dumps(row))
+        row = {"error": " ".join(str(error).split()), "seconds": time.monotonic() - start_s}
+    write_text(words["row"], json.dumps(row))
     return code
 
 

@@ -14,8 +14,7 @@ import numpy as np
 
 from converters.annotate.session import with_annotations
 from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig, Decomposition, cache_folder, decompose_all
-from converters.bodies.objects import PlacedObject, name_objects, place_object
-from converters.bodies.physical import physical_properties
+from converters.bodies.objects import PlacedObject, name_objects, physical_properties, place_object
 from converters.bodies.placement import align_objects
 from converters.check.gates import drawn_shares, evaluate
 from converters.check.settle import Settled, settle
@@ -29,7 +28,7 @@ from converters.read.source import read_source
 from converters.read.surfaces import split_storeys
 from converters.records.cache import NOT_HASHED, StageCache
 from converters.records.errors import SceneRejected
-from converters.records.gate import Gate
+from converters.records.limits import Gate
 from converters.records.raw import ATTRIBUTION, CATEGORY_LABELS, RawScene, at_origin
 from converters.records.visual import TexturedMesh, VisualMesh, joined_clouds
 from converters.structure.cut import CutResult, cut_furniture
@@ -37,10 +36,9 @@ from converters.structure.fill import fill_holes, wall_planes
 from converters.structure.floor import LIFT_M, level_floor
 from converters.structure.maps import FloorPlan, main_direction, make_floor_plan, resample
 from converters.structure.walls import wall_boxes
-from converters.write.drawn import Drawn, as_it_is, draw_objects
 from converters.write.emit import SceneParts, write_scene
 from converters.write.manifest import make_manifest, scene_objects
-from converters.write.texture import bake_structure, colour_cloud
+from converters.write.texture import Drawn, as_it_is, bake_structure, colour_cloud, draw_objects
 from interactive_nav_common.files import check_name, part_folder, publish, write_text
 from scenes_mjcf.schema import SceneManifest, SceneMaps, save_manifest, save_maps
 

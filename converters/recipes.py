@@ -1,4 +1,4 @@
-"""A recipe file in, scene folders out: every scene of a set generated, converted and drawn by one call.
+"""Generate, convert and draw every scene of a recipe file.
 
 A recipe names a seed, a split, a tier and how the building departs from the tier's defaults; the split decides
 which CAD models may be used. The same recipes give the same scenes, byte for byte.
@@ -40,7 +40,7 @@ Report = Callable[[str, float], None]
 
 @dataclasses.dataclass(frozen=True)
 class SceneRecipe:
-    """How one scene is made."""
+    """Everything that determines one scene."""
 
     name: str
     split: Literal["train", "test"]
@@ -49,7 +49,7 @@ class SceneRecipe:
 
     @property
     def tier(self) -> str:
-        """How full the building is."""
+        """Return how full the building is."""
         return self.building.tier if isinstance(self.building, HomeConfig) else SPARSE
 
 
@@ -64,7 +64,7 @@ class Recipes:
 
 @dataclasses.dataclass(frozen=True)
 class _Recipe:
-    """A scene as a recipe file says it."""
+    """A scene as a recipe file describes it."""
 
     split: Literal["train", "test"]
     seed: Natural
@@ -84,30 +84,24 @@ class _File:
 _RECIPES = Reader(GenerationError, "scenes_mjcf/recipes.yaml shows the form")
 
 
-def _refuse_unknown(given: Iterable[str], known: Iterable[str], where: str) -> None:
-    known = tuple(known)
-    for key in given:
-        if key not in known:
-            raise GenerationError(
-                f"{where}: unknown key '{key}'{nearest(str(key), known)}; known keys: {', '.join(sorted(known))}"
-            )
+def _refuse_unknown(given: Iterable[str], fields: Iterable[str], where: str) -> None:
+    fields = tuple(fields)
+    for key in (key for key in given if key not in fields):
+        keys = ", ".join(sorted(fields))
+        raise GenerationError(f"{where}: unknown key '{key}'{nearest(str(key), fields)}; known keys: {keys}")
 
 
 def _value(value: Any, hint: Any, where: str) -> Any:
-    """A setting as its field takes it: one number stands for a range of that number."""
+    """Return a setting as its field takes it: one number stands for a range of that number."""
     ranges = [kind for kind in (hint, *get_args(hint)) if get_origin(kind) is tuple and ... not in get_args(kind)]
     one = ranges and isinstance(value, int | float) and not isinstance(value, bool)
     return _RECIPES.typed([value, value] if one else value, hint, where)
 
 
 def building_of(tier: str, settings: dict[str, Any], split: str, where: str) -> BuildingConfig | HomeConfig:
-    """What to build, from a tier's name and settings as a recipe or a command line gives them.
+    """Return what to build, from a tier (`sparse` or one of `TIERS`) and settings as a recipe or command gives them.
 
-    Args:
-        tier: `sparse`, or one of `converters.generate.homes.config.TIERS`.
-        settings: by name: those of `BuildingConfig`, or of `HomeConfig` and its shell.
-        split: train or test; decides the CAD models.
-        where: named in errors.
+    Settings are those of `BuildingConfig`, or of `HomeConfig` and its shell; the split decides the CAD models.
     """
     if tier not in (SPARSE, *TIERS):
         raise GenerationError(f"{where}: tier is {tier!r}, expected one of {', '.join((SPARSE, *TIERS))}")
@@ -124,7 +118,7 @@ def building_of(tier: str, settings: dict[str, Any], split: str, where: str) -> 
 
 
 def check_conversion(settings: dict[str, Any], where: str) -> None:
-    """Refuses settings of a conversion that do not exist, or are no whole numbers."""
+    """Refuse settings of a conversion that do not exist, or are no whole numbers."""
     _refuse_unknown(settings, _CONVERSION, where)
     for key, value in settings.items():
         if not isinstance(value, int) or isinstance(value, bool) or value < 0:
@@ -132,18 +126,12 @@ def check_conversion(settings: dict[str, Any], where: str) -> None:
 
 
 def parse_recipes(data: Any, where: str) -> Recipes:
-    """Decoded YAML -> recipes.
-
-    Args:
-        data: the decoded file: `scenes` {name: {split, seed, tier, building}}, `conversion`, and `shared`, which only
-            holds anchors.
-        where: file named in errors.
-    """
-    found = _RECIPES.record(data, _File, where)
-    conversion = found.conversion or {}
+    """Build recipes from decoded YAML of the form of `_File`; errors name the file `where`."""
+    file = _RECIPES.record(data, _File, where)
+    conversion = file.conversion or {}
     check_conversion(conversion, f"{where}: conversion")
     scenes = []
-    for name, recipe in found.scenes.items():
+    for name, recipe in file.scenes.items():
         here = f"{where}: scenes: {check_name(str(name), f'{where}: scenes: a name', GenerationError)}: building"
         building = building_of(recipe.tier, recipe.building or {}, recipe.split, here)
         scenes.append(SceneRecipe(str(name), recipe.split, recipe.seed, building))
@@ -151,7 +139,7 @@ def parse_recipes(data: Any, where: str) -> Recipes:
 
 
 def load_recipes(path: Path) -> Recipes:
-    """Reads a recipe file."""
+    """Read a recipe file."""
     try:
         text = read_bytes(path)
     except OSError as error:
@@ -162,37 +150,36 @@ def load_recipes(path: Path) -> Recipes:
     return parse_recipes(_RECIPES.decoded(text, "YAML", str(path)), str(path))
 
 
-def missed(building: BuildingConfig | HomeConfig, made: Converted) -> str:
-    """Which share a converted home was asked for and does not have, or which gate it fails; empty: none.
+def missed(building: BuildingConfig | HomeConfig, result: Converted) -> str:
+    """Return which share a converted home should have and lacks, or which gates it fails; empty: none.
 
     Things stand as coacd's boxes let them, not as they were placed: a passage may have closed.
     """
-    asked = building.must_push if isinstance(building, HomeConfig) else {}
-    if failed := [gate.name for gate in made.gates if not gate.passed and isinstance(building, HomeConfig)]:
+    if not isinstance(building, HomeConfig):
+        return ""
+    if failed := [gate.name for gate in result.gates if not gate.passed]:
         return f"gates that fail once converted: {', '.join(failed)}"
-    for robot, (low, high) in asked.items():
-        share = made.manifest.measures["must_push_share"][robot]
+    for robot, (low, high) in building.must_push.items():
+        share = result.manifest.measures["must_push_share"][robot]
         if not low - SHARE_TOLERANCE <= share <= high + SHARE_TOLERANCE:
             return f"must_push_{robot} is {share} once converted: expected {low} to {high}"
     return ""
 
 
-def _made(recipe: SceneRecipe, config: ConvertConfig, work: Path, report: Report) -> Converted:
-    """The recipe's building, generated and converted.
+def _generated(recipe: SceneRecipe, config: ConvertConfig, work: Path, report: Report) -> Converted:
+    """Generate and convert the recipe's building.
 
-    A home takes the next of its seeds where one gives no plan that can be furnished so, or misses what was asked for
-    once it is converted.
+    A home takes the next of its seeds where one gives no plan that can be furnished so, or `missed` once converted.
     """
     tries = MOST_SEEDS if isinstance(recipe.building, HomeConfig) else 1
     for k in range(tries):
-        raw, made = work / "raw", work / recipe.name
-        for folder in (raw, made):
+        raw, scene = work / "raw", work / recipe.name
+        for folder in (raw, scene):
             shutil.rmtree(folder, ignore_errors=True)
         try:
-            generate_building(
-                raw, recipe.seed + k * NEXT_SEED, lambda s, share: report(s, GENERATE * share), recipe.building
-            )
-            result = convert(raw, made, config, lambda s, share: report(s, GENERATE + CONVERT * share))
+            seed = recipe.seed + k * NEXT_SEED
+            generate_building(raw, seed, lambda s, share: report(s, GENERATE * share), recipe.building)
+            result = convert(raw, scene, config, lambda s, share: report(s, GENERATE + CONVERT * share))
             if why := missed(recipe.building, result):
                 raise GenerationError(why)
         except GenerationError as error:
@@ -204,24 +191,17 @@ def _made(recipe: SceneRecipe, config: ConvertConfig, work: Path, report: Report
 
 
 def make_scene(recipe: SceneRecipe, conversion: dict[str, Any], folder: Path, jobs: int, report: Report) -> list[str]:
-    """Generates, converts and draws one scene; `folder` appears whole or not at all.
+    """Generate, convert and draw one scene; return the names of the gates that fail.
 
-    Args:
-        recipe: what to make.
-        conversion: settings of `ConvertConfig`.
-        folder: scene folder to make or replace.
-        jobs: decompositions side by side.
-        report: progress callback.
-
-    Returns:
-        Names of the gates that fail.
+    `folder` is created or replaced, whole or not at all. `conversion` are settings of `ConvertConfig`, `jobs` is the
+    number of decompositions side by side.
     """
     with part_folder(folder, overwrite=True) as work:
         config = ConvertConfig(format="gibson", split=recipe.split, jobs=jobs, **conversion)
-        result, made = _made(recipe, config, work, report), work / recipe.name
+        result, scene = _generated(recipe, config, work, report), work / recipe.name
         report("drawing", GENERATE + CONVERT)
-        preview(made, made / "preview.png")
-        publish({made: folder})
+        preview(scene, scene / "preview.png")
+        publish({scene: folder})
     report("done", 1.0)
     return [g.name for g in result.gates if not g.passed]
 
@@ -230,19 +210,13 @@ def chosen(
     recipes: Recipes, out: Path, names: tuple[str, ...] = (), overwrite: bool = False,
     tell: Callable[[str], None] = lambda line: None,
 ) -> tuple[SceneRecipe, ...]:  # fmt: skip
-    """The recipes whose scenes are to be made.
+    """Return the recipes, of all or of these names, whose scenes are not there yet, or all with `overwrite`.
 
-    Args:
-        recipes: all of them.
-        out: folder of scene folders.
-        names: of scenes; empty: all.
-        overwrite: those too that are there.
-        tell: told one line for each that is there and kept.
+    `tell` is called with one line for each that is there and kept.
     """
-    known = [r.name for r in recipes.scenes]
-    for name in names:
-        if name not in known:
-            raise GenerationError(f"no recipe named '{name}'{nearest(name, known)}; known: {', '.join(known)}")
+    every = [r.name for r in recipes.scenes]
+    for name in (name for name in names if name not in every):
+        raise GenerationError(f"no recipe named '{name}'{nearest(name, every)}; known: {', '.join(every)}")
     wanted = tuple(r for r in recipes.scenes if not names or r.name in names)
     todo = tuple(r for r in wanted if overwrite or not (out / r.name).exists())
     for recipe in wanted:
@@ -255,21 +229,10 @@ def make_scenes(
     todo: Sequence[SceneRecipe], conversion: dict[str, Any], out: Path, overwrite: bool = False, jobs: int = 2,
     report: Report = lambda stage, share: None, tell: Callable[[str], None] = lambda line: None,
 ) -> dict[str, list[str]]:  # fmt: skip
-    """Makes scenes one after the other.
+    """Generate scenes one after the other; return name -> gates that fail, of the scenes generated now.
 
-    Interrupted, `chosen` names those that are left: a scene is there whole or not at all.
-
-    Args:
-        todo: what to make.
-        conversion: settings of `ConvertConfig`.
-        out: folder of scene folders.
-        overwrite: make those again that are there.
-        jobs: decompositions side by side.
-        report: progress over all of them.
-        tell: told one line a scene.
-
-    Returns:
-        Name -> gates that fail, of the scenes made now.
+    After an interruption, `chosen` names those that are left: a scene is there whole or not at all. `tell` is called
+    with one line for each scene.
     """
     weight = [sum(r.building.floor_area_m2) for r in todo]
     failed: dict[str, list[str]] = {}
@@ -279,7 +242,7 @@ def make_scenes(
             done = (sum(weight[:k]) + weight[k] * share) / sum(weight)
             report(f"{k + 1}/{len(todo)} {recipe.name}: {stage}", done)
 
-        if not overwrite and (out / recipe.name).exists():  # another generator's, made since
+        if not overwrite and (out / recipe.name).exists():  # another generator's, finished since
             tell(f"{recipe.name}: is there, kept")
             continue
         failed[recipe.name] = make_scene(recipe, conversion, out / recipe.name, jobs, inner)

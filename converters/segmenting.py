@@ -1,4 +1,4 @@
-"""Commands of `python -m converters` that label scans, and what they print; their words are in words.yaml."""
+"""Run the commands of `python -m converters` that label scans; words.yaml has their words."""
 
 import argparse
 import json
@@ -43,7 +43,7 @@ def _segment(arguments: argparse.Namespace, console: Console) -> None:
 
 
 def label_unlabelled(arguments: argparse.Namespace, console: Console) -> None:
-    """The step of `convert --segment`: labels the source beside it, unless it has labels, perhaps edited ones."""
+    """Label the source of `convert --segment` beside it, unless it has labels, perhaps edited ones."""
     target = _beside(arguments.source, "labels.npz")
     if not target.exists():
         return _label(arguments, target, None, console)
@@ -51,7 +51,7 @@ def label_unlabelled(arguments: argparse.Namespace, console: Console) -> None:
 
 
 def propose_unproposed(arguments: argparse.Namespace, console: Console) -> Path | None:
-    """The next step of it: beside the mesh, the models that fit, unless they are there; None where alignments are."""
+    """Write the models that fit beside the mesh, unless there are some; return their file, None if alignments exist."""
     from converters.propose.pieces import MIN_VOXELS
     from converters.propose.proposals import as_scan2cad
     from converters.propose.report import given_up, retrieve_sure
@@ -69,16 +69,16 @@ def propose_unproposed(arguments: argparse.Namespace, console: Console) -> Path 
     with stage_progress(console) as report:
         floors = split_storeys(_read(arguments))
         fitted = [retrieve_sure(floor, library, lambda share: report("propose", share)) for floor in floors]
-    pairs = [(p, sure.get(k)) for found, sure in fitted for k, p in enumerate(found)]
+    pairs = [(p, sure.get(k)) for new, sure in fitted for k, p in enumerate(new)]
     placed, models = [p for p, model in pairs if model], [model for _, model in pairs if model]
     text = json.dumps(as_scan2cad(source.stem, tuple(placed), dict(enumerate(models))), indent=1, allow_nan=False)
     write_text(target, text + "\n")
     console.print(f"{target}: {len(models)} models", soft_wrap=True)
     counts = np.bincount(np.concatenate([classes_of(floor.scan.labels) for floor in floors]), minlength=len(NAMES))
     unfit = [name for name in UNFIT if counts[NAMES.index(name)] >= MIN_VOXELS]
-    told = given_up([p for p, model in pairs if model is None], ())
-    told += (f"labelled, and never given a model: {', '.join(unfit)}",) if unfit else ()
-    for line in (*told, *((f"{_annotate(source)} places models by hand",) if told else ())):
+    lines = given_up([p for p, model in pairs if model is None], ())
+    lines += (f"labelled, and never given a model: {', '.join(unfit)}",) if unfit else ()
+    for line in (*lines, *((f"{_annotate(source)} places models by hand",) if lines else ())):
         console.print(f"{source}: {line}", soft_wrap=True, highlight=False)
     return target
 
@@ -126,17 +126,17 @@ def _score(arguments: argparse.Namespace, console: Console) -> None:
     scores = load_scores(arguments.weights)
     with stage_progress(console) as report:
         for source in arguments.sources:
-            found = score_source(read_source(source), scores, report)
-            _table(console, str(source), found["iou"])
+            score = score_source(read_source(source), scores, report)
+            _table(console, str(source), score["iou"])
             console.print(
-                f"{source}: of {found['objects']} annotated objects {found['found']} found, "
-                f"{found['found_true']} with its own labels",
+                f"{source}: of {score['objects']} annotated objects {score['found']} found, "
+                f"{score['found_true']} with its own labels",
                 soft_wrap=True,
             )
         if arguments.homes:
             # Whole buildings of other seeds than those whose crops the training was watched by.
-            found = score_homes(HELD_OUT_SEED + 50_000, arguments.homes, scores, report)
-            _table(console, f"{arguments.homes} held-out buildings", found)
+            iou = score_homes(HELD_OUT_SEED + 50_000, arguments.homes, scores, report)
+            _table(console, f"{arguments.homes} held-out buildings", iou)
 
 
 def _table(console: Console, what: str, iou: dict[str, float]) -> None:

@@ -1,7 +1,7 @@
-"""A tier and a number in, a set of scene folders out: side by side, resumable, on this machine or on many.
+"""Generate sets of scene folders side by side, resumable, on this machine or on many.
 
-Each scene is made by a process of its own (`generate-scenes --only NAME`), so that one that fails costs no other, and
-so that any machine that sees the folder can make it.
+Each scene has a process (`generate-scenes --only NAME`), so that one that fails costs no other, and so that any machine
+that reaches the folder can run it.
 """
 
 import dataclasses
@@ -39,7 +39,7 @@ TEST_SHARE = 0.2
 CONVERSION = {"structure_faces": 16000, "object_faces": 3000, "structure_texture": 1024, "object_texture": 256}
 """How large meshes and textures are."""
 GRACE_S = 10.0
-"""What was begun and is not wanted any more has this long to end itself."""
+"""A process that is not wanted any more has this long to end itself."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Wanted:
 
 
 def tier_recipes(tier: str, count: int, seed: int = SEEDS) -> str:
-    """The YAML of a set's recipes: the last fifth of its scenes is to test in, with CAD models of its own."""
+    """Return the YAML of a set's recipes: the last fifth of its scenes is to test in, with held-out CAD models."""
     if count < 1:
         raise GenerationError(f"count is {count}, expected at least 1")
     first_test = count - round(TEST_SHARE * count)
@@ -73,7 +73,7 @@ def tier_recipes(tier: str, count: int, seed: int = SEEDS) -> str:
 
 
 def begin_set(out: Path, tier: str, count: int, seed: int = SEEDS) -> None:
-    """Writes a set's recipes, unless they are there."""
+    """Write a set's recipes, unless they are there."""
     text, path = tier_recipes(tier, count, seed), out / RECIPES
     if path.is_file() and path.read_text(encoding="utf-8") != text:
         raise GenerationError(
@@ -85,9 +85,9 @@ def begin_set(out: Path, tier: str, count: int, seed: int = SEEDS) -> None:
 
 
 def list_set(recipes: Recipes, out: Path, tell: Callable[[str], None] = lambda line: None) -> SceneSet:
-    """Writes `set.json` beside the scenes: which there are to be, and the digests of those that were made.
+    """Write `set.json` beside the scenes: which there are to be, and the digests of those that are there.
 
-    A scene whose digest is not the one that the file already lists is told of and stays listed as it was: made
+    A scene whose digest is not the one that the file already lists is reported and stays listed as it was: generated
     elsewhere, it should be the same up to rounding.
     """
     path = out / FILE
@@ -109,7 +109,7 @@ def list_set(recipes: Recipes, out: Path, tell: Callable[[str], None] = lambda l
 
 
 def make_launcher(launcher: str, address: str | None, jobs: int, count: int) -> tuple[Launcher, int]:
-    """Where `count` commands run, and how many of them side by side."""
+    """Return where `count` commands run, and how many of them side by side."""
     if launcher == "ray":
         from interactive_nav_common.jobs.on_ray import RayLauncher
 
@@ -126,10 +126,9 @@ def run_side_by_side(
     commands: Mapping[str, list[str]], launcher: Launcher, folder: Path, report: Report, tell: Callable[[str], None],
     ended: Callable[[str, int, str], str] = _last_line, what: str = "scenes",
 ) -> list[str]:  # fmt: skip
-    """Runs commands, several at a time; what was begun when a signal or an error comes is ended.
+    """Run commands, several at a time; return the names of those that did not exit with 0.
 
-    Returns:
-        Names of those that did not exit with 0.
+    A signal or an error ends what runs.
     """
     failed: list[str] = []
     folder.mkdir(parents=True, exist_ok=True)
@@ -153,11 +152,7 @@ def run_side_by_side(
 
 
 def generate_scenes(wanted: Wanted, report: Report, tell: Callable[[str], None]) -> list[str]:
-    """Makes the scenes that are not there yet, and lists them.
-
-    Returns:
-        Names of those that were not made, or do not pass every gate.
-    """
+    """Generate and list the scenes that are not there yet; return the names of those that fail, or fail a gate."""
     if wanted.tier and wanted.count is not None and wanted.seed is not None:
         begin_set(wanted.out, wanted.tier, wanted.count, wanted.seed)
     path = wanted.recipes or wanted.out / RECIPES
@@ -177,23 +172,21 @@ def generate_scenes(wanted: Wanted, report: Report, tell: Callable[[str], None])
 
 
 def make_packaged(names: Sequence[str], jobs: int, report: Report, tell: Callable[[str], None]) -> list[str]:
-    """Makes scenes of the package's own sets in the cache folder, unless the package has them.
+    """Generate scenes of the package's sets in the cache folder, unless the package has them.
 
-    What the cache has in a scene's place and is not the listed scene is replaced.
-
-    Returns:
-        Names of those that were not made, do not pass every gate, or are not what the set lists.
+    What the cache has in a scene's place and is not the listed scene is replaced. Return the names of those that fail,
+    do not pass every gate, or are not what the set lists.
     """
     sets = {name: packaged_set(name).scenes for name in PACKAGED}
-    known = [word for name, members in sets.items() for word in (name, f"{name}/train", f"{name}/test", *members)]
-    for word in (word for word in names if word not in known):
-        raise GenerationError(f"no scene or set {word!r}{nearest(word, known)}; 'scenes list' shows them")
+    words = [word for name, members in sets.items() for word in (name, f"{name}/train", f"{name}/test", *members)]
+    for word in (word for word in names if word not in words):
+        raise GenerationError(f"no scene or set {word!r}{nearest(word, words)}; 'scenes list' shows them")
     failed: list[str] = []
     for name, folder in PACKAGED.items():
         members = sets[name]
-        asked = [n for n, m in members.items() if {n, name, f"{name}/{m.split}"} & set(names)]
-        wanted = {n: members[n] for n in asked if not (folder / n / "scene.json").is_file()}
-        for scene in (n for n in asked if n not in wanted):
+        named = [n for n, m in members.items() if {n, name, f"{name}/{m.split}"} & set(names)]
+        wanted = {n: members[n] for n in named if not (folder / n / "scene.json").is_file()}
+        for scene in (n for n in named if n not in wanted):
             tell(f"{scene}: is there, {folder / scene}")
         out = in_cache(folder)
         todo = tuple(n for n, m in wanted.items() if not is_listed(out / n, m))
@@ -207,7 +200,7 @@ def make_packaged(names: Sequence[str], jobs: int, report: Report, tell: Callabl
         asks = Wanted(out, folder / RECIPES, None, None, None, todo, bool(others), jobs, "local", None)
         failed += generate_scenes(asks, report, tell)
         for scene in (n for n in todo if n not in failed and not is_listed(out / n, wanted[n])):
-            own = f"python -m converters generate-scenes FOLDER --recipes {folder / RECIPES} --only {scene}"
-            tell(f"{scene}: not the scene that the set {name} lists; as a scene of your own: {own}")
+            command = f"python -m converters generate-scenes FOLDER --recipes {folder / RECIPES} --only {scene}"
+            tell(f"{scene}: not the scene that the set {name} lists; as a scene of your own: {command}")
             failed.append(scene)
     return failed

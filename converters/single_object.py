@@ -1,4 +1,4 @@
-"""One mesh or URDF in; a folder with an MJCF body (`object.xml`), its description (`object.json`) and assets out.
+"""Convert one mesh or URDF to a folder with an MJCF body (`object.xml`), its description (`object.json`) and assets.
 
 The body's frame is a scene object's: origin at the middle of the base, z up. `object.xml` holds the body alone,
 with a free joint, so that it can be attached to any model; it stands as it comes to rest on a level floor.
@@ -17,8 +17,7 @@ import mujoco
 import numpy as np
 
 from converters.bodies.decompose import DecomposeConfig, cache_folder, decompose_all
-from converters.bodies.objects import PlacedObject
-from converters.bodies.physical import MATERIALS, Physical, mass_moments
+from converters.bodies.objects import PlacedObject, physical_properties
 from converters.check.gates import collide_with, physical_values
 from converters.check.settle import settle
 from converters.geometry.boxes import Hull, convex_hull, fit_box
@@ -30,10 +29,9 @@ from converters.read.obj import TexturedMesh
 from converters.read.urdf import RigidObject, read_urdf
 from converters.records.errors import SceneRejected
 from converters.records.visual import VisualMesh
-from converters.write.drawn import as_it_is
 from converters.write.emit import SceneParts, build_spec, write_scene
 from converters.write.manifest import PACKAGES
-from converters.write.texture import bake_object, textured_cloud
+from converters.write.texture import as_it_is, bake_object, textured_cloud
 from interactive_nav_common.files import whole_folder
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, matrix_from_quat
 from scenes_mjcf.categories import TABLE
@@ -51,7 +49,7 @@ class ObjectConfig:
     """Choices of one object."""
 
     category: str | None = None
-    """One of `CATEGORIES`; None: told from the name, `other` where it tells nothing."""
+    """One of `CATEGORIES`; None: guessed from the name, else `other`."""
     mass_kg: float | None = None
     friction: float | None = None
     scale: float = 1.0
@@ -60,17 +58,16 @@ class ObjectConfig:
     """Seed of coacd's search."""
     overwrite: bool = False
     source: Path | None = None
-    """Folder that the files which the model names must lie in; None: the model's own."""
+    """Folder that the files which the model names must lie in; None: the model's."""
     strict: bool = False
     """Refuse what would be repaired with a warning."""
     timeout_s: float = 240.0
 
 
 def guess_category(*names: str) -> str | None:
-    """The category whose word stands in a name, the longest word first; None where there is none."""
+    """Return the category whose word stands in a name, the longest word first; None where there is none."""
     text = re.sub(r"[^a-z]", "", " ".join(names).lower())
-    found = [(len(word), category.name) for category in TABLE for word in category.words if word in text]
-    return max(found)[1] if found else None
+    return max(((len(w), c.name) for c in TABLE for w in c.words if w in text), default=(0, None))[1]
 
 
 def _category(config: ObjectConfig, names: tuple[str, ...], source: SourceFolder) -> str:
@@ -84,7 +81,7 @@ def _category(config: ObjectConfig, names: tuple[str, ...], source: SourceFolder
 
 
 def read_object(path: Path, config: ObjectConfig) -> tuple[RigidObject, SourceFolder]:
-    """Reads a URDF or a mesh, in metres and z up."""
+    """Read a URDF or a mesh, in metres and z up."""
     source = SourceFolder(config.source or path.parent, config.strict)
     relative = source.inside(path)
     if path.suffix.lower() == ".urdf":
@@ -100,7 +97,7 @@ def read_object(path: Path, config: ObjectConfig) -> tuple[RigidObject, SourceFo
 
 
 def _level_feet(points: np.ndarray, foot_m: float) -> Hull:
-    """Convex hull of (n, 3) points, body frame, with the lowest ones brought down to the base z = 0.
+    """Return the hull of (n, 3) points, body frame, with the lowest ones brought down to the base z = 0.
 
     A plate that is thickened (`convex_hull`) grows to both sides; what then stands below the base is lifted.
     """
@@ -111,7 +108,7 @@ def _level_feet(points: np.ndarray, foot_m: float) -> Hull:
 
 
 def _visual(surface: TexturedMesh, where: str, source: SourceFolder) -> VisualMesh:
-    """The surface as it is where it is small, else simplified with a texture of its own (body frame)."""
+    """Return the surface (body frame) as it is where it is small, else simplified with a new texture."""
     vertices, faces, keep = merge_vertices(surface.vertices, surface.faces)
     colours = colours_of_faces(surface)[keep]
     vertices, faces, colours = clean_surface(source, where, vertices, faces, colours)
@@ -130,7 +127,7 @@ def convert_object(
     cache: Path | None = None,
     warn: Callable[[str], None] = lambda warning: None,
 ) -> dict[str, Any]:
-    """Converts one mesh or URDF; `target` appears whole or not at all.
+    """Convert one mesh or URDF; `target` appears whole or not at all.
 
     The URDF's mass, friction and collision mesh are used; its inertia is not (released ones are placeholders): it
     follows from the hulls at that mass.
@@ -145,70 +142,42 @@ def convert_object(
         category = _category(config, (item.name, path.stem), source)
         for warning in source.warnings:
             warn(warning)
-        low, high = _bounds(item, path)
+        low, high = item.surface.vertices.min(axis=0), item.surface.vertices.max(axis=0)
+        if not 0.005 < (high - low).max() < 10.0:
+            raise SceneRejected(
+                f"{path}: is {(high - low).max():g} m long, expected 0.5 cm to 10 m; give --scale for another unit"
+            )
         hulls, hull_source = _hulls(item, path, config, source, cache)
         base = np.array([*(low + high)[:2] / 2, min(float(h.vertices[:, 2].min()) for h in hulls)])
         hulls = tuple(_level_feet(h.vertices - base, FOOT_SHARE * float(high[2] - low[2])) for h in hulls)
         surface = dataclasses.replace(item.surface, vertices=item.surface.vertices - base)
         visual = _visual(surface, path.name, source)
-        volume, com, inertia = mass_moments(hulls)
-        mass, mass_source = _mass(item, category, volume, config)
-        friction, friction_source = _friction(item, category, config)
-        physical = Physical(mass, com, inertia * mass / volume, friction, volume, False)
-        placed = _at_origin(target.name, category, item, base, hulls)
+        mass_kg, mass_source = _given(config.mass_kg, item.mass_kg, "density")
+        friction, friction_source = _given(config.friction, item.friction, "category")
+        physical = physical_properties(category, hulls, mass_kg, friction)
+        mesh = surface.vertices, surface.faces, colours_of_faces(surface)
+        boxes = tuple(fit_box(h, 0.0) for h in hulls)
+        placed = PlacedObject(target.name, category, item.name, *mesh, hulls, boxes)
         parts = settle(SceneParts(placed.name, (placed,), (physical,), ())).parts
-        about = _origin(item, source) | {
+        about = {
+            "source_name": item.name,
+            "source": {"sha256": dict(sorted(source.sha256.items()))},
+            "warnings": source.warnings,
+            "versions": {name: version(name) for name in PACKAGES},
             "name": target.name,
             "category": category,
-            "mass_kg": round(mass, 5),
+            "mass_kg": round(physical.mass_kg, 5),
             "mass_source": mass_source,
-            "friction": friction,
+            "friction": physical.friction,
             "friction_source": friction_source,
             "n_hulls": len(hulls),
             "hull_source": hull_source,
-            "hull_volume_m3": round(volume, 8),
+            "hull_volume_m3": round(physical.volume_m3, 8),
             "size_m": [round(float(v), 4) for v in high - low],
             "rest": _rest(parts),
         }
         _write(dataclasses.replace(parts, object_visuals=(visual,)), about, folder)
     return about
-
-
-def _origin(item: RigidObject, source: SourceFolder) -> dict[str, Any]:
-    """What object.json says of where the object comes from."""
-    return {
-        "source_name": item.name,
-        "source": {"sha256": dict(sorted(source.sha256.items()))},
-        "warnings": source.warnings,
-        "versions": {name: version(name) for name in PACKAGES},
-    }
-
-
-def _bounds(item: RigidObject, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest corner of the surface, m."""
-    low, high = item.surface.vertices.min(axis=0), item.surface.vertices.max(axis=0)
-    if not 0.005 < (high - low).max() < 10.0:
-        raise SceneRejected(
-            f"{path}: is {(high - low).max():g} m long, expected 0.5 cm to 10 m; give --scale for another unit"
-        )
-    return low, high
-
-
-def _at_origin(name: str, category: str, item: RigidObject, base: np.ndarray, hulls: tuple[Hull, ...]) -> PlacedObject:
-    """The object with the point `base` of its file at the world's origin, unturned."""
-    return PlacedObject(
-        name=name,
-        category=category,
-        cad_id=item.name,
-        vertices_b=item.surface.vertices - base,
-        faces=item.surface.faces,
-        face_colours=colours_of_faces(item.surface),
-        hulls_b=hulls,
-        boxes_b=tuple(fit_box(h, 0.0) for h in hulls),
-        position_w=np.zeros(3),
-        quaternion_w=np.array([1.0, 0.0, 0.0, 0.0]),
-        hinge=None,
-    )
 
 
 def _hulls(
@@ -217,37 +186,21 @@ def _hulls(
     if item.pieces is not None:
         return tuple(Hull(*p) for p in item.pieces), "collision mesh"
     vertices, faces, _ = merge_vertices(*item.collision)
-    made = decompose_all(
-        {path.name: (vertices, faces)},
-        DecomposeConfig(seed=config.seed, timeout_s=config.timeout_s),
-        1,
-        cache or cache_folder(),
-        strict=config.strict,
-    )
-    for why in made.fallbacks.values():
+    search = DecomposeConfig(seed=config.seed, timeout_s=config.timeout_s)
+    meshes = {path.name: (vertices, faces)}
+    result = decompose_all(meshes, search, 1, cache or cache_folder(), strict=config.strict)
+    for why in result.fallbacks.values():
         source.note(f"{why}; its convex hull stands for it")
-    return made.hulls[path.name], "convex hull" if made.fallbacks else "coacd"
+    return result.hulls[path.name], "convex hull" if result.fallbacks else "coacd"
 
 
-def _mass(item: RigidObject, category: str, volume_m3: float, config: ObjectConfig) -> tuple[float, str]:
-    if config.mass_kg is not None:
-        return config.mass_kg, "given"
-    if item.mass_kg is not None:
-        return item.mass_kg, "urdf"
-    material = MATERIALS[category]
-    return float(np.clip(material.density_kg_m3 * volume_m3, *material.mass_range_kg)), "density"
-
-
-def _friction(item: RigidObject, category: str, config: ObjectConfig) -> tuple[float, str]:
-    if config.friction is not None:
-        return config.friction, "given"
-    if item.friction is not None:
-        return item.friction, "urdf"
-    return MATERIALS[category].friction, "category"
+def _given(option: float | None, urdf: float | None, default: str) -> tuple[float | None, str]:
+    """Return the value that a source gives, an option before the URDF, and where it came from."""
+    return (option, "given") if option is not None else (urdf, default if urdf is None else "urdf")
 
 
 def _rest(parts: SceneParts) -> dict[str, Any]:
-    """Pose at rest on a level floor, and how far hulls and boxes drift from it in the gates' time."""
+    """Return the pose at rest on a level floor, and how far hulls and boxes drift from it in the gates' time."""
     (placed,) = parts.objects
     up = matrix_from_quat(placed.quaternion_w)[:, 2]
     result: dict[str, Any] = {
@@ -268,19 +221,15 @@ def _rest(parts: SceneParts) -> dict[str, Any]:
 
 
 def _write(parts: SceneParts, about: dict[str, Any], folder: Path) -> None:
-    """`object.json`, `assets/` and `object.xml`: the scene writer's file without floor, light and structure."""
+    """Write `object.json`, `assets/` and `object.xml`: the scene's file without floor, light and structure."""
     (placed,) = parts.objects
     centred = dataclasses.replace(placed, position_w=placed.position_w * [0.0, 0.0, 1.0])
     write_scene(dataclasses.replace(parts, objects=(centred,)), folder)
     path = folder / "scene.xml"
     spec = mujoco.MjSpec.from_file(str(path))
-    for geom in [g for g in spec.worldbody.geoms if g.name == "floor"]:
-        spec.delete(geom)
-    for light in list(spec.lights):
-        spec.delete(light)
-    structure = spec.body("structure")
-    if structure is not None:
-        spec.delete(structure)
+    floor = [g for g in spec.worldbody.geoms if g.name == "floor"]
+    for part in (*floor, *spec.lights, spec.body("structure")):
+        spec.delete(part)
     spec.compile()
     path.unlink()
     (folder / "object.xml").write_text(spec.to_xml(), encoding="utf-8")

@@ -11,7 +11,7 @@ from rich.text import Text
 
 if TYPE_CHECKING:
     from converters.propose.report import Proposed
-    from converters.records.gate import Gate
+    from converters.records.limits import Gate
 
 
 def bounds(gate: Gate) -> str:

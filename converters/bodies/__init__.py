@@ -1,1 +1,1 @@
-"""Aligned CAD models in, movable bodies out: poses, hulls, masses."""
+"""Turn aligned CAD models into movable bodies: poses, hulls, masses."""

@@ -1,4 +1,4 @@
-"""Keypoint pairs in, the placement of least residual out.
+"""Solve for the placement of least residual of keypoint pairs.
 
 The seven free parameters (three scales, three translations, yaw; roll and pitch fixed) are those of the
 original annotation (Interactive Gibson, section III-B).
@@ -45,7 +45,7 @@ class Alignment:
     """CAD frame (z up) -> scan frame: `Rz(yaw) @ diag(scale) @ p + translation`."""
 
     scale: np.ndarray
-    """(3,) along the CAD model's own axes."""
+    """(3,) along the CAD model's axes."""
     translation: np.ndarray
     """(3,) m."""
     yaw: float
@@ -55,7 +55,7 @@ class Alignment:
 
 
 def _check_spread(points: np.ndarray) -> None:
-    """Refuses keypoints that leave one of the seven parameters open.
+    """Refuse keypoints that leave one of the seven parameters open.
 
     Roll and pitch being fixed, height separates from the rest: the z scale needs extent along z, the two
     horizontal scales and the yaw need points that do not lie on one line seen from above.
@@ -89,16 +89,12 @@ def _check_spread(points: np.ndarray) -> None:
 def least_squares(
     p: np.ndarray, q: np.ndarray, round_model: bool = False, weights: np.ndarray | None = None
 ) -> Alignment:
-    """Least squares over all pairs, in closed form where all scales come out positive.
+    """Fit by least squares over all pairs, in closed form where all scales come out positive.
 
     For a fixed yaw the best scales are one-dimensional regressions, and the explained variance left as a
     function of (cos, sin) is a quadratic form: its leading eigenvector is the yaw. A mirrored optimum (a
-    negative scale) is refused; the best yaw with positive scales is then searched for.
-
-    Args:
-        p: (k, 3) CAD frame.
-        q: (k, 3) scan frame, m.
-        weights: (k,) of the squared distances, or None for equal ones.
+    negative scale) is refused; the best yaw with positive scales is then searched for. `p` are (k, 3) in the CAD frame,
+    `q` in the scan frame, m, and `weights` (k,) those of the squared distances.
     """
     _check_spread(p)
     share = np.full(len(p), 1.0 / len(p)) if weights is None else weights / weights.sum()
@@ -135,17 +131,17 @@ def least_squares(
     return Alignment(scale, translation, yaw, float(np.sqrt(share @ (residual**2).sum(axis=1))))
 
 
-def apply_alignment(found: Alignment, points: np.ndarray) -> np.ndarray:
-    """(n, 3) points of the CAD frame moved to the scan frame."""
-    return points * found.scale @ yaw_matrix(found.yaw).T + found.translation
+def apply_alignment(fit: Alignment, points: np.ndarray) -> np.ndarray:
+    """Move (n, 3) points from the CAD frame to the scan frame."""
+    return points * fit.scale @ yaw_matrix(fit.yaw).T + fit.translation
 
 
-def _squared(found: Alignment, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    return ((apply_alignment(found, p) - q) ** 2).sum(axis=1)
+def _squared(fit: Alignment, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    return ((apply_alignment(fit, p) - q) ** 2).sum(axis=1)
 
 
 def _best_without(p: np.ndarray, q: np.ndarray, count: int, round_model: bool) -> tuple[np.ndarray, Alignment] | None:
-    """The fit of least residual over the pairs that stay when `count` are left out (least trimmed squares).
+    """Return the fit of least residual over the pairs that stay when `count` are left out (least trimmed squares).
 
     All choices are tried where they are few; else random starts are refined until the pairs that stay are those
     of least residual (Rousseeuw and Van Driessen 1999, C-steps).
@@ -156,12 +152,12 @@ def _best_without(p: np.ndarray, q: np.ndarray, count: int, round_model: bool) -
     def offer(keep: np.ndarray) -> Alignment | None:
         nonlocal best
         try:
-            found = least_squares(p[keep], q[keep], round_model)
+            fit = least_squares(p[keep], q[keep], round_model)
         except AlignmentError:
             return None
-        if len(keep) == k - count and (best is None or found.rms_m < best[1].rms_m):
-            best = (keep, found)
-        return found
+        if len(keep) == k - count and (best is None or fit.rms_m < best[1].rms_m):
+            best = (keep, fit)
+        return fit
 
     if math.comb(k, count) <= MAX_SUBSETS:
         for left_out in itertools.combinations(range(k), count):
@@ -171,18 +167,16 @@ def _best_without(p: np.ndarray, q: np.ndarray, count: int, round_model: bool) -
     for _ in range(RANDOM_STARTS):
         keep = np.sort(rng.choice(k, 5, replace=False))
         for _ in range(20):
-            found = offer(keep)
-            if found is None:
+            fit, last = offer(keep), keep
+            if fit is not None:
+                keep = np.sort(np.argsort(_squared(fit, p, q), kind="stable")[: k - count])
+            if np.array_equal(keep, last):
                 break
-            closest = np.sort(np.argsort(_squared(found, p, q), kind="stable")[: k - count])
-            if np.array_equal(closest, keep):
-                break
-            keep = closest
     return best
 
 
 def _inliers(p: np.ndarray, q: np.ndarray, round_model: bool) -> np.ndarray:
-    """(k,) bool: pairs that are no gross outliers.
+    """Return (k,) bool: pairs that are no gross outliers.
 
     Leaving pairs out always lowers the residual. They count as outliers where it falls by more than chance
     allows: an F test of the fit with against the fit without them, at `OUTLIER_P` shared among the choices.
@@ -198,32 +192,31 @@ def _inliers(p: np.ndarray, q: np.ndarray, round_model: bool) -> np.ndarray:
         best = _best_without(p, q, count, round_model) if freedom > 0 else None
         if best is None:
             continue
-        keep, found = best
-        rest = found.rms_m**2 * len(keep)
+        keep, fit = best
+        rest = fit.rms_m**2 * len(keep)
         if rest < 1e-18 * max(float((q - q.mean(axis=0)).var()), 1e-12) * k:
             rest = 1e-18  # exact pairs: only the rounding is left
         limit = float(fdtri(3 * count, freedom, 1 - OUTLIER_P / math.comb(k, count)))
         off = np.delete(np.arange(k), keep)
         single = float(fdtri(3, freedom, 1 - OUTLIER_P / k)) * 3 * rest / freedom
-        each_far = (_squared(found, p[off], q[off]) > single).all()
+        each_far = (_squared(fit, p[off], q[off]) > single).all()
         if each_far and (full - rest) / (3 * count) > limit * rest / freedom:
             every[off] = False
             return every
     return every
 
 
-def _canonical(found: Alignment, period: float) -> Alignment:
-    """The equivalent pose whose yaw is the smallest; a quarter turn swaps the horizontal scales."""
+def _canonical(fit: Alignment, period: float) -> Alignment:
+    """Return the equivalent pose whose yaw is the smallest; a quarter turn swaps the horizontal scales."""
     if not period or period >= 2 * math.pi - 1e-9:
-        return dataclasses.replace(found, yaw=wrap_angle(found.yaw))
-    yaw = wrap_angle(found.yaw, period)
-    swapped = round((found.yaw - yaw) / (math.pi / 2)) % 2 == 1
-    scale = found.scale[[1, 0, 2]] if swapped else found.scale
-    return dataclasses.replace(found, scale=scale, yaw=yaw)
+        return dataclasses.replace(fit, yaw=wrap_angle(fit.yaw))
+    yaw = wrap_angle(fit.yaw, period)
+    swapped = round((fit.yaw - yaw) / (math.pi / 2)) % 2 == 1
+    return dataclasses.replace(fit, scale=fit.scale[[1, 0, 2]] if swapped else fit.scale, yaw=yaw)
 
 
 def solve_alignment(cad_points: np.ndarray, scan_points: np.ndarray, symmetry: str = "__SYM_NONE") -> Alignment:
-    """Scales, translation and yaw of least squared point-to-point distance, without gross outliers.
+    """Solve for scales, translation and yaw of least squared point-to-point distance, without gross outliers.
 
     Robust to one gross outlier in eight pairs (see `_inliers`); `rms_m` is over the pairs that were kept.
 
@@ -231,10 +224,8 @@ def solve_alignment(cad_points: np.ndarray, scan_points: np.ndarray, symmetry: s
     equivalent CAD point that fits, and the pose is the equivalent one of smallest yaw. The axis of symmetry is
     the CAD frame's z axis, as in ShapeNet. A round model (`__SYM_ROTATE_UP_INF`) keeps one horizontal scale.
 
-    Args:
-        cad_points: (k, 3) in a z-up CAD frame, unscaled, k >= 6.
-        scan_points: (k, 3) in the scan frame, m, row by row the same physical points.
-        symmetry: Scan2CAD's word, a key of `SYMMETRY_PERIOD_RAD`.
+    Points are (k, 3), k >= 6, in a z-up CAD frame, unscaled, and row by row the same physical points in the scan frame,
+    m; `symmetry` is a key of `SYMMETRY_PERIOD_RAD`.
     """
     p, q = np.asarray(cad_points, float), np.asarray(scan_points, float)
     if p.shape != q.shape or p.ndim != 2 or p.shape[1] != 3:
@@ -255,11 +246,11 @@ def solve_alignment(cad_points: np.ndarray, scan_points: np.ndarray, symmetry: s
 
 
 def gross_outliers(cad_points: np.ndarray, scan_points: np.ndarray, symmetry: str = "__SYM_NONE") -> np.ndarray:
-    """(k,) bool: the pairs that `solve_alignment` leaves out (same arguments)."""
-    found = solve_alignment(cad_points, scan_points, symmetry)
+    """Return (k,) bool: the pairs that `solve_alignment` leaves out (same arguments)."""
+    fit = solve_alignment(cad_points, scan_points, symmetry)
     p, period = np.asarray(cad_points, float), SYMMETRY_PERIOD_RAD[symmetry]
     if period and period < 6:
-        p = _equivalents(p, np.asarray(scan_points, float), found, round(2 * math.pi / period))
+        p = _equivalents(p, np.asarray(scan_points, float), fit, round(2 * math.pi / period))
     return ~_inliers(p, np.asarray(scan_points, float), period == 0.0)
 
 
@@ -269,30 +260,30 @@ def _robust_fit(p: np.ndarray, q: np.ndarray, round_model: bool) -> Alignment:
     return least_squares(p[keep], q[keep], round_model)
 
 
-def _equivalents(p: np.ndarray, q: np.ndarray, found: Alignment, folds: int) -> np.ndarray:
-    """(k, 3) of each CAD point's `folds` images under the symmetry the one that the fit brings closest."""
+def _equivalents(p: np.ndarray, q: np.ndarray, fit: Alignment, folds: int) -> np.ndarray:
+    """Return (k, 3) of each CAD point's `folds` images under the symmetry the one that the fit brings closest."""
     images = np.stack([p @ yaw_matrix(2 * math.pi * i / folds).T for i in range(folds)])
-    distance = np.stack([_squared(found, image, q) for image in images])
+    distance = np.stack([_squared(fit, image, q) for image in images])
     return images[np.argmin(distance, axis=0), np.arange(len(p))]
 
 
 def _fit_equivalents(p: np.ndarray, q: np.ndarray, first: Alignment, folds: int) -> Alignment:
-    """Alternates between choosing equivalent CAD points and fitting, while the residual falls."""
+    """Alternate between choosing equivalent CAD points and fitting, while the residual falls."""
     best, images = first, p
     for _ in range(10):
         images = _equivalents(p, q, best, folds)
         try:
-            found = _robust_fit(images, q, False)
+            fit = _robust_fit(images, q, False)
         except AlignmentError:
             break
-        if found.rms_m >= best.rms_m - 1e-12:
+        if fit.rms_m >= best.rms_m - 1e-12:
             break
-        best = found
+        best = fit
     return best
 
 
 def _best_positive_yaw(a: float, b: float, d: float, e: float, power: np.ndarray) -> float:
-    """Yaw of least residual among those with two positive horizontal scales."""
+    """Return the yaw of least residual among those with two positive horizontal scales."""
 
     def unexplained(yaw: float) -> float:
         c, s = math.cos(yaw), math.sin(yaw)
@@ -300,5 +291,5 @@ def _best_positive_yaw(a: float, b: float, d: float, e: float, power: np.ndarray
 
     step = math.radians(1.0)
     start = min(np.arange(-math.pi, math.pi, step), key=unexplained)
-    found = minimize_scalar(unexplained, bounds=(start - step, start + step), method="bounded")
-    return wrap_angle(float(getattr(found, "x")))  # noqa: B009 (scipy's result has no static fields)
+    best = minimize_scalar(unexplained, bounds=(start - step, start + step), method="bounded")
+    return wrap_angle(float(getattr(best, "x")))  # noqa: B009 (scipy's result has no static fields)

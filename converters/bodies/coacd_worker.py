@@ -1,4 +1,4 @@
-"""`python -m converters.bodies.coacd_worker IN.npz OUT.npz`: one mesh in, its convex hulls out."""
+"""Decompose one mesh: `python -m converters.bodies.coacd_worker IN.npz OUT.npz`."""
 
 import sys
 
@@ -9,7 +9,7 @@ from converters.records.errors import CANNOT_WRITE
 
 
 def main(source: str, target: str) -> None:
-    """Runs coacd once. Its return value is a list of [vertices (n, 3), faces (m, 3)]."""
+    """Run coacd once. Its return value is a list of [vertices (n, 3), faces (m, 3)]."""
     with np.load(source, allow_pickle=False) as arrays:
         values = {k: arrays[k] for k in arrays.files}
     mesh = coacd.Mesh(values.pop("vertices"), values.pop("faces"))

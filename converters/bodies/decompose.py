@@ -78,13 +78,9 @@ def decompose_all(
     overrides: Mapping[str, Mapping[str, float]] | None = None,
     strict: bool = False,
 ) -> Decomposition:
-    """Decompose every mesh, `jobs` processes at a time.
+    """Decompose every mesh, name -> (vertices (n, 3), faces (m, 3)), `jobs` processes at a time.
 
-    Args:
-        meshes: name -> (vertices (n, 3), faces (m, 3)).
-        config: coacd's parameters.
-        progress: called with the share that is done, 0 to 1.
-        overrides: name -> parameters that differ from the config's.
+    `overrides`: name -> parameters that differ from the config's.
     """
     changes = overrides or {}
     configs = {name: dataclasses.replace(config, **changes.get(name, {})) for name in meshes}  # pyright: ignore
@@ -128,7 +124,7 @@ def _results(
     configs: Mapping[str, DecomposeConfig],
     jobs: int,
 ) -> Generator[tuple[tuple[str, str], tuple[tuple[Hull, ...] | None, str, float]], None, None]:
-    """Key and name, and what `_run` says, of each that waits, as they end; closed early, it ends what runs."""
+    """Yield key and name, and what `_run` returns, of each that waits, as they end; closed early, end what runs."""
     stop = threading.Event()
     with tempfile.TemporaryDirectory(prefix="hulls-") as folder, concurrent.futures.ThreadPoolExecutor(jobs) as pool:
         try:
@@ -145,7 +141,7 @@ def _run(
     key: str, name: str, vertices: np.ndarray, faces: np.ndarray, config: DecomposeConfig, scratch: Path,
     stop: threading.Event,
 ) -> tuple[tuple[Hull, ...] | None, str, float]:  # fmt: skip
-    """Hulls, or None and the reason, and the memory that it took, MiB; what is out of time or to stop is killed."""
+    """Return hulls, or None and the reason, and its memory, MiB; kill what is out of time or to stop."""
     process, peak_mib, until = _start(key, name, vertices, faces, config, scratch), 0.0, time.monotonic()
     until += config.timeout_s
     while process.poll() is None and time.monotonic() < until and not stop.wait(0.05):

@@ -1,4 +1,4 @@
-"""CAD models, hulls and upright poses in, `PlacedObject` records out."""
+"""Build `PlacedObject` records of CAD models, hulls and upright poses, and their masses and friction."""
 
 import collections
 import dataclasses
@@ -7,17 +7,19 @@ import math
 
 import numpy as np
 import shapely
+import trimesh
 
 from converters.bodies.alignment import Alignment
-from converters.geometry.boxes import Hull, OrientedBox, convex_hull, fit_box
-from converters.geometry.pieces import MAX_PIECES
+from converters.geometry.boxes import MAX_PIECES, Hull, OrientedBox, convex_hull, fit_box
 from converters.records.raw import Annotation, CadModel
 from converters.records.visual import TexturedMesh
 from interactive_nav_common.rotations import matrix_from_quat, yaw_matrix
+from scenes_mjcf.categories import TABLE
 
 FOOT_M = 0.02
 ROUND_FILL = 0.9
 """Outlines that fill less of their smallest box are round: that box then stands along the walls."""
+MATERIALS = {category.name: category.material for category in TABLE if category.material is not None}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,24 +45,24 @@ class PlacedObject:
     faces: np.ndarray
     face_colours: np.ndarray
     hulls_b: tuple[Hull, ...]
-    boxes_b: tuple[OrientedBox, ...]
+    boxes_b: tuple[OrientedBox, ...] = ()
     """The oriented box of each hull, same order."""
-    position_w: np.ndarray
+    position_w: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
     """(3,) m."""
-    quaternion_w: np.ndarray
+    quaternion_w: np.ndarray = dataclasses.field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
     """(4,) w x y z."""
-    hinge: BodyHinge | None
+    hinge: BodyHinge | None = None
     surface_b: TexturedMesh | None = None
     """What the model looks like, where it has more than the colours of its faces."""
 
 
 def to_world(placed: PlacedObject, points_b: np.ndarray) -> np.ndarray:
-    """Moves (n, 3) points from the body frame to the world."""
+    """Move (n, 3) points from the body frame to the world."""
     return points_b @ matrix_from_quat(placed.quaternion_w).T + placed.position_w
 
 
 def flatten_feet(hull: Hull) -> Hull:
-    """Cuts a hull at the body frame's z = 0 and brings what ends within `FOOT_M` above it down to it.
+    """Cut a hull at the body frame's z = 0 and bring what ends within `FOOT_M` above it down to it.
 
     Decomposition works on voxels: hulls stand out of the model by some millimetres and feet come out of
     unequal length; the object would rest tilted on its hulls and upright on its boxes.
@@ -72,11 +74,11 @@ def flatten_feet(hull: Hull) -> Hull:
 
 
 def with_feet(hulls: tuple[Hull, ...], vertices: np.ndarray) -> tuple[Hull, ...]:
-    """Adds a low hull for each foot that no hull has: voxels lose legs of open surfaces, and the object would tip."""
+    """Add a low hull for each foot that no hull has: voxels lose legs of open surfaces, and the object would tip."""
     stands = [h.vertices[h.vertices[:, 2] < FOOT_M, :2] for h in hulls]
-    known = shapely.union_all([shapely.MultiPoint(p).convex_hull for p in stands if len(p)])
+    covered = shapely.union_all([shapely.MultiPoint(p).convex_hull for p in stands if len(p)])
     base = vertices[vertices[:, 2] < FOOT_M, :2]
-    lost = base[shapely.distance(shapely.points(base), known) > FOOT_M] if not known.is_empty else base[:0]
+    lost = base[shapely.distance(shapely.points(base), covered) > FOOT_M] if not covered.is_empty else base[:0]
     columns = (
         shapely.get_parts(shapely.union_all(shapely.buffer(shapely.points(lost), 2 * FOOT_M))) if len(lost) else []
     )
@@ -89,7 +91,7 @@ def with_feet(hulls: tuple[Hull, ...], vertices: np.ndarray) -> tuple[Hull, ...]
 
 
 def _door_hinge(annotation: Annotation, scale: np.ndarray, base_cad: np.ndarray, extent: np.ndarray) -> BodyHinge:
-    """The door's hinge in the body frame; without an articulation, one at the leaf's edge is assumed."""
+    """Return the door's hinge in the body frame; without an articulation, assume one at the leaf's edge."""
     hinge = annotation.hinge
     if hinge is None:
         along = int(np.argmax(extent[:2]))
@@ -111,11 +113,9 @@ def place_object(
     floor_height_m: float,
     walls_yaw: float,
 ) -> PlacedObject:
-    """Scales a CAD model and its hulls, moves the origin to the middle of the base and states the world pose.
+    """Scale a CAD model and its hulls, move the origin to the middle of the base and state the world pose.
 
-    Args:
-        floor_height_m: of the scan frame; the world's z is the scan's less this.
-        walls_yaw: main direction of the building, rad.
+    The world's z is the scan's less `floor_height_m`; `walls_yaw` is the main direction of the building, rad.
     """
     vertices, look = cad.vertices * pose.scale, cad.surface
     low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -145,6 +145,50 @@ def place_object(
 
 
 def name_objects(annotations: tuple[Annotation, ...]) -> tuple[str, ...]:
-    """Body names `<category>_<k>`, k counting from 0 inside its category in the annotation's order."""
+    """Return body names `<category>_<k>`, k counting from 0 inside its category in the annotation's order."""
     count = collections.defaultdict(itertools.count)
     return tuple(f"{a.category}_{next(count[a.category])}" for a in annotations)
+
+
+@dataclasses.dataclass(frozen=True)
+class Physical:
+    """Rigid-body properties in the body frame."""
+
+    mass_kg: float
+    com_b: np.ndarray
+    """(3,) m."""
+    inertia_b: np.ndarray
+    """(3, 3) kg m2 about the centre of mass, along the body's axes."""
+    friction: float
+    volume_m3: float
+
+
+def mass_moments(hulls: tuple[Hull, ...]) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return summed volume, m3, centre of mass (3,), m, and inertia (3, 3) about it at unit density, of hulls."""
+    volumes, centres, inertias = [], [], []
+    for hull in hulls:
+        properties = trimesh.triangles.mass_properties(hull.vertices[hull.faces])
+        volumes.append(abs(float(properties.volume)))
+        centres.append(np.asarray(properties.center_mass, float))
+        inertias.append(np.asarray(properties.inertia, float))  # about the hull's own centre, unit density
+    com = np.average(centres, axis=0, weights=volumes)
+    inertia = np.zeros((3, 3))
+    for v, centre, about_centre in zip(volumes, centres, inertias, strict=True):
+        r = centre - com
+        inertia += about_centre + v * (r @ r * np.eye(3) - np.outer(r, r))  # parallel axes
+    return float(sum(volumes)), com, inertia
+
+
+def physical_properties(
+    category: str, hulls: tuple[Hull, ...], mass_kg: float | None = None, friction: float | None = None
+) -> Physical:
+    """Return mass, moments (body frame, m, kg) and friction; moments scale with the mass.
+
+    The mass is density x summed hull volume, clipped to the category's range, unless the source gives one.
+    """
+    material = MATERIALS[category]
+    volume, com, inertia = mass_moments(hulls)
+    usual = float(np.clip(material.density_kg_m3 * volume, *material.mass_range_kg))
+    mass = usual if mass_kg is None else mass_kg
+    friction = material.friction if friction is None else friction
+    return Physical(mass, com, inertia * usual / volume * (mass / usual), friction, volume)

@@ -1,4 +1,4 @@
-"""Annotated poses in, upright placements and rows that compare them with the re-solved ones out."""
+"""Place annotated objects upright, and compare their poses with the re-solved ones."""
 
 import dataclasses
 import math
@@ -23,7 +23,7 @@ LYING_DEG = 15.0
 
 
 def upright(pose: np.ndarray, pivot_cad: np.ndarray) -> tuple[Alignment, float]:
-    """Takes the small roll and pitch out of an annotated pose, turning about the object's own middle.
+    """Take the small roll and pitch out of an annotated pose, turning about the object's middle.
 
     `pose`: (4, 4) CAD frame -> scan frame, with scale.
     `pivot_cad`: (3,) point of the CAD frame that keeps its place (the middle of the bounding box).
@@ -41,7 +41,7 @@ def upright(pose: np.ndarray, pivot_cad: np.ndarray) -> tuple[Alignment, float]:
 def compare(
     annotation: Annotation, placed: Alignment, tilt_rad: float, pivot_cad: np.ndarray, name: str
 ) -> dict[str, Any]:
-    """One row of the alignment report: residual of the annotated pose, and the re-solved pose beside it.
+    """Return one row of the alignment report: residual of the annotated pose, and the re-solved pose beside it.
 
     `pivot_cad`: (3,) where the two poses' translations are compared.
     """
@@ -79,7 +79,7 @@ def compare(
 
 @dataclasses.dataclass(frozen=True)
 class PoseDifference:
-    """How far one pose of a model is from another, modulo the model's symmetry."""
+    """Distance of one pose of a model from another, modulo the model's symmetry."""
 
     translation_m: float
     yaw_rad: float
@@ -89,7 +89,7 @@ class PoseDifference:
 
 
 def pose_difference(one: Alignment, other: Alignment, pivot_cad: np.ndarray, symmetry: str) -> PoseDifference:
-    """Compares two poses of the same model at the pivot; turns that the symmetry allows do not count.
+    """Compare two poses of the same model at the pivot; turns that the symmetry allows do not count.
 
     `pivot_cad`: (3,) point of the CAD frame where translations are compared.
     `symmetry`: Scan2CAD's word; unknown words count as none.
@@ -104,7 +104,7 @@ def pose_difference(one: Alignment, other: Alignment, pivot_cad: np.ndarray, sym
 
 
 def align_objects(raw: RawScene) -> tuple[list[Alignment], list[dict[str, Any]]]:
-    """Upright placements from the annotations, and the report that compares them with re-solved ones."""
+    """Return upright placements from the annotations, and the report that compares them with re-solved ones."""
     placements, rows = [], []
     for name, annotation in zip(name_objects(raw.annotations), raw.annotations, strict=True):
         vertices = raw.cads[annotation.cad_id].vertices

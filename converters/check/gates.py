@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import pdist
 
 from converters.check.surfaces import surface_values
-from converters.records.gate import Gate, Limit
+from converters.records.limits import Gate, Limit
 from converters.structure.walls import border_cells
 from interactive_nav_common.grids import clearance, largest_component
 from interactive_nav_common.records import read_packaged
@@ -30,8 +30,6 @@ OFF_MAP_M = 1.0
 DRIFT_S = 5.0
 TIMESTEP_S = 0.02
 """The environments' physics timestep (`sim_dt_s`), for hulls and for boxes."""
-
-
 LIMITS: dict[str, Limit] = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, Limit])
 """Gate -> what it demands."""
 

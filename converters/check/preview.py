@@ -211,21 +211,12 @@ def _placed(scene: _Scene) -> tuple[PlacedObject, ...]:
         names = [f"{item.name}_hull_{i}" for i in range(item.n_hulls)]
         hulls = [geom_mesh(scene.model, scene.model.geom(name).id)[0] for name in names]
         body = scene.model.body(item.name).id
-        placed.append(
-            PlacedObject(
-                name=item.name,
-                category=item.category,
-                cad_id=item.cad_id,
-                vertices_b=vertices,
-                faces=faces,
-                face_colours=np.zeros((len(faces), 3), np.uint8),
-                hulls_b=tuple(convex_hull(h) for h in hulls),
-                boxes_b=(),
-                position_w=scene.data.xpos[body].copy(),
-                quaternion_w=scene.data.xquat[body].copy(),
-                hinge=None,
-            )
+        mesh, pose = (
+            (vertices, faces, np.zeros_like(faces, np.uint8)),
+            (scene.data.xpos[body].copy(), scene.data.xquat[body].copy()),
         )
+        solids = tuple(convex_hull(h) for h in hulls)
+        placed.append(PlacedObject(item.name, item.category, item.cad_id, *mesh, solids, (), *pose))
     return tuple(placed)
 
 

@@ -1,4 +1,4 @@
-"""Points in; convex hulls and boxes round them out."""
+"""Enclose points by convex hulls and boxes, and join convex pieces of a mesh into few."""
 
 import dataclasses
 import itertools
@@ -6,14 +6,13 @@ import math
 
 import numpy as np
 import trimesh
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 
+from converters.geometry.faces import face_areas
 from interactive_nav_common.rotations import yaw_matrix
 
 MIN_THICKNESS_M = 0.01
 """Hulls and boxes thinner than this make contacts that a simulation step can tunnel through."""
-
-
 PREFER_SLACK = 1.15
 
 NOISE_DIGITS = 9
@@ -23,8 +22,12 @@ TIE_DIGITS = 6
 
 MIN_DRAW_IN = 0.85
 """Least horizontal factor on an upright box; a circle's is sqrt(pi / 4) = 0.886."""
-
-
+MAX_PIECES = 16
+"""Convex pieces of one object; the gates' limit (`hulls_per_object`)."""
+SLIVER_SHARE = 0.1
+"""Of a mesh's area that flat pieces may have."""
+CONVEX_SHARE = 0.9
+"""A piece that fills this share of its convex hull counts as convex."""
 AXES = np.array(
     [
         np.eye(3)[list(order)] * signs
@@ -58,7 +61,7 @@ class OrientedBox:
 
 
 def convex_hull(points: np.ndarray) -> Hull:
-    """Convex hull of a point cloud; one without volume is first thickened to `MIN_THICKNESS_M` across.
+    """Return the convex hull of a point cloud; one without volume is first thickened to `MIN_THICKNESS_M` across.
 
     Points are rounded to a nanometre, so that processors that round differently give the same vertices and faces.
     """
@@ -81,7 +84,7 @@ def convex_hull(points: np.ndarray) -> Hull:
 
 
 def upright_box(points: np.ndarray, prefer_yaw: float = 0.0, round_fill: float = 1.0) -> OrientedBox:
-    """Smallest box with a vertical axis around (n, 3) points.
+    """Return the smallest box with a vertical axis around (n, 3) points.
 
     Round things have no smallest direction: where the box along `prefer_yaw` is at most `PREFER_SLACK`
     larger in area it is taken, so that a round table's box stands square to the walls and not with a corner
@@ -106,11 +109,9 @@ def upright_box(points: np.ndarray, prefer_yaw: float = 0.0, round_fill: float =
 
 
 def least_turned(rotation: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same axes named and directed so that they are turned least, and right-handed.
+    """Return the same axes (3, 3 columns), named and directed so that they are turned least, and right-handed.
 
-    Args:
-        rotation: (3, 3) columns are the axes.
-        along: (3,) what belongs to each of them, such as a box's half sizes.
+    `along`: (3,) what belongs to each of them, such as a box's half sizes; it is returned in the new order.
     """
     turns = np.einsum("ij,pjk->pik", rotation, AXES)
     turns = turns[np.linalg.det(turns) > 0]
@@ -120,18 +121,14 @@ def least_turned(rotation: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, n
 
 
 def fit_box(hull: Hull, lowest_m: float, prefer_yaw: float = 0.0, round_fill: float = 1.0) -> OrientedBox:
-    """Oriented box that stands for a hull where collisions are boxes, at least `MIN_THICKNESS_M` thick.
+    """Return the box that stands for a hull (body frame, m) where collisions are boxes, `MIN_THICKNESS_M` or thicker.
 
-    The general smallest box of a slanted leg reaches below the leg's own foot and would lift the object off
-    the floor; where it would go below `lowest_m`, and where it gains little, the box keeps a vertical axis.
+    The general smallest box of a slanted leg reaches below the leg's foot and would lift the object off
+    the floor; where it would go below `lowest_m` (the object's lowest point), and where it gains little, the box keeps
+    a vertical axis.
     Such a box is drawn in horizontally until its cross-section equals the hull's shadow (at most to
     `MIN_DRAW_IN`): the corners of the box around a round table top would otherwise stand a fifth of its
-    width outside it.
-
-    Args:
-        hull: body frame, m.
-        lowest_m: height of the object's lowest point, body frame.
-        prefer_yaw: direction of the walls in the body frame, rad.
+    width outside it. `prefer_yaw`: direction of the walls in the body frame, rad.
     """
     box = upright_box(hull.vertices, prefer_yaw, round_fill)
     shadow = float(ConvexHull(hull.vertices[:, :2]).volume)  # scipy: `volume` of a planar hull is its area
@@ -145,3 +142,71 @@ def fit_box(hull: Hull, lowest_m: float, prefer_yaw: float = 0.0, round_fill: fl
     better = np.prod(tilted.half) < 0.9 * np.prod(upright.half) and foot >= lowest_m + 0.002
     chosen = tilted if better else upright
     return dataclasses.replace(chosen, half=np.maximum(chosen.half, MIN_THICKNESS_M / 2))
+
+
+def convex_pieces(
+    vertices: np.ndarray, faces: np.ndarray, most: int = MAX_PIECES, slack: float | None = None
+) -> tuple[tuple[np.ndarray, np.ndarray], ...] | None:
+    """Return vertices and faces of the hull of each connected piece of a mesh, or None where one is not convex.
+
+    Pieces are connected through shared vertex indices, as V-HACD writes them (neighbours only touch); the closest are
+    joined, see `merge_pieces`. `slack`: how much joining may add, as a share of the mesh's bounding box.
+    """
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    groups = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(faces)), min_len=1)
+    points: list[np.ndarray] = []
+    flat_m2 = 0.0
+    for group in groups:
+        corners = vertices[np.unique(faces[group])]
+        full = hull_volume(corners)
+        if full <= 0:
+            flat_m2 += float(face_areas(vertices, faces[group]).sum())
+            continue  # flat slivers
+        if abs(trimesh.triangles.mass_properties(vertices[faces[group]]).volume) < CONVEX_SHARE * full:
+            return None
+        points.append(corners)
+    # Faces that share no vertices are flat pieces too, of a solid that only its source knows.
+    if not points or flat_m2 > SLIVER_SHARE * float(face_areas(vertices, faces).sum()):
+        return None
+    points = merge_pieces(points, most, None if slack is None else slack * float(np.ptp(vertices, axis=0).prod()))
+    hulls = [trimesh.convex.convex_hull(p) for p in points]
+    return tuple((np.asarray(h.vertices, float), np.asarray(h.faces, np.int64)) for h in hulls)
+
+
+def hull_volume(points: np.ndarray) -> float:
+    """Return the volume of the convex hull; 0 for points in a plane."""
+    try:
+        return float(ConvexHull(points).volume) if len(points) > 3 else 0.0
+    except QhullError:
+        return 0.0
+
+
+def box_volume(points: np.ndarray) -> float:
+    """Return the volume of the box along the axes."""
+    return float(np.ptp(points, axis=0).prod())
+
+
+def merge_pieces(points: list[np.ndarray], most: int, slack: float | None = None) -> list[np.ndarray]:
+    """Join pairs of convex pieces, each time the pair whose common hull encloses least that neither does."""
+    pieces, size = list(points), hull_volume if slack is None else box_volume
+    volume = [size(p) for p in pieces]
+
+    def cost(i: int, j: int) -> float:
+        return size(np.vstack([pieces[i], pieces[j]])) - volume[i] - volume[j]
+
+    alive = set(range(len(pieces)))
+    needed = len(alive) > most or slack is not None
+    costs = {(i, j): cost(i, j) for i in alive for j in alive if i < j} if needed else {}
+    while costs:
+        i, j = min(costs, key=lambda pair: (costs[pair], pair))
+        if len(alive) <= most and (slack is None or costs[i, j] > slack):
+            break
+        joined = np.vstack([pieces[i], pieces[j]])
+        pieces.append(joined[ConvexHull(joined).vertices])
+        volume.append(size(joined))
+        alive -= {i, j}
+        costs = {pair: c for pair, c in costs.items() if not {i, j} & set(pair)}
+        new = len(pieces) - 1
+        costs |= {(k, new): cost(k, new) for k in alive}
+        alive.add(new)
+    return [pieces[k] for k in sorted(alive)]

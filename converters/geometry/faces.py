@@ -1,4 +1,4 @@
-"""Triangle meshes in; areas, labels, samples and cleaned surfaces out."""
+"""Compute areas, labels and samples of triangle meshes, and join, part and simplify them."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -15,54 +15,52 @@ BLOCK, LARGE = 1_000_000, 10_000
 
 
 def face_labels(labels: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(m,) label of each face: the one that two corners share, else the first corner's."""
+    """Return (m,) label of each face: the one that two corners share, else the first corner's."""
     a, b, c = labels[faces].T
     return np.where((b == c) & (a != b), b, a)
 
 
 def face_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(m, 3) normals of the faces, twice as long as their areas (m2)."""
+    """Return (m, 3) normals of the faces, twice as long as their areas (m2)."""
     a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
     return np.cross(b - a, c - a)
 
 
 def unit_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(m, 3) unit normals of the faces; about zero without an area."""
+    """Return (m, 3) unit normals of the faces; about zero without an area."""
     normal = face_vectors(vertices, faces)
     return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
 
 
 def vertex_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(n, 3) sums of the `face_vectors` around each vertex."""
-    own, out = face_vectors(vertices, faces), np.zeros_like(vertices)
+    """Return (n, 3) sums of the `face_vectors` around each vertex."""
+    vectors, out = face_vectors(vertices, faces), np.zeros_like(vertices)
     for k in range(3):
         for corner in range(3):
-            out[:, k] += np.bincount(faces[:, corner], own[:, k], len(vertices))
+            out[:, k] += np.bincount(faces[:, corner], vectors[:, k], len(vertices))
     return out
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(n, 3) unit normals, weighted by face area; (0, 0, 1) where there are no faces."""
+    """Return (n, 3) unit normals, weighted by face area; (0, 0, 1) where there are no faces."""
     out = vertex_vectors(vertices, faces)
     length = np.linalg.norm(out, axis=1, keepdims=True)
     return np.where(length > 1e-12, out / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
 
 
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(m,) m2."""
+    """Return (m,) areas, m2."""
     return np.linalg.norm(face_vectors(vertices, faces), axis=1) / 2
 
 
 def sample_faces(
     vertices: np.ndarray, faces: np.ndarray, spacing_m: float, most_steps: int = math.isqrt(2 * BLOCK)
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points on every face no further apart than the spacing, by even barycentric steps (no chance involved), or by
-    even rows on faces with more than `most_steps` of these: long thin ones then need few.
+    """Return points (k, columns) on every face no further apart than the spacing, and (k,) the face of each.
 
-    Vertices (n, 3 or more) may have more columns than x, y and z (m), such as texture coordinates.
-
-    Returns:
-        points (k, columns), face (k,) the face each lies on.
+    Points lie at even barycentric steps (no chance involved), or in even rows on faces with more than `most_steps` of
+    these: long thin ones then need few. Vertices (n, 3 or more) may have more columns than x, y and z (m), such as
+    texture coordinates.
     """
     if len(faces) == 0:
         return np.zeros((0, vertices.shape[1])), np.zeros(0, np.int64)
@@ -77,7 +75,7 @@ def sample_faces(
 def count_samples(
     vertices: np.ndarray, faces: np.ndarray, spacing_m: float, most_steps: int = math.isqrt(2 * BLOCK)
 ) -> float:
-    """How many points `sample_faces` gives, about."""
+    """Return how many points `sample_faces` gives, about."""
     corners = vertices[faces]
     steps, short = _steps(corners, spacing_m).astype(float), _sides(corners).min(axis=1) / spacing_m
     return float(np.where(steps > most_steps, steps * (short / 2 + 1), steps**2 / 2).sum())
@@ -86,7 +84,7 @@ def count_samples(
 def sampled(
     vertices: np.ndarray, faces: np.ndarray, spacing_m: float, most_steps: int = math.isqrt(2 * BLOCK)
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The points of `sample_faces` and their faces, in blocks that fit the memory however large the faces are."""
+    """Yield the points of `sample_faces` and their faces, in blocks that fit the memory however large the faces are."""
     corners = vertices[faces]
     steps = _steps(corners, spacing_m)
     beyond = steps > most_steps
@@ -118,12 +116,12 @@ def _by_rows(corners: np.ndarray, n: int, spacing_m: float) -> Iterator[np.ndarr
 
 
 def beyond_block(corners: np.ndarray, spacing_m: float) -> np.ndarray:
-    """(m,) bool: triangles (m, 3, 3) with more points, by even barycentric steps, than are sampled at a time."""
+    """Return (m,) bool: triangles (m, 3, 3) with more points, by even steps, than are sampled at a time."""
     return _steps(corners, spacing_m) > math.isqrt(2 * BLOCK)
 
 
 def _sides(corners: np.ndarray) -> np.ndarray:
-    """(m, 3) m: lengths of the sides of triangles, each from the corner before."""
+    """Return (m, 3) lengths of the sides of triangles, m, each from the corner before."""
     return np.linalg.norm((corners - np.roll(corners, 1, axis=1))[..., :3], axis=2)
 
 
@@ -134,15 +132,12 @@ def _steps(corners: np.ndarray, spacing_m: float) -> np.ndarray:
 def weld(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Group vertices (n, 3) at equal positions, to 1e-6 of the extent.
 
-    Returns:
-        first (k,) index of one vertex of each group, sorted by position; group (n,) of each vertex.
+    Returns first (k,), the index of one vertex of each group, sorted by position, and group (n,) of each vertex.
     """
     step = max(float(np.ptp(vertices, axis=0).max(initial=0.0)), 1e-9) * 1e-6
     cell = np.round(vertices / step).astype(np.int64)
     cell -= cell.min(axis=0) if len(cell) else 0
-    key = (
-        (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
-    )  # each below 2**20 + 2: the key's order is that of x, y, z
+    key = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]  # each below 2**20 + 2: in the order of x, y, z
     _, first, group = np.unique(key, return_index=True, return_inverse=True)
     return first, group.reshape(-1)
 
@@ -160,23 +155,22 @@ def loose_parts(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def compacted(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices that some faces use, and the faces into these."""
+    """Return the vertices that some faces use, and the faces into these."""
     used, index = np.unique(faces, return_inverse=True)
     return vertices[used], index.reshape(-1, 3)
 
 
 def stacked(parts: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, k) and faces (m, 3) of several meshes as one."""
+    """Join vertices (n, k) and faces (m, 3) of several meshes."""
     vertices, faces = zip(*parts, strict=True)
     first = np.cumsum([0, *map(len, vertices)])
     return np.vstack(vertices), np.vstack([f + k for f, k in zip(faces, first, strict=False)])
 
 
 def merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Joins vertices at equal positions (to 1e-6 of the extent) and drops faces that collapse.
+    """Join vertices at equal positions (to 1e-6 of the extent) and drop faces that collapse.
 
-    Returns:
-        vertices (n', 3), faces (m', 3), keep (m',) indices of the faces that stayed.
+    Returns vertices (n', 3), faces (m', 3) and (m',) the indices of the faces that stayed.
     """
     first, group = weld(vertices)
     faces = group[faces]
@@ -185,7 +179,7 @@ def merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
 
 
 def simplify(vertices: np.ndarray, faces: np.ndarray, max_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Quadric simplification to at most about `max_faces` faces; equal positions are joined first."""
+    """Simplify by quadrics to at most about `max_faces` faces; equal positions are joined first."""
     vertices, faces, _ = merge_vertices(vertices, faces)
     if len(faces) > max_faces:
         points, triangles = fast_simplification.simplify(

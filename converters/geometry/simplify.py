@@ -1,4 +1,4 @@
-"""A triangle mesh and an error in; as few triangles as keep its surface out, every loose part for itself."""
+"""Simplify a triangle mesh to as few triangles as keep its surface within an error, each loose part by itself."""
 
 import fast_simplification
 import numpy as np
@@ -47,7 +47,7 @@ class Surface:
         self._tree = KDTree(samples, balanced_tree=False)  # as exact, and sooner built
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """(n,) distance of points, m: to the nearest of the faces whose samples are nearest.
+        """Return (n,) distances of points, m, to the nearest of the faces whose samples are nearest.
 
         At most the samples' spacing too large, which is a share of the mesh's size.
         """
@@ -58,7 +58,7 @@ class Surface:
         return np.linalg.norm(near.reshape(*index.shape, 3) - points[:, None], axis=2).min(axis=1)
 
     def farthest(self, points: np.ndarray, most_m: float = 0.0) -> float:
-        """Largest distance of points, m; exact where it is beyond `most_m`."""
+        """Return the largest distance of points, m; exact where it is beyond `most_m`."""
         # None is farther than its nearest sample, nor nearer by more than the spacing: which can be the farthest?
         above = np.asarray(self._tree.query(points)[0])
         if above.max() <= most_m:
@@ -73,22 +73,22 @@ class Surface:
 
 
 def _simplified(vertices: np.ndarray, faces: np.ndarray, most_m: float, least: float) -> tuple[np.ndarray, np.ndarray]:
-    """One part with half its faces, a quarter and so on, as long as it keeps the surface."""
+    """Return one part with half its faces, a quarter and so on, as long as it keeps the surface."""
     area = float(face_areas(vertices, faces).sum())
     points = np.vstack([vertices, sample_faces(vertices, faces, max(np.sqrt(2 * area / SAMPLES), 1e-4))[0]])
     points = points[:: max(len(points) // (2 * SAMPLES), 1)]
-    best, own = (vertices, faces), Surface(vertices, faces)
+    best, surface = (vertices, faces), Surface(vertices, faces)
     low, high = 0, len(faces)
     while high - low > max(4, high // 12):
         target = (low + high) // 2
-        made = fast_simplification.simplify(vertices, faces.astype(np.int32), target_count=max(target, 2))[:2]
-        tried = np.asarray(made[0], float), np.asarray(made[1], np.int64)
+        few = fast_simplification.simplify(vertices, faces.astype(np.int32), target_count=max(target, 2))
+        tried = np.asarray(few[0], float), np.asarray(few[1], np.int64)
         reached = len(tried[1])
         if (
             0 < reached < len(best[1])
             and face_areas(*tried).sum() >= least * area
             and Surface(*tried).farthest(points, most_m) <= most_m
-            and own.farthest(tried[0], most_m) <= most_m
+            and surface.farthest(tried[0], most_m) <= most_m
         ):
             best, high = tried, target
         else:
@@ -99,15 +99,9 @@ def _simplified(vertices: np.ndarray, faces: np.ndarray, most_m: float, least: f
 def simplify_within(
     vertices: np.ndarray, faces: np.ndarray, most_m: float = MOST_M, least: float = LEAST_AREA
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh with as few faces as leave each loose part where it was.
+    """Return the mesh with as few faces as leave each loose part within `most_m` and its area above a share `least`.
 
-    Args:
-        vertices: (n, 3) m.
-        faces: (m, 3).
-        least: share of each part's area that stays.
-
-    Returns:
-        vertices, faces; equal positions are joined.
+    Equal positions are joined.
     """
     vertices, faces, _ = merge_vertices(vertices, faces)
     part = loose_parts(vertices, faces)
@@ -116,7 +110,7 @@ def simplify_within(
 
 
 def simplify_to(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh simplified within `MOST_M` and `LEAST_AREA`; within more, and then in any case, to so many faces."""
+    """Simplify within `MOST_M` and `LEAST_AREA`; within more, and then in any case, to so many faces."""
     most_m, low = MOST_M, simplify_within(vertices, faces)
     while len(low[1]) > most_faces and most_m < MOST_M * LOOSER**ROUNDS:
         most_m *= LOOSER
@@ -127,13 +121,13 @@ def simplify_to(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> tup
 def surface_loss(
     vertices: np.ndarray, faces: np.ndarray, low_vertices: np.ndarray, low_faces: np.ndarray
 ) -> tuple[float, float]:
-    """Share of a mesh's area that a simplified one has, and the farthest that the mesh lies from it, m."""
+    """Return the share of a mesh's area that a simplified one has, and how far the mesh lies from it at most, m."""
     kept = face_areas(low_vertices, low_faces).sum() / face_areas(vertices, faces).sum()
     return float(kept), Surface(low_vertices, low_faces).farthest(sample_faces(vertices, faces, LOSS_M)[0])
 
 
 def simplify_open(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """A surface with holes simplified to at most about so many faces, the holes' rims kept.
+    """Simplify a surface with holes to at most about so many faces, and keep the holes' rims.
 
     Quadrics do not see a rim: windows and doorways would fray. So each edge of a rim gets a face that stands upright on
     it, and takes part, but is not in the result.
@@ -153,13 +147,13 @@ def simplify_open(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> t
     )
     target, left = most_faces, faces
     for _ in range(RIM_ROUNDS):
-        # Which corner went where is told by the replay alone, but its places are in single precision, kilometres off.
-        made, *_, collapses = fast_simplification.simplify(points, whole, target_count=target, return_collapses=True)
+        # Only the replay returns which corner went where, but its places are in single precision, kilometres off.
+        moved, *_, collapses = fast_simplification.simplify(points, whole, target_count=target, return_collapses=True)
         place = fast_simplification.replay_simplification(points, whole, collapses)[2]
         corners = np.asarray(place, np.int64)[faces]
         left = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
         left = left[np.unique(np.sort(left, axis=1), axis=0, return_index=True)[1]]
-        vertices = np.asarray(made, float)
+        vertices = np.asarray(moved, float)
         if len(left) <= 1.02 * most_faces:
             break
         target = max(target * most_faces // len(left), 4)
@@ -167,7 +161,7 @@ def simplify_open(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> t
 
 
 def simplify_parts(parts: tuple[tuple[np.ndarray, np.ndarray], ...], max_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """All parts as one mesh of about so many faces, shared out by the roots of their areas.
+    """Return all parts as one mesh of about so many faces, shared out by the roots of their areas.
 
     What plain parts leave of their shares goes to the others; one that has too many faces still is simplified within
     `MOST_M` and `LEAST_AREA`, and further only where all together have too many then. A level plane that is simplified
@@ -188,7 +182,7 @@ def simplify_parts(parts: tuple[tuple[np.ndarray, np.ndarray], ...], max_faces: 
 
 
 def _shares(parts: list[tuple[np.ndarray, np.ndarray]], weight: np.ndarray, total: int) -> list[int]:
-    """Of so many faces those of each part: by its weight, or all that it has where that is less."""
+    """Return how many of so many faces each part gets: by its weight, or all that it has where that is less."""
     need = np.array([len(faces) for _, faces in parts])
     taken, left = np.zeros(len(need), bool), total
     while not taken.all():

@@ -1,4 +1,4 @@
-"""A scan in any frame and unit in; which way is up, how it is turned there, and metres a unit, out."""
+"""Find which way is up in a scan in any frame and unit, how to turn it there, and its unit."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ DRAWS = 300
 ALONG, ACROSS = np.cos(np.radians(8.0)), np.sin(np.radians(8.0))
 """Faces count as level or as steep within 8 degrees."""
 SMALLER = 0.85
-"""A storey is lower than this share of its shorter side; else its extents do not tell its height."""
+"""A storey is lower than this share of its shorter side; else its extents do not show its height."""
 EDGE_SHARE = 0.12
 """Of the height: what lies this near to the lowest or highest level may be floor or ceiling."""
 BIN_M, MAIN_SHARE, SLAB_M = 0.05, 0.5, 1.0
@@ -30,7 +30,7 @@ def _vectors(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _extent(values: np.ndarray, area: np.ndarray) -> tuple[float, float]:
-    """Values that all but 1 % of the area lies between, on either side: strays do not count."""
+    """Return the values that all but 1 % of the area lies between, on either side: strays do not count."""
     order = np.argsort(values)
     share = np.cumsum(area[order]) / area.sum()
     low, high = np.searchsorted(share, (0.01, 0.99))
@@ -38,15 +38,11 @@ def _extent(values: np.ndarray, area: np.ndarray) -> tuple[float, float]:
 
 
 def find_up(vertices: np.ndarray, faces: np.ndarray, where: str) -> np.ndarray:
-    """(3,) unit vector that points up in a room's scan.
+    """Return (3,) unit vector that points up in a room's scan of any unit, whose faces' front is to the room.
 
     Rooms are level and upright: nearly all area lies along or across three directions that are square to each other.
     Of these the storey's height is the shortest extent. What the scan shows of furniture are tops and not undersides,
-    and a floor without a ceiling looks up: that tells the sense.
-
-    Args:
-        vertices: (n, 3) in any unit.
-        faces: (m, 3), their front to the room.
+    and a floor without a ceiling looks up: that shows the sense.
     """
     normal, area = _vectors(vertices, faces)
     if not area.sum() > 0:
@@ -67,9 +63,9 @@ def find_up(vertices: np.ndarray, faces: np.ndarray, where: str) -> np.ndarray:
     spans = [np.ptp(_extent(middle @ axis, area)) for axis in axes]
     order = np.argsort(spans)
     if spans[order[0]] > SMALLER * spans[order[1]]:
-        told = ", ".join(f"{span:.3g}" for span in sorted(spans))
+        extents = ", ".join(f"{span:.3g}" for span in sorted(spans))
         raise SceneRejected(
-            f"{where}: its extents of {told} do not tell which is its height; say which axis points up with --up"
+            f"{where}: its extents of {extents} do not tell which is its height; say which axis points up with --up"
         )
     up = axes[order[0]]
     height = middle @ up
@@ -80,7 +76,7 @@ def find_up(vertices: np.ndarray, faces: np.ndarray, where: str) -> np.ndarray:
     top_up, top_down = (area[inner & (sign * level > ALONG)].sum() for sign in (1, -1))
     floors = (height <= low + edge) & (level > ALONG), (height >= high - edge) & (level < -ALONG)
     floor_up, floor_down = (area[floor].sum() for floor in floors)
-    # A ceiling is about as large as the floor; then furniture's tops, though small, tell the sense.
+    # A ceiling is about as large as the floor; then furniture's tops, though small, show the sense.
     if max(floor_up, floor_down) > SURE**2 * min(floor_up, floor_down):
         right = floor_up > floor_down
     elif max(top_up, top_down) > SURE * min(top_up, top_down):
@@ -95,7 +91,7 @@ def find_up(vertices: np.ndarray, faces: np.ndarray, where: str) -> np.ndarray:
 
 
 def _mean_direction(axis: np.ndarray, normal: np.ndarray, area: np.ndarray) -> np.ndarray:
-    """The axis refined: principal direction of the normals near it."""
+    """Refine the axis: the principal direction of the normals near it."""
     for _ in range(3):
         near = np.abs(normal @ axis) > ALONG
         axis = np.linalg.eigh((normal[near] * area[near, None]).T @ normal[near])[1][:, 2]
@@ -103,7 +99,7 @@ def _mean_direction(axis: np.ndarray, normal: np.ndarray, area: np.ndarray) -> n
 
 
 def turn_upright(up: np.ndarray) -> np.ndarray:
-    """(3, 3) the smallest turn that brings `up` to z; never a mirror image."""
+    """Return (3, 3) the smallest turn that brings `up` to z; never a mirror image."""
     x, y, z = up
     if z < -1 + 1e-12:
         return np.diag([1.0, -1.0, -1.0])
@@ -113,13 +109,9 @@ def turn_upright(up: np.ndarray) -> np.ndarray:
 
 
 def faces_away(vertices: np.ndarray, faces: np.ndarray) -> bool:
-    """True where a room's floor faces down, or its ceiling up: it is mirrored, or the order of its faces is wrong.
+    """Return whether a room's floor faces down, or its ceiling up: it is mirrored, or its faces' order is wrong.
 
-    The outer sides of slabs do so too, but have another side near them that does not.
-
-    Args:
-        vertices: (n, 3) m, z up or down.
-        faces: (m, 3).
+    The outer sides of slabs do so too, but have another side near them that does not. `vertices`: m, z up or down.
     """
     normal, area = _vectors(vertices, faces)
     height = vertices[faces, 2].mean(axis=1)
@@ -137,12 +129,7 @@ def faces_away(vertices: np.ndarray, faces: np.ndarray) -> bool:
 
 
 def find_unit(vertices: np.ndarray, faces: np.ndarray, where: str) -> str:
-    """Word of `UNITS_M` in which a storey's height is plausible, of m, cm and mm.
-
-    Args:
-        vertices: (n, 3), z up.
-        faces: (m, 3).
-    """
+    """Return the word of `UNITS_M` in which a storey's height (z up) is plausible, of m, cm and mm."""
     low, high = _extent(vertices[faces, 2].mean(axis=1), face_areas(vertices, faces))
     fits = [word for word in ("m", "cm", "mm") if HEIGHTS_M[0] <= (high - low) * UNITS_M[word] <= HEIGHTS_M[1]]
     if len(fits) == 1:

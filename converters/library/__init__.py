@@ -1,1 +1,1 @@
-"""Furniture that people modelled: catalogues of it, a packaged selection, and how that is made."""
+"""Furniture that people modelled: catalogues of it, a packaged selection, and how to build that."""

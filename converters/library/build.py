@@ -47,23 +47,17 @@ class Piece:
     """Name of the library's file, without its ending."""
     name: str
     """As people call it."""
-    group: str
-    """Category of the catalogue, such as Bedroom."""
     model: str
     """Path of the model in the archive."""
     size_m: tuple[float, float, float]
     """Width, height and depth: along x, y (up) and z (to the front) of the turned model."""
     rotation: np.ndarray
-    """(3, 3) turns the model's own axes to those."""
-    elevation_m: float
-    """Of its base above the floor."""
-    movable: bool
-    door_or_window: bool
+    """(3, 3) turns the model's axes to those."""
     creator: str
 
     @property
     def key(self) -> str:
-        """Names it among all libraries, such as `Scopia/armchair1`."""
+        """Return its name among all libraries, such as `Scopia/armchair1`."""
         return f"{self.library}/{PurePosixPath(self.model).stem}"
 
 
@@ -77,20 +71,18 @@ class Catalogue:
 
 
 def parse_properties(data: bytes) -> dict[str, str]:
-    """Key -> value of a Java properties file (ISO 8859-1, lines that go on, `\\uXXXX`)."""
+    """Return key -> value of a Java properties file (ISO 8859-1, lines that go on, `\\uXXXX`)."""
     text = re.sub(r"\\\r?\n[ \t]*", "", data.decode("latin-1"))
-    found = {}
+    values = {}
     for line in text.splitlines():
         match = re.match(r"\s*([^\s#!=:][^\s=:]*)\s*[=:]?\s*(.*)", line)
         if match:
-            found[match[1]] = _ESCAPE.sub(lambda m: chr(int(m[1], 16)) if m[1] else m[2], match[2])
-    return found
+            values[match[1]] = _ESCAPE.sub(lambda m: chr(int(m[1], 16)) if m[1] else m[2], match[2])
+    return values
 
 
-def _number(of: dict[str, str], key: str, where: str, default: float | None = None) -> float:
+def _number(of: dict[str, str], key: str, where: str) -> float:
     text = of.get(key)
-    if text is None and default is not None:
-        return default
     value = as_number(text)
     if not math.isfinite(value):
         raise SceneRejected(f"{where}: {key} is {text!r}, expected a number of centimetres; fetch the library again")
@@ -114,19 +106,15 @@ def _piece(library: str, of: dict[str, str], where: str, names: set[str]) -> Pie
     return Piece(
         library,
         of.get("name", ""),
-        of.get("category", ""),
         model,
         (width, height, depth),
         turn.reshape(3, 3),
-        _number(of, "elevation", where, 0.0) / 100,
-        of.get("movable", "true") == "true",
-        of.get("doorOrWindow", "false") == "true",
         of.get("creator", ""),
     )
 
 
 def read_catalogue(path: Path) -> Catalogue:
-    """Reads the pieces of a `.sh3f` file."""
+    """Read the pieces of a `.sh3f` file."""
     try:
         with zipfile.ZipFile(path) as archive:
             names, data = set(archive.namelist()), archive.read(PROPERTIES)
@@ -146,11 +134,7 @@ def read_catalogue(path: Path) -> Catalogue:
 
 
 def unpack_model(catalogue: Catalogue, piece: Piece, folder: Path) -> Path:
-    """Writes a piece's model with what lies beside it into an empty folder.
-
-    Returns:
-        Path of the model.
-    """
+    """Write a piece's model with what lies beside it into an empty folder; return the model's path."""
     home = PurePosixPath(piece.model).parent
     try:
         with zipfile.ZipFile(catalogue.path) as archive:
@@ -197,8 +181,8 @@ class Chosen:
 
 
 def read_selection(catalogues: Sequence[Catalogue], path: Path = SELECTION) -> tuple[Chosen, ...]:
-    """The pieces that a selection names, by category."""
-    known = {piece.key: (catalogue, piece) for catalogue in catalogues for piece in catalogue.pieces}
+    """Return the pieces that a selection names, by category."""
+    pieces = {piece.key: (catalogue, piece) for catalogue in catalogues for piece in catalogue.pieces}
     data = Reader(ConfigError, "converters/library/selection.yaml shows the form").decoded(
         path.read_bytes(), "YAML", str(path)
     )
@@ -208,19 +192,19 @@ def read_selection(catalogues: Sequence[Catalogue], path: Path = SELECTION) -> t
             raise ConfigError(f"{path}: category is '{category}', expected one of {', '.join(CATEGORIES)}")
         for split in sorted(of):
             for key in of[split]:
-                found = [known.get(one) for one in key.split("+")]
-                if None in found:
+                several = [pieces.get(one) for one in key.split("+")]
+                if None in several:
                     raise ConfigError(f"{path}: {category}: no piece '{key}' in the libraries")
-                (catalogue, piece), *riders = [of for of in found if of is not None]
-                for _, own in ((catalogue, piece), *riders):
-                    if splits.setdefault(own.creator, split) != split:
-                        raise ConfigError(f"{path}: {key}: its creator {own.creator} has models in both splits")
+                (catalogue, piece), *riders = [of for of in several if of is not None]
+                for creator in (one.creator for _, one in ((catalogue, piece), *riders)):
+                    if splits.setdefault(creator, split) != split:
+                        raise ConfigError(f"{path}: {key}: its creator {creator} has models in both splits")
                 chosen.append(Chosen(catalogue, piece, category, split, tuple(riders)))
     return tuple(chosen)
 
 
 def as_catalogued(surface: TexturedMesh, piece: Piece, where: str) -> TexturedMesh:
-    """The surface turned and scaled as its catalogue says, the middle of its base at the origin."""
+    """Return the surface turned and scaled as its catalogue says, the middle of its base at the origin."""
     if not len(surface.faces):
         raise SceneRejected(f"{where}: has no face; choose another model")
     vertices, faces = compacted(surface.vertices, surface.faces)
@@ -245,17 +229,17 @@ def _surface(catalogue: Catalogue, piece: Piece) -> TexturedMesh:
 
 
 def on_top(surface: TexturedMesh, rider: TexturedMesh) -> TexturedMesh:
-    """Both as one: the rider on what is highest below its footprint, at the middle, its back near the other's."""
-    span, own = np.ptp(surface.vertices, axis=0), np.ptp(rider.vertices, axis=0)
-    back = min(0.0, own[2] / 2 + 0.03 - span[2] / 2)
+    """Join both: the rider on what is highest below its footprint, at the middle, its back near the other's."""
+    span, rider_span = np.ptp(surface.vertices, axis=0), np.ptp(rider.vertices, axis=0)
+    back = min(0.0, rider_span[2] / 2 + 0.03 - span[2] / 2)
     points, _ = sample_faces(surface.vertices, surface.faces, 0.02)
-    below = (np.abs(points[:, [0, 2]] - [0.0, back]) < own[[0, 2]] / 2).all(axis=1)
+    below = (np.abs(points[:, [0, 2]] - [0.0, back]) < rider_span[[0, 2]] / 2).all(axis=1)
     top = float(points[below, 1].max()) if below.any() else float(span[1])
     return join_meshes(surface, dataclasses.replace(rider, vertices=rider.vertices + [0.0, top, back]))
 
 
 def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]:
-    """One model, ready to be packaged."""
+    """Build one model, ready to be packaged."""
     piece, where = chosen.piece, f"{chosen.catalogue.path}: {chosen.piece.model}"
     surface = _surface(chosen.catalogue, piece)
     for rider in chosen.riders:
@@ -263,10 +247,10 @@ def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]
     vertices, faces, keep = merge_vertices(surface.vertices, surface.faces)
     colours = colours_of_faces(surface)[keep]
     solid = simplify_within(vertices, faces, SOLID_M)
-    made = decompose_all({chosen.key: solid}, HULLS, 1, cache or cache_folder(), strict=True)
+    result = decompose_all({chosen.key: solid}, HULLS, 1, cache or cache_folder(), strict=True)
     size_m = np.ptp(surface.vertices, axis=0)
     foot_m = FOOT_SHARE * size_m[1]
-    hulls = tuple(convex_hull(_standing(hull.vertices, foot_m)) for hull in made.hulls[chosen.key])
+    hulls = tuple(convex_hull(_standing(hull.vertices, foot_m)) for hull in result.hulls[chosen.key])
     for most in (*LEAN_FACES, MOST_FACES):
         low = simplify_to(vertices, faces, most)
         kept, off_m = surface_loss(vertices, faces, *low)
@@ -295,21 +279,14 @@ def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]
 def _licence(text: str) -> str:
     if text == "Public domain":
         return "CC0 1.0"
-    found = re.search(r"Attribution 3.0( United States)?", text)
-    return f"CC BY 3.0{' US' if found and found[1] else ''}" if found else text
+    match = re.search(r"Attribution 3.0( United States)?", text)
+    return f"CC BY 3.0{' US' if match[1] else ''}" if match else text
 
 
 def build(
     files: Sequence[Path], target: Path, jobs: int, report: Callable[[str, float], None], selection: Path = SELECTION
 ) -> int:
-    """Makes `models.zip` and `ATTRIBUTION.md` from the libraries; each appears whole or not at all.
-
-    Args:
-        files: `.sh3f` libraries.
-
-    Returns:
-        How many models.
-    """
+    """Build `models.zip` and `ATTRIBUTION.md` from `.sh3f` libraries, whole or not at all; return how many models."""
     chosen = read_selection([read_catalogue(path) for path in files], selection)
     done: list[tuple[Model, Shape]] = []
     with concurrent.futures.ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:

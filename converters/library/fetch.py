@@ -1,4 +1,4 @@
-"""Debian's package of furniture libraries, or a folder of them, in; checked `.sh3f` files in the cache folder out."""
+"""Fetch Debian's package of furniture libraries, or a folder of them, as checked `.sh3f` files."""
 
 import hashlib
 import io
@@ -25,24 +25,20 @@ REMEDY = f"give the package with --from (on Debian: apt-get download {PACKAGE}),
 
 
 def library_folder() -> Path:
-    """Where fetched libraries lie."""
+    """Return where fetched libraries lie."""
     return cache_folder().parent / "library" / f"sweethome3d-{VERSION}"
 
 
 def fetch(given: Path | None, target: Path, overwrite: bool = False) -> tuple[Path, ...]:
-    """Puts the libraries into a folder, all or none.
+    """Put the libraries into a folder, all or none, and return their paths.
 
-    Args:
-        given: the Debian package, or a folder that holds the files somewhere; None: the package is downloaded.
-
-    Returns:
-        Paths of the files.
+    `given`: the Debian package, or a folder that holds the files somewhere; None: download the package.
     """
     with whole_folder(target, overwrite) as folder, tempfile.TemporaryDirectory(prefix="library-") as scratch:
         place = given or _downloaded(Path(scratch))
-        found = _of_folder(place) if place.is_dir() else _of_package(place)
+        libraries = _of_folder(place) if place.is_dir() else _of_package(place)
         for name, digest in FILES.items():
-            data = found.get(name)
+            data = libraries.get(name)
             if data is None:
                 raise FileError(f"{place}: holds no {name}.sh3f; {REMEDY}")
             if hashlib.sha256(data).hexdigest() != digest:
@@ -55,11 +51,11 @@ def _downloaded(folder: Path) -> Path:
     if shutil.which("apt-get") is None:
         raise FileError(f"{PACKAGE}: apt-get is not here to download it; {REMEDY}")
     done = subprocess.run(["apt-get", "-qq", "download", PACKAGE], cwd=folder, capture_output=True, text=True)
-    made = sorted(folder.glob("*.deb"))
-    if done.returncode or not made:
+    packages = sorted(folder.glob("*.deb"))
+    if done.returncode or not packages:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
         raise FileError(f"{PACKAGE}: apt-get cannot download it ({last}); run apt-get update, or {REMEDY}")
-    return made[0]
+    return packages[0]
 
 
 def _of_folder(folder: Path) -> dict[str, bytes]:
@@ -67,7 +63,7 @@ def _of_folder(folder: Path) -> dict[str, bytes]:
 
 
 def _of_package(path: Path) -> dict[str, bytes]:
-    """The libraries in a Debian package: an `ar` archive with a tar in it."""
+    """Return the libraries in a Debian package: an `ar` archive with a tar in it."""
     with readable(path, FileError, REMEDY, " as a Debian package"):
         data = path.read_bytes()
         at, tar = 8, b""

@@ -34,7 +34,7 @@ _DAY = (1980, 1, 1, 0, 0, 0)
 
 @dataclasses.dataclass(frozen=True)
 class Credit:
-    """Whose a model is, and what it is called there."""
+    """Creator, title and licence of a model."""
 
     title: str
     creator: str
@@ -63,7 +63,7 @@ class Model:
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """What a model looks like and collides with."""
+    """Surface and hulls of a model."""
 
     visual: VisualMesh
     hulls: tuple[Hull, ...]
@@ -80,7 +80,7 @@ def _webp(image: np.ndarray) -> bytes:
 
 
 def _planes(table: np.ndarray) -> np.ndarray:
-    """(2, columns, rows) bytes of the steps from row to row of a table (rows, columns): they pack to less."""
+    """Return (2, columns, rows) bytes of the steps from row to row of a table (rows, columns): they pack to less."""
     steps = np.diff(table.T, axis=1, prepend=np.uint16(0))
     return np.stack([steps & 255, steps >> 8]).astype(np.uint8)
 
@@ -91,7 +91,7 @@ def _table(planes: np.ndarray) -> np.ndarray:
 
 
 def _by_use(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points in the order in which faces name them, and of each corner how far it lies behind the next new point."""
+    """Return points in the order in which faces name them, and how far each corner lies behind the next new point."""
     flat = faces.ravel()
     first = np.unique(flat, return_index=True)[1]
     order = flat[np.sort(first)]
@@ -126,7 +126,7 @@ def _arrays(shape: Shape) -> bytes:
 
 
 def write_library(path: Path, models: Sequence[tuple[Model, Shape]]) -> None:
-    """Writes the archive: the same models, the same bytes."""
+    """Write the archive: the same models, the same bytes."""
     with zipfile.ZipFile(path, "w") as archive:
 
         def put(name: str, data: bytes) -> None:
@@ -140,7 +140,7 @@ def write_library(path: Path, models: Sequence[tuple[Model, Shape]]) -> None:
 
 
 def attribution(models: Sequence[Model]) -> str:
-    """The file that names who made what, and what was changed, as the licences ask."""
+    """Return the file that credits the creators and says what was changed, as the licences require."""
     lines = [
         "# Furniture: whose models these are",
         "",
@@ -167,18 +167,18 @@ def _member(path: Path, name: str) -> bytes:
 
 @functools.cache
 def read_index(path: Path = PACKED) -> dict[str, Model]:
-    """Name -> model, in the archive's order."""
-    found = {}
+    """Return name -> model, in the archive's order."""
+    models = {}
     for row in json.loads(_member(path, "index.json")):
         credits = tuple(Credit(**one) for one in row["credits"])
         values: dict[str, Any] = {**row, "size_m": tuple(row["size_m"]), "credits": credits}
-        found[row["name"]] = Model(**values)
-    return found
+        models[row["name"]] = Model(**values)
+    return models
 
 
 @functools.cache
 def read_shape(name: str, path: Path = PACKED) -> Shape:
-    """A model's surface and hulls."""
+    """Read a model's surface and hulls."""
     buffer = io.BytesIO(_member(path, f"{name}.arrays"))
     try:
         bounds, *planes = (np.lib.format.read_array(buffer, allow_pickle=False) for _ in range(8))

@@ -1,4 +1,6 @@
-"""Labelled points in, pieces of one class out: connected voxels, merged, parted at necks and in rows."""
+"""Group labelled points into pieces of one class: connected voxels, merged, then split at necks, in rows and by tops.
+
+Tables and desks are split where two tops meet in a step, or make the outline of two rectangles."""
 
 import dataclasses
 import itertools
@@ -7,10 +9,11 @@ from typing import Any
 
 import numpy as np
 from scipy import ndimage
-from scipy.spatial import KDTree
+from scipy.spatial import ConvexHull, KDTree
 
 from converters.geometry.boxes import upright_box
-from interactive_nav_common.grids import nearest_cell
+from interactive_nav_common.grids import label, nearest_cell
+from interactive_nav_common.rotations import yaw_matrix
 from scenes_mjcf.categories import TABLE
 
 MIN_VOXELS = 60
@@ -25,12 +28,27 @@ LABEL_CATEGORIES = {c.labels[0]: c.name for c in sorted(TABLE, key=lambda c: c.l
 """NYU40 id -> category."""
 LONGEST = {c.name: c.longest for c in TABLE if c.longest is not None}
 FLAT = ("door",)
-"""Seen from above a line, whose breadth says nothing."""
+"""A line from above, whose breadth says nothing."""
 NECK_SHARE = 0.6
 """Where a footprint is narrower than this share of the narrower side's width, two things touch."""
 CORE_CELLS = 2.0
 PART_SHARE = 0.7
 """A part of a piece is a thing from this share of the class's least usual width on."""
+TOPS_M = {c.name: c.top_m for c in TABLE if c.top_m is not None}
+RECTANGULAR = 0.9
+"""Least share of its smallest rectangle that a rectangular top fills as scanned; a round one fills 0.785."""
+NOTCH_M = 0.2
+"""Least sides of the corner that two tops put together leave free; smaller ones are what a scan lost."""
+NOTCH_SHOWN = 0.5
+"""Least share of that corner in which the scan shows the floor: otherwise it may hide more of the top."""
+AROUND_M = 0.5
+"""Where no floor is visible around a top either, the scan says nothing about corners."""
+OUTLINE_RAD = math.radians(4.0)
+"""Stretches of an outline within this run the same way."""
+STEP_M = 0.08
+"""Least difference in height of two tops put together."""
+PART_DEPTH_M = 0.3
+"""Least depth of a top."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +62,7 @@ class Piece:
 
 
 def components(points: np.ndarray, label: int, origin: np.ndarray, voxel_m: float) -> list[Piece]:
-    """26-connected pieces of one class."""
+    """Return the 26-connected pieces of one class."""
     index = np.floor((points - origin) / voxel_m).astype(np.int64)
     low = index.min(axis=0)
     grid = np.zeros(index.max(axis=0) - low + 1, bool)
@@ -59,7 +77,7 @@ def components(points: np.ndarray, label: int, origin: np.ndarray, voxel_m: floa
 
 
 def _footprint(voxels: np.ndarray) -> set[tuple[int, int]]:
-    """Columns of voxels, one voxel wider on each side."""
+    """Return columns of voxels, one voxel wider on each side."""
     cells = np.unique(voxels[:, :2], axis=0)
     around = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
     return set(map(tuple, (cells[:, None] + around).reshape(-1, 2).tolist()))
@@ -72,7 +90,7 @@ def _join(pieces: list[Piece]) -> Piece:
 
 
 def merge(pieces: list[Piece], same: Any) -> list[Piece]:
-    """Joins pieces for which `same` holds, the largest first, until none is left to join."""
+    """Join pieces for which `same` holds, the largest first, until none is left to join."""
     pieces = sorted(pieces, key=lambda p: (-len(p.voxels), p.voxels[0].tolist()))
     while pair := next((p for p in itertools.combinations(range(len(pieces)), 2) if same(*(pieces[k] for k in p))), ()):
         i, j = pair
@@ -81,15 +99,15 @@ def merge(pieces: list[Piece], same: Any) -> list[Piece]:
 
 
 def stacked(one: Piece, other: Piece) -> bool:
-    """Whether two pieces of one class stand above each other: they are one thing."""
+    """Return whether two pieces of one class stand above each other: they are one thing."""
     a, b = _footprint(one.voxels), _footprint(other.voxels)
     return len(a & b) > STACKED_SHARE * min(len(a), len(b))
 
 
 def same_box(one: Piece, other: Piece) -> bool:
-    """Whether two pieces of different classes fill the same box: they are one thing."""
+    """Return whether two pieces of different classes fill the same box: they are one thing."""
     if one.label == other.label:
-        return False  # joined, or parted, already
+        return False  # joined, or split, already
     low = np.maximum(one.voxels.min(axis=0), other.voxels.min(axis=0))
     high = np.minimum(one.voxels.max(axis=0), other.voxels.max(axis=0)) + 1
     shared = np.prod(np.maximum(high - low, 0))
@@ -98,11 +116,10 @@ def same_box(one: Piece, other: Piece) -> bool:
 
 
 def _basins(mask: np.ndarray) -> np.ndarray:
-    """Basins around the local maxima of the distance to the outline, from the highest down (a watershed).
+    """Return (rows, columns) numbers of basins from 1 on, 0 outside, around the peaks of the distance to the outline.
 
-    A basin that meets a higher one where the distance is at least `NECK_SHARE` of its own greatest joins it.
-
-    Returns (rows, columns) number of the basin from 1 on, 0 outside.
+    This is a watershed from the highest peak down: a basin that meets a higher one where the distance is at least
+    `NECK_SHARE` of its greatest joins it.
     """
     distance = np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1)))
     distance = np.where(np.pad(mask, 1), ndimage.gaussian_filter(distance, 0.7), 0.0)
@@ -138,26 +155,26 @@ def _basins(mask: np.ndarray) -> np.ndarray:
 
 
 def _wide(points: np.ndarray) -> tuple[float, float]:
-    """Longer and shorter horizontal side of the upright box of points, m."""
+    """Return the longer and the shorter horizontal side of the upright box of points, m."""
     half = upright_box(points).half
     return 2 * float(max(half[:2])), 2 * float(min(half[:2]))
 
 
 def part_by_number(piece: Piece, chosen: np.ndarray, of_point: np.ndarray, of_voxel: np.ndarray) -> list[Piece]:
-    """One piece for each of the chosen numbers; what has another number goes to the nearest of them."""
+    """Return one piece for each of the chosen numbers; what has another number goes to the nearest of them."""
     if len(chosen) < 2:
         return [piece]
-    middles = KDTree(piece.voxels[np.isin(of_voxel, chosen)])
-    known = of_voxel[np.isin(of_voxel, chosen)]
-    of_voxel = np.where(np.isin(of_voxel, chosen), of_voxel, known[middles.query(piece.voxels)[1]])
-    nearest = KDTree(piece.points[np.isin(of_point, chosen)])
-    known = of_point[np.isin(of_point, chosen)]
-    of_point = np.where(np.isin(of_point, chosen), of_point, known[nearest.query(piece.points)[1]])
+
+    def nearest(places: np.ndarray, of: np.ndarray) -> np.ndarray:
+        among = np.isin(of, chosen)
+        return np.where(among, of, of[among][KDTree(places[among]).query(places)[1]])
+
+    of_voxel, of_point = nearest(piece.voxels, of_voxel), nearest(piece.points, of_point)
     return [Piece(piece.label, piece.points[of_point == k], piece.voxels[of_voxel == k]) for k in chosen]
 
 
 def split_at_necks(piece: Piece, origin: np.ndarray, voxel_m: float) -> list[Piece]:
-    """The things of a piece that touch where its footprint is narrow."""
+    """Split a piece into things that touch where its footprint is narrow."""
     category = LABEL_CATEGORIES[piece.label]
     if category in FLAT:
         return [piece]
@@ -180,7 +197,7 @@ def split_at_necks(piece: Piece, origin: np.ndarray, voxel_m: float) -> list[Pie
 
 
 def split_row(piece: Piece, origin: np.ndarray, voxel_m: float) -> list[Piece]:
-    """The things of a piece that is too long for one: equal lengths, as many as have the usual shape."""
+    """Split a piece that is too long for one thing into equal lengths, as many as have the usual shape."""
     category = LABEL_CATEGORIES[piece.label]
     if category not in LONGEST:
         return [piece]
@@ -200,3 +217,166 @@ def split_row(piece: Piece, origin: np.ndarray, voxel_m: float) -> list[Piece]:
     ]
     of_point, of_voxel = (np.clip((a * count).astype(int), 0, count - 1) for a in along)
     return part_by_number(piece, np.arange(count), of_point, of_voxel)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Plan:
+    """A piece seen from above, along its main direction."""
+
+    axes: np.ndarray
+    """(2, 2) columns: directions of rows and columns."""
+    low: np.ndarray
+    """(2,) m, of cell [0, 0] along the axes."""
+    cell_m: float
+    top: np.ndarray
+    """(rows, columns) height of what is uppermost, m; nan where there is nothing."""
+
+    @property
+    def shape(self) -> np.ndarray:
+        """Return (rows, columns) bool: the footprint."""
+        return ~np.isnan(self.top)
+
+    def cells(self, xy: np.ndarray) -> np.ndarray:
+        """Return (n, 2) cells of (n, 2) points, which may lie outside."""
+        return np.floor((xy @ self.axes - self.low) / self.cell_m).astype(np.int64)
+
+
+def _main_yaw(xy: np.ndarray) -> float:
+    """Return the direction along which most of the outline of (n, 2) points runs, rad, modulo 90 degrees."""
+    outline = xy[ConvexHull(xy).vertices]
+    edges = np.roll(outline, -1, axis=0) - outline
+    length = np.linalg.norm(edges, axis=1)
+    turn = np.exp(4j * np.arctan2(edges[:, 1], edges[:, 0]))  # the same for every quarter turn
+    alike = np.real(turn[:, None] * turn.conj()) > math.cos(4 * OUTLINE_RAD)
+    best = alike[int(np.argmax(alike @ length))]
+    return float(np.angle((turn * length)[best].sum()) / 4)
+
+
+def _plan(points: np.ndarray, cell_m: float) -> _Plan:
+    axes = yaw_matrix(_main_yaw(points[:, :2]))[:2, :2]
+    flat = points[:, :2] @ axes
+    low = flat.min(axis=0)
+    index = np.floor((flat - low) / cell_m).astype(np.int64)
+    top = np.full(index.max(axis=0) + 1, -np.inf)
+    np.maximum.at(top, tuple(index.T), points[:, 2])
+    hit = np.isfinite(top)
+    # Cells without a sample, and holes: as high as what is nearest.
+    padded = np.pad(hit, 2)
+    closed = ndimage.binary_fill_holes(ndimage.binary_closing(padded, np.ones((3, 3))))
+    assert closed is not None
+    return _Plan(axes, low, cell_m, np.where(closed[2:-2, 2:-2], top[tuple(nearest_cell(hit))], np.nan))
+
+
+def _fill(mask: np.ndarray) -> float:
+    """Return the share of a mask's upright rectangle that it fills."""
+    rows, columns = np.nonzero(mask)
+    return len(rows) / float((np.ptp(rows) + 1) * (np.ptp(columns) + 1)) if len(rows) else 0.0
+
+
+def _sides(mask: np.ndarray, cell_m: float) -> tuple[float, float]:
+    """Return the longer and the shorter side of a mask's upright rectangle, m."""
+    rows, columns = np.nonzero(mask)
+    sides = sorted(((np.ptp(rows) + 1) * cell_m, (np.ptp(columns) + 1) * cell_m)) if len(rows) else [0.0, 0.0]
+    return sides[1], sides[0]
+
+
+def _usual_top(mask: np.ndarray, cell_m: float, category: str) -> bool:
+    """Return whether a mask is as large as the class's tops are, and rectangular."""
+    long, short = _sides(mask, cell_m)
+    least, most = SIZES_M[category][0]
+    return PART_SHARE * least <= long <= most and short >= PART_DEPTH_M and _fill(mask) >= RECTANGULAR
+
+
+def _two_levels(plan: _Plan) -> np.ndarray | None:
+    """Return (rows, columns) part 1 or 2 of a footprint whose tops are two whole rectangles at two heights."""
+    shape = plan.shape
+    heights = np.sort(plan.top[shape])
+    gap = int(np.argmax(np.diff(heights)))
+    # The greatest jump between neighbouring heights; tops are level, so it is empty but for slants.
+    if heights[gap + 1] - heights[gap] < STEP_M:
+        return None
+    upper = shape & (plan.top > (heights[gap] + heights[gap + 1]) / 2)
+    parts = (upper, shape & ~upper)
+    if not all(_usual_top(p, plan.cell_m, "table") for p in parts):
+        return None
+    return np.where(upper, 2, np.where(shape, 1, 0))
+
+
+def _two_rectangles(plan: _Plan, shown_floor: np.ndarray | None, category: str) -> np.ndarray | None:
+    """Return (rows, columns) part 1 or 2 of an outline that one straight cut turns into two rectangles, or None."""
+    shape = plan.shape
+    best, best_score = None, -math.inf
+    margin, notch = (math.ceil(v / plan.cell_m) for v in (PART_DEPTH_M, NOTCH_M))
+    index = np.indices(shape.shape)
+    for axis in (0, 1):
+        for cut in range(margin, shape.shape[axis] - margin + 1):
+            below = index[axis] < cut
+            parts = (shape & below, shape & (index[axis] > cut))  # the row between may hold some of both
+            if not all(_usual_top(p, plan.cell_m, category) for p in parts):
+                continue
+            sides = [_sides(p, plan.cell_m) for p in parts]
+            boxes = np.zeros_like(shape)
+            for p in parts:
+                rows, columns = np.nonzero(p)
+                boxes[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1] = True
+            # Of two cuts that fit, as an L has them, the one with parts of usual proportions.
+            odd = sum(abs(math.log(long / short / TOPS_M[category][2])) for long, short in sides)
+            score = float(shape.sum() / boxes.sum()) - 0.1 * odd
+            # What the two leave free of the common rectangle, without stripes along them.
+            free = np.asarray(ndimage.binary_opening(~boxes & (index[axis] != cut), np.ones((notch, notch))))
+            numbers, count = label(free)
+            corners = [numbers == k for k in range(1, count + 1)]
+            hidden = shown_floor is not None and not any(shown_floor[c].mean() >= NOTCH_SHOWN for c in corners)
+            if corners and not hidden and score > best_score:
+                across = np.flatnonzero(parts[0].any(axis=axis))
+                between = (index[axis] == cut) & (index[1 - axis] >= across[0]) & (index[1 - axis] <= across[-1])
+                best, best_score = np.where(shape, np.where(below | between, 1, 2), 0), score
+    return best
+
+
+def _too_large(plan: _Plan, category: str) -> np.ndarray | None:
+    """Return (rows, columns) numbers of the equal parts of a rectangle too long or deep for one top, or None."""
+    shape = plan.shape
+    if _fill(shape) < RECTANGULAR:
+        return None
+    deepest, longest, usual = TOPS_M[category]
+    long, short = _sides(shape, plan.cell_m)
+    along = int(np.argmax(shape.shape))
+    if short > deepest:
+        along, count = 1 - along, math.ceil(short / deepest)
+    elif long > longest * short or long > SIZES_M[category][0][1]:
+        count = max(round(long / (usual * short)), 2)
+    else:
+        return None
+    index = np.indices(shape.shape)[along]
+    return np.where(shape, 1 + index * count // shape.shape[along], 0)
+
+
+def split_tops(piece: Piece, floor_xy: np.ndarray, origin: np.ndarray, voxel_m: float) -> list[Piece]:
+    """Split a piece into tables or desks; `floor_xy`: (n, 2) places of floor that the scan shows, m."""
+    category = LABEL_CATEGORIES[piece.label]
+    if category not in TOPS_M:
+        return [piece]
+    plan = _plan(piece.points, voxel_m)
+    part = None
+    if category == "table":  # desks have corners and shelves
+        rim = math.ceil(AROUND_M / voxel_m)
+        shown = np.zeros(np.array(plan.top.shape) + 2 * rim, bool)
+        at = plan.cells(floor_xy) + rim
+        shown[tuple(at[((at >= 0) & (at < shown.shape)).all(axis=1)].T)] = True
+        shown = np.asarray(ndimage.binary_closing(shown, np.ones((3, 3))))
+        shown = shown[rim:-rim, rim:-rim] if shown.any() else None
+        part = _two_levels(plan)
+        part = _two_rectangles(plan, shown, category) if part is None else part
+    part = _too_large(plan, category) if part is None else part
+    if part is None:
+        return [piece]
+    numbers = np.unique(part[part > 0])
+    middles = (piece.voxels[:, :2] + 0.5) * voxel_m + origin[:2]
+    of_point, of_voxel = (
+        part[tuple(np.clip(plan.cells(xy), 0, np.array(part.shape) - 1).T)] for xy in (piece.points[:, :2], middles)
+    )
+    parts = part_by_number(piece, numbers, of_point, of_voxel)
+    if min(len(p.voxels) for p in parts) < MIN_VOXELS:
+        return [piece]
+    return [smaller for p in parts for smaller in split_tops(p, floor_xy, origin, voxel_m)]

@@ -1,8 +1,8 @@
-"""Labelled scan in, furniture instances with class, box and confidence out (section III-B's region proposals).
+"""Find furniture instances with class, box and confidence in a labelled scan (section III-B's region proposals).
 
 The labels are put into a voxel grid; connected voxels of one class are an instance. What a scan tears apart
 (the seat of a swivel chair above its base: the thin column is missing) or names twice (table and desk) is
-merged by footprint. Things of one class that touch are parted where their common footprint has a neck, and where it is
+merged by footprint. Things of one class that touch are split where their common footprint has a neck, and where it is
 too long for one of its class; tables and desks also where two tops meet in a step, or make an outline that two
 rectangles have and one has not.
 """
@@ -25,9 +25,9 @@ from converters.propose.pieces import (
     same_box,
     split_at_necks,
     split_row,
+    split_tops,
     stacked,
 )
-from converters.propose.tops import split_tops
 from converters.records.raw import FLOOR, SYNSETS, UNLABELLED, WALL, ScanMesh
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, yaw_matrix
 
@@ -48,7 +48,7 @@ class Proposal:
     centre: np.ndarray
     """(3,) of the upright box, scan frame, m."""
     extent_m: np.ndarray
-    """(3,) full sizes along the box's own axes."""
+    """(3,) full sizes along the box's axes."""
     yaw: float
     """rad, of the box's x axis; modulo 90 degrees."""
     n_voxels: int
@@ -57,12 +57,12 @@ class Proposal:
 
 
 def _inside_range(value: float, limits: tuple[float, float]) -> float:
-    """1 inside the range, falling with the ratio outside: half the lower limit gives 0.5."""
+    """Return 1 inside the range, falling with the ratio outside: half the lower limit gives 0.5."""
     return min(1.0, value / limits[0], limits[1] / max(value, 1e-9))
 
 
 def _confidence(category: str, extent: np.ndarray, purity: float, n_voxels: int, voxel_m: float) -> float:
-    """Product of three shares: size usual for the class, labels in the box that agree, and surface seen.
+    """Return the product of three shares: usual size for the class, labels in the box that agree, and visible surface.
 
     `purity` is the class's share of the box's furniture voxels. Surface counts as enough when the voxels cover
     half of one side and the top of the box.
@@ -70,15 +70,12 @@ def _confidence(category: str, extent: np.ndarray, purity: float, n_voxels: int,
     wide, high = SIZES_M[category]
     size = _inside_range(float(max(extent[:2])), wide) * _inside_range(float(extent[2]), high)
     surface = extent[0] * extent[1] + max(extent[0], extent[1]) * extent[2]
-    seen = min(1.0, n_voxels * voxel_m**2 / max(0.5 * surface, 1e-9))
-    return float(size * purity * seen)
+    visible = min(1.0, n_voxels * voxel_m**2 / max(0.5 * surface, 1e-9))
+    return float(size * purity * visible)
 
 
 def propose_instances(scan: ScanMesh, voxel_m: float = VOXEL_M) -> tuple[Proposal, ...]:
-    """Instances of every furniture class, the most certain first.
-
-    `scan`: with NYU40 labels.
-    """
+    """Return instances of every furniture class in a scan with NYU40 labels, the most certain first."""
     points, face = sample_faces(scan.vertices, scan.faces, voxel_m / 2)
     label = face_labels(scan.labels, scan.faces)[face]
     origin = scan.vertices.min(axis=0)
@@ -86,11 +83,11 @@ def propose_instances(scan: ScanMesh, voxel_m: float = VOXEL_M) -> tuple[Proposa
     pieces: list[Piece] = []
     for wanted in LABEL_CATEGORIES:
         if (label == wanted).any():
-            found = merge(components(points[label == wanted], wanted, origin, voxel_m), stacked)
-            found = [p for p in found if len(p.voxels) >= MIN_VOXELS]
-            found = [part for p in found for part in split_at_necks(p, origin, voxel_m)]
-            found = [part for p in found for part in split_tops(p, floor_xy, origin, voxel_m)]
-            pieces += [part for p in found for part in split_row(p, origin, voxel_m)]
+            parts = merge(components(points[label == wanted], wanted, origin, voxel_m), stacked)
+            parts = [p for p in parts if len(p.voxels) >= MIN_VOXELS]
+            parts = [part for p in parts for part in split_at_necks(p, origin, voxel_m)]
+            parts = [part for p in parts for part in split_tops(p, floor_xy, origin, voxel_m)]
+            pieces += [part for p in parts for part in split_row(p, origin, voxel_m)]
     pieces = merge(pieces, same_box)
     other = ~np.isin(label, (UNLABELLED, WALL, 2, 22))
     other_voxels = np.unique(np.floor((points[other] - origin) / voxel_m).astype(np.int64), axis=0)
@@ -112,14 +109,14 @@ def propose_instances(scan: ScanMesh, voxel_m: float = VOXEL_M) -> tuple[Proposa
 
 
 def box_iou(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> float:
-    """Intersection over union of two axis-aligned boxes, each (low (3,), high (3,))."""
+    """Return the intersection over union of two axis-aligned boxes, each (low (3,), high (3,))."""
     shared = np.prod(np.maximum(np.minimum(one[1], other[1]) - np.maximum(one[0], other[0]), 0.0))
     total = np.prod(one[1] - one[0]) + np.prod(other[1] - other[0]) - shared
     return float(shared / total) if total > 0 else 0.0
 
 
 def bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(low (3,), high (3,)) of (n, 3) points."""
+    """Return (low (3,), high (3,)) of (n, 3) points."""
     return points.min(axis=0), points.max(axis=0)
 
 
@@ -131,7 +128,7 @@ def scan2cad_model(
     symmetry: str = "__SYM_NONE",
     pairs: tuple[np.ndarray, np.ndarray] = (NO_POINTS, NO_POINTS),
 ) -> dict[str, Any]:
-    """One model of Scan2CAD's list, whose world is y up; arguments are z up.
+    """Return one model of Scan2CAD's list, whose world is y up; arguments are z up.
 
     `pose`: scale (3,), yaw (rad) and translation (3,) m of the upright model.
     `vertices`: (n, 3) of the model, CAD frame.
@@ -140,7 +137,7 @@ def scan2cad_model(
     """
     (scale, yaw, translation), (low, high) = pose, bounds(vertices @ Y_UP_TO_Z_UP)
     return {
-        "catid_cad": next(key for key, own in SYNSETS.items() if own == category),
+        "catid_cad": next(key for key, name in SYNSETS.items() if name == category),
         "id_cad": cad_id,
         "sym": symmetry,
         "trs": {
@@ -158,12 +155,10 @@ def scan2cad_model(
 
 
 def as_scan2cad(scan_id: str, proposals: tuple[Proposal, ...], chosen: dict[int, Any] | None = None) -> list[dict]:
-    """The proposals in the shape of Scan2CAD's annotation list, for an annotation tool to take further.
+    """Return the proposals in the shape of Scan2CAD's annotation list, for an annotation tool to take further.
 
     A proposal without a model is a unit cube with `id_cad` "" and the box as its pose; keypoints are empty. Each
-    has one key more, `proposal`, with what was measured.
-
-    `chosen`: proposal's index -> `Retrieval` (model and pose), where one was found.
+    has one key more, `proposal`, with what was measured. `chosen`: proposal's index -> `Retrieval` (model and pose).
     """
     models = []
     for k, proposal in enumerate(proposals):
@@ -176,16 +171,16 @@ def as_scan2cad(scan_id: str, proposals: tuple[Proposal, ...], chosen: dict[int,
         }
         cube, pose = np.array([[-0.5], [0.5]]).repeat(3, 1), (proposal.extent_m, proposal.yaw, proposal.centre)
         entry = scan2cad_model(proposal.category, "", pose, cube)
-        if (found := (chosen or {}).get(k)) is not None:
-            pose = found.pose.scale, found.pose.yaw, found.pose.translation
-            entry = scan2cad_model(found.cad.category, found.cad.cad_id, pose, found.cad.vertices)
-            about |= {"retrieval_confidence": found.confidence, "residual_m": found.residual_m}
+        if (best := (chosen or {}).get(k)) is not None:
+            pose = best.pose.scale, best.pose.yaw, best.pose.translation
+            entry = scan2cad_model(best.cad.category, best.cad.cad_id, pose, best.cad.vertices)
+            about |= {"retrieval_confidence": best.confidence, "residual_m": best.residual_m}
         models.append(entry | {"proposal": about})
     return scan2cad_list(scan_id, models)
 
 
 def scan2cad_list(scan_id: str, models: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Scan2CAD's list of one scan, whose `trs` turns its z up to the file's y."""
+    """Return Scan2CAD's list of one scan, whose `trs` turns its z up to the file's y."""
     half = math.sqrt(0.5)
     return [
         {
@@ -198,7 +193,7 @@ def scan2cad_list(scan_id: str, models: list[dict[str, Any]]) -> list[dict[str, 
 
 
 def box_corners(proposal: Proposal) -> np.ndarray:
-    """(4, 2) corners of the box seen from above, counter-clockwise, m."""
+    """Return (4, 2) corners of the box from above, counter-clockwise, m."""
     half = proposal.extent_m[:2] / 2
     square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half
     return square @ yaw_matrix(proposal.yaw)[:2, :2].T + proposal.centre[:2]

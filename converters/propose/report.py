@@ -1,4 +1,4 @@
-"""A raw folder in; `proposals.json` (Scan2CAD's shape) and `proposals.png` out, and retrieval's report."""
+"""Write `proposals.json` (Scan2CAD's shape) and `proposals.png` of a raw folder, and report on retrieval."""
 
 import collections
 import dataclasses
@@ -34,7 +34,7 @@ SAME_OBJECT_SHARE = 0.3
 
 @dataclasses.dataclass(frozen=True)
 class Proposed:
-    """What `propose` found."""
+    """Result of `propose`."""
 
     proposals: tuple[Proposal, ...]
     retrieved: dict[int, Retrieval]
@@ -43,7 +43,7 @@ class Proposed:
 
 
 def floor_of(raw: RawScene) -> float:
-    """Height of the floor in the scan frame, m."""
+    """Return the height of the floor in the scan frame, m."""
     given = raw.floor_height_m
     return given if given is not None else fit_floor(raw.scan.vertices, raw.scan.faces, raw.scan.labels).height_m
 
@@ -52,27 +52,27 @@ def retrieve_sure(
     raw: RawScene, library_root: Path | None, progress: Callable[[float], None]
 ) -> tuple[tuple[Proposal, ...], dict[int, Retrieval]]:
     """Return the furniture without an annotation, and by its index the model of a library where that is sure."""
-    found = propose_instances(raw.scan)
-    found = tuple(found[k] for k in without_annotation(found, raw.annotations, raw.cads))
-    retrieved = auto_align(found, read_library(library_root), floor_of(raw), progress) if found else {}
-    return found, {k: retrieved[k] for k in sorted(retrieved) if retrieved[k].confidence >= MIN_CONFIDENCE}
+    new = propose_instances(raw.scan)
+    new = tuple(new[k] for k in without_annotation(new, raw.annotations, raw.cads))
+    retrieved = auto_align(new, read_library(library_root), floor_of(raw), progress) if new else {}
+    return new, {k: retrieved[k] for k in sorted(retrieved) if retrieved[k].confidence >= MIN_CONFIDENCE}
 
 
-def given_up(found: Sequence[Proposal], sure: Container[int]) -> tuple[str, ...]:
+def given_up(proposals: Sequence[Proposal], sure: Container[int]) -> tuple[str, ...]:
     """Return one line that counts the furniture for which no model is sure, or none."""
-    counts = collections.Counter(p.category for k, p in enumerate(found) if k not in sure)
+    counts = collections.Counter(p.category for k, p in enumerate(proposals) if k not in sure)
     listed = ", ".join(f"{count} {category}" for category, count in sorted(counts.items()))
     return (f"no sure model, so part of the structure: {listed}",) if listed else ()
 
 
 def with_retrieved(raw: RawScene, library_root: Path | None, progress: Callable[[float], None]) -> RawScene:
     """Add to the annotations what `retrieve_sure` finds, and to the warnings what it gives up."""
-    found, sure = retrieve_sure(raw, library_root, progress)
+    proposals, sure = retrieve_sure(raw, library_root, progress)
     return dataclasses.replace(
         raw,
         annotations=raw.annotations + tuple(as_annotation(r) for r in sure.values()),
         cads=raw.cads | {r.cad.cad_id: r.cad for r in sure.values()},
-        warnings=raw.warnings + given_up(found, sure),
+        warnings=raw.warnings + given_up(proposals, sure),
     )
 
 
@@ -84,8 +84,8 @@ def _nearest_proposal(raw: RawScene, proposals: tuple[Proposal, ...], k: int) ->
     return order[0] if order and shares[order[0]] > SAME_OBJECT_SHARE else None
 
 
-def _draw(raw: RawScene, found: Proposed, target: Path) -> None:
-    """The scan from above, proposals as boxes with class and confidence, retrieved models as outlines."""
+def _draw(raw: RawScene, proposed: Proposed, target: Path) -> None:
+    """Draw the scan from above, proposals as boxes with class and confidence, retrieved models as outlines."""
     import matplotlib  # 0.3 s that no conversion needs
 
     matplotlib.use("Agg")
@@ -100,11 +100,11 @@ def _draw(raw: RawScene, found: Proposed, target: Path) -> None:
     if raw.scan.vertex_colours is not None:
         shade = raw.scan.vertex_colours[keep][low] / 255.0
     axes.scatter(*vertices[low][:, :2].T, s=0.6, c=shade, alpha=0.5, linewidths=0)
-    for k, proposal in enumerate(found.proposals):
+    for k, proposal in enumerate(proposed.proposals):
         colour = CATEGORIES[proposal.category].preview_colour
         axes.add_patch(Polygon(box_corners(proposal), fill=False, edgecolor=colour, linewidth=2))
         text = f"{proposal.category} {proposal.confidence:.2f}"
-        model = found.retrieved.get(k)
+        model = proposed.retrieved.get(k)
         if model is not None:
             outline = MultiPoint(apply_alignment(model.pose, model.cad.vertices)[:, :2]).convex_hull
             axes.add_patch(
@@ -117,12 +117,12 @@ def _draw(raw: RawScene, found: Proposed, target: Path) -> None:
     for annotation in raw.annotations:
         hull = MultiPoint(annotated_vertices(annotation, raw.cads)[:, :2]).convex_hull
         axes.plot(*np.asarray(hull.exterior.coords).T, "k:", linewidth=1)
-    shown = sorted({p.category for p in found.proposals})
+    shown = sorted({p.category for p in proposed.proposals})
     handles = [Patch(facecolor="none", edgecolor=CATEGORIES[c].preview_colour, label=c) for c in shown]
     handles.append(Patch(facecolor="none", edgecolor="black", linestyle=":", label="annotated model"))
     axes.legend(handles=handles, fontsize=8, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.06), frameon=False)
     axes.set(aspect="equal", xlabel="x, m (scan frame)", ylabel="y, m (scan frame)")
-    axes.set_title(f"{raw.name}: {len(found.proposals)} proposals, class and confidence")
+    axes.set_title(f"{raw.name}: {len(proposed.proposals)} proposals, class and confidence")
     figure.tight_layout()
     figure.savefig(target, metadata={"Software": None})
     plt.close(figure)
@@ -134,13 +134,9 @@ def propose(
     library: Mapping[str, CadModel] | None = None,
     report: Callable[[str, float], None] | None = None,
 ) -> Proposed:
-    """Finds instances, with a library also their models, and writes both files into `target`.
+    """Find instances, with a library of models by id also their models, and write both files into a folder.
 
-    Args:
-        raw: the read source.
-        target: folder, made if absent; on failure older files in it stay as they were.
-        library: models to choose from, by id; None: boxes only.
-        report: progress, (stage, share).
+    The folder is created if absent; on failure older files in it stay as they were. `report`: stage and share.
     """
     say = report or (lambda stage, share: None)
     say("propose", 0.0)
@@ -156,11 +152,11 @@ def propose(
             at = _nearest_proposal(raw, proposals, k)
             if at is not None and at in retrieved:
                 comparisons.append(compare_retrieval(annotation, raw.cads, proposals[at], retrieved[at], floor))
-    found = Proposed(proposals, retrieved, tuple(comparisons))
+    proposed = Proposed(proposals, retrieved, tuple(comparisons))
     say("draw", 0.95)
     text = json.dumps(as_scan2cad(raw.name, proposals, retrieved), indent=1, allow_nan=False) + "\n"
     with whole_file(target / "proposals.json") as written, whole_file(target / "proposals.png") as picture:
         written.write_text(text, encoding="utf-8")
-        _draw(raw, found, picture)
+        _draw(raw, proposed, picture)
     say("draw", 1.0)
-    return found
+    return proposed

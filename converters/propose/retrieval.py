@@ -1,4 +1,4 @@
-"""Proposals and a CAD library in; for each proposal the model and pose that fit best, and how sure that is, out.
+"""Find for each proposal the model of a CAD library and the pose that fit best, and how sure that is.
 
 The paper had people choose and align models. Here every model of the class is fitted from several yaws by a
 two-sided iterative closest point scheme with the same seven parameters (three scales, position, yaw), and
@@ -29,7 +29,7 @@ from converters.records.visual import TexturedMesh
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, transformed, wrap_angle, yaw_matrix
 
 N_YAWS = 24
-"""Starting yaws, even steps over the circle from the box's own."""
+"""Starting yaws, even steps over the circle from the box's."""
 COARSE_STEPS, FINE_STEPS = 6, 20
 KEEP = 4
 """Starts that are refined to the end, per model."""
@@ -63,7 +63,7 @@ class Retrieval:
 
 
 def _packaged() -> dict[str, CadModel]:
-    """The packaged furniture of classes that are looked for, by id."""
+    """Return the packaged furniture of classes that are looked for, by id."""
     library = {}
     for name, model in read_index().items():
         if model.category not in SIZES_M:
@@ -84,16 +84,15 @@ def _packaged() -> dict[str, CadModel]:
 
 
 def read_library(root: Path | None) -> dict[str, CadModel]:
-    """Every model under `root/cad/<synset>/<id>/models/model_normalized.obj` of a class that is looked for, by id.
+    """Read every model under `root/cad/<synset>/<id>/models/model_normalized.obj` of a class that is looked for, by id.
 
     `root`: folder that holds `cad/`; None: the packaged furniture.
     """
     if root is None:
         return _packaged()
     source = SourceFolder(root)
-    found = sorted((root / "cad").glob("*/*/models/model_normalized.obj"))
     library = {}
-    for path in found:
+    for path in sorted((root / "cad").glob("*/*/models/model_normalized.obj")):
         synset, cad_id = path.parts[-4], path.parts[-3]
         if SYNSETS.get(synset) in SIZES_M:
             library[cad_id] = read_cad(source, synset, cad_id)
@@ -106,7 +105,7 @@ def read_library(root: Path | None) -> dict[str, CadModel]:
 
 
 def _thin(points: np.ndarray, count: int) -> np.ndarray:
-    """At most about `count` of the points, spread evenly: the first in each cell of the finest grid that fits."""
+    """Return at most about `count` of the points, spread evenly: the first in each cell of the finest fitting grid."""
     if len(points) <= count:
         return points
     low, high = 1e-3, float(np.ptp(points, axis=0).max())
@@ -123,7 +122,7 @@ def _thin(points: np.ndarray, count: int) -> np.ndarray:
 
 
 def _surface(cad: CadModel, count: int) -> np.ndarray:
-    """About `count` even samples of the model's surface, CAD frame."""
+    """Return about `count` even samples of the model's surface, CAD frame."""
     mesh = trimesh.Trimesh(cad.vertices, cad.faces, process=False)
     return _thin(np.asarray(trimesh.sample.sample_surface(mesh, 8 * count, seed=0)[0]), count)
 
@@ -131,7 +130,7 @@ def _surface(cad: CadModel, count: int) -> np.ndarray:
 def _start(
     cad_low: np.ndarray, cad_high: np.ndarray, points: np.ndarray, floor_m: float | None, yaw: float
 ) -> Alignment:
-    """The pose that lays the model's box on the box of the scan's points along that yaw."""
+    """Return the pose that lays the model's box on the box of the scan's points along that yaw."""
     turned = points @ yaw_matrix(yaw)
     # The outermost hundredth is noise and mislabelled neighbours.
     low, high = np.percentile(turned, 1, axis=0), np.percentile(turned, 99, axis=0)
@@ -143,7 +142,7 @@ def _start(
 
 
 def _on_floor(pose: Alignment, p: np.ndarray, q: np.ndarray, w: np.ndarray, base: float, floor_m: float) -> Alignment:
-    """The pose with its base on the floor: the z scale is then a regression through that height."""
+    """Return the pose with its base on the floor: the z scale is then a regression through that height."""
     height = p[:, 2] - base
     scale_z = max(float(w @ (height * (q[:, 2] - floor_m))) / max(float(w @ height**2), 1e-12), 0.05)
     scale = pose.scale * [1.0, 1.0, 0.0] + [0.0, 0.0, scale_z]
@@ -155,7 +154,7 @@ def _on_floor(pose: Alignment, p: np.ndarray, q: np.ndarray, w: np.ndarray, base
 def _refine(
     pose: Alignment, surface: np.ndarray, points: np.ndarray, tree: KDTree, steps: int, floor_m: float | None
 ) -> Alignment:
-    """Alternates closest pairs, both ways, with the fit of the seven parameters."""
+    """Alternate closest pairs, both ways, with the fit of the seven parameters."""
     reach = 0.3
     base = float(surface[:, 2].min())
     for _ in range(steps):
@@ -171,17 +170,15 @@ def _refine(
         weight[distance > 2 * reach] = 0.0
         used = weight > 0
         try:
-            found = least_squares(p[used], q[used], weights=weight[used])
+            fit = least_squares(p[used], q[used], weights=weight[used])
         except AlignmentError:
             return pose
         # A fit to a partial scan creeps together: bound a step and the inequality of the scales.
-        found = dataclasses.replace(found, scale=np.clip(found.scale, 0.9 * pose.scale, 1.1 * pose.scale))
+        fit = dataclasses.replace(fit, scale=np.clip(fit.scale, 0.9 * pose.scale, 1.1 * pose.scale))
         middle = (weight[used] @ p[used]) / weight[used].sum()
         target = (weight[used] @ q[used]) / weight[used].sum()
-        found = dataclasses.replace(found, translation=target - yaw_matrix(found.yaw) @ (found.scale * middle))
-        if floor_m is not None:
-            found = _on_floor(found, p[used], q[used], weight[used], base, floor_m)
-        pose = found
+        fit = dataclasses.replace(fit, translation=target - yaw_matrix(fit.yaw) @ (fit.scale * middle))
+        pose = fit if floor_m is None else _on_floor(fit, p[used], q[used], weight[used], base, floor_m)
         reach = max(0.8 * reach, 0.08)
     return pose
 
@@ -207,7 +204,7 @@ def _judge(pose: Alignment, surface: np.ndarray, points: np.ndarray, tree: KDTre
 
 
 def fit_model(proposal: Proposal, cad: CadModel, floor_m: float | None) -> _Fit:
-    """The best pose of one model: many coarse starts, the best few refined."""
+    """Return the best pose of one model: many coarse starts, the best few refined."""
     low, high = cad.vertices.min(axis=0), cad.vertices.max(axis=0)
     coarse = _thin(proposal.points, COARSE_POINTS)
     coarse_tree, coarse_surface = KDTree(coarse), _surface(cad, COARSE_POINTS)
@@ -231,14 +228,14 @@ def fit_model(proposal: Proposal, cad: CadModel, floor_m: float | None) -> _Fit:
 
 
 def fits_label(cad: CadModel, label: int) -> bool:
-    """True when scans label such a model so (a desk is often labelled a table)."""
+    """Return whether scans label such a model so (a desk is often labelled a table)."""
     return label in CATEGORY_LABELS[cad.category]
 
 
 def retrieve(
     proposal: Proposal, library: Mapping[str, CadModel], floor_m: float | None, any_category: bool = False
 ) -> Retrieval | None:
-    """The model of the library that fits a proposal best; None when none is of its class."""
+    """Return the model of the library that fits a proposal best; None when none is of its class."""
     floor = None if proposal.category == "door" else floor_m
     fits = {
         cad_id: fit_model(proposal, cad, floor)
@@ -260,10 +257,10 @@ def retrieve(
     )
 
 
-def as_annotation(found: Retrieval) -> Annotation:
+def as_annotation(best: Retrieval) -> Annotation:
     """Return the retrieved pose as an annotation without keypoints."""
-    pose = transform(yaw_matrix(found.pose.yaw) * found.pose.scale, found.pose.translation)
-    return Annotation(found.cad.category, found.cad.cad_id, pose, confidence=found.confidence)
+    pose = transform(yaw_matrix(best.pose.yaw) * best.pose.scale, best.pose.translation)
+    return Annotation(best.cad.category, best.cad.cad_id, pose, confidence=best.confidence)
 
 
 MIN_CONFIDENCE = 0.2
@@ -278,7 +275,7 @@ def annotated_vertices(annotation: Annotation, cads: Mapping[str, CadModel]) -> 
 def without_annotation(
     proposals: tuple[Proposal, ...], annotations: tuple[Annotation, ...], cads: Mapping[str, CadModel]
 ) -> list[int]:
-    """Indices of the proposals of which less than half lies in the (10 cm larger) box of an annotated model."""
+    """Return indices of the proposals of which less than half lies in the (10 cm larger) box of an annotated model."""
     boxes = [bounds(annotated_vertices(a, cads)) for a in annotations]
     result = []
     for k, proposal in enumerate(proposals):
@@ -297,15 +294,15 @@ def auto_align(
     floor_m: float | None,
     progress: Callable[[float], None] | None = None,
 ) -> dict[int, Retrieval]:
-    """Index of a proposal -> what was retrieved for it; proposals without a model of their class are left out."""
-    found = {}
+    """Return index of a proposal -> what was retrieved for it, without proposals with no model of their class."""
+    retrieved = {}
     for k, proposal in enumerate(proposals):
         one = retrieve(proposal, library, floor_m)
         if one is not None:
-            found[k] = one
+            retrieved[k] = one
         if progress is not None:
             progress((k + 1) / len(proposals))
-    return found
+    return retrieved
 
 
 @dataclasses.dataclass(frozen=True)
@@ -319,35 +316,35 @@ class Comparison:
     """Of the annotated model among those tried, from 1; 0: it was not tried."""
     n_tried: int
     difference: PoseDifference
-    """Of the annotated model's own best fit to its annotated pose: what `pose_difference` says."""
+    """Of the annotated model's best fit to its annotated pose: what `pose_difference` says."""
     iou: float
     """Of the axis-aligned boxes of the chosen and of the annotated model."""
     confidence: float
 
 
 def compare_retrieval(
-    annotation: Annotation, cads: Mapping[str, CadModel], proposal: Proposal, found: Retrieval, floor_m: float | None
+    annotation: Annotation, cads: Mapping[str, CadModel], proposal: Proposal, best: Retrieval, floor_m: float | None
 ) -> Comparison:
-    """Holds a retrieval against the annotation.
+    """Compare a retrieval with the annotation.
 
-    Yaw and scale can only be compared for the same model, so the annotated model's own best fit stands for them
+    Yaw and scale can only be compared for the same model, so the annotated model's best fit stands for them
     where another one was chosen.
     """
     cad = cads[annotation.cad_id]
     pivot = (cad.vertices.min(axis=0) + cad.vertices.max(axis=0)) / 2
     reference, _ = upright(annotation.pose, pivot)
-    own = found.pose
-    if found.cad.cad_id != annotation.cad_id:
-        own = fit_model(proposal, cad, None if proposal.category == "door" else floor_m).pose
-    ids = [cad_id for cad_id, _ in found.ranking]
-    chosen = apply_alignment(found.pose, found.cad.vertices)
+    pose = best.pose
+    if best.cad.cad_id != annotation.cad_id:
+        pose = fit_model(proposal, cad, None if proposal.category == "door" else floor_m).pose
+    ids = [cad_id for cad_id, _ in best.ranking]
+    chosen = apply_alignment(best.pose, best.cad.vertices)
     return Comparison(
         annotation.category,
         annotation.cad_id,
-        found.cad.cad_id,
+        best.cad.cad_id,
         ids.index(annotation.cad_id) + 1 if annotation.cad_id in ids else 0,
         len(ids),
-        pose_difference(own, reference, pivot, annotation.symmetry),
+        pose_difference(pose, reference, pivot, annotation.symmetry),
         box_iou(bounds(chosen), bounds(annotated_vertices(annotation, cads))),
-        found.confidence,
+        best.confidence,
     )

@@ -12,8 +12,8 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from converters.geometry.boxes import convex_pieces
 from converters.geometry.faces import merge_vertices
-from converters.geometry.pieces import convex_pieces
 from converters.read.files import SourceFolder, read_json, read_mesh, read_obj
 from converters.read.meshes import clean_surface
 from converters.read.obj import GREY, TexturedMesh, join_textures, read_painted_obj, texels

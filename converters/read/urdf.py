@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from converters.geometry.pieces import convex_pieces
+from converters.geometry.boxes import convex_pieces
 from converters.read.files import SourceFolder, read_obj
 from converters.read.meshes import read_surface
 from converters.read.obj import TexturedMesh, find_file, in_colour, join_meshes

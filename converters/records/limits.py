@@ -1,6 +1,8 @@
-"""What a source may hold at most: the one table of limits, checked before the work that they bound."""
+"""Limits of what a source may hold, checked before the work that they bound, and of a scene's gates."""
 
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 
@@ -23,13 +25,13 @@ Image.MAX_IMAGE_PIXELS = PIXELS // 2  # Pillow warns from here on, and refuses t
 
 
 def check_count(where: object, count: float, most: float, what: str, remedy: str = "split the source") -> None:
-    """Refuses more of `what` than there may be, naming the file and the remedy."""
+    """Refuse more of `what` than there may be, naming the file and the remedy."""
     if not count <= most:
         raise SceneRejected(f"{where}: has {count:,.0f} {what}, expected at most {most:,.0f}; {remedy}")
 
 
 def check_image(path: Path) -> None:
-    """Refuses a file whose header tells of too large an image; what is no image passes."""
+    """Refuse a file whose header declares too large an image; what is no image passes."""
     try:
         with Image.open(path):
             pass
@@ -37,3 +39,30 @@ def check_image(path: Path) -> None:
         raise SceneRejected(f"{path}: {error}; scale the image down") from error
     except (OSError, ValueError, SyntaxError):
         return
+
+
+@dataclasses.dataclass(frozen=True)
+class Limit:
+    """What a gate demands."""
+
+    unit: str
+    least: float | None = None
+    most: float | None = None
+    meaning: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Gate:
+    """One gate's outcome."""
+
+    name: str
+    value: float
+    passed: bool
+    limit: Limit
+    warnings: tuple[str, ...] = ()
+    """What the value does not tell, passed or not."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what scene.json says of it."""
+        bound = {k: v for k, v in (("least", self.limit.least), ("most", self.limit.most)) if v is not None}
+        return {"passed": self.passed, "value": round(self.value, 6), "limit": bound, "unit": self.limit.unit}

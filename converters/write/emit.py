@@ -11,8 +11,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from converters.bodies.objects import PlacedObject
-from converters.bodies.physical import Physical
+from converters.bodies.objects import Physical, PlacedObject
 from converters.geometry.boxes import OrientedBox, least_turned
 from converters.records.raw import Lamp, Window
 from converters.records.visual import VisualMesh
@@ -25,8 +24,6 @@ DOOR_DAMPING = 2.0
 """N m s/rad: a pushed interior door stops after about a second."""
 DOOR_FRICTION = 0.4
 """N m: no latch, only this dry friction: keeps a door where it was left, half a newton at the handle."""
-
-
 ONE = (1.0, 1.0, 1.0)
 LAMP, LAMP_FALL = 0.8, (1.0, 0.0, 0.15)
 """Of a white lamp at full power: how bright it is, and by which powers of the distance (m) that falls."""
@@ -138,22 +135,17 @@ def _add_movable(
                 mesh.file = f"{name}.obj"
             else:
                 mesh.uservert = _tidy(hull.vertices).reshape(-1)
-        body.add_geom(
-            spec.find_default("hull"),
-            name=name,
-            type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=shared,
-            friction=friction,
-        )
-        body.add_geom(
-            spec.find_default("box"),
-            name=f"{placed.name}_box_{i}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=_tidy(box.half),
-            pos=_tidy(box.centre),
-            quat=np.round(_quaternion(box.rotation), 9),
-            friction=friction,
-        )
+        kind, mesh_geom = spec.find_default("hull"), mujoco.mjtGeom.mjGEOM_MESH
+        body.add_geom(kind, name=name, type=mesh_geom, meshname=shared, friction=friction)
+        _add_box(spec, body, "box", f"{placed.name}_box_{i}", box, friction)
+
+
+def _add_box(
+    spec: mujoco.MjSpec, body: mujoco.MjsBody, kind: str, name: str, box: OrientedBox, friction: list[float]
+) -> None:
+    place = {"size": _tidy(box.half), "pos": _tidy(box.centre), "quat": np.round(_quaternion(box.rotation), 9)}
+    geom = mujoco.mjtGeom.mjGEOM_BOX
+    body.add_geom(spec.find_default(kind), name=name, type=geom, friction=friction, **place)
 
 
 def _add_look(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, look: Look) -> None:
@@ -271,15 +263,7 @@ def _add_structure(spec: mujoco.MjSpec, parts: SceneParts, look: Look | None) ->
     if look is not None:
         _add_look(spec, structure, "structure", look)
     for i, wall in enumerate(parts.walls):
-        structure.add_geom(
-            spec.find_default("structure"),
-            name=f"wall_{i}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=_tidy(wall.half),
-            pos=_tidy(wall.centre),
-            quat=np.round(_quaternion(wall.rotation), 9),
-            friction=[0.6, 0.005, 0.0001],
-        )
+        _add_box(spec, structure, "structure", f"wall_{i}", wall, [0.6, 0.005, 0.0001])
     for k, window in enumerate(parts.windows):  # of a group that viewers hide
         quat = np.round(_quaternion(yaw_matrix(window.yaw)), 9)
         place = {"pos": _tidy(window.middle), "size": _tidy(window.half), "quat": quat}

@@ -19,7 +19,7 @@ import trimesh
 from PIL import Image
 
 from converters.__main__ import main
-from converters.check.gates import LIMITS
+from converters.check.gates import LIMITS, Limit
 from converters.check.settle import push_apart, settle
 from converters.clock import STAGES
 from converters.geometry.boxes import OrientedBox
@@ -28,7 +28,6 @@ from converters.read.files import read_obj
 from converters.read.homes.parts import built_in
 from converters.read.source import read_source
 from converters.records.errors import SceneRejected
-from converters.records.gate import Limit
 from converters.structure.floor import LIFT_M
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import remove_stale

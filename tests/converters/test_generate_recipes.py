@@ -139,7 +139,7 @@ def test_a_home_without_a_plan_or_with_other_shares_takes_the_next_of_its_seeds(
 
     def made(recipe):
         tried.clear()
-        return recipes._made(recipe, ConvertConfig(), tmp_path, lambda stage, share: None)
+        return recipes._generated(recipe, ConvertConfig(), tmp_path, lambda stage, share: None)
 
     monkeypatch.setattr(recipes, "generate_building", generate)
     monkeypatch.setattr(recipes, "convert", convert)

@@ -17,8 +17,8 @@ import numpy as np
 
 from converters.generate.models import parts as shapes
 from converters.generate.models.parts import MATERIALS, Part, on_floor
+from converters.geometry.boxes import convex_pieces
 from converters.geometry.faces import stacked
-from converters.geometry.pieces import convex_pieces
 from converters.library.store import read_index, read_shape
 from converters.read.annotations import MOST_PIECES, SLACK
 from converters.records.visual import VisualMesh

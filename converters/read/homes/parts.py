@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import shapely
 
+from converters.geometry.boxes import MAX_PIECES, convex_pieces
 from converters.geometry.faces import face_vectors, merge_vertices, sample_faces
-from converters.geometry.pieces import MAX_PIECES, convex_pieces
 from converters.read.files import SourceFolder
 from converters.read.gibson import read_attribution, read_licence
 from converters.read.interactive_gibson import SHOWN_M, assume_hinge, leaf_turn

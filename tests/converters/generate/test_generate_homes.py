@@ -38,8 +38,7 @@ from converters.generate.models.parts import (
     shell,
     turned,
 )  # fmt: skip
-from converters.geometry.boxes import convex_hull
-from converters.geometry.pieces import merge_pieces
+from converters.geometry.boxes import convex_hull, merge_pieces
 from converters.read.annotations import MOST_PIECES, SLACK
 from scenes_mjcf.categories import CATEGORIES, OBJECT_CATEGORIES
 

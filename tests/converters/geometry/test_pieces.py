@@ -8,7 +8,7 @@ import trimesh
 
 from converters.generate.models.cad import cad_model
 from converters.generate.surface.write import write_cad
-from converters.geometry.pieces import convex_pieces, hull_volume, merge_pieces
+from converters.geometry.boxes import convex_pieces, hull_volume, merge_pieces
 from converters.read.annotations import MOST_PIECES, read_cad
 from converters.read.files import SourceFolder
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP

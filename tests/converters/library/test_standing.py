@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from converters.bodies.alignment import Alignment
-from converters.bodies.objects import place_object
-from converters.bodies.physical import physical_properties
+from converters.bodies.objects import physical_properties, place_object
 from converters.check.gates import collide_with, judge, physical_values
 from converters.check.settle import settle
 from converters.generate.models.cad import cad_model

@@ -10,8 +10,7 @@ import trimesh
 from PIL import Image
 from scipy.spatial import KDTree
 
-from converters.bodies.objects import PlacedObject
-from converters.bodies.physical import physical_properties
+from converters.bodies.objects import PlacedObject, physical_properties
 from converters.check.surfaces import geom_surface
 from converters.geometry.boxes import convex_hull, fit_box
 from converters.records.visual import VisualMesh
