@@ -66,8 +66,8 @@ def parser() -> argparse.ArgumentParser:
 
 
 COMMANDS = {
-    **{"data": "learning.data", "train": "learning.train", "map": "maps.make_map", "navigate": "episodes.navigate"},
-    **{"evaluate": "episodes.evaluate", "adapt": "adapt.run", "export": "maps.export_runs"},
+    **{"data": "learning.data", "train": "learning.train", "map": "episodes.make_map", "navigate": "episodes.navigate"},
+    **{"evaluate": "episodes.evaluate", "adapt": "learning.adapt", "export": "episodes.export_runs"},
 }
 """Command -> what runs it, in a module that is imported once the command is known: it is heavy."""
 

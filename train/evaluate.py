@@ -24,13 +24,11 @@ from scenes_mjcf.sets import installed, scene_folders
 from train import config_io
 from train.config import EnvConfig, TrainConfig
 from train.runs.run import build_env, config_to_play
-from train.runs.run_folder import RunFolder, claim
+from train.runs.run_folder import EvaluationRequest, RunFolder, claim, paths_beside
 from train.scoring.brought import named
-from train.scoring.evaluation import AUTO_BATCH, LEARNED, POLICIES, SEED, evaluate, write_paths
+from train.scoring.evaluation import AUTO_BATCH, LEARNED, POLICIES, SEED, BatchPlayer, evaluate, write_paths
 from train.scoring.evaluation import load_policy as load_policy
 from train.scoring.policies import PLANNERS
-from train.scoring.rollout import BatchPlayer
-from train.scoring.row_files import EvaluationRequest, paths_beside
 from train.scoring.rows import score_table
 
 EPISODES = 200
@@ -177,7 +175,7 @@ def _run(arguments: argparse.Namespace, build_env: Callable[[EnvConfig], Any], k
             player = None  # the old one's memory goes before the new one's comes
             player, built = BatchPlayer(build_env(config.env)), kinds[i]
         trained_steps = folder.origin().get("env_steps") if folder else None
-        notes = {"asked": json.dumps(request.plain()), "trained_steps": json.dumps(trained_steps)}
+        notes = {"asked": json.dumps(dataclasses.asdict(request)), "trained_steps": json.dumps(trained_steps)}
         rows, stood = pa.table({}), out.exists()
         unfinished = out.with_name(f".unfinished-{out.name}")  # which figures and sweeps pass over
         for rows, played in evaluate(folder, config, player, request, arguments.record, console, file, arguments.batch):

@@ -23,9 +23,8 @@ from train import evaluate, figures
 from train.config import RunConfig
 from train.runs import checkpoint
 from train.runs.run import train_run
-from train.runs.run_folder import RunFolder
-from train.scoring import rollout
-from train.scoring.row_files import paths_beside
+from train.runs.run_folder import RunFolder, paths_beside
+from train.scoring import evaluation
 from train.scoring.rows import score_table
 
 SPARSE = str(Path(__file__).parents[2] / "scenes_mjcf" / "episodes" / "sparse-turtlebot-test.json.gz")
@@ -131,14 +130,14 @@ def test_runs_of_one_kind_are_evaluated_in_one_go_into_a_dataset(run, second, ev
         return built[-1]
 
     traced = []
-    usual = rollout.BatchPlayer._play_chunk
+    usual = evaluation.BatchPlayer._play_chunk
 
     def counted(*arguments):
         traced.append(arguments)
         return usual(*arguments)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rollout.BatchPlayer, "_play_chunk", counted)
+        patch.setattr(evaluation.BatchPlayer, "_play_chunk", counted)
         words = ["--policies", "learned", "--episodes", "12", "--seed", "4", "--dataset", str(tmp_path)]
         assert evaluate.main([str(run.path), str(second.path), *words], build_env=build) == 0
         once = len(traced)
@@ -185,7 +184,7 @@ def test_policies_that_never_learned_need_no_run_folder(tmp_path, monkeypatch):
 def test_what_is_stopped_keeps_the_policies_that_have_played(run, tmp_path, monkeypatch, capsys, number):
     """A signal in the second policy: the first one's rows are there; whole rows of before are not given up for them."""
     out, words = tmp_path / "rows.parquet", [str(run.path), "--episodes", "3", "--policies", "random,follower"]
-    played = rollout.BatchPlayer.play
+    played = evaluation.BatchPlayer.play
     count = []
 
     def stopped(self, *arguments):
@@ -195,7 +194,7 @@ def test_what_is_stopped_keeps_the_policies_that_have_played(run, tmp_path, monk
         return played(self, *arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(rollout.BatchPlayer, "play", stopped)
+        patch.setattr(evaluation.BatchPlayer, "play", stopped)
         assert evaluate.main([*words, "--out", str(out)], build_env=build_toy) == 128 + number
     told = f"train.evaluate: stopped by {number.name}; kept: rows of random in "
     assert capsys.readouterr().err == f"{told}{out}\n"
@@ -203,7 +202,7 @@ def test_what_is_stopped_keeps_the_policies_that_have_played(run, tmp_path, monk
     assert evaluate.main([*words, "--out", str(out)], build_env=build_toy) == 0
     whole = out.read_bytes()
     with monkeypatch.context() as patch:
-        patch.setattr(rollout.BatchPlayer, "play", stopped)
+        patch.setattr(evaluation.BatchPlayer, "play", stopped)
         assert evaluate.main([*words, "--out", str(out)], build_env=build_toy) == 128 + number
     begun = tmp_path / ".unfinished-rows.parquet"
     assert capsys.readouterr().err == f"{told}{begun}\n"

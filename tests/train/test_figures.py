@@ -12,11 +12,10 @@ import pytest
 from interactive_nav_common.figures import BLUE, GREEN
 from interactive_nav_common.rows import write_parquet
 from tests.train.synthetic import baseline_rows, paper_like, run_rows, write_results
-from train import figures
 from train.figures import cli, curves, paths, scores, style, tables
 from train.figures.cli import chosen_split
+from train.runs.run_folder import paths_beside
 from train.scoring.claims import claims
-from train.scoring.row_files import paths_beside
 from train.scoring.rows import BY_CATEGORY, COLUMNS
 
 
@@ -79,7 +78,7 @@ def record(shift_m: float, episodes: int = 3) -> dict[str, np.ndarray]:
 
 
 def test_every_figure_of_a_sweep_is_drawn(results, tmp_path, capsys):
-    assert figures.main([str(results), "-o", str(tmp_path)]) == 0
+    assert cli.main([str(results), "-o", str(tmp_path)]) == 0
     assert sorted(path.stem for path in tmp_path.iterdir()) == [
         "effort_terms",
         "ins_over_alpha_fetch",
@@ -195,7 +194,7 @@ def test_paths_side_by_side_are_of_the_same_episodes():
     np.testing.assert_array_equal(merged["k_int = 1/goal_xy_w"], one["learned/goal_xy_w"][[0, 2]])
     # Most was moved in the last one.
     assert list(paths.spread_episodes(merged, 1)) == [1] and list(paths.spread_episodes(merged, 5)) == [0, 1]
-    figure = figures.trajectories(merged, episodes=[1])
+    figure = paths.trajectories(merged, episodes=[1])
     lines = [line for line in figure.axes[0].lines if len(xy(line)) == 5]
     assert [xy(line)[-1, 0] for line in lines] == [3.0, 3.0]
     assert lines[0].get_linestyle() != lines[1].get_linestyle()
@@ -204,7 +203,7 @@ def test_paths_side_by_side_are_of_the_same_episodes():
 def test_random_walks_are_thin_and_grey():
     one = record(0.0)
     merged = paths.side_by_side({"learned": one, "random": one})
-    figure = figures.trajectories(merged, episodes=[0])
+    figure = paths.trajectories(merged, episodes=[0])
     learned, random = [line for line in figure.axes[0].lines if len(xy(line)) == 5]
     assert random.get_color() == "0.6" and random.get_linewidth() < learned.get_linewidth() / 2
     assert figure.axes[0].get_title() == "den, episode 0\nall reach it" and figure.get_figwidth() <= 7.2
@@ -217,7 +216,7 @@ def test_titles_of_many_policies_name_the_fewer_and_fit_above_their_panel():
 
     def title(losers: list[str]) -> str:
         merged = paths.side_by_side({name: lost if name in losers else won for name in ["avoider", *planners]})
-        return figures.trajectories(merged).axes[0].get_title().partition("\n")[2]
+        return paths.trajectories(merged).axes[0].get_title().partition("\n")[2]
 
     assert title(["avoider"]) == "missed by avoider"
     assert title(planners) == "reached by avoider"
@@ -247,13 +246,13 @@ def test_goals_of_a_sweep_are_drawn_a_panel_a_robot():
         {"env_steps": 1000, "episodes": 3.0, "episode/success": 1.0},
         {"env_steps": 3000, "episodes": 20.0, "episode/success": 0.5},
     ]
-    figure = figures.cell_curves({("turtlebot", "ppo", 0.1): [lines, lines], ("fetch", "sac", 0.1): [lines]})
+    figure = curves.cell_curves({("turtlebot", "ppo", 0.1): [lines, lines], ("fetch", "sac", 0.1): [lines]})
     assert [axis.get_title() for axis in figure.axes] == ["TurtleBot", "Fetch"]
     assert [xy(axis.lines[0]).tolist() for axis in figure.axes] == [[[1000, 3], [3000, 5]]] * 2
 
 
 def test_tables_say_what_the_rows_say(results, capsys):
-    assert figures.main([str(results), "--tables"]) == 0
+    assert cli.main([str(results), "--tables"]) == 0
     printed = capsys.readouterr().out
     lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in printed.splitlines() if line[:1] == "|"]
     found = {tuple(line[:4]): line[4:] for line in lines}
@@ -271,12 +270,12 @@ def test_tables_of_policies_that_never_learned_alone(tmp_path, capsys):
     rows = baseline_rows()
     at_walls = pa.array([1, 0] * (len(rows) // 2))
     write_parquet(rows.append_column("structure_steps", at_walls), tmp_path / "y.parquet")
-    assert figures.main([str(tmp_path), "--tables"]) == 0
+    assert cli.main([str(tmp_path), "--tables"]) == 0
     printed = capsys.readouterr().out
     assert [line for line in printed.splitlines() if line[:2] == "##"] == ["## Policies that never learned"]
     assert "| TurtleBot | namo:0.5 | unseen | 20 | 0.950 [" in printed
     write_parquet(rows.drop_columns("policy"), tmp_path / "y.parquet")
-    assert figures.main([str(tmp_path), "--tables"]) == 2
+    assert cli.main([str(tmp_path), "--tables"]) == 2
     assert "has no column 'policy', expected text there; evaluate the run again" in capsys.readouterr().err
 
 
@@ -368,7 +367,7 @@ def test_effort_without_walls_leaves_their_episodes_out():
 
 def test_a_scene_in_place_of_a_run_is_refused(tmp_path, capsys):
     np.savez(tmp_path / "maps.npz", height=np.zeros((2, 2)))  # an archive, but no recorded paths
-    assert figures.main([str(tmp_path), "-o", str(tmp_path / "figures")]) == 2
+    assert cli.main([str(tmp_path), "-o", str(tmp_path / "figures")]) == 2
     assert "nothing to draw" in capsys.readouterr().err
 
 
@@ -388,12 +387,12 @@ def test_a_damaged_column_is_one_line_that_names_it(tmp_path, column, capsys):
     ):
         write_parquet(damaged, path)
         for words in ([], ["--tables"]):
-            assert figures.main([str(tmp_path), "-o", str(tmp_path / "out"), *words]) == 2
+            assert cli.main([str(tmp_path), "-o", str(tmp_path / "out"), *words]) == 2
             assert capsys.readouterr().err.startswith(f"train.figures: {path}: {told}")
 
 
 def test_categories_of_another_kind_are_one_line(tmp_path, capsys):
     rows = paper_like(("fetch",))
     write_parquet(rows.append_column("by_category", pa.array([1] * len(rows))), tmp_path / "rows.parquet")
-    assert figures.main([str(tmp_path), "--tables"]) == 2
+    assert cli.main([str(tmp_path), "--tables"]) == 2
     assert "rows.parquet: column 'by_category' holds int64, expected list" in capsys.readouterr().err

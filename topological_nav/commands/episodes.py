@@ -1,4 +1,4 @@
-"""`navigate` and `evaluate`: episodes played, drawn and scored; maps that are nowhere are made first."""
+"""Run `map`, `navigate`, `evaluate` and `export`: build maps, play, draw and score episodes, export runs and maps."""
 
 import argparse
 import dataclasses
@@ -13,18 +13,21 @@ from interactive_nav_common.files import write_text
 from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.rows import where
 from scenes_mjcf.sets import scene_folders
-from topological_nav.commands.maps import build
 from topological_nav.commands.progress import bar, say
-from topological_nav.config import PASSAGE_POLICY, RUNS, EvaluationConfig, MapConfig, NavigatorConfig
+from topological_nav.config import PASSAGE_POLICY, RUNS, EvaluationConfig, ExportConfig, MapConfig, NavigatorConfig
 from topological_nav.evaluate.contest import Contest, contest_scenes, play_contest, tracks_of
 from topological_nav.evaluate.scores import console_table, differences, markdown, summary
 from topological_nav.figures.journey import drive_episode, film
-from topological_nav.figures.maps import journeys_figure, save
+from topological_nav.figures.learning import export_figure
+from topological_nav.figures.maps import journeys_figure, map_figure, save
+from topological_nav.maps.build import Built, build_map, forget
+from topological_nav.maps.graph import save_map
+from topological_nav.weights.export import export, size_lines
 from topological_nav.weights.packaged import choose, fitting_map
 
 
 def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: Sequence[str], out: Path):
-    """The contest asked for; networks and maps that were not named are chosen, and maps that are nowhere made."""
+    """Return the contest that is requested; choose networks and maps that are not named, and build missing maps."""
     contest = Contest(
         scenes=tuple(Path(scene) for scene in scene_folders(scenes)),
         contenders=tuple(contenders),
@@ -45,28 +48,20 @@ def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: S
     for folder in contest.scenes if arguments.maps is None else ():
         scene = load_scene(folder)
         there = fitting_map(chosen, scene.name, scene.digest)
-        own = maps / f"{scene.name}.npz"
-        # One that was made by hand with other networks is refused later, in words, and not written over.
-        if there is None and (chosen.renewed or not own.is_file()):
-            say(f"{scene.name} has no map of these networks yet; it is made once and kept in {own}")
-            build(folder, chosen.localiser, chosen.detector, MapConfig(), own)
-        files[scene.name] = there or own
-    return dataclasses.replace(
-        contest,
-        maps=maps,
-        map_files=files,
-        localiser=chosen.localiser,
-        detector=chosen.detector,
-        policy=chosen.policy,
-    )
+        default = maps / f"{scene.name}.npz"
+        # One that was built by hand with other networks is refused later, in words, and not written over.
+        if there is None and (chosen.renewed or not default.is_file()):
+            say(f"{scene.name} has no map of these networks yet; it is made once and kept in {default}")
+            build(folder, chosen.localiser, chosen.detector, MapConfig(), default)
+        files[scene.name] = there or default
+    runs = {"localiser": chosen.localiser, "detector": chosen.detector, "policy": chosen.policy}
+    return dataclasses.replace(contest, maps=maps, map_files=files, **runs)
 
 
 def _refuse_unused(arguments: argparse.Namespace, contest: Contest) -> None:
-    """Refuses what changes nothing for these contenders."""
-    names, who = (
-        set(contest.contenders),
-        f"without a contender that needs it (contenders: {', '.join(contest.contenders)})",
-    )
+    """Refuse settings that change nothing for these contenders."""
+    names = set(contest.contenders)
+    who = f"without a contender that needs it (contenders: {', '.join(contest.contenders)})"
     if not names & {"dense", "sparse"}:
         navigators = {f.name for f in dataclasses.fields(NavigatorConfig)} - {"limit_s", "run_s"}
         refuse_unused(arguments, "--truth --maps --localiser --detector --policy supersample", who)
@@ -82,22 +77,21 @@ def _refuse_unused(arguments: argparse.Namespace, contest: Contest) -> None:
 
 
 def navigate(arguments: argparse.Namespace) -> None:
-    """Drives one episode and draws it."""
+    """Drive one episode and draw it."""
     if arguments.video and arguments.video.suffix != ".mp4":
         raise ConfigError(f"--video {arguments.video}: expected a name that ends in .mp4")
     refuse_unused(arguments, "batch", "in 'navigate', which drives one episode")
     contest = _contest(arguments, [arguments.scene], ["sparse" if arguments.sparse else "dense"], RUNS)
     name = Path(arguments.scene).resolve().name
     out = arguments.out or RUNS / "navigate" / f"{name}-{arguments.episode}.png"
-    with bar() as tell:
+    with bar() as report:
         limit_s = int(contest.config.limit_s)
-        driven = drive_episode(
-            contest,
-            arguments.episode,
-            bool(arguments.video),
-            lambda time_s: tell(f"{name}, simulated s", int(time_s), limit_s),
-        )
-    for line in driven.told:
+
+        def on_time(time_s: float) -> None:
+            report(f"{name}, simulated s", int(time_s), limit_s)
+
+        driven = drive_episode(contest, arguments.episode, bool(arguments.video), on_time)
+    for line in driven.log:
         print(line)
     save(driven.figure(), out)
     print(f"{out}: {driven.outcome}")
@@ -106,28 +100,77 @@ def navigate(arguments: argparse.Namespace) -> None:
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
-    """Plays episodes and scores them."""
+    """Play episodes and score them."""
     names = ("dense", "sparse", "expert", *(["ppo"] if arguments.ppo else []))
     names = arguments.contenders.split(",") if arguments.contenders else names
     if "ppo" not in names:
         refuse_unused(arguments, "--ppo", f"without contender ppo (--contenders {arguments.contenders})")
     contest = _contest(arguments, arguments.scenes, names, arguments.out)
-    with bar() as tell:
+    with bar() as report:
         venues = contest_scenes(contest)
-        rows = play_contest(contest, venues, tell)
+        rows = play_contest(contest, venues, report)
     for venue in venues:
         panels = {}
         for name in contest.contenders:
-            mine = where(rows, scene=venue.scene.name, contender=name).to_pylist()
-            made = venue.map_of(name) if name in ("dense", "sparse") else None
-            panels[name] = (made, tracks_of(contest, venue, name), {row["episode"]: row for row in mine})
-        save(
-            journeys_figure(venue.scene.name, venue.space, panels, contest.config.passable),
-            contest.out / f"{venue.scene.name}.png",
-        )
+            played = where(rows, scene=venue.scene.name, contender=name).to_pylist()
+            graph = venue.map_of(name) if name in ("dense", "sparse") else None
+            panels[name] = (graph, tracks_of(contest, venue, name), {row["episode"]: row for row in played})
+        figure = journeys_figure(venue.scene.name, venue.space, panels, contest.config.passable)
+        save(figure, contest.out / f"{venue.scene.name}.png")
     lines, compared = summary(rows), differences(rows)
     write_text(contest.out / "summary.md", markdown(lines, compared))
     SafeConsole(width=None if sys.stdout.isatty() else 160).print(console_table(lines))
     for difference in compared:
         print(difference)
     print(f"{contest.out}: {len(rows)} episodes; tables in summary.md, a picture a scene")
+
+
+def make_map(arguments: argparse.Namespace) -> None:
+    """Build a map and draw it."""
+    config = overridden(MapConfig(), arguments.settings)
+    chosen = choose(arguments.localiser, arguments.detector, PASSAGE_POLICY)
+    if chosen.said:
+        say(chosen.said)
+    out = arguments.out or chosen.maps[0] / f"{Path(arguments.scene).resolve().name}.npz"
+    build(Path(arguments.scene), chosen.localiser, chosen.detector, config, out, arguments.route)
+
+
+def build(
+    scene: Path, localiser: Path, detector: Path, config: MapConfig, out: Path, ends: Sequence[int] | None = None
+) -> None:
+    """Build a map, draw and describe it."""
+    parts = out.with_name(f"{out.name}.parts")
+    with bar() as report:
+        built = build_map(scene, localiser, detector, config, report, parts)
+    keep_map(built, out, ends)
+    forget(parts)
+
+
+def keep_map(built: Built, out: Path, ends: Sequence[int] | None = None) -> None:
+    """Write, draw and describe a map, with the path between two nodes if requested."""
+    save_map(built.map, out)
+    route = None
+    if ends:
+        route = built.map.plan(*ends)
+        print(f"{ends[0]} to {ends[1]}: {' '.join(map(str, route.nodes))}, cost {route.cost:.2f}")
+    picture = out.with_suffix(".png")
+    save(map_figure(built, route), picture)
+    for name, value in built.scores.items():
+        print(f"{name}: {value}")
+    print(
+        f"{out}: {len(built.map.xy_w)} nodes, {len(built.map.edges)} edges, {out.stat().st_size / 1024:.0f} KiB; "
+        f"drawn in {picture}"
+    )
+
+
+def export_runs(arguments: argparse.Namespace) -> None:
+    """Write finished runs as a small folder."""
+    config = overridden(ExportConfig(), arguments.settings)
+    with bar() as report:
+        runs = (arguments.localiser, arguments.detector, arguments.policy, arguments.maps)
+        sizes, compared = export(*runs, arguments.images, arguments.out, config, report)
+    picture = arguments.picture or arguments.out.with_name(f"{arguments.out.name}.png")
+    save(export_figure(sizes, compared, config.limit_mib), picture)
+    for name, value in compared.scores.items():
+        print(f"{name.replace('_', ' ')}: {value:.3g}")
+    print(f"{arguments.out}: {size_lines(sizes, config.limit_mib)}; drawn in {picture}")

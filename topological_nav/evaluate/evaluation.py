@@ -27,7 +27,7 @@ from topological_nav.navigate.state import Events, State
 from topological_nav.scenes.rooms import Rooms
 from topological_nav.scenes.simulation import Camera, Snapshot, episode_starts
 from topological_nav.scenes.space import FreeSpace
-from train.scoring.planners import Planner
+from train.scoring.policies import Planner
 
 CONNECTED_M = 0.25
 """Start and goal are joined by a way with this clearance: half of TTbot's width and the grid's rounding."""
@@ -314,7 +314,7 @@ class ActionPlayer(Contender):
 
 
 def expert(player: Player, config: EvaluationConfig) -> ActionPlayer:
-    """Return the planner of `train.scoring.planners`, which has the map and all poses, and drives round what it can.
+    """Return the planner of `train.scoring.policies`, which has the map and all poses, and drives round what it can.
 
     Where its grid leaves no way between an object and a wall, it takes the one through the least of objects: episodes
     are joined by ways 0.25 m from everything, which is nearer than it otherwise goes.

@@ -1,4 +1,4 @@
-"""One episode of a scene, driven by the navigator with everything it did kept: for a picture, a log and a film."""
+"""Drive one episode of a scene with the navigator and keep everything it does for a picture, a log and a film."""
 
 import dataclasses
 import textwrap
@@ -49,12 +49,12 @@ class Driven:
     """[t] i8."""
     views: dict[int, np.ndarray]
     """Control step -> image, where it was filmed."""
-    told: list[str]
-    """What happened, a line each."""
+    log: list[str]
+    """Events, a line each."""
 
     @property
     def outcome(self) -> str:
-        """In words."""
+        """Return the outcome in words."""
         played = self.played
         what = "reached the goal" if played.success[0] else "did not reach the goal"
         return (
@@ -64,7 +64,7 @@ class Driven:
         )
 
     def figure(self) -> Figure:
-        """Path over plan and map."""
+        """Draw the path over plan and map."""
         space, passable = self.venue.space, self.venue.contest.config.passable
         extent = np.ptp(space.centres(0.0), axis=0) + 0.8
         figure, axis = plt.subplots(figsize=(8.0, 0.7 + 6.6 * extent[1] / extent[0]), layout="constrained")
@@ -86,7 +86,7 @@ class Driven:
         return figure
 
     def frame(self, step: int, plan: np.ndarray, pixels: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """[H, W, 3] u8: the plan with the path so far; beside it what the camera saw, if it did."""
+        """Return [H, W, 3] u8: the plan with the path so far, beside it the camera's image, if any."""
         image = Image.fromarray(plan)
         draw = ImageDraw.Draw(image)
         if step:
@@ -98,18 +98,18 @@ class Driven:
         x, y = pixels(here)
         draw.ellipse((x - 6, y - 6, x + 6, y + 6), fill=RED)
         draw.line([(x, y), tuple(pixels(nose))], fill=RED, width=3)
-        said = f"{self.venue.scene.name}  {self.time_s[step]:.0f} s  {PHASES[self.phase[step]]}"
-        draw.text((6, 4), said, fill=(0, 0, 0))
+        caption = f"{self.venue.scene.name}  {self.time_s[step]:.0f} s  {PHASES[self.phase[step]]}"
+        draw.text((6, 4), caption, fill=(0, 0, 0))
         view = self.views.get(step)
         if view is None:
             return np.asarray(image)
         width = int(round(len(plan) * view.shape[1] / view.shape[0] / 2)) * 2
-        seen = Image.fromarray(view).resize((width, len(plan)), Image.Resampling.NEAREST)
-        return np.concatenate([np.asarray(image), np.asarray(seen)], 1)
+        beside = Image.fromarray(view).resize((width, len(plan)), Image.Resampling.NEAREST)
+        return np.concatenate([np.asarray(image), np.asarray(beside)], 1)
 
 
 def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callable[[float], None]) -> Driven:
-    """Drives one of the episodes of a contest's only scene, as the contest's only contender."""
+    """Drive one of the episodes of a contest's only scene, as the contest's only contender."""
     (venue,) = contest_scenes(contest)
     if not 0 <= number < len(venue.episodes):
         raise ConfigError(
@@ -117,27 +117,27 @@ def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callabl
         )
     journey = venue.episodes.take(np.array([number]))
     navigator = venue.navigator(contest.contenders[0])
-    made = navigator.map
-    seen_at: list[tuple[float, np.ndarray, float, int]] = []
+    graph = navigator.map
+    steps: list[tuple[float, np.ndarray, float, int]] = []
     views: dict[int, np.ndarray] = {}
-    told: list[str] = []
+    log: list[str] = []
     every = _film_every(venue)
 
-    def watch(time_s: float, seen: Snapshot, state: State, events: Events) -> None:
-        if filmed and not contest.truth and len(seen_at) % every == 0:
-            views[len(seen_at)] = venue.camera(seen.xy_w[:1], seen.yaw_rad[:1], seen.qpos[:1])[0]
-        seen_at.append((time_s, seen.xy_w[0], seen.yaw_rad[0], int(state.phase[0])))
-        told.extend(f"{time_s:7.1f} s  {said}" for said in _said(made, state, events))
+    def watch(time_s: float, now: Snapshot, state: State, events: Events) -> None:
+        if filmed and not contest.truth and len(steps) % every == 0:
+            views[len(steps)] = venue.camera(now.xy_w[:1], now.yaw_rad[:1], now.qpos[:1])[0]
+        steps.append((time_s, now.xy_w[0], now.yaw_rad[0], int(state.phase[0])))
+        log.extend(f"{time_s:7.1f} s  {line}" for line in _log_lines(graph, state, events))
 
     player = NavigatorPlayer(venue.player, contest.config, navigator, venue.camera, watch)
     played = player.play(journey, lambda _, time_s: progress(time_s))
     assert player.state is not None
-    time_s, xy, yaw, phase = zip(*seen_at, strict=True)
+    time_s, xy, yaw, phase = zip(*steps, strict=True)
     columns = (np.array(column) for column in (time_s, xy, yaw, phase))
-    return Driven(venue, made, journey, played, int(player.state.goal[0]), *columns, views=views, told=told)
+    return Driven(venue, graph, journey, played, int(player.state.goal[0]), *columns, views=views, log=log)
 
 
-def _said(made: TopologicalMap, state: State, events: Events) -> Iterator[str]:
+def _log_lines(graph: TopologicalMap, state: State, events: Events) -> Iterator[str]:
     node, edge = int(state.node[0]), int(state.edge[0])
     if events.localised[0] or events.glanced[0]:
         yield f"{'looked about' if events.localised[0] else 'glanced'}: at node {node}"
@@ -149,8 +149,8 @@ def _said(made: TopologicalMap, state: State, events: Events) -> Iterator[str]:
     if events.lost[0]:
         yield f"the map has no way from node {node} to {int(state.goal[0])}"
     elif edge >= 0 and (events.localised[0] or events.glanced[0] or events.blocked[0] or still):
-        degrees = np.rad2deg(made.angle_rad[edge])
-        yield f"next: node {made.edges[edge, 1]}, heading {degrees:.0f} degrees, p {made.p[edge]:.2f}"
+        degrees = np.rad2deg(graph.angle_rad[edge])
+        yield f"next: node {graph.edges[edge, 1]}, heading {degrees:.0f} degrees, p {graph.p[edge]:.2f}"
     if events.run_started[0] and state.run[0] == 0:
         yield "drives"
     if events.arrived[0]:
@@ -165,7 +165,7 @@ def _film_every(venue: ContestScene) -> int:
 
 
 def film(driven: Driven, path: Path) -> int:
-    """Writes a film, the plan beside the camera's images; returns the number of frames."""
+    """Write a film, the plan beside the camera's images; return the number of frames."""
     plan, pixels = plan_picture(driven.venue.space, driven.map, driven.venue.contest.config.passable, FILM_HEIGHT)
     steps = range(0, len(driven.time_s), _film_every(driven.venue))
     with whole_file(path) as partial:

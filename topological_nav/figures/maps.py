@@ -2,7 +2,7 @@
 
 import functools
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,6 @@ from interactive_nav_common.figures import (
     PINK,
     SKY,
     VERMILION,
-    curves,
-    panels,
     parts,
     plt,
     scene_axes,
@@ -169,20 +167,6 @@ def dataset_figure(folder: Path) -> Figure:
         axis.imshow(np.concatenate(list(strip), 1))
         axis.set_axis_off()
         axis.set_title(f"room {rooms.names[rooms.label[position]]}, level, turning left", fontsize=7, loc="left")
-    return figure
-
-
-def curves_figure(lines: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw loss and accuracy over epochs, from lines of a run's metrics.jsonl, a column a phase."""
-    names = {"pairs": "without labels (VICReg)", "labels": "with labels"}
-    phases = list(dict.fromkeys(line["phase"] for line in lines))
-    figure, grid = panels((4.6 * len(phases), 3.2), 1, len(phases))
-    for axis, phase in zip(grid[0], phases, strict=True):
-        mine = [line for line in lines if line["phase"] == phase]
-        labels = {"loss": "loss", "accuracy": "accuracy on training images"}
-        curves(axis, mine, {name: label for name, label in labels.items() if name in mine[0]}, marker=".")
-        axis.set_title(names[phase], fontsize=9)
-        axis.set_ylim(bottom=0)
     return figure
 
 

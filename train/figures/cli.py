@@ -19,7 +19,7 @@ from train.figures.curves import cell_curves, learning_curves
 from train.figures.paths import side_by_side, spread_episodes, trajectories
 from train.figures.scores import efficiency_plane, effort_terms, frontier, ins_over_alpha, robots_plane, seen_and_unseen
 from train.figures.tables import document
-from train.scoring.row_files import PATHS
+from train.runs.run_folder import PATHS
 from train.scoring.rows import check_rows
 from train.scoring.statistics import run_means
 

@@ -1,4 +1,4 @@
-"""Keep one run's folder: config, versions, metrics, TensorBoard events, summary; nothing else writes there.
+"""Keep one run's folder: config, versions, metrics, TensorBoard events, summary; name the files of its rows.
 
 <out_dir>/<name>/config.yaml       what was run, every value resolved
                  versions.json     packages, device, commit
@@ -12,6 +12,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 import tempfile
 from pathlib import Path
@@ -21,6 +22,7 @@ from interactive_nav_common.config import Natural, NotNegative, flatten, replace
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import append_text, write_text, writing
 from interactive_nav_common.records import METRICS, RUNS, cut_metrics, read_metrics
+from interactive_nav_common.rows import digest_of
 from interactive_nav_common.versions import versions
 from train.config import TrainConfig
 from train.config_io import from_yaml, to_yaml
@@ -142,3 +144,48 @@ def claim(path: Path, needed_mb: float = 0.0) -> None:
             f"{path}: {free_mb:.0f} MB free on its disk, expected {needed_mb:.0f} MB for checkpoints; "
             "make room, or set run.out_dir or run.env_state_limit_mb"
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationRequest:
+    """The episodes and policies of an evaluation; together with the run it names a file of rows."""
+
+    scenes: tuple[str, ...]
+    policies: tuple[str, ...]
+    episodes: int
+    seed: int
+    balanced: bool
+    """Scenes take turns."""
+    checkpoint: str
+    deterministic: bool
+    settings: tuple[str, ...] = ()
+    """env.key=value words."""
+    episode_file: str = ""
+    """Digest of a file of episodes."""
+
+    def file_name(self, run: str) -> str:
+        """Return `<run>-<8 hex>.parquet`: the same request for a run replaces its file, another one adds one."""
+        return f"{run}-{digest_of(dataclasses.asdict(self))}.parquet"
+
+
+PATHS = "_paths"
+"""Folder of recorded paths in a dataset; readers of a dataset pass over it."""
+
+
+def files_of_run(dataset: Path, run: str, ending: str = ".parquet") -> list[Path]:
+    """Return the files of rows in a dataset folder that are of one run."""
+    name = re.compile(re.escape(run) + r"-[0-9a-f]{8}" + re.escape(ending))
+    return sorted(path for path in dataset.glob(f"*{ending}") if name.fullmatch(path.name))
+
+
+def paths_beside(rows: Path) -> Path:
+    """Return where the recorded paths of a file of rows lie: in a dataset's `PATHS`."""
+    in_dataset = re.search(r"-[0-9a-f]{8}\.parquet$", rows.name)
+    folder = rows.parent / PATHS if in_dataset else rows.parent
+    return folder / f"{rows.stem}.npz"
+
+
+def lonely_paths(dataset: Path, run: str) -> list[Path]:
+    """Return recorded paths of one run without their rows, which are written after them."""
+    every = files_of_run(dataset / PATHS, run, ".npz")
+    return [path for path in every if not (dataset / f"{path.stem}.parquet").is_file()]

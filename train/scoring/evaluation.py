@@ -1,6 +1,5 @@
 """Play fixed episodes of an environment with every policy of a run, as rows and recorded paths."""
 
-import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -13,7 +12,8 @@ import pyarrow as pa
 from rich.console import Console
 
 from interactive_nav.episodes import EpisodeFile, starts_of
-from interactive_nav.task.rollout import HostPolicy, PolicyFn, episode_keys
+from interactive_nav.task.rollout import HostPolicy, Player, PolicyFn, Recorder, episode_keys
+from interactive_nav.types import OF_OBJECTS
 from interactive_nav_common.files import write_arrays
 from interactive_nav_common.jobs.progress import progress_bar
 from interactive_nav_common.versions import versions
@@ -22,12 +22,10 @@ from train.learners.algorithms import ALGORITHMS
 from train.runs import checkpoint
 from train.runs.checkpoint import CheckpointMeta
 from train.runs.run import check_fits
-from train.runs.run_folder import RunFolder
+from train.runs.run_folder import EvaluationRequest, RunFolder
 from train.scoring.brought import BroughtPolicy
 from train.scoring.policies import BASELINES, make_baseline
-from train.scoring.rollout import BatchPlayer, PlayedEpisodes
-from train.scoring.row_files import EvaluationRequest
-from train.scoring.rows import episode_table
+from train.scoring.rows import Paths, PlayedEpisodes, episode_table
 
 LEARNED = "learned"
 POLICIES = (LEARNED, *BASELINES)
@@ -40,6 +38,49 @@ OF_LEARNED = (
 """Columns that are empty for a policy that never learned."""
 AUTO_BATCH = {"native": 4096, "jax": 1024, "warp": 4096}
 """PlayedEpisodes played at a time, per physics backend."""
+
+
+RECORDERS = {
+    "metrics": Recorder(lambda state, action: dict(state.metrics)),
+    "of_objects": Recorder(lambda state, action: {name: state.info["nav"].memory[name] for name in OF_OBJECTS}),
+    "object_end_w": Recorder(lambda state, action: state.info["nav"].object_pos_w),
+    "robot_xy_w": Recorder(lambda state, action: state.info["nav"].robot_pos_w[:, :2], "step"),
+}
+
+
+class BatchPlayer(Player):
+    """Plays episodes of one environment for their scores."""
+
+    def __init__(self, env: Any):
+        super().__init__(env, RECORDERS)
+        self.cached: dict[Any, Any] = {}
+        """Functions of learned policies, by kind: see `load_policy`."""
+
+    def play(
+        self,
+        policy: PolicyFn | HostPolicy,
+        keys: jax.Array,
+        record: int = 0,
+        on_progress: Callable[[int, int], None] = lambda finished, step: None,
+        starts: Any = None,
+        scene_index: np.ndarray | None = None,
+        batch: int | None = None,
+        on_note: Callable[[str], None] = lambda note: None,
+    ) -> PlayedEpisodes:
+        """Play every episode to its end; see `Player.rollout`."""
+        played = self.rollout(policy, keys, starts, scene_index, record, batch, on_progress, on_note)
+        first, values, xy = played.first, played.values, played.values["robot_xy_w"]
+        over = np.arange(xy.shape[1]) >= played.num_steps[:record, None]
+        xy = np.where(over[..., None], np.float32(np.nan), xy)
+        paths = Paths(
+            scene_index=first.scene_index[:record],
+            start_xy_w=first.start_xy_w[:record],
+            goal_xy_w=first.goal_xy_w[:record],
+            robot_xy_w=np.concatenate([first.robot_pos_w[:record, None, :2], xy], 1),
+            object_start_w=first.object_pos_w[:record],
+            object_end_w=values["object_end_w"][:record],
+        )
+        return PlayedEpisodes(first.scene_index, values["metrics"], values["of_objects"], paths)
 
 
 def load_policy(
@@ -134,10 +175,13 @@ def evaluate(
     tables, played = [], {}
     for name, (policy, meta) in policies.items():
         began = time.perf_counter()
-        with _progress(console, name, request.episodes) as on_progress:
-            played[name] = player.play(
-                policy, keys, record, on_progress, starts, turns, batch, lambda note: console.print(note)
-            )
+        with progress_bar(console, name, request.episodes, transient=True) as update:
+            update(status="compiling")
+
+            def on_progress(over: int, step: int, update: Any = update) -> None:
+                update(completed=over, status=f"{over} of {request.episodes} episodes over, step {step}")
+
+            played[name] = player.play(policy, keys, record, on_progress, starts, turns, batch, console.print)
         wall_s = time.perf_counter() - began
         constants = {**where, "policy": name, "evaluation_wall_s": wall_s}
         if meta:
@@ -191,13 +235,3 @@ def write_paths(path: Path, played: dict[str, PlayedEpisodes], env: Any) -> None
         arrays[f"scene/{i}/origin_w"] = np.array(scene.maps.origin_w)
         arrays[f"scene/{i}/object_names"] = np.array(env.world.slots.names[i], dtype=str)
     write_arrays(path, **arrays)
-
-
-@contextlib.contextmanager
-def _progress(console: Console, name: str, episodes: int) -> Iterator[Callable[[int, int], None]]:
-    """Show a line that says how many episodes are over."""
-    with progress_bar(console, name, episodes, transient=True) as update:
-        update(status="compiling")
-        yield lambda finished, step: update(
-            completed=finished, status=f"{finished} of {episodes} episodes over, step {step}"
-        )

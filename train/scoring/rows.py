@@ -1,11 +1,9 @@
-"""Write a row for each played episode to Parquet files, read them back, and show means with their intervals."""
-
-from __future__ import annotations
+"""Make a row of each played episode, check rows that are read back, and show means with their intervals."""
 
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,11 +12,8 @@ from rich.table import Table
 
 from interactive_nav.types import OF_OBJECTS
 from interactive_nav_common.errors import FileError
-from interactive_nav_common.rows import Columns, console_table, where
+from interactive_nav_common.rows import Columns, Rows, console_table, where
 from interactive_nav_common.statistics import RESAMPLES, over_episodes
-
-if TYPE_CHECKING:
-    from train.scoring.rollout import PlayedEpisodes
 
 SCORES = {"success": "success", "path_efficiency": "P_eff", "effort_efficiency": "E_eff", "ins_0.5": "INS_0.5"}
 
@@ -58,6 +53,37 @@ BY_CATEGORY = pa.list_(
 """Of the column `by_category`: how many objects of each category that a scene has were there and were touched, and,
 summed over them, control steps in contact, path lengths of their centres of mass, and largest net forces of the
 steps."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Paths(Rows):
+    """Where the robot went and what it moved, in the first E episodes; world frame, m."""
+
+    scene_index: np.ndarray
+    """[E] i32."""
+    start_xy_w: np.ndarray
+    """[E, 2]."""
+    goal_xy_w: np.ndarray
+    """[E, 2]."""
+    robot_xy_w: np.ndarray
+    """[E, T + 1, 2], NaN after the episode's end."""
+    object_start_w: np.ndarray
+    """[E, M, 3]."""
+    object_end_w: np.ndarray
+    """[E, M, 3]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PlayedEpisodes:
+    """N finished episodes."""
+
+    scene_index: np.ndarray
+    """[N] i32."""
+    metrics: dict[str, np.ndarray]
+    """name -> [N], the environment's metrics at the step that ended the episode."""
+    of_objects: dict[str, np.ndarray]
+    """name of `OF_OBJECTS` -> [N, M]."""
+    paths: Paths
 
 
 def check_rows(rows: pa.Table, path: Path) -> None:

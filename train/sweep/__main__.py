@@ -5,9 +5,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from interactive_nav_common.config import refuse_unused
+from interactive_nav_common.config import refuse_unused, settings_help
 from interactive_nav_common.errors import ConfigError, reports_errors
-from interactive_nav_common.jobs.processes import Launcher
 from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.signals import stop_signals
 from interactive_nav_common.words import program
@@ -17,32 +16,24 @@ from train.runs.run_folder import claim
 from train.sweep import spec
 from train.sweep.devices import Machine, find_gpus
 from train.sweep.folder import SweepFolder
-from train.sweep.scheduler import STAGES, Programs, Scheduler
-from train.sweep.spec import Sweep
+from train.sweep.scheduler import PROGRAMS, STAGES, Programs, Scheduler
+from train.sweep.spec import SweepConfig
 from train.sweep.table import SweepDisplay, status_table, totals
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     epilog = (
-        f"keys of the file (default):\n{spec.help_text()}\n\nexit codes: 0 all done (or in another sweep's hands), "
+        f"keys of the file (default):\n{settings_help(SweepConfig(), equals=': ')}\n\n"
+        "exit codes: 0 all done (or in another sweep's hands), "
         "1 runs were given up or are not done, 2 the file is wrong, 3 stopped by the time limit, 128 + signal"
     )
     table, sweeps = Path(__file__).parents[1] / "words.yaml", ", ".join(preset_names(spec.SWEEP_DIR))
     return program(table, "sweep", epilog, sweeps=sweeps, step=STEP, stages=STAGES)
 
 
-def make_launcher(name: str, address: str, sweep: Sweep) -> Launcher:
-    """Return where jobs are to run."""
-    if name == "ray":
-        from interactive_nav_common.jobs.on_ray import RayLauncher
-
-        return RayLauncher(address)
-    return Machine(find_gpus(), sweep.config.launch.slots)
-
-
 @reports_errors("train.sweep")
-def main(argv: Sequence[str] | None = None, programs: Programs | None = None) -> int:
+def main(argv: Sequence[str] | None = None, programs: Programs = PROGRAMS) -> int:
     """Run a sweep; see `Outcome.exit_code`."""
     arguments = parser().parse_args(argv)
     console = SafeConsole()
@@ -78,7 +69,12 @@ def main(argv: Sequence[str] | None = None, programs: Programs | None = None) ->
         raise ConfigError(f"--only evaluate: no run of {folder.root} has trained a step; train first, without --only")
     claim(folder.root)
     folder.prepare()
-    launcher = make_launcher(arguments.launcher, arguments.ray_address or "auto", sweep)
+    if arguments.launcher == "ray":
+        from interactive_nav_common.jobs.on_ray import RayLauncher
+
+        launcher = RayLauncher(arguments.ray_address or "auto")
+    else:
+        launcher = Machine(find_gpus(), sweep.config.launch.slots)
     stages = (arguments.only,) if arguments.only else STAGES
     try:
         with stop_signals(second_ends=False) as stops, SweepDisplay(console) as display:

@@ -21,13 +21,8 @@ class Gpu:
     memory_gb: float
 
 
-@dataclasses.dataclass(frozen=True)
-class Share:
-    """Part of a machine for one run."""
-
-    gpu: Gpu | None
-    fraction: float
-    """Of the GPU's memory, or of the machine's cores."""
+Share = tuple[str | None, float]
+"""Part of a machine for one run: a GPU's name, if it has any, and a fraction of its memory or of the cores."""
 
 
 def find_gpus() -> list[Gpu]:
@@ -64,49 +59,34 @@ class Machine(Launcher):
     def __init__(self, gpus: list[Gpu], slots: int):
         super().__init__()
         self._gpus, self._slots = gpus, slots
-        self._given: list[Share] = []
+        self._shares: list[Share] = []
 
     def take(self, launch: LaunchConfig, factor: float = 1.0) -> Share | None:
         """Take a share for a run; None where there is no room."""
-        if not self._gpus:
-            if len(self._given) >= self._slots:
-                return None
-            share = Share(None, 1.0 / self._slots)
-        else:
-            free = {gpu: 1.0 - sum(s.fraction for s in self._given if s.gpu == gpu) for gpu in self._gpus}
+        share, room = (None, 1.0 / self._slots), self._slots > len(self._shares)
+        if self._gpus:
+            free = {gpu: 1.0 - sum(part for name, part in self._shares if name == gpu.name) for gpu in self._gpus}
             gpu, runs = max(free, key=lambda g: free[g]), launch.runs_per_gpu
             if launch.gpu_memory_gb:
                 runs = max(1, min(runs, int(USABLE * gpu.memory_gb / launch.gpu_memory_gb)))
-            share = Share(gpu, min(1.0, factor * (1.0 / runs)))
-            if share.fraction > free[gpu] + 1e-9:
-                return None
-        self._given.append(share)
+            share = gpu.name, min(1.0, factor * (1.0 / runs))
+            room = share[1] <= free[gpu] + 1e-9
+        if not room:
+            return None
+        self._shares.append(share)
         return share
 
     def give_back(self, share: Share) -> None:
         """Free the share of a run that is over."""
-        self._given.remove(share)
+        self._shares.remove(share)
 
     def _begin(self, job: Job) -> Begun | None:
         assert isinstance(job, RunJob)
         share = self.take(job.launch, job.factor)
         if share is None:
             return None
-        where = "cpu" if share.gpu is None else f"gpu {share.gpu.name}"
-        return Child(job, share_env(share, job.launch)), where, lambda: self.give_back(share)
-
-
-def share_env(share: Share, launch: LaunchConfig) -> dict[str, str]:
-    """Return environment variables that keep a run within its share."""
-    if share.gpu is None:
-        cores = max(1, int((os.cpu_count() or 1) * share.fraction))
-        return {"OMP_NUM_THREADS": str(cores)} if share.fraction < 1.0 else {}
-    memory = USABLE * share.fraction * launch.jax_memory_share
-    return {
-        "CUDA_DEVICE_ORDER": "PCI_BUS_ID",  # nvidia-smi's order
-        "CUDA_VISIBLE_DEVICES": share.gpu.name,
-        "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{memory:.3f}",
-    }
+        where = "cpu" if share[0] is None else f"gpu {share[0]}"
+        return Child(job, job.env_on(*share)), where, lambda: self.give_back(share)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -121,5 +101,12 @@ class RunJob(Job):
     """Times the usual share of a GPU."""
 
     def env_on(self, gpu: str | None, part: float) -> Mapping[str, str]:
-        """Return variables that keep it within its part."""
-        return share_env(Share(Gpu(gpu, 0.0) if gpu else None, part), self.launch)
+        """Return environment variables that keep it within its part of a GPU or of the cores."""
+        if gpu is None:
+            cores = max(1, int((os.cpu_count() or 1) * part))
+            return {"OMP_NUM_THREADS": str(cores)} if part < 1.0 else {}
+        return {
+            "CUDA_DEVICE_ORDER": "PCI_BUS_ID",  # nvidia-smi's order
+            "CUDA_VISIBLE_DEVICES": gpu,
+            "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{USABLE * part * self.launch.jax_memory_share:.3f}",
+        }

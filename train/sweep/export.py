@@ -1,4 +1,4 @@
-"""Export what is worth keeping of a sweep's folder: rows, thinned curves, origins, the best checkpoints.
+"""Export from a sweep's folder rows, thinned curves, origins and the best checkpoints.
 
 Rows become one file, which takes half of what a file a run does: many columns are the same in all of them.
 """
@@ -18,8 +18,7 @@ from interactive_nav_common.rows import read_notes, read_rows, write_parquet
 from train.errors import CheckpointError
 from train.runs import checkpoint
 from train.runs.checkpoint import STEP
-from train.runs.run_folder import RunFolder
-from train.scoring.row_files import PATHS, files_of_run, paths_beside
+from train.runs.run_folder import PATHS, RunFolder, files_of_run, paths_beside
 from train.scoring.statistics import run_means
 from train.sweep.folder import SweepFolder
 from train.sweep.spec import RunSpec
@@ -44,11 +43,10 @@ UNSEEN_ONLY = {"by_category", "force_sum_n", "object_displacement_kg_m", "reward
 
 
 def export(folder: SweepFolder, out: Path, step: float = STEP) -> tuple[int, dict[tuple[Any, ...], str]]:
-    """Copy a sweep's results; what is there already of the same runs is replaced.
+    """Copy a sweep's results, in place of earlier ones of the same runs.
 
-    Returns:
-        Bytes of all that lies there; and by cell the run whose checkpoint was kept: that of the highest mean INS_0.5
-        over its rows, on test scenes where there are any.
+    Return the bytes of all that lies there, and by cell the run whose checkpoint was kept: that of the highest mean
+    INS_0.5 over its rows, on test scenes where there are any.
     """
     runs = [run for run in folder.sweep.runs if (folder.runs / run.name / "metrics.jsonl").is_file()]
     if not runs:

@@ -2,8 +2,8 @@
 
 <out_dir>/<name>/configs/<run>.yaml     complete config of a run, as `python -m train --config` takes it
                  runs/<run>/            its run folder
-                 rows/<run>-*.parquet   what it scored; in rows/_paths/ where its robot went in some episodes
-                 logs/<run>.log         what its programs printed
+                 rows/<run>-*.parquet   its scores; in rows/_paths/ where its robot went in some episodes
+                 logs/<run>.log         the output of its programs
                  failed/<run>.json      why it was given up
                  locks/<run>            held by whoever works on it
 """
@@ -15,7 +15,6 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +24,7 @@ from interactive_nav_common.locks import is_locked
 from interactive_nav_common.records import RUNS
 from interactive_nav_common.rows import read_notes
 from train.config_io import to_yaml
-from train.runs.run_folder import RunFolder
-from train.scoring.row_files import PATHS, EvaluationRequest, files_of_run, lonely_paths, paths_beside
+from train.runs.run_folder import PATHS, EvaluationRequest, RunFolder, files_of_run, lonely_paths, paths_beside
 from train.sweep.spec import EvaluateConfig, RunSpec, Sweep
 
 TAIL_BYTES = 1 << 16
@@ -53,8 +51,8 @@ class RunState:
 class _Failure:
     """Content of failed/<run>.json."""
 
-    reason: str
-    attempts: int
+    reason: str = ""
+    attempts: int = 0
 
 
 class SweepFolder:
@@ -112,7 +110,7 @@ class SweepFolder:
         """Return why a run was given up, or nothing. Read once: another sweep may try the run again meanwhile."""
         path = self.root / "failed" / f"{run}.json"
         try:
-            return RUNS.record(RUNS.json(path, {"reason": "", "attempts": 0}), _Failure, str(path)).reason
+            return RUNS.record(RUNS.json(path, {}), _Failure, str(path)).reason
         except FileError as error:
             return str(error)
 
@@ -207,25 +205,16 @@ def programs_env() -> dict[str, str]:
     return {"PYTHONPATH": os.pathsep.join(dict.fromkeys(paths)), "PYTHONUNBUFFERED": "1"}
 
 
-def words_of_training(folder: SweepFolder, run: str, program: tuple[str, ...]) -> list[str]:
-    """Return the command that trains a run, or continues it."""
-    return [sys.executable, *program, "--config", str(folder.config(run))]
-
-
 def words_of_evaluation(folder: SweepFolder, runs: list[str], program: tuple[str, ...]) -> list[str]:
     """Return the command that evaluates runs of one environment."""
-
-    def words() -> Iterator[str]:
-        wanted = folder.sweep.config.evaluate
-        yield from (str(folder.runs / run) for run in runs)
-        yield from ("--dataset", str(folder.rows), "--policies", "learned", "--checkpoint", wanted.checkpoint)
-        yield from ("--record", str(wanted.record))
-        yield "--stochastic" if wanted.stochastic else "--no-stochastic"
-        yield from ("--batch", str(wanted.batch)) if wanted.batch else ()
-        files = folder.episode_files(next(run for run in folder.sweep.runs if run.name == runs[0]))
-        yield from (word for file in files for word in ("--episode-file", file))
-        drawn = ("--episodes", str(wanted.episodes), "--seed", str(wanted.seed))
-        yield from () if files else (*drawn, *(("--balanced",) if wanted.balanced else ()))  # of files all
-        yield from ("--scenes", *wanted.scenes) if wanted.scenes else ()
-
-    return [sys.executable, *program, *words()]
+    wanted = folder.sweep.config.evaluate
+    words = [sys.executable, *program, *(str(folder.runs / run) for run in runs), "--dataset", str(folder.rows)]
+    words += ["--policies", "learned", "--checkpoint", wanted.checkpoint, "--record", str(wanted.record)]
+    words += ["--stochastic" if wanted.stochastic else "--no-stochastic"]
+    words += ["--batch", str(wanted.batch)] if wanted.batch else []
+    if files := folder.episode_files(next(run for run in folder.sweep.runs if run.name == runs[0])):
+        words += [word for file in files for word in ("--episode-file", file)]
+    else:  # of files all episodes are played
+        words += ["--episodes", str(wanted.episodes), "--seed", str(wanted.seed)]
+        words += ["--balanced"] if wanted.balanced else []
+    return words + (["--scenes", *wanted.scenes] if wanted.scenes else [])

@@ -4,8 +4,9 @@ import contextlib
 import dataclasses
 import os
 import signal
+import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from interactive_nav_common.config import replace
@@ -17,9 +18,7 @@ from train.sweep.folder import (
     log_tail,
     programs_env,
     words_of_evaluation,
-    words_of_training,
 )
-from train.sweep.spec import RunSpec
 from train.sweep.table import SweepDisplay
 
 STAGES = ("train", "evaluate")
@@ -31,16 +30,13 @@ LAST_START_S = 60.0
 ELSEWHERE_S = 10.0
 """Between two looks whether a run that somebody else works on is free."""
 REFUSED = 2
-"""Exit code for what another try cannot mend."""
+"""Exit code of errors that another try cannot mend."""
 OUT_OF_MEMORY = ("resource_exhausted", "out of memory", "cuda_error_out_of_memory", "memory allocation failed")
 
 
-@dataclasses.dataclass(frozen=True)
-class Programs:
-    """What `python` is to run; tests give others."""
-
-    train: tuple[str, ...] = ("-m", "train")
-    evaluate: tuple[str, ...] = ("-m", "train.evaluate")
+Programs = Mapping[str, tuple[str, ...]]
+PROGRAMS: Programs = {"train": ("-m", "train"), "evaluate": ("-m", "train.evaluate")}
+"""Stage -> the words of its `python`; tests give others."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,11 +64,7 @@ class Outcome:
 
 
 class Scheduler:
-    """Decides what runs next.
-
-    Args:
-        clock: seconds.
-    """
+    """Decides what runs next."""
 
     def __init__(
         self,
@@ -82,12 +74,12 @@ class Scheduler:
         stages: Sequence[str] = STAGES,
         redo: bool = False,
         unfinished: bool = False,
-        programs: Programs | None = None,
+        programs: Programs = PROGRAMS,
         clock: Callable[[], float] = time.monotonic,
     ):
         self._folder, self._launcher, self._display = folder, launcher, display
         self._stages, self._unfinished = stages, unfinished
-        self._programs, self._clock = programs or Programs(), clock
+        self._programs, self._clock = programs, clock
         self._runs = {run.name: run for run in folder.sweep.runs}
         self._attempts: dict[tuple[str, str], int] = {}
         self._factor: dict[tuple[str, str], float] = {}
@@ -101,8 +93,7 @@ class Scheduler:
     def run(self, stops: list[int], time_limit_s: float | None = None, poll_s: float = POLL_S) -> Outcome:
         """Work until nothing is left, the time is over, or a signal requests a stop; a second one does not wait.
 
-        Args:
-            time_limit_s: after it all runs are stopped, with their checkpoints; None: no limit.
+        After the time limit, if any, all runs are stopped, with their checkpoints.
         """
         began, deadline, killed = self._clock(), None, False
         timed_out = False
@@ -162,13 +153,14 @@ class Scheduler:
     def _start(self, states: list[RunState]) -> None:
         """Start what there is room for: training first, then evaluation."""
         for name in self._free("train", states):
-            command = words_of_training(self._folder, name, self._programs.train)
-            if self._runs[name].launch.slots > 1 and not self._runs[name].config.env.threads:
-                command = [*command, f"env.threads={_threads(self._runs[name])}"]
+            run = self._runs[name]
+            command = [sys.executable, *self._programs["train"], "--config", str(self._folder.config(name))]
+            if run.launch.slots > 1 and not run.config.env.threads:
+                command += [f"env.threads={max(1, (os.cpu_count() or 1) // run.launch.slots)}"]
             if not self._begin("train", [name], command):
                 return
         for group in self._groups(self._free("evaluate", states)):
-            command = words_of_evaluation(self._folder, group, self._programs.evaluate)
+            command = words_of_evaluation(self._folder, group, self._programs["evaluate"])
             if not self._begin("evaluate", group, command):
                 return
 
@@ -259,10 +251,6 @@ class Scheduler:
             )
         for line in shown:
             self._display.event(f"    {line}")
-
-
-def _threads(run: RunSpec) -> int:
-    return max(1, (os.cpu_count() or 1) // run.launch.slots)
 
 
 def _how(code: int) -> str:

@@ -19,7 +19,6 @@ from interactive_nav_common.config import (
     nearest,
     nested,
     overlay,
-    settings_help,
 )
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import check_name
@@ -198,9 +197,7 @@ def expand(config: SweepConfig, where: str) -> Sweep:
 def select(sweep: Sweep, where: Sequence[str], shard: str | None) -> Sweep:
     """Return the part of a sweep that one machine takes.
 
-    Args:
-        where: `setting=value[,value]` words; a run must match them all.
-        shard: `I/N`, every N-th run beginning with the I-th (from 0); None: all.
+    A run must match all `setting=value[,value]` words of `where`. Shard `I/N`: every N-th run from the I-th on.
     """
     runs = list(sweep.runs)
     for word in where:
@@ -222,11 +219,6 @@ def select(sweep: Sweep, where: Sequence[str], shard: str | None) -> Sweep:
     if not runs:
         raise ConfigError("no run of the sweep is left; expected --where and --shard to leave some")
     return dataclasses.replace(sweep, runs=tuple(runs))
-
-
-def help_text() -> str:
-    """Return one line for each key of a sweep's file."""
-    return settings_help(SweepConfig(), equals=": ")
 
 
 def _mapping(value: Any, where: str, what: str) -> Any:

@@ -16,8 +16,8 @@ from interactive_nav_common.records import read_metrics
 from topological_nav.config import PITCHES
 from topological_nav.data.dataset import load_rooms
 from topological_nav.data.domains import as_seen, preset
+from topological_nav.figures.learning import features_figure
 from topological_nav.figures.maps import save
-from topological_nav.figures.transfer_figures import features_figure
 
 
 def main() -> None:

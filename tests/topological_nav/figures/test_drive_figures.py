@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.collections import LineCollection
 
 from topological_nav.drives.dataset import load_drives
-from topological_nav.figures.drive_figures import drives_figure
+from topological_nav.figures.learning import drives_figure
 
 
 def test_every_kept_step_is_a_line_of_its_turning(driven, painted):

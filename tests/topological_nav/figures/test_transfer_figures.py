@@ -5,7 +5,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from topological_nav.figures.transfer_figures import features_figure, passages_figure
+from topological_nav.figures.learning import features_figure, passages_figure
 
 IMAGES = np.zeros((7, 8, 8, 3), np.uint8)
 

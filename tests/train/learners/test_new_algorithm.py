@@ -25,8 +25,7 @@ from train.learners.learner import Snapshot
 from train.runs import checkpoint
 from train.runs.run import train_run
 from train.runs.run_folder import RunFolder
-from train.scoring.evaluation import load_policy
-from train.scoring.rollout import BatchPlayer
+from train.scoring.evaluation import BatchPlayer, load_policy
 
 WORDS = (
     *("algorithm=td3", "td3.num_envs=16", "td3.steps_per_update=8", "td3.grad_steps_per_update=4", "td3.batch_size=32"),

@@ -19,8 +19,8 @@ from tests.train.toy_env import ToyEnv
 from tests.train.toy_run import build_toy
 from train import evaluate
 from train.scoring.brought import BroughtPolicy, _on_host, describe_env, named
+from train.scoring.evaluation import BatchPlayer
 from train.scoring.policies import make_follower
-from train.scoring.rollout import BatchPlayer
 
 KEYS = episode_keys(5, 8)
 

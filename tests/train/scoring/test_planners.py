@@ -14,9 +14,8 @@ from interactive_nav.task.rollout import episode_keys
 from interactive_nav.types import EpisodeStart
 from interactive_nav_common.errors import UserError
 from tests.toys import write_room
-from train.scoring.planners import Planner
-from train.scoring.policies import make_baseline
-from train.scoring.rollout import BatchPlayer
+from train.scoring.evaluation import BatchPlayer
+from train.scoring.policies import Planner, make_baseline
 
 
 @pytest.fixture(scope="module")

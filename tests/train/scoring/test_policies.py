@@ -14,8 +14,8 @@ from interactive_nav.robots.spec import TwistMap, wheel_twist
 from interactive_nav.task.rollout import episode_keys
 from interactive_nav_common.errors import UserError
 from tests.train.toy_env import ToyConfig, ToyEnv
+from train.scoring.evaluation import BatchPlayer
 from train.scoring.policies import make_follower, make_random, steer
-from train.scoring.rollout import BatchPlayer
 
 # Wheel radius 0.05 m, track 0.2 m, action -1 .. 1 is -10 .. 30 rad/s: action = (w - 10) / 20.
 ROBOT = dataclasses.replace(

@@ -18,10 +18,10 @@ from interactive_nav_common.errors import FileError
 from interactive_nav_common.rows import read_notes, read_rows, write_parquet
 from interactive_nav_common.statistics import Estimate, over_episodes
 from tests.train.toy_env import ToyConfig, ToyEnv
+from train.runs.run_folder import EvaluationRequest, files_of_run
+from train.scoring.evaluation import BatchPlayer
 from train.scoring.policies import make_follower, make_random
-from train.scoring.rollout import BatchPlayer, Paths, PlayedEpisodes
-from train.scoring.row_files import EvaluationRequest, files_of_run
-from train.scoring.rows import episode_table
+from train.scoring.rows import Paths, PlayedEpisodes, episode_table
 
 
 def test_an_episode_is_the_same_whatever_runs_beside_it(monkeypatch):

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 import yaml
 
 from interactive_nav_common.files import whole_file, write_text
-from train.scoring.row_files import EvaluationRequest
+from train.runs.run_folder import EvaluationRequest
 
 
 def fates(run: Path) -> dict[str, list[str]]:

@@ -7,7 +7,7 @@ import yaml
 
 from interactive_nav_common.rows import read_rows
 from tests.toys import write_room
-from train import figures
+from train.figures import cli
 from train.sweep.__main__ import main
 
 pytestmark = pytest.mark.slow
@@ -43,7 +43,7 @@ def test_from_a_file_to_pictures(tmp_path, monkeypatch, capfd):
     # Both runs played the same episodes.
     assert rows["shortest_path_m"][:6] == rows["shortest_path_m"][6:]
     assert len(set(rows["shortest_path_m"])) == 6
-    assert figures.main([str(tmp_path / "tiny"), "-o", str(tmp_path / "figures")]) == 0
+    assert cli.main([str(tmp_path / "tiny"), "-o", str(tmp_path / "figures")]) == 0
     made = {picture.stem for picture in (tmp_path / "figures").iterdir()}
     assert {"ins_over_alpha_turtlebot", "path_effort_turtlebot", "seen_unseen", "learning_curves"} <= made
     capfd.readouterr()

@@ -15,7 +15,7 @@ from interactive_nav_common.rows import read_notes, read_rows, write_parquet
 from tests.train.sweep.test_sweep import write_sweep
 from tests.train.synthetic import run_rows
 from train.runs import checkpoint
-from train.scoring.row_files import paths_beside
+from train.runs.run_folder import paths_beside
 from train.sweep import export as export_module
 from train.sweep import spec
 from train.sweep.__main__ import main

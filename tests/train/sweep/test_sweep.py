@@ -22,13 +22,13 @@ from interactive_nav_common.jobs import processes as jobs
 from interactive_nav_common.locks import is_locked, take_lock
 from train.sweep import spec
 from train.sweep.__main__ import main
-from train.sweep.devices import Gpu, Machine, find_gpus, parse_gpus, share_env
+from train.sweep.devices import Gpu, Machine, RunJob, find_gpus, parse_gpus
 from train.sweep.folder import RunState, SweepFolder, last_line
-from train.sweep.scheduler import Outcome, Programs, Scheduler
+from train.sweep.scheduler import Outcome, Scheduler
 from train.sweep.spec import LaunchConfig
 from train.sweep.table import SweepDisplay, totals
 
-FAKE = Programs(train=("-m", "tests.train.sweep.fake", "train"), evaluate=("-m", "tests.train.sweep.fake", "evaluate"))
+FAKE = {stage: ("-m", "tests.train.sweep.fake", stage) for stage in ("train", "evaluate")}
 ROOT = Path(__file__).parents[3]
 
 
@@ -390,7 +390,7 @@ def test_a_run_whose_next_stage_another_sweep_has_begun_did_not_fail(tmp_path, m
         os.close(descriptor)
 
 
-def test_shares_of_a_machine():
+def test_shares_of_a_machine(tmp_path):
     listing = "0, GPU-aa, 143771\n1, GPU-bb, 143771\nnonsense\n"
     gpus = parse_gpus(listing, None)
     assert [g.name for g in gpus] == ["0", "1"] and gpus[0].memory_gb == pytest.approx(150.75, abs=0.01)
@@ -401,9 +401,9 @@ def test_shares_of_a_machine():
     machine = Machine(gpus, 1)
     shares = [machine.take(launch) for _ in range(5)]
     # 0.95 * 150.75 GB hold two runs of 60 GB, not four; the emptier GPU comes first.
-    assert [s.gpu.name if s and s.gpu else None for s in shares] == ["0", "1", "0", "1", None]
+    assert [share[0] if share else None for share in shares] == ["0", "1", "0", "1", None]
     assert shares[0] is not None
-    assert share_env(shares[0], launch) == {
+    assert RunJob("job", (), tmp_path / "log", kind="train", runs=(), launch=launch).env_on(*shares[0]) == {
         "CUDA_DEVICE_ORDER": "PCI_BUS_ID",
         "CUDA_VISIBLE_DEVICES": "0",
         "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.237",
@@ -412,7 +412,7 @@ def test_shares_of_a_machine():
     assert machine.take(launch) is not None and machine.take(launch) is None
     cpu = Machine([], 2)
     first = cpu.take(launch)
-    assert first is not None and first.gpu is None and cpu.take(launch) is not None and cpu.take(launch) is None
+    assert first is not None and first[0] is None and cpu.take(launch) is not None and cpu.take(launch) is None
 
 
 def test_exit_codes():
