@@ -143,7 +143,6 @@ def test_what_would_change_nothing_is_refused(words, unused, capsys):
         (["navigator", "--goal", "G"], "--goal"),
         (["navigator", "--policy", "passage"], "--policy"),
         (["check", "seed=1"], "seed"),
-        (["all", "width=1"], "width"),
     ],
 )
 def test_what_a_node_would_not_look_at_is_refused(words, unused, capsys):

@@ -1,5 +1,4 @@
-"""The simulator and the navigator as ROS 1 nodes; nothing else of the project needs ROS.
+"""Run the simulator and the navigator as ROS 2 nodes.
 
-`python -m topological_nav.ros all scene:=SCENE` has roslaunch start `episode.launch`; docs/ros.md has topics,
-units and frames. `messages` (pure) and `simulator` run without ROS; `debian` is where ROS comes in.
+Only this package needs ROS, and only when a node starts: `pip install 'interactive-nav[ros2]'`. See `docs/ros.md`.
 """

@@ -1,4 +1,4 @@
-"""Settings of the simulator and of what drives: frozen dataclasses checked on construction; docstrings are the help."""
+"""Define the settings of the simulator and of driver `heading`, checked on construction; docstrings are the help."""
 
 import dataclasses
 import math

@@ -1,30 +1,38 @@
-"""What the navigator's node drives by: a picture, a heading and a time in, a velocity out."""
-
-from __future__ import annotations
+"""Define what drives a robot behind the navigator's node: a picture, a heading and a time in, a velocity out."""
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
 
 import numpy as np
+from PIL import Image
 
-from interactive_nav_common.errors import UserError
+from interactive_nav.robots import get_robot
+from interactive_nav_common.errors import ConfigError, UserError
+from scenes_mjcf.look import Lens
+from topological_nav.config import NavigatorConfig
+from topological_nav.data.folders import lens_of
+from topological_nav.drives.driving import local_policy
+from topological_nav.learn.training import load_networks
+from topological_nav.maps.graph import load_map
+from topological_nav.maps.sight import NetworkSight
+from topological_nav.navigate.navigator import Navigator
+from topological_nav.navigate.state import State
 from topological_nav.ros.config import HeadingConfig
-
-if TYPE_CHECKING:
-    from scenes_mjcf.look import Lens
-    from topological_nav.navigate.navigator import Navigator
-    from topological_nav.navigate.state import State
+from topological_nav.ros.messages import seen_through
+from topological_nav.weights.packaged import Choice
 
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """What a driver wants until its next step."""
+    """The velocity that a driver commands until its next step."""
 
     linear_mps: float
     angular_radps: float
     done: bool = False
-    """The episode is over: the robot stands, and no more is asked."""
+    """The episode is over, and the robot stands."""
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.linear_mps + self.angular_radps):
@@ -34,11 +42,11 @@ class Command:
 
 
 class Driver(Protocol):
-    """Drives one episode; called once for each picture that arrives."""
+    """Drives one episode; its `step` is called once for each picture that arrives."""
 
     @property
     def lens(self) -> Lens | None:
-        """That its pictures must be seen through; None: any."""
+        """Return the lens that its pictures must have; None: any."""
         ...
 
     def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> Command:
@@ -47,7 +55,7 @@ class Driver(Protocol):
 
 
 class HeadingDriver:
-    """Turns to a heading and drives along it; looks at no picture. For tests, and for trying out a robot's topics."""
+    """Turn to a heading and drive along it without looking at pictures: for tests and for trying out a robot."""
 
     lens: Lens | None = None
 
@@ -83,3 +91,28 @@ class PilotDriver:
         self._state, linear, angular, events = self._navigator.step(self._state, *seen)
         done = bool(events.arrived[0]) or bool(events.timed_out[0])
         return Command(0.0, 0.0, done=True) if done else Command(float(linear[0]), float(angular[0]))
+
+
+def topological_driver(
+    map_file: Path, choice: Choice, goals: Sequence[Path], goal_heading_rad: float, config: NavigatorConfig
+) -> PilotDriver:
+    """Return the navigator with its goal; the first picture of it looks along `goal_heading_rad` in the map's frame."""
+    networks, built = load_networks(choice.localiser, choice.detector), load_map(map_file)
+    lens = lens_of(networks.camera, get_robot(networks.camera.robot))
+    sight = NetworkSight(built, networks.localiser, networks.detector, config.match)
+    runs = (choice.localiser, networks.localiser), (choice.detector, networks.detector)
+    policy = local_policy(choice.policy, sight, config, *runs)
+    if not goals:
+        raise ConfigError("the navigator has no goal; name a picture taken there: --goal PICTURE")
+    pictures = np.stack([seen_through(_picture(path), lens.fov_deg, lens) for path in goals])
+    around = goal_heading_rad + 2 * np.pi * np.arange(len(pictures)) / len(pictures)
+    navigator = Navigator(built, sight, policy, config)
+    return PilotDriver(navigator, navigator.start(navigator.goal_nodes(pictures[None], around)), lens)
+
+
+def _picture(path: Path) -> np.ndarray:
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB"))
+    except OSError as error:
+        raise ConfigError(f"{path}: is no picture that can be read ({error})") from None

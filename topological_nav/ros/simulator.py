@@ -1,4 +1,4 @@
-"""A scene and velocity commands in, what a robot's sensors tell out; without ROS.
+"""Simulate a robot's sensors in a scene under velocity commands; without ROS.
 
 TTbot on C MuJoCo (`native`), its lidar and odometry from `interactive_nav.sensing.sensors`, its pictures from
 `interactive_nav.pictures.camera`. The odometry's frame is the start's; the heading is the world's, as a compass has
@@ -30,7 +30,7 @@ _FOREVER = 10**9
 
 @dataclasses.dataclass(frozen=True)
 class Sensed:
-    """One moment, as sensors tell it; and the truth, for scoring."""
+    """One moment as sensors measure it, and the ground truth for scoring."""
 
     time_s: float
     rgb: np.ndarray
@@ -50,7 +50,48 @@ class Sensed:
     force_n: float
     """Mean over the last control step of what the robot pushes with."""
     truth_w: np.ndarray
-    """(3,) x, y (m), yaw (rad), world: no sensor tells it."""
+    """(3,) x, y (m), yaw (rad), world: no sensor measures it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pace:
+    """How simulated time runs."""
+
+    factor: float = 1.0
+    """Simulated seconds per second; 0: as fast as possible."""
+    lockstep: bool = False
+    """Each picture waits for its command, so that nothing depends on the computer's speed."""
+    limit_s: float = 1800.0
+    """Simulated seconds until the episode is over."""
+    recorded: bool = False
+    """Start when every topic has a listener, and the picture has two."""
+
+
+@dataclasses.dataclass
+class Tally:
+    """Totals of an episode, from the simulator's ground truth."""
+
+    seconds: float = 0.0
+    path_m: float = 0.0
+    movable_s: float = 0.0
+    structure_s: float = 0.0
+    done: bool = False
+    """The navigator declared the episode over, within the limit."""
+    end_w: tuple[float, ...] = ()
+    """x, y (m), yaw (rad), world."""
+
+    def add(self, before: Sensed, after: Sensed) -> None:
+        """Add a control step."""
+        step = after.time_s - before.time_s
+        self.seconds += step
+        self.path_m += float(np.linalg.norm(after.truth_w[:2] - before.truth_w[:2]))
+        self.movable_s += step * after.touches_movable
+        self.structure_s += step * after.touches_structure
+        self.end_w = tuple(round(float(v), 4) for v in after.truth_w)
+
+    def row(self) -> dict[str, Any]:
+        """Return the totals as JSON holds them."""
+        return {k: round(v, 4) if isinstance(v, float) else v for k, v in dataclasses.asdict(self).items()}
 
 
 class RosSimulator:
@@ -59,7 +100,7 @@ class RosSimulator:
     range_min_m, lidar_pos_m = LIDAR_NEAR_M, LIDAR_POS_M
 
     def __init__(self, scene: Path, config: SimulatorConfig):
-        """Builds the world and places the robot; compiles."""
+        """Build the world, place the robot and compile."""
         need_engine(config.engine)
         self.config = config
         self._env = interactive_nav.make(
@@ -93,14 +134,15 @@ class RosSimulator:
             start = start.replace(start_xy_w=jnp.asarray([x, y], jnp.float32), start_yaw_rad=jnp.float32(yaw))
         self._state = jax.jit(self._env.reset_to)(start, jax.random.fold_in(key, 1))
         self._force_before = 0.0
+        jax.block_until_ready(self._step(self._state, jnp.zeros(self._env.action_size)))  # compiled before it counts
 
     @property
     def camera_pos_m(self) -> tuple[float, float, float]:
-        """Of the camera in the base's frame."""
+        """Return the camera's position in the base's frame."""
         return self._env.robot.camera.pos_m
 
     def step(self, linear_mps: float, angular_radps: float) -> Sensed:
-        """Drives for one control step; commands beyond what the robot can do are cut."""
+        """Drive for one control step; commands beyond the robot's limits are clipped."""
         self._force_before = float(self._state.info["nav"].memory["force_sum_n"])
         action = self._env.robot.drive(jnp.float32(linear_mps), jnp.float32(angular_radps), jnp)
         self._state = self._step(self._state, action)
@@ -109,7 +151,7 @@ class RosSimulator:
         return self.sense()
 
     def sense(self) -> Sensed:
-        """What the sensors tell now."""
+        """Return what the sensors measure now."""
         nav, values = self._state.info["nav"], self._parts()
         by = self.config.supersample
         drawn = self._camera.frame(self._state, self.lens.width * by, self.lens.height * by, ("rgb",), "robot")["rgb"]

@@ -1,7 +1,6 @@
-"""Messages by value: what is in them, and what comes back; the message types are those of `rosbags`, not ROS's own."""
+"""Messages by value: their fields, and what is read back."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,26 +9,24 @@ from hypothesis import strategies as st
 
 from scenes_mjcf.look import Lens
 from topological_nav.ros import messages
-from topological_nav.ros.topics import Headings, time_parts
+from topological_nav.ros.nodes import Headings
 
-
-def tree(fields):
-    """Nested dicts as objects with attributes."""
-    return SimpleNamespace(**{k: tree(v) if isinstance(v, dict) else v for k, v in fields.items()})
+HEAD = messages.header(0.3, "base_link")
 
 
 def test_an_image_comes_back_and_its_bytes_run_left_to_right_top_to_bottom():
     rgb = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
-    fields = messages.image_fields(rgb)
-    assert (fields["height"], fields["width"], fields["step"], fields["encoding"]) == (2, 3, 9, "rgb8")
-    assert fields["data"][:6] == bytes([0, 1, 2, 3, 4, 5]) and len(fields["data"]) == 18
-    assert (messages.image_array(tree(fields)) == rgb).all()
+    image = messages.image_message(rgb, HEAD)
+    assert (image.height, image.width, image.step, image.encoding) == (2, 3, 9, "rgb8")
+    assert bytes(image.data[:6]) == bytes([0, 1, 2, 3, 4, 5]) and len(image.data) == 18
+    assert (messages.image_array(image) == rgb).all()
+    assert (image.header.frame_id, messages.seconds(image.header.stamp)) == ("base_link", pytest.approx(1.3))
 
 
 def test_other_encodings_and_padded_rows_are_read():
     # One row of two pixels, blue first, with an alpha byte, and two bytes of padding.
     data = bytes([1, 2, 3, 255, 4, 5, 6, 255, 0, 0])
-    message = SimpleNamespace(height=1, width=2, step=10, encoding="bgra8", data=data)
+    message = messages.Image(height=1, width=2, step=10, encoding="bgra8", data=data)
     assert messages.image_array(message).tolist() == [[[3, 2, 1], [6, 5, 4]]]
 
 
@@ -42,33 +39,33 @@ def test_other_encodings_and_padded_rows_are_read():
     ],
 )
 def test_images_that_cannot_be_read_are_told(changed, told):
-    message = SimpleNamespace(**{"height": 1, "width": 2, "step": 6, "encoding": "rgb8", "data": bytes(6), **changed})
+    message = messages.Image(**{"height": 1, "width": 2, "step": 6, "encoding": "rgb8", "data": bytes(6), **changed})
     with pytest.raises(messages.MessageError) as error:
         messages.image_array(message)
     assert told in str(error.value)
 
 
 def test_a_camera_of_90_degrees_has_a_focal_length_of_half_its_height():
-    fields = messages.camera_info_fields(Lens(640, 480, 90.0))
-    assert fields["K"] == pytest.approx([240, 0, 319.5, 0, 240, 239.5, 0, 0, 1])
-    assert fields["P"] == pytest.approx([240, 0, 319.5, 0, 0, 240, 239.5, 0, 0, 0, 1, 0])
-    lens = messages.info_lens(tree(fields))
+    info = messages.info_message(Lens(640, 480, 90.0), HEAD)
+    assert info.k == pytest.approx([240, 0, 319.5, 0, 240, 239.5, 0, 0, 1])
+    assert info.p == pytest.approx([240, 0, 319.5, 0, 0, 240, 239.5, 0, 0, 0, 1, 0])
+    lens = messages.info_lens(info)
     assert (lens.width, lens.height) == (640, 480) and lens.fov_deg == pytest.approx(90.0)
 
 
 @pytest.mark.parametrize(
     ("name", "at", "value", "told"),
     [
-        ("K", 4, 0.0, "no focal length"),
-        ("K", 0, 300.0, "focal lengths 300.0 and 240.0, expected square pixels"),
-        ("D", 0, -0.2, "subscribe to a rectified image"),
+        ("k", 4, 0.0, "no focal length"),
+        ("k", 0, 300.0, "focal lengths 300.0 and 240.0, expected square pixels"),
+        ("d", 0, -0.2, "subscribe to a rectified image"),
     ],
 )
 def test_cameras_that_are_no_pinholes_are_refused(name, at, value, told):
-    fields = messages.camera_info_fields(Lens(640, 480, 90.0))
-    fields[name][at] = value
+    info = messages.info_message(Lens(640, 480, 90.0), HEAD)
+    getattr(info, name)[at] = value
     with pytest.raises(messages.MessageError, match=told):
-        messages.info_lens(tree(fields))
+        messages.info_lens(info)
 
 
 def test_a_narrower_lens_sees_the_middle():
@@ -91,60 +88,53 @@ def test_a_wider_lens_than_the_cameras_is_refused():
 
 def test_a_scan_begins_at_the_right_and_infinity_means_nothing_met():
     # Four beams over 240 degrees: -120, -60, 0 and 60; the third meets a wall 2.8 m ahead.
-    fields = messages.scan_fields(np.array([1.0, 0.5, 0.5, 0.25], np.float32), 240.0, 0.05, 5.6, 0.1)
-    assert np.degrees([fields["angle_min"], fields["angle_max"], fields["angle_increment"]]) == pytest.approx(
-        [-120, 60, 60]
-    )
-    assert fields["ranges"] == pytest.approx([math.inf, 2.8, 2.8, 1.4])
+    scan = messages.scan_message(np.array([1.0, 0.5, 0.5, 0.25], np.float32), 240.0, 0.05, 5.6, 0.1, HEAD)
+    assert np.degrees([scan.angle_min, scan.angle_max, scan.angle_increment]) == pytest.approx([-120, 60, 60])
+    assert list(scan.ranges) == pytest.approx([math.inf, 2.8, 2.8, 1.4])
 
 
 @given(st.floats(-math.pi, math.pi))
 def test_headings_survive_the_quaternion(yaw):
     quat = messages.yaw_quat(yaw)
-    assert math.hypot(quat["z"], quat["w"]) == pytest.approx(1)
-    assert math.remainder(messages.quat_yaw(tree(quat)) - yaw, math.tau) == pytest.approx(0, abs=1e-9)
+    assert math.hypot(quat.z, quat.w) == pytest.approx(1)
+    assert math.remainder(messages.quat_yaw(quat) - yaw, math.tau) == pytest.approx(0, abs=1e-9)
 
 
 def test_yaw_of_a_tilted_robot_and_of_a_quaternion_that_is_not_of_length_one():
     # Yaw 90 degrees after a roll of 30: q = qz(90) qx(30).
     s, c = math.sin(math.radians(15)), math.cos(math.radians(15))
     half = math.sqrt(0.5)
-    quat = SimpleNamespace(x=2 * half * s, y=2 * half * s, z=2 * half * c, w=2 * half * c)
+    quat = messages.Quaternion(x=2 * half * s, y=2 * half * s, z=2 * half * c, w=2 * half * c)
     assert messages.quat_yaw(quat) == pytest.approx(math.pi / 2)
-    with pytest.raises(messages.MessageError, match="tells no heading"):
-        messages.quat_yaw(SimpleNamespace(x=0.0, y=0.0, z=0.0, w=0.0))
+    with pytest.raises(messages.MessageError, match="has no heading"):
+        messages.quat_yaw(messages.Quaternion(x=0.0, y=0.0, z=0.0, w=0.0))
 
 
 def test_odometry_has_its_pose_in_the_start_frame_and_its_speed_in_the_robots():
-    fields = messages.odometry_fields(np.array([1.0, 2.0, math.pi]), np.array([0.5, 0.1, 0.0]), np.array([0, 0, -0.2]))
-    pose, twist = fields["pose"]["pose"], fields["twist"]["twist"]
-    assert pose["position"] == {"x": 1.0, "y": 2.0, "z": 0.0}
-    assert messages.quat_yaw(tree(pose["orientation"])) == pytest.approx(math.pi)
-    assert twist == {"linear": {"x": 0.5, "y": 0.1, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": -0.2}}
+    moving = np.array([0.5, 0.1, 0.0]), np.array([0, 0, -0.2])
+    odometry = messages.odometry_message(np.array([1.0, 2.0, math.pi]), *moving, HEAD)
+    pose, twist = odometry.pose.pose, odometry.twist.twist
+    assert (pose.position.x, pose.position.y, pose.position.z) == (1.0, 2.0, 0.0)
+    assert messages.quat_yaw(pose.orientation) == pytest.approx(math.pi)
+    assert (twist.linear.x, twist.linear.y, twist.angular.z, odometry.child_frame_id) == (0.5, 0.1, -0.2, "base_link")
 
 
 def test_the_imu_marks_accelerations_as_unknown():
-    fields = messages.imu_fields(0.3, np.array([0.0, 0.0, 0.7]))
-    assert messages.quat_yaw(tree(fields["orientation"])) == pytest.approx(0.3)
-    assert fields["angular_velocity"]["z"] == 0.7 and fields["linear_acceleration_covariance"][0] == -1
+    imu = messages.imu_message(0.3, np.array([0.0, 0.0, 0.7]), HEAD)
+    assert messages.quat_yaw(imu.orientation) == pytest.approx(0.3)
+    assert imu.angular_velocity.z == 0.7 and imu.linear_acceleration_covariance[0] == -1
 
 
 def test_velocity_commands_come_back_and_must_be_finite():
-    blank = tree({"linear": {"x": 9.0, "y": 0.0}, "angular": {"x": 0.0, "z": 9.0}})
-    message = messages.set_fields(blank, messages.twist_fields(0.4, -0.25))
+    message = messages.twist_message(0.4, -0.25)
     assert messages.twist_command(message) == (0.4, -0.25)
     message.angular.z = math.nan
     with pytest.raises(messages.MessageError, match="expected finite numbers"):
         messages.twist_command(message)
 
 
-def test_a_field_that_a_message_lacks_is_no_new_field():
-    with pytest.raises(AttributeError):
-        messages.set_fields(SimpleNamespace(width=1), {"widht": 2})
-
-
 def test_the_optical_frame_looks_along_x_with_its_x_to_the_right():
-    x, y, z, w = messages.OPTICAL_QUAT
+    x, y, z, w = (getattr(messages.OPTICAL_QUAT, name) for name in "xyzw")
     rotation = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -157,9 +147,8 @@ def test_the_optical_frame_looks_along_x_with_its_x_to_the_right():
 
 
 def test_times_are_whole_microseconds():
-    assert time_parts(1.3) == (1, 300_000_000)
-    assert time_parts(0.1 + 0.2) == (0, 300_000_000)
-    assert time_parts(2.9999999) == (3, 0)
+    stamps = [messages.stamp(time_s) for time_s in (0.3, 0.1 + 0.2, 1.9999999)]
+    assert [(s.sec, s.nanosec) for s in stamps] == [(1, 300_000_000), (1, 300_000_000), (3, 0)]
 
 
 def test_headings_turn_the_short_way_between_two_tellings():

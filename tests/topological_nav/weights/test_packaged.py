@@ -21,7 +21,7 @@ from topological_nav.errors import RunError
 from topological_nav.learn.training import camera_of, load_trained
 from topological_nav.maps.build import renderer_of
 from topological_nav.maps.graph import load_map, save_map
-from topological_nav.ros.__main__ import _seeing
+from topological_nav.ros.__main__ import _networks
 from topological_nav.ros.__main__ import parser as ros_parser
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.rooms import find_rooms, recorded_rooms
@@ -183,7 +183,7 @@ def test_rows_of_exported_networks_are_not_those_of_the_runs(made, exported):
 def test_the_robots_navigator_uses_the_package_too(made, exported, here, capsys):
     shutil.copytree(exported, here)
     words = ["navigator", "--driver", "topological", "--map", str(made.map)]
-    chosen = _seeing(ros_parser().parse_args(words))
+    chosen = _networks(ros_parser().parse_args(words))
     assert (chosen.localiser, chosen.detector) == (here / "rooms", here / "passages")
     assert chosen.policy == str(here / "policy") and "of the package" in capsys.readouterr().err
 
