@@ -1,7 +1,7 @@
-"""`python -m converters convert|export|object|propose|check|generate|...`: parse, print, exit.
+"""Parse, run and print the commands of `python -m converters`.
 
-Exit codes: 0 done, 1 a gate failed (`convert` has then written the scene all the same), 2 unusable input (one
-line on stderr), 130 or 143 interrupted.
+Exit codes: 0 done, 1 a gate failed (`convert` has written the scene anyway), 2 unusable input (one line on stderr),
+130 or 143 interrupted.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 def _words_of(config: type[Any], arguments: argparse.Namespace) -> dict[str, Any]:
-    """Fields of a dataclass of choices that the command line has."""
+    """Return the fields of a dataclass of choices that the command line has."""
     return {f.name: getattr(arguments, f.name) for f in dataclasses.fields(config) if f.name in arguments}
 
 
@@ -113,15 +113,15 @@ def _object(arguments: argparse.Namespace, console: Console) -> None:
 
     config = ObjectConfig(**_words_of(ObjectConfig, arguments) | {"source": arguments.within})
     warn = warn_once(console)
-    made = convert_object(arguments.source, arguments.out, config, warn=warn)
-    for warning in made["warnings"]:
+    about = convert_object(arguments.source, arguments.out, config, warn=warn)
+    for warning in about["warnings"]:
         warn(warning)
-    size = " x ".join(f"{100 * v:.1f}" for v in made["size_m"])
+    size = " x ".join(f"{100 * v:.1f}" for v in about["size_m"])
     console.print(
-        f"{arguments.out}: {made['category']}, {made['mass_kg']:.3f} kg ({made['mass_source']}), {size} cm, "
-        f"{made['n_hulls']} hulls ({made['hull_source']}); at rest it drifts "
-        f"{1000 * made['rest']['drift_hulls_m']:.2f} mm with hulls, "
-        f"{1000 * made['rest']['drift_boxes_m']:.2f} mm with boxes",
+        f"{arguments.out}: {about['category']}, {about['mass_kg']:.3f} kg ({about['mass_source']}), {size} cm, "
+        f"{about['n_hulls']} hulls ({about['hull_source']}); at rest it drifts "
+        f"{1000 * about['rest']['drift_hulls_m']:.2f} mm with hulls, "
+        f"{1000 * about['rest']['drift_boxes_m']:.2f} mm with boxes",
         soft_wrap=True,
     )
 
@@ -165,10 +165,9 @@ def _propose(arguments: argparse.Namespace, console: Console) -> None:
     with stage_progress(console) as report:
         raw, library = read_source(arguments.source, arguments.format), None
         if arguments.auto_align or arguments.library:
-            own = arguments.source if (arguments.source / "cad").is_dir() else None
-            library = read_library(arguments.library or own)
-        found = propose(raw, arguments.output, library, report)
-    for table in proposal_tables(found):
+            library = read_library(arguments.library, arguments.source)
+        proposed = propose(raw, arguments.output, library, report)
+    for table in proposal_tables(proposed):
         console.print(table)
     console.print(f"{arguments.output}: proposals.json and proposals.png", soft_wrap=True)
 
@@ -184,8 +183,8 @@ def _annotate(arguments: argparse.Namespace, console: Console) -> int:
 
     with alone_in(arguments.output):
         raw = read_source(arguments.source, arguments.format, up=arguments.up, unit=arguments.unit)
-        own = arguments.source if (arguments.source / "cad").is_dir() else None
-        store, proposals = Store(arguments.output, read_library(arguments.library or own)), propose_instances(raw.scan)
+        store = Store(arguments.output, read_library(arguments.library, arguments.source))
+        proposals = propose_instances(raw.scan)
         session = store.save(store.open(raw, lambda: start(raw, proposals)))
         server, address = guarded_server(arguments.host, arguments.port, raw.name, "annotate")
         page = Page(server, store, session, raw, proposals)
@@ -196,8 +195,8 @@ def _annotate(arguments: argparse.Namespace, console: Console) -> int:
             number = number_of(stop)  # Ctrl-C is how it ends
         server.stop()
     states = [item.state for item in page.session.items]
-    told = ", ".join(f"{states.count(word)} {word}" for word in ("accepted", "skipped", "open"))
-    console.print(f"{arguments.output}: {told}", soft_wrap=True)
+    counts = ", ".join(f"{states.count(word)} {word}" for word in ("accepted", "skipped", "open"))
+    console.print(f"{arguments.output}: {counts}", soft_wrap=True)
     return 0 if number == signal.SIGINT else 128 + number
 
 
@@ -238,7 +237,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _parse(argv: list[str] | None) -> argparse.Namespace:
-    """The command line's words; those of `generate` and `convert` may stand before and after its options."""
+    """Parse the command line's words; those of `generate` and `convert` may stand before and after its options."""
     parser = _parser()
     arguments, rest = parser.parse_known_args(argv)
     free = "settings" if "settings" in arguments else "places"
@@ -261,17 +260,17 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
 def _standing(arguments: argparse.Namespace) -> dict[str, int]:
     """What stands where the command writes: path -> inode, another one once something was put in its place."""
     target = glob.escape(str(getattr(arguments, "out", None) or getattr(arguments, "output", "")))
-    found = {}
+    inodes = {}
     for path in (p for pattern in arguments.writes for p in glob.glob(pattern.format(target))):
         with contextlib.suppress(OSError):
-            found[path] = os.stat(path).st_ino
-    return found
+            inodes[path] = os.stat(path).st_ino
+    return inodes
 
 
 @reports_errors("error")
 @interrupts_heard(*STOPS)
 def main(argv: list[str] | None = None) -> int:
-    """Runs one command and returns its exit code."""
+    """Run one command and return its exit code."""
     arguments = _parse(argv)
     console = SafeConsole()
     before = _standing(arguments)

@@ -1,4 +1,4 @@
-"""How long each stage of a conversion takes, what share of it all is done, and the memory that it takes."""
+"""Measure the time of each stage of a conversion, the share that is done, and the memory that it takes."""
 
 import contextlib
 import re
@@ -14,14 +14,14 @@ Report = Callable[[str, float], None]
 
 
 def peak_memory_mib(pid: int | str = "self") -> float:
-    """Most memory that a process has held, MiB; 0 where the system does not tell, or it has ended.
+    """Return the most memory that a process has held, MiB; 0 where the system does not say, or it has ended.
 
     VmHWM and not `getrusage`: Linux keeps the latter's `ru_maxrss` through fork and exec, so a process started by a
     large one reports its parent's.
     """
     with contextlib.suppress(OSError):
-        if found := re.search(r"VmHWM:\s+(\d+) kB", Path("/proc", str(pid), "status").read_text()):
-            return int(found[1]) / 1024
+        if match := re.search(r"VmHWM:\s+(\d+) kB", Path("/proc", str(pid), "status").read_text()):
+            return int(match[1]) / 1024
     return 0.0
 
 

@@ -46,8 +46,8 @@ def _make_scenes(arguments: argparse.Namespace, console: Console) -> int:
     from converters.sets import make_packaged
 
     with stage_progress(console) as report:
-        tell = functools.partial(console.print, soft_wrap=True, highlight=False)
-        failed = make_packaged(arguments.names, arguments.jobs, report, tell)
+        log = functools.partial(console.print, soft_wrap=True, highlight=False)
+        failed = make_packaged(arguments.names, arguments.jobs, report, log)
     return 1 if failed else 0
 
 
@@ -70,7 +70,7 @@ def _models(arguments: argparse.Namespace, console: Console) -> None:
 
 
 def _get(arguments: argparse.Namespace, console: Console) -> None:
-    from converters.library.fetch import fetch, library_folder
+    from converters.library.build import fetch, library_folder
 
     target = arguments.out or library_folder()
     files = fetch(arguments.given, target, arguments.overwrite)
@@ -78,8 +78,7 @@ def _get(arguments: argparse.Namespace, console: Console) -> None:
 
 
 def _build(arguments: argparse.Namespace, console: Console) -> None:
-    from converters.library.build import build
-    from converters.library.fetch import FILES, library_folder
+    from converters.library.build import FILES, build, library_folder
 
     given = arguments.given or library_folder()
     files = [given / f"{name}.sh3f" for name in FILES]

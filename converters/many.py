@@ -64,7 +64,7 @@ def digest_of(source: Path, config: ConvertConfig, scenes: Sequence[Path] = ()) 
 
 def convert_many(
     sources: Sequence[Path], into: Path, config: ConvertConfig, launcher: Launcher, side_by_side: int,
-    report: Callable[[str, float], None], tell: Callable[[str], None],
+    report: Callable[[str, float], None], log: Callable[[str], None],
 ) -> list[str]:  # fmt: skip
     """Convert what has not been converted with these options; the row of each is written as it ends.
 
@@ -84,7 +84,7 @@ def convert_many(
             digests[name] = digest_of(source, config, scenes)
             same = old and ours and old["digest"] == digests[name] and old["exit_code"] in (0, 1)
             if old and same and not config.overwrite:
-                tell(f"{name}: is there, kept")
+                log(f"{name}: is there, kept")
                 bad += [name] if old["exit_code"] else []
                 continue
             choices = {**dataclasses.asdict(config), "jobs": jobs, "overwrite": config.overwrite or ours}
@@ -102,7 +102,7 @@ def convert_many(
             write_parquet(pa.Table.from_pylist(list(rows.values()), SCHEMA), path)
             return _line(rows[name])
 
-        return bad + run_side_by_side(commands, launcher, into, report, tell, ended, "sources")
+        return bad + run_side_by_side(commands, launcher, into, report, log, ended, "sources")
 
 
 def _line(row: Mapping[str, Any]) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from converters.check.preview import preview
+from converters.clock import Report
 from converters.generate import generate_building
 from converters.generate.design.config import BuildingConfig, GenerationError
 from converters.generate.homes.config import SHARE_TOLERANCE, TIERS, HomeConfig, home_config, home_fields
@@ -33,9 +34,6 @@ SPARSE = "sparse"
 """Tier of buildings that `BuildingConfig` describes: a recipe's, where it names none."""
 GENERATE, CONVERT, DRAW = 0.55, 0.35, 0.10
 """Shares of one scene's time, hulls cached: weights of the progress bar."""
-
-Report = Callable[[str, float], None]
-"""Called with what is being done and the share (0..1) that is done."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -208,11 +206,11 @@ def make_scene(recipe: SceneRecipe, conversion: dict[str, Any], folder: Path, jo
 
 def chosen(
     recipes: Recipes, out: Path, names: tuple[str, ...] = (), overwrite: bool = False,
-    tell: Callable[[str], None] = lambda line: None,
+    log: Callable[[str], None] = lambda line: None,
 ) -> tuple[SceneRecipe, ...]:  # fmt: skip
     """Return the recipes, of all or of these names, whose scenes are not there yet, or all with `overwrite`.
 
-    `tell` is called with one line for each that is there and kept.
+    `log` is called with one line for each that is there and kept.
     """
     every = [r.name for r in recipes.scenes]
     for name in (name for name in names if name not in every):
@@ -221,17 +219,17 @@ def chosen(
     todo = tuple(r for r in wanted if overwrite or not (out / r.name).exists())
     for recipe in wanted:
         if recipe not in todo:
-            tell(f"{recipe.name}: is there, kept")
+            log(f"{recipe.name}: is there, kept")
     return todo
 
 
 def make_scenes(
     todo: Sequence[SceneRecipe], conversion: dict[str, Any], out: Path, overwrite: bool = False, jobs: int = 2,
-    report: Report = lambda stage, share: None, tell: Callable[[str], None] = lambda line: None,
+    report: Report = lambda stage, share: None, log: Callable[[str], None] = lambda line: None,
 ) -> dict[str, list[str]]:  # fmt: skip
     """Generate scenes one after the other; return name -> gates that fail, of the scenes generated now.
 
-    After an interruption, `chosen` names those that are left: a scene is there whole or not at all. `tell` is called
+    After an interruption, `chosen` names those that are left: a scene is there whole or not at all. `log` is called
     with one line for each scene.
     """
     weight = [sum(r.building.floor_area_m2) for r in todo]
@@ -243,9 +241,9 @@ def make_scenes(
             report(f"{k + 1}/{len(todo)} {recipe.name}: {stage}", done)
 
         if not overwrite and (out / recipe.name).exists():  # another generator's, finished since
-            tell(f"{recipe.name}: is there, kept")
+            log(f"{recipe.name}: is there, kept")
             continue
         failed[recipe.name] = make_scene(recipe, conversion, out / recipe.name, jobs, inner)
         verdict = f"gates that fail: {', '.join(failed[recipe.name])}" if failed[recipe.name] else "every gate passes"
-        tell(f"{recipe.name}: {recipe.split}, seed {recipe.seed}, {verdict}")
+        log(f"{recipe.name}: {recipe.split}, seed {recipe.seed}, {verdict}")
     return failed

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import yaml
 
+from converters.clock import Report
 from converters.generate.design.config import GenerationError
-from converters.recipes import Recipes, Report, chosen, load_recipes, make_scenes, parse_recipes
+from converters.recipes import Recipes, chosen, load_recipes, make_scenes, parse_recipes
 from interactive_nav_common.config import nearest
 from interactive_nav_common.files import write_text
 from interactive_nav_common.jobs.processes import LOST, Job, Launcher, LocalLauncher
@@ -84,7 +85,7 @@ def begin_set(out: Path, tier: str, count: int, seed: int = SEEDS) -> None:
     write_text(path, text)
 
 
-def list_set(recipes: Recipes, out: Path, tell: Callable[[str], None] = lambda line: None) -> SceneSet:
+def list_set(recipes: Recipes, out: Path, log: Callable[[str], None] = lambda line: None) -> SceneSet:
     """Write `set.json` beside the scenes: which there are to be, and the digests of those that are there.
 
     A scene whose digest is not the one that the file already lists is reported and stays listed as it was: generated
@@ -97,7 +98,7 @@ def list_set(recipes: Recipes, out: Path, tell: Callable[[str], None] = lambda l
         if (out / recipe.name / "scene.json").is_file():
             digest = scene_digest(out / recipe.name)
             if listed.digest not in ("", digest):
-                tell(f"{recipe.name}: not the scene that {path} lists")
+                log(f"{recipe.name}: not the scene that {path} lists")
             else:
                 measures = load_manifest(out / recipe.name).measures
                 listed = dataclasses.replace(listed, digest=digest, measures=measures)
@@ -123,7 +124,7 @@ def _last_line(name: str, code: int, printed: str) -> str:
 
 
 def run_side_by_side(
-    commands: Mapping[str, list[str]], launcher: Launcher, folder: Path, report: Report, tell: Callable[[str], None],
+    commands: Mapping[str, list[str]], launcher: Launcher, folder: Path, report: Report, log: Callable[[str], None],
     ended: Callable[[str, int, str], str] = _last_line, what: str = "scenes",
 ) -> list[str]:  # fmt: skip
     """Run commands, several at a time; return the names of those that did not exit with 0.
@@ -142,7 +143,7 @@ def run_side_by_side(
                 for job, code in launcher.ended():
                     running -= 1
                     printed = job.log.read_text(errors="replace").partition("\n")[2] if code != LOST else "lost"
-                    tell(ended(job.name, -1 if code == LOST else code, printed))
+                    log(ended(job.name, -1 if code == LOST else code, printed))
                     failed += [job.name] if code else []
                     report(f"{count - len(todo) - running}/{count} {what}", 1 - (len(todo) + running) / count)
                 time.sleep(0.05)
@@ -151,27 +152,27 @@ def run_side_by_side(
     return failed
 
 
-def generate_scenes(wanted: Wanted, report: Report, tell: Callable[[str], None]) -> list[str]:
+def generate_scenes(wanted: Wanted, report: Report, log: Callable[[str], None]) -> list[str]:
     """Generate and list the scenes that are not there yet; return the names of those that fail, or fail a gate."""
     if wanted.tier and wanted.count is not None and wanted.seed is not None:
         begin_set(wanted.out, wanted.tier, wanted.count, wanted.seed)
     path = wanted.recipes or wanted.out / RECIPES
     recipes = load_recipes(path)
-    todo = chosen(recipes, wanted.out, tuple(wanted.only), wanted.overwrite, tell)
+    todo = chosen(recipes, wanted.out, tuple(wanted.only), wanted.overwrite, log)
     if len(todo) > 1 and (wanted.jobs > 1 or wanted.launcher == "ray"):
         launcher, _ = make_launcher(wanted.launcher, wanted.ray_address, wanted.jobs, len(todo))
         words = [sys.executable, "-m", "converters", "generate-scenes", str(wanted.out), "--recipes", str(path)]
         words += ["--jobs", "1", *(["--overwrite"] if wanted.overwrite else []), "--only"]
-        failed = run_side_by_side({r.name: [*words, r.name] for r in todo}, launcher, wanted.out, report, tell)
+        failed = run_side_by_side({r.name: [*words, r.name] for r in todo}, launcher, wanted.out, report, log)
     else:
-        gates = make_scenes(todo, recipes.conversion, wanted.out, wanted.overwrite, wanted.jobs, report, tell)
+        gates = make_scenes(todo, recipes.conversion, wanted.out, wanted.overwrite, wanted.jobs, report, log)
         failed = [name for name, failing in gates.items() if failing]
     if not wanted.only and (wanted.tier or (wanted.out / FILE).is_file()):
-        list_set(recipes, wanted.out, tell)
+        list_set(recipes, wanted.out, log)
     return failed
 
 
-def make_packaged(names: Sequence[str], jobs: int, report: Report, tell: Callable[[str], None]) -> list[str]:
+def make_packaged(names: Sequence[str], jobs: int, report: Report, log: Callable[[str], None]) -> list[str]:
     """Generate scenes of the package's sets in the cache folder, unless the package has them.
 
     What the cache has in a scene's place and is not the listed scene is replaced. Return the names of those that fail,
@@ -187,20 +188,20 @@ def make_packaged(names: Sequence[str], jobs: int, report: Report, tell: Callabl
         named = [n for n, m in members.items() if {n, name, f"{name}/{m.split}"} & set(names)]
         wanted = {n: members[n] for n in named if not (folder / n / "scene.json").is_file()}
         for scene in (n for n in named if n not in wanted):
-            tell(f"{scene}: is there, {folder / scene}")
+            log(f"{scene}: is there, {folder / scene}")
         out = in_cache(folder)
         todo = tuple(n for n, m in wanted.items() if not is_listed(out / n, m))
         others = [n for n in todo if (out / n).exists()]
         for scene in (n for n in wanted if n not in todo):
-            tell(f"{scene}: is there, {out / scene}")
+            log(f"{scene}: is there, {out / scene}")
         for scene in others:
-            tell(f"{scene}: in the cache is not the scene that the set {name} lists; made again")
+            log(f"{scene}: in the cache is not the scene that the set {name} lists; made again")
         if not todo:
             continue
         asks = Wanted(out, folder / RECIPES, None, None, None, todo, bool(others), jobs, "local", None)
-        failed += generate_scenes(asks, report, tell)
+        failed += generate_scenes(asks, report, log)
         for scene in (n for n in todo if n not in failed and not is_listed(out / n, wanted[n])):
             command = f"python -m converters generate-scenes FOLDER --recipes {folder / RECIPES} --only {scene}"
-            tell(f"{scene}: not the scene that the set {name} lists; as a scene of your own: {command}")
+            log(f"{scene}: not the scene that the set {name} lists; as a scene of your own: {command}")
             failed.append(scene)
     return failed

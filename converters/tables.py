@@ -1,4 +1,4 @@
-"""Gates, alignments and proposals as tables for the terminal."""
+"""Format gates, alignments and proposals as tables for the terminal."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 
 
 def bounds(gate: Gate) -> str:
-    """A gate's limits in words."""
+    """Return a gate's limits in words."""
     pairs = ((">=", gate.limit.least), ("<=", gate.limit.most))
     return " ".join(f"{word} {value:g}" for word, value in pairs if value is not None)
 
 
 def gate_table(gates: tuple[Gate, ...]) -> Table:
-    """One row a gate."""
+    """Return a table of one row a gate."""
     table = Table("gate", "value", "limit", "", title="Gates")
     for gate in gates:
         verdict = Text("PASS", "green") if gate.passed else Text("FAIL", "red")
@@ -30,18 +30,9 @@ def gate_table(gates: tuple[Gate, ...]) -> Table:
 
 
 def alignment_table(rows: tuple[dict[str, Any], ...]) -> Table:
-    """Units in the head; `settled` is how far the short simulation moved the object from its annotation."""
-    table = Table(
-        "object",
-        "pairs",
-        "rms cm",
-        "shift cm",
-        "yaw °",
-        "scale x y z",
-        "tilt °",
-        "settled cm",
-        title="Pose re-solved from keypoints, against the annotated pose",
-    )
+    """Return a table of alignments; `settled` is how far the simulation moved the object from its annotation."""
+    heads = ("object", "pairs", "rms cm", "shift cm", "yaw °", "scale x y z", "tilt °", "settled cm")
+    table = Table(*heads, title="Pose re-solved from keypoints, against the annotated pose")
     for row in rows:
         if row["solved"]:
             solved = (
@@ -52,21 +43,16 @@ def alignment_table(rows: tuple[dict[str, Any], ...]) -> Table:
             )
         else:
             solved = ("-", "-", "-", row["reason"])
-        table.add_row(
-            row["name"],
-            str(row["n_keypoints"]),
-            *solved,
-            f"{row['tilt_removed_deg']:.1f}",
-            f"{100 * row['settle_shift_m']:.1f}",
-        )
+        moved = f"{row['tilt_removed_deg']:.1f}", f"{100 * row['settle_shift_m']:.1f}"
+        table.add_row(row["name"], str(row["n_keypoints"]), *solved, *moved)
     return table
 
 
-def proposal_tables(found: Proposed) -> Iterator[Table]:
-    """What was found; and with a library and annotations, how well."""
+def proposal_tables(proposed: Proposed) -> Iterator[Table]:
+    """Yield a table of the proposals; and with a library and annotations, how well."""
     table = Table("class", "confidence", "x y z, m", "size, m", "model", "sure", title="Proposals")
-    for k, proposal in enumerate(found.proposals):
-        model = found.retrieved.get(k)
+    for k, proposal in enumerate(proposed.proposals):
+        model = proposed.retrieved.get(k)
         table.add_row(
             proposal.category,
             f"{proposal.confidence:.2f}",
@@ -76,22 +62,12 @@ def proposal_tables(found: Proposed) -> Iterator[Table]:
             f"{model.confidence:.2f}" if model else "-",
         )
     yield table
-    if not found.comparisons:
+    if not proposed.comparisons:
         return
-    table = Table(
-        "class",
-        "annotated",
-        "chosen",
-        "rank",
-        "cm",
-        "yaw °",
-        "scale x y z",
-        "IoU",
-        "sure",
-        title="Retrieved models against the annotation",
-        caption="cm, yaw and scale: the annotated model's own best fit against its annotated pose",
-    )
-    for row in found.comparisons:
+    heads = ("class", "annotated", "chosen", "rank", "cm", "yaw °", "scale x y z", "IoU", "sure")
+    caption = "cm, yaw and scale: the annotated model's best fit against its annotated pose"
+    table = Table(*heads, title="Retrieved models against the annotation", caption=caption)
+    for row in proposed.comparisons:
         table.add_row(
             row.category,
             row.true_cad[:6],

@@ -241,7 +241,7 @@ def test_what_is_not_the_listed_scene_is_not_found_and_is_made_again(
     assert main(["scenes", "list"]) == 0
     assert "one             in the cache is another scene" in capsys.readouterr().out
 
-    def generate(wanted, report, tell):
+    def generate(wanted, report, log):
         assert wanted.only == ("one",) and wanted.overwrite and (wanted.out / "one").exists()
         shutil.rmtree(wanted.out / "one")
         shutil.copytree(ROOT / "scenes_mjcf" / "alder", wanted.out / "one")
@@ -262,7 +262,7 @@ def test_scenes_that_are_made_by_name_are_compared(tmp_path: Path, monkeypatch: 
     shutil.copytree(ROOT / "scenes_mjcf" / "elm", tmp_path / "package" / "elm")
     asked = []
 
-    def generate(wanted, report, tell):
+    def generate(wanted, report, log):
         asked.append((wanted.out, wanted.recipes, wanted.only))
         for name in wanted.only:
             given = "cedar" if name == "birch" else name

@@ -46,7 +46,7 @@ class View:
 
 
 def painted(scan: ScanMesh) -> trimesh.Trimesh:
-    """The scan with a colour at each vertex, without its ceiling."""
+    """Return the scan with a colour at each vertex, without its ceiling."""
     colours = scan.vertex_colours
     if scan.texture is not None and scan.corner_uv is not None:
         colours = np.full((len(scan.vertices), 3), 180, np.uint8)
@@ -56,16 +56,16 @@ def painted(scan: ScanMesh) -> trimesh.Trimesh:
 
 
 def around(mesh: trimesh.Trimesh, item: Item) -> trimesh.Trimesh:
-    """The scan's faces about an object; all of them where there are none."""
+    """Return the scan's faces about an object; all of them where there are none."""
     half = np.array([math.hypot(*item.extent_m[:2]) / 2] * 2 + [item.extent_m[2] / 2]) + MARGIN_M
     near = (np.abs(mesh.triangles_center - item.centre) < half).all(axis=1)
-    found = mesh.submesh([np.flatnonzero(near)], append=True, repair=False) if near.any() else mesh
-    assert isinstance(found, trimesh.Trimesh)
-    return found
+    part = mesh.submesh([np.flatnonzero(near)], append=True, repair=False) if near.any() else mesh
+    assert isinstance(part, trimesh.Trimesh)
+    return part
 
 
 def view_of(item: Item, cad: CadModel | None, raw: RawScene) -> View:
-    """Object on the left, model on the right, seen from the room's middle so that walls stand behind."""
+    """Show the object on the left, the model on the right, from the room's middle so that walls stand behind."""
     inwards = raw.scan.vertices[:, :2].mean(axis=0) - item.centre[:2]
     far = float(np.linalg.norm(inwards))
     x, y = inwards / far if far > 0.3 else (0.0, -1.0)
@@ -81,14 +81,14 @@ def view_of(item: Item, cad: CadModel | None, raw: RawScene) -> View:
 
 
 def coloured(cad: CadModel, pose: Alignment) -> trimesh.Trimesh:
-    """A model under a pose, its faces coloured."""
+    """Return a model under a pose, its faces coloured."""
     mesh = trimesh.Trimesh(apply_alignment(pose, cad.vertices), cad.faces, face_colors=cad.face_colours, process=False)
     mesh.unmerge_vertices()
     return mesh
 
 
 def hit(mesh: trimesh.Trimesh, origin: np.ndarray, direction: np.ndarray) -> tuple[float, np.ndarray]:
-    """Distance along a ray to the nearest surface, m, and the point (3,); infinite where it meets none."""
+    """Return the distance along a ray to the nearest surface, m, and the point (3,); infinite where it meets none."""
     points = mesh.ray.intersects_location([origin], [direction])[0].reshape(-1, 3)
     along = (points - origin) @ (direction / np.linalg.norm(direction))
     k = int(np.argmin(along)) if len(along) else -1
@@ -96,7 +96,7 @@ def hit(mesh: trimesh.Trimesh, origin: np.ndarray, direction: np.ndarray) -> tup
 
 
 def thumbnail(cad: CadModel) -> np.ndarray:
-    """(`THUMBNAIL`, `THUMBNAIL`, 3) uint8 picture of a model from its front, right and above."""
+    """Draw a (`THUMBNAIL`, `THUMBNAIL`, 3) uint8 picture of a model from its front, right and above."""
     mesh = cad.surface or textured_by_face(cad.vertices, cad.faces, cad.face_colours)
     return mesh_picture(mesh, camera_axes() @ Y_UP_TO_Z_UP.T, THUMBNAIL)
 
@@ -117,19 +117,19 @@ MARKS = {"open": "", "accepted": " ✔ accepted", "skipped": " – skipped"}
 
 
 class Page:
-    """What a server shows, and what clicking there does."""
+    """The page of a server, and its reactions to clicks."""
 
     def __init__(
         self, server: Any, store: Store, session: Session, raw: RawScene, proposals: tuple[Proposal, ...]
     ) -> None:
-        """On a running viser server."""
+        """Fill the page of a running viser server."""
         self.server, self.store, self.session, self.raw = server, store, session, raw
         self.library: Mapping[str, CadModel] = store.library
         self._proposals, self._room = proposals, painted(raw.scan)
         self._lock, self._pool = threading.RLock(), concurrent.futures.ThreadPoolExecutor(1)
         self._ranked: dict[int, list[str]] = {}
         self._drawn: dict[str, Any] = {}
-        self._first, self._adding, self._said = 0, False, ""
+        self._first, self._adding, self._error = 0, False, ""
         self._picture = functools.cache(lambda cad_id: thumbnail(self.library[cad_id]))
         server.gui.configure_theme(control_width="large", show_share_button=False, show_logo=False)
         self._words()
@@ -159,7 +159,7 @@ class Page:
         self._whole.on_update(lambda _: self._draw())
 
         def choose(handle: Any, action: Callable[[str], Callable[[Session], Session]]) -> None:
-            # What the page itself sets is told too, but comes from nobody.
+            # Values that the page sets raise an event too, without a client.
             handle.on_update(lambda event: event.client_id is not None and self.do(action(handle.value)))
 
         choose(self._object, lambda word: lambda s: s.at_object(int(word.split()[0]) - 1))
@@ -168,22 +168,22 @@ class Page:
         self._pick.on_click(lambda event: self._picked(event.target.value))
 
     def do(self, action: Callable[[Session], Session]) -> None:
-        """Saves what an action makes of the session, then shows it; what is refused is said and changes nothing."""
+        """Save the session after an action, then show it; a refused action shows an error and changes nothing."""
         with self._lock:
             try:
-                before, self._said = self.session, ""
+                before, self._error = self.session, ""
                 self.session = self.store.save(action(self.session))
                 if before.items and self.session.item.category != before.item.category or self.session.at != before.at:
                     self._first = 0
             except UserError as error:
-                self._said = str(error)
+                self._error = str(error)
             self._draw()
 
     def candidates(self) -> list[str]:
-        """Ids of the models of the object's class, the likeliest first."""
-        own = [k for k, cad in sorted(self.library.items()) if cad.category == self.session.item.category]
+        """Return ids of the models of the object's class, the likeliest first."""
+        models = [k for k, cad in sorted(self.library.items()) if cad.category == self.session.item.category]
         ranked = self._ranked.get(self.session.at, [])
-        return sorted(own, key=lambda k: ranked.index(k) if k in ranked else len(ranked))
+        return sorted(models, key=lambda k: ranked.index(k) if k in ranked else len(ranked))
 
     def _add(self) -> None:
         self._adding = not self._adding
@@ -191,25 +191,25 @@ class Page:
 
     def _picked(self, word: str) -> None:
         with self._lock:
-            found = self.candidates() if self.session.items else []
+            candidates = self.candidates() if self.session.items else []
             at = self._first + (SHOWN if word == "more" else int(word) - 1)
             if word == "more":
-                self._first = at if at < len(found) else 0
+                self._first = at if at < len(candidates) else 0
                 self._draw()
-            elif at < len(found):
-                self.do(lambda s: s.chose(self.library[found[at]]))
+            elif at < len(candidates):
+                self.do(lambda s: s.chose(self.library[candidates[at]]))
 
     def _clicked(self, event: Any) -> None:
-        """A click: a point of the scan, or of the model that stands beside it, whichever the ray meets first."""
+        """Handle a click: a point of the scan, or of the model that stands beside it, whichever the ray meets first."""
         origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
         with self._lock:
-            found = {
-                side: hit(mesh, origin, direction) for side, mesh in self._drawn.items() if side in ("scan", "model")
+            hits = {
+                side: hit(self._drawn[side], origin, direction) for side in ("scan", "model") if side in self._drawn
             }
-            side = min(found, key=lambda k: found[k][0], default="scan")
-            if not found or not np.isfinite(found[side][0]):
+            side = min(hits, key=lambda k: hits[k][0], default="scan")
+            if not hits or not np.isfinite(hits[side][0]):
                 return
-            point = found[side][1]
+            point = hits[side][1]
             if self._adding:
                 self._adding = False
                 self.do(lambda s: s.added(self._class.value, point))
@@ -220,7 +220,7 @@ class Page:
                 self.do(lambda s: s.clicked("model", (point - bench.translation) @ yaw_matrix(bench.yaw) / bench.scale))
 
     def _rank(self) -> None:
-        """Fits every model of the object's class, on a thread of its own; the pictures then stand in that order."""
+        """Fit every model of the object's class, on another thread; the pictures then stand in that order."""
         at, item = self.session.at, self.session.item
         if at in self._ranked or at >= len(self._proposals):
             return
@@ -230,10 +230,10 @@ class Page:
             if self.session.at != at:
                 del self._ranked[at]  # looked at no longer; later perhaps
                 return
-            own = {k: cad for k, cad in self.library.items() if cad.category == item.category}
-            found = retrieve(self._proposals[at], own, floor_of(self.raw), any_category=True)
+            models = {k: cad for k, cad in self.library.items() if cad.category == item.category}
+            best = retrieve(self._proposals[at], models, floor_of(self.raw), any_category=True)
             with self._lock:
-                self._ranked[at] = [k for k, _ in found.ranking] if found else []
+                self._ranked[at] = [k for k, _ in best.ranking] if best else []
                 self._draw()
 
         self._pool.submit(work)
@@ -252,10 +252,10 @@ class Page:
                 self._show_candidates()
                 self._rank()
             self._scene()
-            self._steps.content = self._told(done)
+            self._steps.content = self._status(done)
 
-    def _told(self, done: int) -> str:
-        """The steps, the next one in bold; what went wrong last."""
+    def _status(self, done: int) -> str:
+        """Return the steps, the next one in bold, and the last error."""
         if self._adding:
             return "**Click the middle of the new object in the scan.**"
         if not self.session.items:
@@ -270,8 +270,8 @@ class Page:
             steps[1] += f"; now on the **{'model' if len(item.scan) > len(item.model) else 'scan'}**"
         rows = [f"{'▶' if k == step_of(item) else ''} {k}. {text}" for k, text in enumerate(steps, 1)]
         rows[step_of(item) - 1] = f"**{rows[step_of(item) - 1].strip().replace('**', '')}**"
-        said = f"\n\n⚠ {self._said}" if self._said else ""
-        return f"{done} of {len(self.session.items)} objects done\n\n" + "\n\n".join(rows) + said
+        error = f"\n\n⚠ {self._error}" if self._error else ""
+        return f"{done} of {len(self.session.items)} objects done\n\n" + "\n\n".join(rows) + error
 
     def _show_candidates(self) -> None:
         strip = np.full((THUMBNAIL, SHOWN, THUMBNAIL, 3), 255, np.uint8)
@@ -281,7 +281,7 @@ class Page:
         self._image.image = strip.reshape(THUMBNAIL, -1, 3)
 
     def _scene(self) -> None:
-        """Scan, model beside it, points, and the fitted model; sends meshes only if they are others than before."""
+        """Show scan, model beside it, points, and the fitted model; send meshes only if they have changed."""
         item = self.session.item if self.session.items else None
         cad, scene = self.library.get(item.cad_id) if item else None, self.server.scene
         whole = self._adding or self._whole.value or item is None
@@ -300,7 +300,7 @@ class Page:
             if before[:2] != key[:2]:
                 self._look(self.server.get_clients().values())
         scene.remove_by_name("/said")
-        scene.add_frame("/said", show_axes=False)  # under it what the person said: it is removed with it
+        scene.add_frame("/said", show_axes=False)  # the parent of what the person clicked, which is removed with it
         self._fit.content = ""
         if item is None:
             return
@@ -323,7 +323,7 @@ class Page:
             self._fit.content = f"⚠ {error}"
 
     def _look(self, clients: Any) -> None:
-        """Turns the cameras to the object and its model."""
+        """Turn the cameras to the object and its model."""
         view = self._drawn["view"]
         for client in clients:
             with contextlib.suppress(Exception), client.atomic():  # one that has gone away meanwhile

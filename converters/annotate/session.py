@@ -1,6 +1,6 @@
-"""What a person has said about a scan so far: objects, their models and keypoint pairs; as files, and back.
+"""Hold a person's annotations of a scan: objects, their models and keypoint pairs; as files, and back.
 
-Nothing here knows of a browser. An action makes a new `Session`; `Store` writes it after each.
+Nothing here depends on a browser. An action returns a new `Session`; `Store` writes it after each.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ Point = tuple[float, float, float]
 
 @dataclasses.dataclass(frozen=True)
 class Item:
-    """One object of the scan and what was said about it."""
+    """One object of the scan and its annotation."""
 
     category: str
     centre: Point
     """Of its box, scan frame, m."""
     extent_m: Point
-    """Full sizes along the box's own axes."""
+    """Full sizes along the box's axes."""
     yaw: float
     """rad, of the box's x axis."""
     label: int
@@ -61,15 +61,15 @@ class Item:
 
     @property
     def pairs(self) -> int:
-        """Number of whole pairs."""
+        """Return the number of whole pairs."""
         return min(len(self.scan), len(self.model))
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """(pairs, 3) of the model and of the scan."""
+        """Return (pairs, 3) points of the model and of the scan."""
         return np.array(self.model[: self.pairs]), np.array(self.scan[: self.pairs])
 
     def fit(self) -> Alignment:
-        """The model's placement by the whole pairs, as `convert` would solve it."""
+        """Return the model's placement by the whole pairs, as `convert` would solve it."""
         return solve_alignment(*self.points(), self.symmetry)
 
 
@@ -90,56 +90,56 @@ class Session:
 
     @property
     def item(self) -> Item:
-        """The object that is worked on."""
+        """Return the object that is worked on."""
         if not self.items:
             raise AlignmentError("there is no object yet; add one first")
         return self.items[self.at]
 
     def changed(self, **what: Any) -> Session:
-        """The object that is worked on, changed."""
+        """Change the object that is worked on."""
         items, undo = list(self.items), (*self.undo, (self.at, self.item))[-MAX_UNDO:]
         items[self.at] = dataclasses.replace(self.item, **what)
         return dataclasses.replace(self, items=tuple(items), undo=undo)
 
     def chose(self, cad: CadModel) -> Session:
-        """Takes a model: points that were clicked on another one are dropped with it, and its class is taken."""
+        """Take a model: points that were clicked on another one are dropped with it, and its class is taken."""
         model = self.item.model if self.item.cad_id == cad.cad_id else ()
         return self.changed(cad_id=cad.cad_id, category=cad.category, model=model, state="open")
 
     def clicked(self, side: Literal["scan", "model"], point: np.ndarray) -> Session:
-        """Adds a point; a second one on a side whose last point has no partner yet takes that one's place."""
-        own, other = (self.item.scan, self.item.model)[:: 1 if side == "scan" else -1]
-        kept = own[:-1] if len(own) > len(other) else own
+        """Add a point; a second one on a side whose last point has no partner yet takes that one's place."""
+        points, other = (self.item.scan, self.item.model)[:: 1 if side == "scan" else -1]
+        kept = points[:-1] if len(points) > len(other) else points
         return self.changed(**{side: (*kept, _point(point))}, state="open")
 
     def accepted(self) -> Session:
-        """Accepts the fit and goes on to the next open object."""
+        """Accept the fit and go on to the next open object."""
         if not self.item.cad_id:
             raise AlignmentError("no model is chosen; choose one, then click pairs")
         self.item.fit()
         return self.changed(state="accepted").next_open()
 
     def skipped(self) -> Session:
-        """Leaves the object out and goes on to the next open one."""
+        """Leave the object out and go on to the next open one."""
         return self.changed(state="skipped").next_open()
 
     def next_open(self) -> Session:
-        """The next object that is neither accepted nor skipped; stays where none is."""
+        """Go to the next object that is neither accepted nor skipped; stay where there is none."""
         order = [(self.at + k) % len(self.items) for k in range(len(self.items))]
         return dataclasses.replace(self, at=next((k for k in order if self.items[k].state == "open"), self.at))
 
     def at_object(self, index: int) -> Session:
-        """Goes to an object."""
+        """Go to an object."""
         return dataclasses.replace(self, at=index)
 
     def added(self, category: str, centre: np.ndarray) -> Session:
-        """Adds an object that nobody proposed, and works on it."""
+        """Add an object that nobody proposed, and work on it."""
         item = Item(category, _point(centre), (1.0, 1.0, 1.0), 0.0, 0)
         undo = (*self.undo, (len(self.items), None))[-MAX_UNDO:]
         return dataclasses.replace(self, items=(*self.items, item), at=len(self.items), undo=undo)
 
     def undone(self) -> Session:
-        """Takes the last action back; without one nothing changes."""
+        """Take the last action back; without one nothing changes."""
         if not self.undo:
             return self
         (at, before), items = self.undo[-1], list(self.items)
@@ -149,41 +149,37 @@ class Session:
 
 
 def _point(values: np.ndarray) -> Point:
-    """Rounded to 1 um."""
+    """Round to 1 um."""
     x, y, z = np.round(np.asarray(values, float), 6).tolist()
     return x, y, z
 
 
 def scan_sha256(raw: RawScene) -> str:
-    """Digest of the scan's vertices."""
+    """Return a digest of the scan's vertices."""
     return hashlib.sha256(np.ascontiguousarray(raw.scan.vertices, np.float64).tobytes()).hexdigest()
 
 
 def start(raw: RawScene, proposals: tuple[Proposal, ...]) -> Session:
-    """A session in which nothing has been said yet."""
+    """Return a session without annotations."""
     items = [Item(p.category, _point(p.centre), _point(p.extent_m), round(p.yaw, 6), p.label) for p in proposals]
     return Session(raw.name, scan_sha256(raw), tuple(items))
 
 
 def as_annotations(session: Session, library: Mapping[str, CadModel]) -> list[dict[str, Any]]:
-    """The accepted objects as Scan2CAD's annotation list."""
+    """Return the accepted objects as Scan2CAD's annotation list."""
     models = []
     for item in session.items:
         if item.state != "accepted":
             continue
         cad, fit = library[item.cad_id], item.fit()
-        clicked, seen = item.points()
-        pose, pairs = (fit.scale, fit.yaw, fit.translation), (apply_alignment(fit, clicked), seen)
+        of_model, of_scan = item.points()
+        pose, pairs = (fit.scale, fit.yaw, fit.translation), (apply_alignment(fit, of_model), of_scan)
         models.append(scan2cad_model(item.category, item.cad_id, pose, cad.vertices, item.symmetry, pairs))
     return scan2cad_list(session.scan_id, models)
 
 
 def with_annotations(raw: RawScene, path: Path, library_root: Path | None) -> RawScene:
-    """The scene with a file's annotations in place of its own.
-
-    Args:
-        library_root: folder with `cad/`; None: the packaged furniture.
-    """
+    """Replace the scene's annotations by a file's; models are of a folder with `cad/`, or the packaged furniture."""
     _, records = parse_annotations(read_json(path), path)
     library, annotations = read_library(library_root), tuple(a for _, a in records)
     missing = sorted({a.cad_id for a in annotations} - set(library))
@@ -206,9 +202,9 @@ class Store:
     """The folder of one session. Nobody else may write there meanwhile (`interactive_nav_common.locks.alone_in`)."""
 
     def __init__(self, folder: Path, library: Mapping[str, CadModel]) -> None:
-        """Of a folder, with the models that annotations may name."""
+        """Open a folder, with the models that annotations may name."""
         self.folder, self.library = folder, library
-        self._known: dict[str, str] = {}
+        self._read: dict[str, str] = {}
 
     def _digest(self, name: str) -> str:
         try:
@@ -219,12 +215,12 @@ class Store:
             raise FileError(f"{self.folder / name}: cannot be read ({error.strerror}); mend it") from None
 
     def open(self, raw: RawScene, begin: Callable[[], Session]) -> Session:
-        """The session that the folder holds, or what `begin` makes."""
+        """Return the session that the folder holds, or what `begin` returns."""
         path = self.folder / SESSION
-        self._known = {name: self._digest(name) for name in (SESSION, ANNOTATION)}
+        self._read = {name: self._digest(name) for name in (SESSION, ANNOTATION)}
         given = Reader(FileError, "remove it to begin anew").json(path, absent={})
         session = Reader(FileError, "remove it to begin anew").record(given, Session, str(path)) if given else None
-        if self._known[ANNOTATION] not in ("", *(session.wrote_sha256 if session else ())):
+        if self._read[ANNOTATION] not in ("", *(session.wrote_sha256 if session else ())):
             raise FileError(
                 f"{self.folder / ANNOTATION}: was not written by this session, expected none or its own; "
                 "choose another folder (-o) or move the file away"
@@ -246,23 +242,23 @@ class Store:
         return session
 
     def save(self, session: Session) -> Session:
-        """Writes the session, then its annotations, each whole or not at all; returns what stands there."""
-        for name, digest in self._known.items():
+        """Write the session, then its annotations, each whole or not at all; return what stands there."""
+        for name, digest in self._read.items():
             if self._digest(name) != digest:
                 raise FileError(
                     f"{self.folder / name}: another program has changed it since it was read, expected it as it was; "
                     "nothing was overwritten: move it away, or stop and start again to take it"
                 )
         text = json.dumps(as_annotations(session, self.library), indent=1, allow_nan=False) + "\n"
-        own = hashlib.sha256(text.encode()).hexdigest()
-        session = dataclasses.replace(session, wrote_sha256=(self._known[ANNOTATION], own))
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        session = dataclasses.replace(session, wrote_sha256=(self._read[ANNOTATION], digest))
         write_text(self.folder / SESSION, json.dumps(dataclasses.asdict(session), allow_nan=False) + "\n")
-        self._known[SESSION] = self._digest(SESSION)
+        self._read[SESSION] = self._digest(SESSION)
         write_text(self.folder / ANNOTATION, text)
-        self._known[ANNOTATION] = own
+        self._read[ANNOTATION] = digest
         return session
 
 
 def step_of(item: Item) -> int:
-    """Which step is next: 1 choose a model, 2 click pairs, 3 look and accept."""
+    """Return which step is next: 1 choose a model, 2 click pairs, 3 look and accept."""
     return 1 if not item.cad_id else 2 if item.pairs < MIN_POINTS else 3

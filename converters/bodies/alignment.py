@@ -49,7 +49,7 @@ class Alignment:
     translation: np.ndarray
     """(3,) m."""
     yaw: float
-    """rad, counter-clockwise seen from above."""
+    """rad, counter-clockwise from above."""
     rms_m: float
     """Root mean square point-to-point distance of the fit; nan where nothing was fitted."""
 
@@ -58,7 +58,7 @@ def _check_spread(points: np.ndarray) -> None:
     """Refuse keypoints that leave one of the seven parameters open.
 
     Roll and pitch being fixed, height separates from the rest: the z scale needs extent along z, the two
-    horizontal scales and the yaw need points that do not lie on one line seen from above.
+    horizontal scales and the yaw need points that do not lie on one line from above.
     """
     centred = points - points.mean(axis=0)
     spread = np.sqrt((centred**2).mean(axis=0))

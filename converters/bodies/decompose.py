@@ -62,7 +62,7 @@ class Decomposition:
     """Hulls of every model, and which of them are not coacd's."""
 
     hulls: dict[str, tuple[Hull, ...]]
-    """Name -> hulls, in the mesh's own frame."""
+    """Name -> hulls, in the mesh's frame."""
     fallbacks: dict[str, str]
     """Name -> why its one convex hull stands for it."""
     worker_mib: float = 0.0
@@ -142,15 +142,27 @@ def _run(
     stop: threading.Event,
 ) -> tuple[tuple[Hull, ...] | None, str, float]:  # fmt: skip
     """Return hulls, or None and the reason, and its memory, MiB; kill what is out of time or to stop."""
-    process, peak_mib, until = _start(key, name, vertices, faces, config, scratch), 0.0, time.monotonic()
-    until += config.timeout_s
+    mesh_path, output = scratch / f"{key}.in.npz", scratch / f"{key}.npz"
+    parameters = {k: v for k, v in dataclasses.asdict(config).items() if k != "timeout_s"}
+    np.savez(mesh_path, vertices=vertices, faces=faces, **parameters)  # pyright: ignore[reportArgumentType]
+    with output.with_suffix(".log").open("wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", WORKER, str(mesh_path), str(output)],
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            # One thread each: results then do not depend on the machine's load, and `jobs` is what it says.
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
+            stdin=subprocess.DEVNULL,
+            cwd=Path(__file__).resolve().parents[2],
+        )
+    peak_mib, until = 0.0, time.monotonic() + config.timeout_s
     while process.poll() is None and time.monotonic() < until and not stop.wait(0.05):
         peak_mib = max(peak_mib, peak_memory_mib(process.pid))
     if process.poll() is None:
         process.kill()
         process.wait()
         return None, f"coacd ran past {config.timeout_s:g} s on {name}", peak_mib
-    code, output = process.returncode, scratch / f"{key}.npz"
+    code = process.returncode
     if code == CANNOT_WRITE:
         raise OSError(errno.ENOSPC, "the decomposition's result cannot be written", str(scratch))
     if code == 0:
@@ -159,22 +171,3 @@ def _run(
         return hulls, "", peak_mib
     log = output.with_suffix(".log").read_text(errors="replace").strip().splitlines()
     return None, f"coacd failed on {name} (exit code {code}: {log[-1] if log else 'no message'})", peak_mib
-
-
-def _start(
-    key: str, name: str, vertices: np.ndarray, faces: np.ndarray, config: DecomposeConfig, scratch: Path
-) -> subprocess.Popen:
-    mesh_path, output = scratch / f"{key}.in.npz", scratch / f"{key}.npz"
-    parameters = {k: v for k, v in dataclasses.asdict(config).items() if k != "timeout_s"}
-    np.savez(mesh_path, vertices=vertices, faces=faces, **parameters)  # pyright: ignore[reportArgumentType]
-    # One thread each: results then do not depend on the machine's load, and `jobs` is what it says.
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    with output.with_suffix(".log").open("wb") as log:
-        return subprocess.Popen(
-            [sys.executable, "-m", WORKER, str(mesh_path), str(output)],
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            cwd=Path(__file__).resolve().parents[2],
-        )

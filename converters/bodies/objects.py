@@ -29,7 +29,7 @@ class BodyHinge:
     origin_b: np.ndarray
     """(3,) m."""
     range_rad: tuple[float, float]
-    """Counter-clockwise seen from above; 0 is the pose as scanned."""
+    """Counter-clockwise from above; 0 is the pose as scanned."""
     assumed: bool
 
 
@@ -170,7 +170,7 @@ def mass_moments(hulls: tuple[Hull, ...]) -> tuple[float, np.ndarray, np.ndarray
         properties = trimesh.triangles.mass_properties(hull.vertices[hull.faces])
         volumes.append(abs(float(properties.volume)))
         centres.append(np.asarray(properties.center_mass, float))
-        inertias.append(np.asarray(properties.inertia, float))  # about the hull's own centre, unit density
+        inertias.append(np.asarray(properties.inertia, float))  # about the hull's centre, unit density
     com = np.average(centres, axis=0, weights=volumes)
     inertia = np.zeros((3, 3))
     for v, centre, about_centre in zip(volumes, centres, inertias, strict=True):

@@ -166,11 +166,9 @@ def _taken(pose: CameraPose, lens: Lens, surfaces: dict[str, TexturedMesh], cut_
 def from_the_south(
     surfaces: dict[str, TexturedMesh], maps: SceneMaps, low: np.ndarray, high: np.ndarray, pixels: int
 ) -> np.ndarray:
-    """Draw everything, slantwise, `pixels` wide: walls are cut at `CUT_M`; no ceiling or near wall hides a room.
+    """Draw everything from (2,) low to (2,) high x and y, m, slantwise, `pixels` wide.
 
-    Args:
-        low: (2,) least x and y, m.
-        high: (2,) largest.
+    Walls are cut at `CUT_M`; no ceiling or near wall hides a room.
     """
     sin, cos = math.sin(ELEVATION_RAD), math.cos(ELEVATION_RAD)
     axes_w = np.array([[1.0, 0.0, 0.0], [0.0, sin, cos], [0.0, -cos, sin]])
@@ -269,11 +267,7 @@ def mesh_picture(mesh: TexturedMesh, axes: np.ndarray, pixels: int, one_sided: b
 
 
 def model_sheet(target: Path, names: Sequence[str] = ()) -> int:
-    """Draw models into a PNG, whole or not at all.
-
-    Returns:
-        How many models there are on it.
-    """
+    """Draw models into a PNG, whole or not at all; return how many."""
     unknown = [n for n in names if n not in LIBRARY and n not in {d.category for d in LIBRARY.values()}]
     if unknown:
         categories = ", ".join(sorted({d.category for d in LIBRARY.values()}))

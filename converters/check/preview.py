@@ -155,11 +155,9 @@ def _draw_ground(axes: Axes, scene: _Scene) -> None:
 
 
 def apart(centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return centres of labels, moved up or down as little as it takes for none to lie on an earlier one.
+    """Return centres [N, 2] of labels, moved up or down as little as it takes for none to lie on an earlier one.
 
-    Args:
-        centres: [N, 2], in any unit.
-        sizes: [N, 2], width and height of each.
+    `sizes`: [N, 2], width and height of each.
     """
     placed = centres.astype(float)
     for i, (x, y) in enumerate(centres):
@@ -336,10 +334,7 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
     if (folder / "object.json").is_file():
         if source is not None:
             raise SceneError(f"{folder}: is a single object, which has no scan to draw; leave --source out")
-        figure = draw_object(folder)
-        with whole_file(target) as picture:
-            figure.savefig(picture, format="png", metadata={"Software": None})
-        plt.close(figure)
+        _save(draw_object(folder), target)
         return
     manifest, maps = load_manifest(folder), load_maps(folder)
     try:
@@ -354,10 +349,14 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
     raw = read_source(source, manifest, maps.floor_height_m) if source is not None else None
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    figure = draw(_Scene(model, data, manifest, maps, world_surfaces(model, data)), raw)
+    _save(draw(_Scene(model, data, manifest, maps, world_surfaces(model, data)), raw), target, few=True)
+
+
+def _save(figure: Figure, target: Path, few: bool = False) -> None:
     with whole_file(target) as picture:
         figure.savefig(picture, format="png", metadata={"Software": None})
-        with Image.open(picture) as image:
-            few = image.convert("RGB").quantize(method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-            few.save(picture, "PNG", optimize=True)
+        if few:
+            with Image.open(picture) as image:
+                colours = image.convert("RGB").quantize(method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+                colours.save(picture, "PNG", optimize=True)
     plt.close(figure)

@@ -98,10 +98,7 @@ def push_apart(
 ) -> tuple[SceneParts, dict[int, str]]:
     """Slide free objects horizontally until neither hulls nor boxes cut walls or each other.
 
-    Without dynamics, so that nothing flies.
-
-    Returns:
-        The objects apart, and those that were held: number -> what it overlaps.
+    Without dynamics, so that nothing flies. Return also the objects that were held: number -> what it overlaps.
     """
     model = collide_with(build_spec(parts), "both")
     data = mujoco.MjData(model)

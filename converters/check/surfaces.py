@@ -40,12 +40,9 @@ def geom_outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int, axes_w: 
 
 
 def kept_share(vertices: np.ndarray, faces: np.ndarray, drawn: tuple[np.ndarray, np.ndarray]) -> float:
-    """Return the share of a scan's area that lies within `KEPT_M` of what is drawn of the structure.
+    """Return the share of a scan's area, without furniture that was cut out, within `KEPT_M` of the drawn structure.
 
-    Args:
-        vertices: (n, 3) m.
-        faces: (m, 3) of the scan, without those of furniture that was cut out.
-        drawn: vertices (k, 3) m and faces of the drawn structure.
+    `drawn`: vertices (k, 3) m and faces of the drawn structure.
     """
     area = face_areas(vertices, faces)
     if not area.sum():

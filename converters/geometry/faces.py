@@ -34,11 +34,12 @@ def unit_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def vertex_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return (n, 3) sums of the `face_vectors` around each vertex."""
-    vectors, out = face_vectors(vertices, faces), np.zeros_like(vertices)
-    for k in range(3):
-        for corner in range(3):
-            out[:, k] += np.bincount(faces[:, corner], vectors[:, k], len(vertices))
-    return out
+    return sum_at_vertices(face_vectors(vertices, faces), faces, len(vertices))
+
+
+def sum_at_vertices(of_face: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
+    """Return (count, k) sums of values (m, k) of the faces around each vertex."""
+    return np.stack([sum(np.bincount(c, column, count) for c in faces.T) for column in of_face.T], axis=1)
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

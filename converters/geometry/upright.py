@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from converters.geometry.faces import face_areas, face_vectors
+from converters.geometry.faces import face_areas, unit_normals
 from converters.records.errors import SceneRejected
 
 AXES = {word: sign * np.eye(3)[k] for k, axis in enumerate("xyz") for word, sign in ((axis, 1.0), (f"-{axis}", -1.0))}
@@ -23,12 +23,6 @@ SURE = 1.25
 """Ratio of evidence for one sense over the other."""
 
 
-def _vectors(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    normal = face_vectors(vertices, faces)
-    length = np.linalg.norm(normal, axis=1)
-    return normal / np.maximum(length, 1e-300)[:, None], length / 2
-
-
 def _extent(values: np.ndarray, area: np.ndarray) -> tuple[float, float]:
     """Return the values that all but 1 % of the area lies between, on either side: strays do not count."""
     order = np.argsort(values)
@@ -44,7 +38,7 @@ def find_up(vertices: np.ndarray, faces: np.ndarray, where: str) -> np.ndarray:
     Of these the storey's height is the shortest extent. What the scan shows of furniture are tops and not undersides,
     and a floor without a ceiling looks up: that shows the sense.
     """
-    normal, area = _vectors(vertices, faces)
+    normal, area = unit_normals(vertices, faces), face_areas(vertices, faces)
     if not area.sum() > 0:
         raise SceneRejected(f"{where}: its faces enclose no area; fetch it again")
     middle = vertices[faces].mean(axis=1)
@@ -113,7 +107,7 @@ def faces_away(vertices: np.ndarray, faces: np.ndarray) -> bool:
 
     The outer sides of slabs do so too, but have another side near them that does not. `vertices`: m, z up or down.
     """
-    normal, area = _vectors(vertices, faces)
+    normal, area = unit_normals(vertices, faces), face_areas(vertices, faces)
     height = vertices[faces, 2].mean(axis=1)
     middle = np.mean(_extent(height, area))
     level = np.abs(normal[:, 2]) > ALONG

@@ -1,1 +1,1 @@
-"""Furniture found in a labelled scan, and CAD models retrieved for it (section III-B)."""
+"""Find furniture in a labelled scan, and retrieve CAD models for it (section III-B)."""

@@ -221,7 +221,7 @@ def split_row(piece: Piece, origin: np.ndarray, voxel_m: float) -> list[Piece]:
 
 @dataclasses.dataclass(frozen=True)
 class _Plan:
-    """A piece seen from above, along its main direction."""
+    """A piece from above, along its main direction."""
 
     axes: np.ndarray
     """(2, 2) columns: directions of rows and columns."""

@@ -83,19 +83,21 @@ def _packaged() -> dict[str, CadModel]:
     return library
 
 
-def read_library(root: Path | None) -> dict[str, CadModel]:
+def read_library(root: Path | None, source: Path | None = None) -> dict[str, CadModel]:
     """Read every model under `root/cad/<synset>/<id>/models/model_normalized.obj` of a class that is looked for, by id.
 
-    `root`: folder that holds `cad/`; None: the packaged furniture.
+    `root`: folder that holds `cad/`; None: the source's folder if it does, else the packaged furniture.
     """
+    if root is None and source is not None and (source / "cad").is_dir():
+        root = source
     if root is None:
         return _packaged()
-    source = SourceFolder(root)
+    folder = SourceFolder(root)
     library = {}
     for path in sorted((root / "cad").glob("*/*/models/model_normalized.obj")):
         synset, cad_id = path.parts[-4], path.parts[-3]
         if SYNSETS.get(synset) in SIZES_M:
-            library[cad_id] = read_cad(source, synset, cad_id)
+            library[cad_id] = read_cad(folder, synset, cad_id)
     if not library:
         raise SceneRejected(
             f"{root / 'cad'}: no model of a known class (<synset>/<id>/models/model_normalized.obj); "

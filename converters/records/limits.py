@@ -60,7 +60,7 @@ class Gate:
     passed: bool
     limit: Limit
     warnings: tuple[str, ...] = ()
-    """What the value does not tell, passed or not."""
+    """What the value does not show, passed or not."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return what scene.json says of it."""

@@ -1,8 +1,8 @@
 """Records that every reader fills and every stage takes: scan, CAD library, annotations.
 
-Frames: *scan frame* = the scan's own, z up, floor anywhere; *CAD frame* = the library's model turned to z
+Frames: *scan frame* = the scan's, z up, floor anywhere; *CAD frame* = the library's model turned to z
 up, not scaled; *world frame* (`_w`) = scan frame with the floor at z = 0; *body frame* (`_b`) = a placed
-object's own.
+object's.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from interactive_nav_common.rotations import transform
 from scenes_mjcf.categories import TABLE
 
 ATTRIBUTION = "ATTRIBUTION.md"
-"""Whose models a source, and the scene made of it, has."""
+"""Credits of the models in a source, and in its scene."""
 SYNSETS = {category.synset: category.name for category in TABLE if category.synset}
 """ShapeNet synset -> category."""
 
@@ -76,9 +76,9 @@ class CadModel:
     pieces: tuple[tuple[np.ndarray, np.ndarray], ...] | None = None
     """Convex pieces (vertices (n, 3), faces (m, 3)) that came with the model; None: they are to be computed."""
     mass_kg: float | None = None
-    """The source's own mass; None: density times volume."""
+    """The source's mass; None: density times volume."""
     friction: float | None = None
-    """The source's own sliding coefficient; None: the category's."""
+    """The source's sliding coefficient; None: the category's."""
     surface: TexturedMesh | None = None
     """What it looks like, CAD frame; None: nothing but the colours of the faces."""
 
@@ -90,7 +90,7 @@ class ScannedHinge:
     origin: np.ndarray
     """(3,) a point on the axis."""
     sign: float
-    """+1 when positive angles turn counter-clockwise seen from above, -1 otherwise."""
+    """+1 when positive angles turn counter-clockwise from above, -1 otherwise."""
     range_rad: tuple[float, float]
     assumed: bool = False
     """True when the source had no articulation and a hinge at one edge was taken."""
@@ -185,7 +185,7 @@ class RawScene:
     windows: tuple[Window, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
     """Where the source says so."""
     warnings: tuple[str, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
-    """What the reader repaired or found missing, for scene.json."""
+    """What the reader repaired or missed, for scene.json."""
     attribution: str = dataclasses.field(default="", metadata=NOT_HASHED)
     """Whose the models are, for a file beside it; empty: there is none."""
 

@@ -1,4 +1,4 @@
-"""What is drawn: coloured points of a scan, and meshes with their images."""
+"""Hold what is drawn: coloured points of a scan, and meshes with their images."""
 
 import dataclasses
 
@@ -33,7 +33,7 @@ class TexturedMesh:
 
 @dataclasses.dataclass(frozen=True)
 class VisualMesh:
-    """A mesh with texture coordinates of its own index."""
+    """A mesh with separately indexed texture coordinates."""
 
     vertices: np.ndarray
     """(n, 3) m."""
@@ -46,9 +46,9 @@ class VisualMesh:
     image: np.ndarray
     """(h, w, 3) uint8, first row at the top."""
     exact: bool = False
-    """The image is the source's own, and is written as it is."""
+    """The image is the source's, and is written as it is."""
 
 
 def joined_clouds(*clouds: ColourCloud) -> ColourCloud:
-    """All clouds as one."""
+    """Join clouds into one."""
     return ColourCloud(*(np.vstack([getattr(c, f.name) for c in clouds]) for f in dataclasses.fields(ColourCloud)))

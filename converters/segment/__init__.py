@@ -1,1 +1,1 @@
-"""Unlabelled scans in, NYU40 labels of their vertices out: a small volumetric network, its training and its scores."""
+"""Label the vertices of unlabelled scans: a small volumetric network, its training and its scores."""

@@ -1,12 +1,12 @@
 """Label the vertices of an unlabelled scan with NYU40 ids; score how well they fit those of a labelled one."""
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from converters.clock import Report
 from converters.generate import GenerationError
 from converters.propose.proposals import bounds, box_iou, propose_instances
 from converters.propose.report import annotated_vertices
@@ -25,9 +25,8 @@ from converters.segment.voxels import (
     voxelise,
 )
 
-FOUND_IOU = 0.5
+MATCH_IOU = 0.5
 """Of boxes, from which on a proposal is an annotated object."""
-Report = Callable[[str, float], None]
 
 
 def load_scores(weights: Path | None = None) -> Scores:
@@ -62,11 +61,11 @@ def label_scan(raw: RawScene, scores: Scores, report: Report = lambda stage, sha
 
 
 def objects_found(raw: RawScene, scan: ScanMesh) -> int:
-    """Return how many of a source's annotated objects `propose` finds by a scan's labels: category, `FOUND_IOU`."""
+    """Return how many of a source's annotated objects `propose` finds by a scan's labels: category, `MATCH_IOU`."""
     proposals = propose_instances(scan)
     boxes = [(a.category, bounds(annotated_vertices(a, raw.cads))) for a in raw.annotations]
     return sum(
-        any(p.category == category and box_iou(box, bounds(p.points)) >= FOUND_IOU for p in proposals)
+        any(p.category == category and box_iou(box, bounds(p.points)) >= MATCH_IOU for p in proposals)
         for category, box in boxes
     )
 

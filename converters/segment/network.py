@@ -21,7 +21,7 @@ from interactive_nav_common.errors import readable
 from interactive_nav_common.runs import weights
 
 WEIGHTS = Path(__file__).with_name("weights.safetensors")
-"""The package's own."""
+"""The packaged ones."""
 TILE, MARGIN = 160, 16
 """Voxels of a tile's side, and of its border, which is left to the next tile."""
 MULTIPLE = 8

@@ -1,4 +1,4 @@
-"""Seeds in, labelled crops of furnished buildings out, as a hand-held sensor would have scanned them, and worse.
+"""Generate labelled crops of furnished buildings, as a hand-held sensor would have scanned them, and worse.
 
 Frame: scan x, y, height above the floor; metres.
 """
@@ -53,7 +53,7 @@ def _of_item(item: Instance) -> list[Surface]:
 
 
 def building_surface(seed: int, tier: str, split: str) -> tuple[Surface, np.ndarray]:
-    """Structure and furniture of a generated building, with the class of each point."""
+    """Return the surface of a generated building's structure and furniture, with the class of each point."""
     # Not `recipes.building_of`, whose imports a machine for training alone lacks.
     sparse, homes = (TRAIN_MODELS, HOME_TRAIN_MODELS) if split == "train" else (TEST_MODELS, HOME_TEST_MODELS)
     config = BuildingConfig(models=sparse) if tier == "sparse" else home_config(tier, {}, homes)
@@ -68,12 +68,12 @@ def building_surface(seed: int, tier: str, split: str) -> tuple[Surface, np.ndar
     for item in building.items if home else ():
         category = item.model.category
         label = 39 if category in BASKETS else 40 if LABELS[category] in OTHER else LABELS[category]
-        surfaces += (found := _of_item(item))
-        classes += [np.full(len(s.points), classes_of(np.array([label]))[0]) for s in found]
+        surfaces += (new := _of_item(item))
+        classes += [np.full(len(s.points), classes_of(np.array([label]))[0]) for s in new]
     return joined(surfaces), np.concatenate(classes)
 
 
-def _seen(surface: Surface, rng: np.random.Generator, side_m: float) -> np.ndarray:
+def _visible(surface: Surface, rng: np.random.Generator, side_m: float) -> np.ndarray:
     """(n,) bool: points that a sensor carried around the middle sees."""
     occupied = voxelise(surface, 0.0)
     grid = np.zeros((*(occupied.index[:, :2].max(axis=0, initial=0) + 3), LAYERS + 2), bool)
@@ -81,23 +81,23 @@ def _seen(surface: Surface, rng: np.random.Generator, side_m: float) -> np.ndarr
     top = np.array(grid.shape) - 1
     at = occupied.index + 0.5
     normal = occupied.features[:, :3] / 127
-    seen = np.zeros(len(at), bool)
+    visible = np.zeros(len(at), bool)
     for _ in range(int(rng.integers(3, 9))):
         spread = rng.normal(0, side_m / 7, 2)
         camera = (np.array([*spread, rng.uniform(0.8, 1.8)]) - occupied.origin) / VOXEL_M
         start = at + 1.7 * normal
         ray = camera - start
-        facing = np.flatnonzero(~seen & ((ray * normal).sum(axis=1) > 0.1 * np.linalg.norm(ray, axis=1)))
+        facing = np.flatnonzero(~visible & ((ray * normal).sum(axis=1) > 0.1 * np.linalg.norm(ray, axis=1)))
         free = np.ones(len(facing), bool)
         for t in np.linspace(0, 1, 64, endpoint=False):
             cell = np.clip((start[facing] + t * ray[facing]).astype(int), 0, top)
             free &= ~grid[tuple(cell.T)]
-        seen[facing[free]] = True
-    return seen[occupied.of_point] & (occupied.of_point >= 0)
+        visible[facing[free]] = True
+    return visible[occupied.of_point] & (occupied.of_point >= 0)
 
 
 def _recoloured(colours: np.ndarray | None, rng: np.random.Generator) -> np.ndarray | None:
-    """Another exposure, white balance and camera; a quarter of all without any colour."""
+    """Return colours of another exposure, white balance and camera; None for a quarter of all."""
     if colours is None or rng.random() < 0.25:
         return None
     c = np.clip(colours / 255, 0.0, 1.0)[:, rng.permutation(3) if rng.random() < 0.15 else [0, 1, 2]]
@@ -113,7 +113,7 @@ def _rows(surface: Surface, rows: np.ndarray) -> Surface:
 
 
 def worn(surface: Surface, classes: np.ndarray, rng: np.random.Generator, side_m: float) -> tuple[Surface, np.ndarray]:
-    """A square column of a building turned, mirrored and scanned badly around its middle, which is at x = y = 0."""
+    """Turn, mirror and badly scan a square column of a building around its middle, which is at x = y = 0."""
     floor = np.flatnonzero((classes == NAMES.index("floor")) & (surface.normals[:, 2] > 0.9))
     middle = surface.points[rng.choice(floor)] if len(floor) else surface.points.mean(axis=0)
     angle, mirror = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0])
@@ -141,23 +141,23 @@ def worn(surface: Surface, classes: np.ndarray, rng: np.random.Generator, side_m
     points = moved + [0, 0, rng.normal(0, 0.02)]
     out = Surface(points, normals, _recoloured(out.colours, rng), out.face)
     if rng.random() < 0.7:
-        left &= _seen(out, rng, side_m)
+        left &= _visible(out, rng, side_m)
     return _rows(out, left), classes[left]
 
 
 def make_crop(surface: Surface, classes: np.ndarray, rng: np.random.Generator, side: int) -> Crop:
-    """Voxels of `worn`, each of the class that most of its points have."""
+    """Return the voxels of `worn`, each of the class that most of its points have."""
     column, of = worn(surface, classes, rng, side * VOXEL_M)
     voxels = voxelise(column, 0.0)
-    votes, known = np.zeros((len(voxels.index), len(NAMES)), np.int32), (voxels.of_point >= 0) & (of < len(NAMES))
-    np.add.at(votes, (voxels.of_point[known], of[known]), 1)
+    votes, has_class = np.zeros((len(voxels.index), len(NAMES)), np.int32), (voxels.of_point >= 0) & (of < len(NAMES))
+    np.add.at(votes, (voxels.of_point[has_class], of[has_class]), 1)
     inside = (voxels.index < side).all(axis=1)
     index, classes = voxels.index.astype(np.uint8), votes.argmax(axis=1).astype(np.uint8)
     return Crop(index[inside], voxels.features[inside], classes[inside])
 
 
 def generate_crops(task: tuple[Path, int, str, int, int]) -> Path:
-    """Writes crops of one building (path, seed, split, count, side), unless they are there.
+    """Write crops of one building (path, seed, split, count, side), unless they are there.
 
     One that cannot be built gives its place to the next of 1,000,000 seeds on.
     """
@@ -178,7 +178,7 @@ def generate_crops(task: tuple[Path, int, str, int, int]) -> Path:
 
 
 def read_crops(path: Path) -> list[Crop]:
-    """What `generate_crops` wrote."""
+    """Read what `generate_crops` wrote."""
     with np.load(path) as file:
         ends = np.cumsum(file["lengths"])[:-1]
         return [

@@ -133,7 +133,7 @@ def score_crops(net: VoxelNet, params: Any, crops: Sequence[Crop], config: Segme
     return intersection_over_union(np.concatenate(truth), np.concatenate(predicted)) if crops else {}
 
 
-def train(out: Path, config: SegmentConfig, report: Callable[[str, float], None], tell: Callable[[str], None]) -> dict:
+def train(out: Path, config: SegmentConfig, report: Callable[[str, float], None], log: Callable[[str], None]) -> dict:
     """Train, or continue; save however it ends. Return the IoU by class on held-out crops, and `mean`.
 
     `report` takes progress: stage and share.
@@ -148,7 +148,7 @@ def train(out: Path, config: SegmentConfig, report: Callable[[str, float], None]
     with multiprocessing.get_context("spawn").Pool(
         config.workers, signal.signal, (signal.SIGINT, signal.SIG_IGN)
     ) as pool:
-        learner = _Learner(out, config, tell, pool.imap_unordered(generate_crops, tasks))
+        learner = _Learner(out, config, log, pool.imap_unordered(generate_crops, tasks))
         try:
             least = min(len(tasks), config.held_out + min(config.buildings, 2 * config.workers))
             for k in range(least):
@@ -163,8 +163,8 @@ def train(out: Path, config: SegmentConfig, report: Callable[[str, float], None]
 class _Learner:
     """Hold the network, its optimiser, the crops and how far the training is."""
 
-    def __init__(self, out: Path, config: SegmentConfig, tell: Callable[[str], None], paths: Any) -> None:
-        self.out, self.config, self.tell, self.paths = out, config, tell, paths
+    def __init__(self, out: Path, config: SegmentConfig, log: Callable[[str], None], paths: Any) -> None:
+        self.out, self.config, self.log, self.paths = out, config, log, paths
         self.crops: dict[str, list[Crop]] = {"crops": [], "held_out": []}
         self.net = VoxelNet(config.widths, jnp.bfloat16 if config.half else jnp.float32)
         start, self.step = make_step(self.net, config)
@@ -217,6 +217,6 @@ class _Learner:
         steps, seconds, loss = self.at["steps"], self.at["seconds"], float(self.loss)
         row = {"step": steps, "seconds": round(seconds, 1), "loss": None if np.isnan(loss) else loss, "iou": scores}
         append_text(self.out / METRICS, json.dumps(row) + "\n")
-        self.tell(f"step {steps}, {seconds:.0f} s, {len(self.crops['crops'])} crops: loss {loss:.3f}, "
+        self.log(f"step {steps}, {seconds:.0f} s, {len(self.crops['crops'])} crops: loss {loss:.3f}, "
                   f"held-out mIoU {scores['mean']:.3f}")  # fmt: skip
         return scores

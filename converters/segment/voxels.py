@@ -1,4 +1,4 @@
-"""A scan's surface in, occupied voxels with features out; what is known of points back at the vertices.
+"""Turn a scan's surface into occupied voxels with features, and scores of points into those of vertices.
 
 Frame: the scan's, z up; voxels are counted from `Voxels.origin`, which lies `BELOW_M` under the floor.
 """
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.geometry.faces import face_areas, unit_normals
+from converters.geometry.faces import face_areas, sum_at_vertices, unit_normals
 from converters.read.obj import texels
 from converters.records.limits import CLOUD
 from converters.records.raw import ScanMesh
@@ -17,13 +17,13 @@ from converters.records.raw import ScanMesh
 VOXEL_M = 0.04
 BELOW_M = 4.5 * VOXEL_M
 LAYERS = 80
-"""Voxels from `BELOW_M` under the floor up: what lies higher has no class of its own."""
+"""Voxels from `BELOW_M` under the floor up: what lies higher has no class."""
 CLASSES: dict[str, tuple[int, ...]] = {
     **{"wall": (1, 11, 19, 30), "floor": (2, 20), "ceiling": (22,), "window": (9, 13, 16, 28), "door": (8,)},
     **{"chair": (5,), "table": (7,), "desk": (14,), "sofa": (6,), "bed": (4,)},
     **{"cabinet": (3, 10, 12, 15, 17, 24, 32), "lamp": (35,), "basket": (39,), "other": (40,)},
 }
-"""Class -> NYU40 ids that mean it, the first is written; an id of no class is `other`, 0 is not known."""
+"""Class -> NYU40 ids that mean it, the first is written; an id of no class is `other`, 0 has none."""
 NAMES = tuple(CLASSES)
 NYU40 = np.array([ids[0] for ids in CLASSES.values()])
 """Class -> id."""
@@ -62,7 +62,7 @@ class Voxels:
 
 
 def classes_of(labels: np.ndarray) -> np.ndarray:
-    """(n,) uint8 classes of NYU40 ids."""
+    """Return (n,) uint8 classes of NYU40 ids."""
     table = np.full(256, NAMES.index("other"), np.uint8)
     table[0] = UNKNOWN
     for k, ids in enumerate(CLASSES.values()):
@@ -71,7 +71,7 @@ def classes_of(labels: np.ndarray) -> np.ndarray:
 
 
 def sample_surface(scan: ScanMesh, spacing_m: float = VOXEL_M / 2) -> Surface:
-    """Points all over a scan, at least one a face, spread evenly and without chance; a scan of one colour has none."""
+    """Sample points all over a scan, at least one a face, evenly and without chance; a scan of one colour has none."""
     area = face_areas(scan.vertices, scan.faces)
     spacing_m = max(spacing_m, math.sqrt(area.sum() / CLOUD))
     count = np.maximum(np.ceil(area / spacing_m**2), 1).astype(np.int64)
@@ -92,7 +92,7 @@ def sample_surface(scan: ScanMesh, spacing_m: float = VOXEL_M / 2) -> Surface:
 
 
 def voxelise(surface: Surface, floor_m: float) -> Voxels:
-    """Means over the points of each voxel."""
+    """Average the features of the points of each voxel."""
     low = surface.points[:, :2].min(axis=0) if len(surface.points) else np.zeros(2)
     origin = np.array([*low, floor_m - BELOW_M])
     index = np.floor((surface.points - origin) / VOXEL_M).astype(np.int64)
@@ -111,30 +111,21 @@ def voxelise(surface: Surface, floor_m: float) -> Voxels:
 
 
 def at_vertices(scores: np.ndarray, surface: Surface, faces: np.ndarray, count: int) -> np.ndarray:
-    """(count, classes) scores of the vertices: sums over the points of all faces around each.
-
-    Args:
-        scores: (n, classes) of the surface's points.
-        faces: (m, 3).
-    """
-    out = np.zeros((count, scores.shape[1]))
-    for k, column in enumerate(scores.T):
-        of_face = np.bincount(surface.face, column, len(faces))
-        for corner in range(3):
-            out[:, k] += np.bincount(faces[:, corner], of_face, count)
-    return out
+    """Return (count, classes) scores of the vertices: sums of (n, classes) over the points of all faces around each."""
+    of_face = np.stack([np.bincount(surface.face, column, len(faces)) for column in scores.T], axis=1)
+    return sum_at_vertices(of_face, faces, count)
 
 
-def intersection_over_union(truth: np.ndarray, found: np.ndarray) -> dict[str, float]:
-    """Class -> IoU of (n,) classes, of those that the truth has; what is `UNKNOWN` there does not count."""
-    known = truth != UNKNOWN
-    confusion = np.bincount(truth[known].astype(int) * 256 + found[known], minlength=65536).reshape(256, 256)
+def intersection_over_union(truth: np.ndarray, predicted: np.ndarray) -> dict[str, float]:
+    """Return class -> IoU of (n,) classes, of those that the truth has; what is `UNKNOWN` there does not count."""
+    labelled = truth != UNKNOWN
+    confusion = np.bincount(truth[labelled].astype(int) * 256 + predicted[labelled], minlength=65536).reshape(256, 256)
     union = confusion.sum(axis=0) + confusion.sum(axis=1) - confusion.diagonal()
     return {name: float(confusion[k, k] / union[k]) for k, name in enumerate(NAMES) if confusion[k].any()}
 
 
 def joined(surfaces: Sequence[Surface]) -> Surface:
-    """All as one; `face` counts on, and what has no colour is grey where others have some."""
+    """Join surfaces; `face` counts on, and what has no colour is grey where others have some."""
     start = np.cumsum([0, *(int(s.face.max(initial=-1)) + 1 for s in surfaces)])
     grey = [np.full((len(s.points), 3), 127.5) if s.colours is None else s.colours for s in surfaces]
     return Surface(

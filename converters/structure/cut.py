@@ -85,11 +85,7 @@ def cut_furniture(
     Floor and walls stay, whatever stands against them: only faces with the object's label, with no
     label or of small things lying on it, and other furniture faces that touch the model, go. Of a part that loses
     faces, pieces smaller than `DEBRIS_AREA_M2` go too; a part that loses none stays whole, however small it is.
-
-    Args:
-        vertices_w: (n, 3) m, floor at z = 0.
-        faces: (m, 3).
-        labels: (n,) NYU40.
+    The scan's floor is at z = 0, its labels are NYU40's.
     """
     if not furnished:
         return CutResult(np.ones(len(faces), bool), np.full(len(faces), -1, np.int64))

@@ -32,19 +32,11 @@ def beyond_obstacles(occupied: np.ndarray, resolution_m: float) -> np.ndarray:
 
 
 def floor_outside(floor: np.ndarray, occupied: np.ndarray, furniture: np.ndarray, resolution_m: float) -> np.ndarray:
-    """Return the part of a floor that lies outside of the walls of a home.
+    """Return the part of a floor that lies outside of the walls of a home; all masks are (rows, columns) bool.
 
     Outside is what a disc that comes from beyond all obstacles covers, if it does not fit through doorways. Nothing is
     outside where no floor lies beyond the obstacles, or where the walls enclose no home: too little floor, or less
-    than half of the furniture.
-
-    Args:
-        floor: (rows, columns) bool.
-        occupied: (rows, columns) bool, walls and other obstacles.
-        furniture: (rows, columns) bool, footprints of movable objects.
-
-    Returns:
-        (rows, columns) bool, a part of `floor`.
+    than half of the furniture, which is the footprints of movable objects.
     """
     cell_m2 = resolution_m**2
     beyond = beyond_obstacles(occupied, resolution_m)

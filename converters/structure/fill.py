@@ -98,11 +98,6 @@ def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> 
     of `RANSAC_DRAWS` is refined by least squares over its support, and over the support of that while it grows (Chum,
     Matas and Kittler 2003, Locally optimized RANSAC), which is then taken out. A plane's normal looks
     to the side that its faces look to: the room, as scans are taken from inside.
-
-    Args:
-        vertices: (n, 3) m, z up.
-        faces: (m, 3) that stay.
-        labels: (n,) NYU40.
     """
     label, area, normal = face_labels(labels, faces), face_areas(vertices, faces), unit_normals(vertices, faces)
     left = np.isin(label, [v for v in STRUCTURE_LABELS if v not in (FLOOR, CEILING)]) & (np.abs(normal[:, 2]) < 0.3)
@@ -267,13 +262,9 @@ def fill_holes(
     planes: list[Plane], plan: FloorPlan, objects: tuple[PlacedObject, ...], cloud: ColourCloud,
     scan: tuple[np.ndarray, np.ndarray],
 ) -> tuple[tuple[np.ndarray, np.ndarray], list[ColourCloud]]:  # fmt: skip
-    """Patch what furniture hid of floor and walls, with coloured points on it.
+    """Patch what furniture hid of floor and walls; return vertices and faces of the patches, and coloured points there.
 
-    Args:
-        scan: vertices (n, 3) m and faces (m, 3) that are drawn.
-
-    Returns:
-        Vertices and faces of the patches; points on them.
+    `scan`: vertices (n, 3) m and faces (m, 3) that are drawn.
     """
     cell_m, turn = plan.grid.resolution_m / 2, yaw_matrix(plan.grid.yaw)
     ground = Plane(turn @ [*plan.grid.origin, LIFT_M], turn[:, 0], turn[:, 1])

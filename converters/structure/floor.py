@@ -61,12 +61,7 @@ def fit_floor(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, near_
     A draw is three such faces' middles, drawn by area; its support is the area within `TOLERANCE_M` of the plane
     through them. Planes steeper than `MAX_TILT_DEG` are no floors. The best is refined by least squares over its
     support, twice. Mislabelled furniture, steps and reflections below the floor do not move it as they move a mean, and
-    not even half of them does as it would a median.
-
-    Args:
-        vertices: (n, 3) m, z up.
-        faces: (m, 3).
-        labels: (n,) NYU40.
+    not even half of them does as it would a median. The scan is z up, its labels are NYU40's.
     """
     labelled = int((labels == FLOOR).sum())
     if labelled < MIN_LABELS:
@@ -107,10 +102,7 @@ def fit_floor(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, near_
 def level_floor(vertices_w: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """Return (n, 3) vertices with tilt and waves of the reconstructed floor removed: the collision floor is level.
 
-    Args:
-        vertices_w: (n, 3) world, m: the floor is near z = 0.
-        faces: (m, 3).
-        labels: (n,) NYU40; a scan without enough floor is returned as it is.
+    The floor is near z = 0; a scan without enough of it is returned as it is.
     """
     result = vertices_w.copy()
     try:

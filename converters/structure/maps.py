@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 import shapely
@@ -235,14 +236,9 @@ def make_floor_plan(
     exact: bool = False,
     resolution_m: float = RESOLUTION_M,
 ) -> FloorPlan:
-    """Read floor and obstacles off the cleaned scan.
+    """Read floor and obstacles off the cleaned scan, whose floor is at z = 0, after the cut, and its NYU40 labels.
 
-    Args:
-        vertices_w: (n, 3) m, floor at z = 0, after the cut.
-        faces: (m, 3) that stay.
-        labels: (n,) NYU40.
-        given: the source's traversable map, or None.
-        yaw: of the grid: the building's `main_direction`, rad.
+    `given` is the source's traversable map; `yaw` of the grid is the building's `main_direction`, rad.
     """
     grid = _grid_around(vertices_w[np.unique(faces)], yaw, resolution_m)
     shown = _shown(grid, vertices_w, faces, face_labels(labels, faces))
@@ -352,20 +348,15 @@ def _heights(shown: _Shown, occupied: np.ndarray, around: int) -> np.ndarray:
 
 def _given_floor(grid: Grid, given: GivenMap) -> np.ndarray:
     """Return (rows, columns) bool: cells whose middle is traversable in the source's map."""
-    centres = grid.centres_w()
-    index = np.floor((centres - given.origin) / given.resolution_m).astype(int)
-    row, column = index[..., 1], index[..., 0]
-    inside = (row >= 0) & (column >= 0) & (row < given.traversable.shape[0]) & (column < given.traversable.shape[1])
-    result = np.zeros(grid.shape, bool)
-    result[inside] = given.traversable[row[inside], column[inside]]
-    return result
+    shape: Any = given.traversable.shape
+    upright = Grid(0.0, given.origin, shape, given.resolution_m)
+    return upright.values(given.traversable, grid.centres_w().reshape(-1, 2)).reshape(grid.shape)
 
 
 def resample(grid: Grid, mask: np.ndarray, resolution_m: float) -> tuple[np.ndarray, tuple[float, float]]:
     """Resample a mask to an axis-aligned grid, conservatively: a cell is true where its middle and corners are.
 
-    Returns:
-        mask [rows along y, columns along x], and the x, y of the outer corner of cell [0, 0], m.
+    Return the mask [rows along y, columns along x], and the x, y of the outer corner of cell [0, 0], m.
     """
     centres = grid.centres_w()[mask]
     low = np.floor((centres.min(axis=0) - grid.resolution_m) / resolution_m) * resolution_m

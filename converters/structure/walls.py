@@ -23,14 +23,9 @@ def border_cells(traversable: np.ndarray) -> np.ndarray:
 
 
 def cover_rectangles(needed: np.ndarray, allowed: np.ndarray) -> Iterator[tuple[int, int, int, int]]:
-    """Cover the needed cells with rectangles of allowed cells, the most useful first.
+    """Cover the needed cells with rectangles of allowed cells, which contain them, the most useful first.
 
-    Args:
-        needed: (rows, columns) bool, every one of these ends up covered.
-        allowed: (rows, columns) bool, contains `needed`; no rectangle leaves it.
-
-    Yields:
-        (row0, row1, column0, column1) half-open, none inside another.
+    Yield (row0, row1, column0, column1), half-open, none inside another.
     """
     assert not (needed & ~allowed).any()
     left = needed.copy()

@@ -190,11 +190,11 @@ def test_scenes_are_made_kept_and_made_again_with_the_same_bytes(tmp_path, hull_
     (tmp_path / "recipes.yaml").write_text(TINY)
     tiny, lines, shares = load_recipes(tmp_path / "recipes.yaml"), [], []
     hut = chosen(tiny, tmp_path, ("hut",))
-    failed = make_scenes(hut, tiny.conversion, tmp_path, report=lambda _, s: shares.append(s), tell=lines.append)
+    failed = make_scenes(hut, tiny.conversion, tmp_path, report=lambda _, s: shares.append(s), log=lines.append)
     assert set(failed) == {"hut"} and shares[-1] == pytest.approx(1.0) and shares == sorted(shares)
     assert (tmp_path / "hut" / "preview.png").is_file() and not (tmp_path / "shed").exists()
     first = digest(tmp_path / "hut")
-    assert chosen(tiny, tmp_path, ("hut",), tell=lines.append) == ()
+    assert chosen(tiny, tmp_path, ("hut",), log=lines.append) == ()
     assert lines[-1] == "hut: is there, kept"
     make_scenes(chosen(tiny, tmp_path, ("hut",), overwrite=True), tiny.conversion, tmp_path, overwrite=True)
     assert digest(tmp_path / "hut") == first
@@ -293,11 +293,11 @@ def test_the_last_word_names_what_was_written(
 def test_a_scene_that_another_generator_made_meanwhile_is_kept(tmp_path, quick):
     lines: list[str] = []
 
-    def tell(line: str) -> None:
+    def log(line: str) -> None:
         lines.append(line)
         (tmp_path / "shed").mkdir(exist_ok=True)  # while the first is made
 
-    assert set(make_scenes(chosen(quick, tmp_path), {}, tmp_path, tell=tell)) == {"hut"}
+    assert set(make_scenes(chosen(quick, tmp_path), {}, tmp_path, log=log)) == {"hut"}
     assert lines[-1] == "shed: is there, kept" and list((tmp_path / "shed").iterdir()) == []
 
 

@@ -136,7 +136,7 @@ def test_of_the_command(tmp_path, monkeypatch, capsys):
     """SRC... and lists of them reach the function; its failures are told last and the exit code is 1."""
     asked = {}
 
-    def convert_many(sources, into, config, runner, side_by_side, report, tell):
+    def convert_many(sources, into, config, runner, side_by_side, report, log):
         asked.update(sources=sources, into=into, config=config, side_by_side=side_by_side)
         return ["b"]
 

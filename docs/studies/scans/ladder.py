@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 from converters.check.pictures import Picture, world_surfaces
 from converters.propose.proposals import bounds, box_iou
 from converters.records.visual import TexturedMesh
-from converters.segment.labelling import FOUND_IOU
+from converters.segment.labelling import MATCH_IOU
 from scenes_mjcf.look import over
 from scenes_mjcf.schema import load_manifest
 
@@ -93,7 +93,7 @@ def main() -> None:
     for scene in arguments.scenes:
         manifest, ious = load_manifest(scene), found(scene, arguments.scenes[-1])
         passed = sum(gate["passed"] for gate in manifest.gates.values())
-        met = sum(iou >= FOUND_IOU for _, iou in ious)
+        met = sum(iou >= MATCH_IOU for _, iou in ious)
         told = ", ".join(f"{name} {iou:.2f}" for name, iou in ious)
         print(
             f"{scene}: {len(manifest.objects)} movable, {met} of {len(ious)} found, {manifest.floor_area_m2:.2f} m2, "

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.library.build import PROPERTIES, parse_properties, read_catalogue, unpack_model
-from converters.library.fetch import fetch
+from converters.library.build import PROPERTIES, fetch, parse_properties, read_catalogue, unpack_model
 from converters.records.errors import SceneRejected
 from interactive_nav_common.errors import FileError
 
