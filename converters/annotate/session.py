@@ -188,7 +188,7 @@ def with_annotations(raw: RawScene, path: Path, library_root: Path | None) -> Ra
         raise SceneRejected(f"{path}: names model {missing[0]}, which {where} lacks; give its --library")
     source = SourceFolder(path.parent)
     source.use(path.name, "")
-    kept = inside_scan(source, path.name, annotations, library, raw.scan.vertices, raw.scan.faces)
+    kept = inside_scan(source, path.name, annotations, library, raw.scan)
     return dataclasses.replace(
         raw,
         annotations=kept,

@@ -5,6 +5,7 @@ each model's `trs` CAD -> world, and both keypoint sets stand in that world (the
 """
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -99,21 +100,17 @@ def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Anno
             cad_points = transformed(_keypoints(model, "keypoints_cad"), np.linalg.inv(pose_y_up @ cad_to_y_up))
             scan_points = transformed(_keypoints(model, "keypoints_scan"), world_to_scan)
             count = min(len(cad_points), len(scan_points))
-            records.append(
-                (
-                    synset,
-                    Annotation(
-                        category=category,
-                        cad_id=cad_id,
-                        pose=pose,
-                        symmetry=str(model.get("sym", "__SYM_NONE")),
-                        keypoints_cad=cad_points[:count],
-                        keypoints_scan=scan_points[:count],
-                        hinge=_hinge(model, where),
-                        confidence=_confidence(model),
-                    ),
-                )
+            annotation = Annotation(
+                category=category,
+                cad_id=cad_id,
+                pose=pose,
+                symmetry=str(model.get("sym", "__SYM_NONE")),
+                keypoints_cad=cad_points[:count],
+                keypoints_scan=scan_points[:count],
+                hinge=_hinge(model, where),
+                confidence=_confidence(model),
             )
+            records.append((synset, annotation))
     except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         what = f"missing key {error}" if isinstance(error, KeyError) else str(error)
         raise SceneRejected(f"{where}: {what}; expected Scan2CAD's annotation layout") from error
@@ -142,15 +139,10 @@ def gap_to_scan(annotation: Annotation, cad_vertices: np.ndarray, vertices: np.n
 
 
 def inside_scan(
-    source: SourceFolder,
-    where: str,
-    annotations: tuple[Annotation, ...],
-    cads: dict[str, CadModel],
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    source: SourceFolder, where: str, annotations: tuple[Annotation, ...], cads: Mapping[str, CadModel], scan: Any
 ) -> tuple[Annotation, ...]:
     """Return the annotations whose objects stand in the scan; leave the others out with a warning each."""
-    gaps = [gap_to_scan(a, cads[a.cad_id].vertices, vertices, faces) for a in annotations]
+    gaps = [gap_to_scan(a, cads[a.cad_id].vertices, scan.vertices, scan.faces) for a in annotations]
     outside = [i for i, gap in enumerate(gaps) if gap > OUTSIDE_M]
     if 2 * len(outside) > len(annotations):
         raise SceneRejected(
@@ -226,7 +218,8 @@ def read_scan2cad(root: Path, strict: bool = False) -> RawScene:
         colours = np.asarray(painted, np.uint8)[:, :3]
     check_upright(f"{root / stem}.ply", vertices, faces, labels, 0.0)
     cads = {a.cad_id: read_cad(source, synset, a.cad_id) for synset, a in records}
-    annotations = inside_scan(source, ANNOTATION, tuple(a for _, a in records), cads, vertices, faces)
-    scan, kept = ScanMesh(vertices, faces, labels, colours), {a.cad_id: cads[a.cad_id] for a in annotations}
-    raw = source.scene("scan2cad", scan, cads=kept, annotations=annotations, licence=LICENCE)
+    scan = ScanMesh(vertices, faces, labels, colours)
+    annotations = inside_scan(source, ANNOTATION, tuple(a for _, a in records), cads, scan)
+    cads = {a.cad_id: cads[a.cad_id] for a in annotations}
+    raw = source.scene("scan2cad", scan, cads=cads, annotations=annotations, licence=LICENCE)
     return dataclasses.replace(raw, name=scan_id)

@@ -20,7 +20,7 @@ from converters.records.errors import SceneRejected
 from converters.records.raw import RawScene, ScanMesh
 from interactive_nav_common.errors import printable, readable
 from interactive_nav_common.records import Reader
-from interactive_nav_common.untrusted.reading import read_npz as open_npz
+from interactive_nav_common.untrusted.reading import read_npz
 
 LARGEST = 1e12
 """Of a coordinate, whatever its unit: products of larger ones overflow."""
@@ -126,15 +126,20 @@ def read_json(path: Path) -> Any:
     return Reader(SceneRejected, "fetch the file again").json(path)
 
 
-def read_npz(path: Path, name: str, remedy: str) -> np.ndarray:
-    """One array of an NPZ file."""
-    with open_npz(path, SceneRejected, remedy) as arrays:
-        return np.asarray(arrays[name])
+def read_numbers(source: SourceFolder, name: str, remedy: str, lines: int | None = None) -> tuple[Path, list[float]]:
+    """Return the path of a text file, and the numbers in it or in its first lines."""
+    path = source.use(name, remedy)
+    text = path.read_text(encoding="utf-8", errors="replace")
+    try:
+        return path, [float(word) for line in text.split("\n")[:lines] for word in line.split()]
+    except ValueError as error:
+        raise SceneRejected(f"{path}: {error}; {remedy}") from error
 
 
 def read_labels(path: Path) -> np.ndarray:
-    """(n,) int64 NYU40 ids: the array `label` of an NPZ."""
-    labels = read_npz(path, "label", "expected an NPZ with the array 'label' of NYU40 ids")
+    """Return (n,) int64 NYU40 ids: the array `label` of an NPZ."""
+    with read_npz(path, SceneRejected, "expected an NPZ with the array 'label' of NYU40 ids") as arrays:
+        labels = np.asarray(arrays["label"])
     if labels.dtype.kind not in "iu":
         raise SceneRejected(f"{path}: labels are {labels.dtype}, expected whole NYU40 ids")
     return labels.reshape(-1).astype(np.int64)

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from converters.read.annotations import inside_scan, parse_annotations, read_cad
-from converters.read.files import SourceFolder, read_image, read_json, read_labels, read_npz
+from converters.read.files import SourceFolder, read_image, read_json, read_labels, read_numbers
 from converters.read.obj import TexturedMesh, read_scan_obj, scan_of
 from converters.read.surfaces import check_upright, label_storeys, labelled, with_split_corners
 from converters.records.errors import SceneRejected
 from converters.records.raw import ATTRIBUTION, FLOOR, WINDOWS, GivenMap, RawScene, Storey, Window
 from interactive_nav_common.errors import readable
-from interactive_nav_common.untrusted.reading import read_npz as open_npz
+from interactive_nav_common.untrusted.reading import read_npz
 
 MESH = "mesh_z_up.obj"
 LABELS = "mesh_z_up.labels.npz"
@@ -50,7 +50,7 @@ def read_gibson(root: Path, strict: bool = False) -> RawScene:
         path = source.use(ALIGNMENTS, "")
         _, records = parse_annotations(read_json(path), path)
         cads = {a.cad_id: read_cad(source, synset, a.cad_id) for synset, a in records}
-        annotations = inside_scan(source, ALIGNMENTS, tuple(a for _, a in records), cads, mesh.vertices, mesh.faces)
+        annotations = inside_scan(source, ALIGNMENTS, tuple(a for _, a in records), cads, mesh)
         cads = {a.cad_id: cads[a.cad_id] for a in annotations}
     else:
         source.note(f"{ALIGNMENTS} is absent: structure only, all furniture stays part of it")
@@ -64,7 +64,7 @@ def building(source: SourceFolder, layout: str, mesh: TexturedMesh, labels, heig
     """The record of a Gibson building: joins what was read with maps, licence and hashes."""
     floor = [mesh.vertices[(labels == FLOOR) & (np.abs(mesh.vertices[:, 2] - h) < STOREY_M / 2), :2] for h in heights]
     maps = [read_traversable(source, k, mesh.vertices[:, :2], floor[k]) for k in range(len(heights))]
-    raw = source.scene(
+    return source.scene(
         layout,
         scan_of(mesh, labels),
         cads=cads,
@@ -72,17 +72,15 @@ def building(source: SourceFolder, layout: str, mesh: TexturedMesh, labels, heig
         floor_height_m=heights[0],
         given_map=maps[0],
         licence=read_licence(source),
+        attribution=read_attribution(source),
         storeys=tuple(Storey(h, m) for h, m in zip(heights, maps, strict=True)) if len(heights) > 1 else (),
     )
-    return dataclasses.replace(raw, attribution=read_attribution(source))
 
 
 def _furnished(path: Path) -> bool:
     """Whether the mesh shows what is annotated: so it does unless the labels' file says otherwise."""
-    with open_npz(path, SceneRejected, "expected labels as an NPZ") as arrays:
-        if "furnished" not in arrays.files:
-            return True
-    value = read_npz(path, "furnished", "expected true or false")
+    with read_npz(path, SceneRejected, "expected labels as an NPZ, furnished as true or false") as arrays:
+        value = np.asarray(arrays["furnished"]) if "furnished" in arrays.files else np.array(True)
     if value.dtype != bool or value.size != 1:
         raise SceneRejected(f"{path}: furnished is {value.dtype} of shape {value.shape}, expected one true or false")
     return bool(value.all())
@@ -90,14 +88,10 @@ def _furnished(path: Path) -> bool:
 
 def read_floors(source: SourceFolder) -> tuple[float, ...]:
     """Heights of the floors, m, lowest first."""
-    path = source.use("floors.txt", "expected one floor height in metres a line")
-    words = path.read_text(encoding="utf-8", errors="replace").split()
-    try:
-        heights = sorted(float(word) for word in words)
-    except ValueError as error:
-        raise SceneRejected(f"{path}: {error}; expected one floor height in metres a line") from error
+    path, heights = read_numbers(source, "floors.txt", "expected one floor height in metres a line")
+    heights = sorted(heights)
     if not heights or not np.isfinite(heights).all() or max(map(abs, heights)) > 1e4:
-        raise SceneRejected(f"{path}: holds {words[:4]}, expected one floor height in metres a line")
+        raise SceneRejected(f"{path}: holds {heights[:4]}, expected one floor height in metres a line")
     for low, high in zip(heights, heights[1:], strict=False):
         if high - low < STOREY_M:
             raise SceneRejected(

@@ -15,7 +15,7 @@ import numpy as np
 from converters.geometry.boxes import upright_box
 from converters.geometry.faces import merge_vertices, sample_faces
 from converters.read.annotations import inside_scan
-from converters.read.files import SourceFolder
+from converters.read.files import SourceFolder, read_numbers
 from converters.read.gibson import building, read_floors, read_traversable
 from converters.read.meshes import clean_surface, colours_of_faces
 from converters.read.obj import TexturedMesh, join_meshes, read_scan_obj
@@ -71,23 +71,22 @@ def read_interactive_gibson(root: Path, strict: bool = False) -> RawScene:
     for k, height in enumerate(heights):
         mesh, labels = _with_plane(source, k, height, mesh, labels)
     points, _ = sample_faces(mesh.vertices, mesh.faces, SHOWN_M)
-    pairs = [_furniture(source, path) for path in sorted(root.glob(f"{PREFIX}*.urdf"))]
-    pairs = [
-        (dataclasses.replace(a, hinge=assume_hinge(c.vertices, a.pose, points)) if a.category == "door" else a, c)
-        for a, c in pairs
-    ]
+    pairs = [_furniture(source, path, points) for path in sorted(root.glob(f"{PREFIX}*.urdf"))]
     cads = {a.cad_id: c for a, c in pairs}
     annotations = _without_doubles(source, tuple(a for a, _ in pairs), cads)
     if annotations:
-        annotations = inside_scan(source, f"{PREFIX}_*.urdf", annotations, cads, mesh.vertices, mesh.faces)
+        annotations = inside_scan(source, f"{PREFIX}_*.urdf", annotations, cads, mesh)
     cads = {a.cad_id: cads[a.cad_id] for a in annotations}
     return building(source, "interactive-gibson", mesh, labels, heights, cads, annotations)
 
 
-def _furniture(source: SourceFolder, path: Path) -> tuple[Annotation, CadModel]:
+def _furniture(source: SourceFolder, path: Path, structure: np.ndarray) -> tuple[Annotation, CadModel]:
     """One piece of furniture and its model."""
     category = category_of_id(path.stem.rsplit("_", 1)[-1], f"{path}: category id is", CLASSES)
-    position = _position(source, path.name)
+    name = path.name.replace(PREFIX, "pos")[: -len("urdf")] + "txt"
+    place, position = read_numbers(source, name, f"expected x y z of {path.name} in metres", lines=1)
+    if len(position) != 3 or not np.isfinite(position).all():
+        raise SceneRejected(f"{place}: holds {len(position)} numbers, expected x y z in metres, all finite")
     item = read_urdf(source, path.name, "")
     vertices, faces, keep = merge_vertices(item.surface.vertices, item.surface.faces)
     colours = colours_of_faces(item.surface)[keep]
@@ -99,7 +98,9 @@ def _furniture(source: SourceFolder, path: Path) -> tuple[Annotation, CadModel]:
         pieces = None if pieces is None else tuple((v @ turn, f) for v, f in pieces)
     name = path.stem.removeprefix(PREFIX).strip("_")
     cad = CadModel(category, name, vertices, faces, colours, pieces, item.mass_kg, item.friction)
-    return Annotation(category, name, transform(turn, position)), cad
+    pose = transform(turn, position)
+    hinge = assume_hinge(vertices, pose, structure) if category == "door" else None
+    return Annotation(category, name, pose, hinge=hinge), cad
 
 
 def leaf_turn(leaf: np.ndarray) -> np.ndarray:
@@ -135,28 +136,13 @@ def assume_hinge(leaf: np.ndarray, pose: np.ndarray, structure: np.ndarray) -> S
         own = (np.abs(point[:, 1]) < half + 0.02) & (point[:, 0] > 0)
         turns = np.arctan2(half, np.maximum(radius, half))  # a point stops the leaf this much before its middle line
         stops = np.asarray(angle - np.sign(angle) * turns)[reach & ~own]
-        ahead, behind = np.sort(stops[stops > 0]), np.sort(np.negative(stops[stops < 0]))
         # Three points make an obstacle; one or two are noise of the scan.
-        left = min(ahead[2] if len(ahead) > 2 else DOOR_MOST_RAD, DOOR_MOST_RAD)
-        right = min(behind[2] if len(behind) > 2 else DOOR_MOST_RAD, DOOR_MOST_RAD)
+        most = [DOOR_MOST_RAD] * 3
+        left, right = (np.sort([*some, *most])[2] for some in (stops[stops > 0], np.negative(stops[stops < 0])))
         span = (-right, left) if inward > 0 else (-left, right)
         choices.append((int((radius < NEAR_HINGE_M + half).sum()), left + right, (end, span)))
     end, span = max(choices, key=lambda c: c[:2])[2]
     return ScannedHinge(np.array([end, across, low[2]]), 1.0, (float(span[0]), float(span[1])), assumed=True)
-
-
-def _position(source: SourceFolder, urdf: str) -> np.ndarray:
-    """(3,) m, of the text file that goes with a URDF."""
-    name = urdf.replace(PREFIX, "pos")[: -len("urdf")] + "txt"
-    path = source.use(name, f"expected x y z of {urdf} in metres")
-    lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
-    try:
-        position = np.array(lines[0].split(), float)
-    except ValueError as error:
-        raise SceneRejected(f"{path}: {error}; expected x y z in metres") from error
-    if position.shape != (3,) or not np.isfinite(position).all():
-        raise SceneRejected(f"{path}: holds {len(position)} numbers, expected x y z in metres, all finite")
-    return position
 
 
 def _without_doubles(
@@ -167,16 +153,16 @@ def _without_doubles(
     for annotation in annotations:
         placed = transformed(cads[annotation.cad_id].vertices, annotation.pose)
         low, high = placed.min(axis=0), placed.max(axis=0)
-        double = None
+        doubles = []
         for other, o_low, o_high in kept:
             shared = np.prod(np.maximum(np.minimum(high, o_high) - np.maximum(low, o_low), 0.0))
             smaller = max(min(np.prod(high - low), np.prod(o_high - o_low)), 1e-12)
             if other.category == annotation.category and shared > SAME_SHARE * smaller:
-                double = other
-        if double is None:
+                doubles.append(other.cad_id)
+        if not doubles:
             kept.append((annotation, low, high))
         else:
-            source.note(f"{annotation.category} {annotation.cad_id} stands in {double.cad_id}; it is left out")
+            source.note(f"{annotation.category} {annotation.cad_id} stands in {doubles[-1]}; it is left out")
     return tuple(a for a, _, _ in kept)
 
 
@@ -191,14 +177,12 @@ def _with_plane(
     plane = read_scan_obj(source, name, "")
     floor_faces = mesh.faces[(labels[mesh.faces] == FLOOR).all(axis=1)]
     near = np.abs(mesh.vertices[floor_faces, 2].mean(axis=1) - height_m) < 0.5
-    seen = set()
+    shown = set()
     if near.any():
-        seen = {tuple(c) for c in _cells(sample_faces(mesh.vertices, floor_faces[near], PLANE_CELL_M / 2)[0])}
+        shown = {tuple(c) for c in _cells(sample_faces(mesh.vertices, floor_faces[near], PLANE_CELL_M / 2)[0])}
     floor_xy = mesh.vertices[labels == FLOOR, :2]
     given = read_traversable(source, number, mesh.vertices[:, :2], floor_xy) if len(floor_xy) else None
-    patch = plane_patch(
-        plane, height_m, seen, given, mesh.vertices[:, :2].min(axis=0), mesh.vertices[:, :2].max(axis=0)
-    )
+    patch = plane_patch(plane, height_m, shown, given, mesh.vertices[:, :2])
     if patch is None:
         return mesh, labels
     return join_meshes(mesh, patch), np.concatenate([labels, np.full(len(patch.vertices), FLOOR, np.int64)])
@@ -209,23 +193,18 @@ def _cells(points: np.ndarray) -> np.ndarray:
 
 
 def plane_patch(
-    plane: TexturedMesh,
-    height_m: float,
-    seen: set[tuple[int, ...]],
-    given: GivenMap | None,
-    low: np.ndarray,
-    high: np.ndarray,
+    plane: TexturedMesh, height_m: float, shown: set[tuple[int, ...]], given: GivenMap | None, mesh_xy: np.ndarray
 ) -> TexturedMesh | None:
-    """Squares of 0.1 m of a floor plane, where its cells are unseen, inside the mesh and on the map.
+    """Return squares of 0.1 m of a floor plane with its texture, or None where none is needed.
 
-    Returns the squares with the plane's texture, or None where none is needed.
+    They lie inside the mesh and on the map, where the scan shows no floor.
     """
     check_extent("a floor plane", plane.vertices)
     points, face = sample_faces(plane.vertices, plane.faces, PLANE_CELL_M / 2)
     cell, first = np.unique(_cells(points), axis=0, return_index=True)
     middle = (cell + 0.5) * PLANE_CELL_M
-    inside = np.atleast_1d(((middle > low) & (middle < high)).all(axis=1))
-    wanted = np.flatnonzero([tuple(c) not in seen and bool(i) for c, i in zip(cell, inside, strict=True)])
+    inside = np.atleast_1d(((middle > mesh_xy.min(axis=0)) & (middle < mesh_xy.max(axis=0))).all(axis=1))
+    wanted = np.flatnonzero([tuple(c) not in shown and bool(i) for c, i in zip(cell, inside, strict=True)])
     if given is not None:
         index = np.floor((middle - given.origin) / given.resolution_m).astype(np.int64)
         on = np.atleast_1d(((index >= 0) & (index < given.traversable.shape[::-1])).all(axis=1))

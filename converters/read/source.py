@@ -1,6 +1,7 @@
 """A raw folder in any layout that we read in, `RawScene` out."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,10 @@ READERS = {
     "habitat": (habitat.scenes_of, habitat.read_habitat),
     "mjcf": (mjcf.mains_of, mjcf.read_mjcf),
     "sh3d": (lambda root: len(list(root.glob(f"*{sh3d.ENDING}"))) == 1, sh3d.read_sh3d),
-    **{name: (scanned.looks_like(name), scanned.reader(name)) for name in scanned.COLLECTIONS},
+    **{
+        name: (lambda root, mark=of.marks[0]: any(root.glob(mark)), functools.partial(scanned.read_scan, name))
+        for name, of in scanned.COLLECTIONS.items()
+    },
 }
 """Layout -> what of a folder shows it, if anything does; its reader."""
 FILES = {

@@ -68,8 +68,10 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = Fal
         rgba = {m.get("name"): str(c.get("rgba")) for m in root.iter("material") for c in m.findall("color")}
         visual = [placed(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "visual", rgba)]
         hard = [placed(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "collision", {})]
-        masses = [_value(e, "inertial/mass") for e in links.values()]
-        frictions = [_value(e, "contact/lateral_friction") for e in links.values()]
+        masses, frictions = (
+            [float(numbers(e.get("value"), (0.0,))[0]) for link in links.values() for e in link.findall(tag)[:1]]
+            for tag in ("inertial/mass", "contact/lateral_friction")
+        )
     except (ElementTree.ParseError, ValueError, KeyError, LookupError) as error:
         if isinstance(error, SceneRejected):
             raise
@@ -83,8 +85,7 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = Fal
     if not hard:
         source.note(f"{relative}: has no collision mesh; the visual one is decomposed")
     body = joined(hard) or surface
-    mass = sum(m for m in masses if m is not None)
-    friction = [f for f in frictions if f is not None and f > 0]
+    mass = sum(masses)
     if mass <= 0:
         source.note(f"{relative}: its mass is {mass:g} kg; mass comes from density and volume")
     return RigidObject(
@@ -93,7 +94,7 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = Fal
         pieces=convex_pieces(body.vertices, body.faces) if hard else None,
         collision=(body.vertices, body.faces),
         mass_kg=mass if mass > 0 else None,
-        friction=max(friction) if friction else None,
+        friction=max((f for f in frictions if f > 0), default=None),
     )
 
 
@@ -136,11 +137,6 @@ def report_unread(source: SourceFolder, where: str, unread: Counter[str]) -> Non
         source.note(f"{where}: {count} x {kind}: not read")
     if len(counts) > MOST_KINDS:
         source.note(f"{where}: {len(counts) - MOST_KINDS} more kinds of elements: not read")
-
-
-def _value(link: ElementTree.Element, tag: str) -> float | None:
-    element = link.find(tag)
-    return None if element is None else float(numbers(element.get("value"), (0.0,))[0])
 
 
 def _origin(element: ElementTree.Element) -> np.ndarray:
@@ -186,7 +182,7 @@ def _geometries(
     source: SourceFolder, path: Path, link: ElementTree.Element, kind: str, rgba: dict[str | None, str]
 ) -> list[TexturedMesh]:
     """Return the meshes of a link's `<visual>` or `<collision>` elements, in the link's frame, coloured by `rgba`."""
-    found = []
+    meshes = []
     for element in link.findall(kind):
         geometry = element.find("geometry")
         shape = None if geometry is None else next(iter(geometry), None)
@@ -198,26 +194,21 @@ def _geometries(
             if target is None:
                 raise SceneRejected(f"{path}: names the mesh '{name}', which is not there; put it beside the URDF")
             inside = source.inside(target)
-            mesh = read_surface(source, inside, "") if kind == "visual" else _bare(source, inside)
+            if kind == "collision" and inside.lower().endswith(".obj"):  # no report of missing colours
+                bare = read_obj(source.use(inside, ""))
+                mesh = TexturedMesh(bare.vertices, bare.faces, None, None)
+            else:
+                mesh = read_surface(source, inside, "")
             mesh = placed(mesh, np.diag([*numbers(shape.get("scale"), (1.0, 1.0, 1.0)), 1.0]))
         else:
             mesh = primitive(path, shape.tag, shape.get)
         for material in element.findall("material"):
-            own = [str(color.get("rgba")) for color in material.findall("color")] or [
-                rgba.get(material.get("name"), "")
-            ]
-            if mesh.texture is None and own[0]:
-                mesh = in_colour(mesh, numbers(own[0], (0.0,) * 4))
-        found.append(placed(mesh, _origin(element)))
-    return found
-
-
-def _bare(source: SourceFolder, relative: str) -> TexturedMesh:
-    """A collision mesh: no colours, and no word about missing ones."""
-    if not relative.lower().endswith(".obj"):
-        return read_surface(source, relative, "")
-    mesh = read_obj(source.use(relative, ""))
-    return TexturedMesh(mesh.vertices, mesh.faces, None, None)
+            colour = material.find("color")
+            text = rgba.get(material.get("name"), "") if colour is None else str(colour.get("rgba"))
+            if mesh.texture is None and text:
+                mesh = in_colour(mesh, numbers(text, (0.0,) * 4))
+        meshes.append(placed(mesh, _origin(element)))
+    return meshes
 
 
 SHAPES = {

@@ -7,7 +7,6 @@ their classes. scenezoo may fetch a collection's tables of splits and classes, w
 import dataclasses
 import importlib
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import numpy as np
 from converters.geometry.upright import find_up, turn_upright
 from converters.read.files import SourceFolder
 from converters.read.gibson import read_licence
-from converters.read.homes.parts import category_of
+from converters.read.homes.parts import by_last_words, category_of
 from converters.read.obj import TexturedMesh, scan_of
 from converters.read.surfaces import floor_level, label_storeys
 from converters.records.errors import SceneRejected
@@ -43,17 +42,6 @@ class Collection:
 
 
 COLLECTIONS = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, Collection])
-
-
-def looks_like(name: str) -> Callable[[Path], bool]:
-    """Whether a folder is a scene of a collection."""
-    first = COLLECTIONS[name].marks[0]
-    return lambda root: any(root.glob(first))
-
-
-def reader(name: str) -> Callable[[Path, bool], RawScene]:
-    """What reads a scene of a collection."""
-    return lambda root, strict=False: read_scan(name, root, strict)
 
 
 def read_scan(name: str, root: Path, strict: bool = False) -> RawScene:
@@ -109,13 +97,9 @@ def _record(
 def label_of(name: str) -> int:
     """NYU40 id of a class's name, by its last words: an office chair is a chair."""
     words = [w for w in re.findall(r"[a-z]+", name.lower()) if len(w) > 1]
-    for first in range(len(words)):
-        tail = "".join(words[first:])
-        found = NYU40.get(tail) or NYU40.get(tail.removesuffix("s"))
-        if found is not None:
-            return found
     category = category_of(name)
-    return category.labels[0] if category is not None and category.labels else PROP
+    default = category.labels[0] if category is not None and category.labels else PROP
+    return by_last_words(words, NYU40) or default
 
 
 def _of_vertices(source: SourceFolder, found: Any, count: int, faces: np.ndarray) -> np.ndarray:

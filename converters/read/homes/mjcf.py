@@ -25,7 +25,7 @@ from converters.records.limits import FILES, GEOMS, PIXELS, check_count, check_i
 from converters.records.raw import RawScene
 from interactive_nav_common.rotations import matrix_from_quat, transform
 from scenes_mjcf.categories import CATEGORIES, Category
-from scenes_mjcf.look import mesh_of
+from scenes_mjcf.look import geom_image, mesh_of
 
 NUMBER = re.compile(r"\+?\d+\.?\d*(e\+?\d+)?", re.IGNORECASE)
 FARTHEST_M = 1e4
@@ -209,7 +209,7 @@ def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Part
         surface = joined([m for m, _, group in seen if body == 0 or group in looks] or [m for m, _ in solid])
         if surface is None:
             continue
-        free = _free(model, body)
+        free = model.body_jntnum[body] == 1 and model.jnt_type[model.body_jntadr[body]] == _JOINT.mjJNT_FREE
         # A body on a hinge or slide is held, and one that has a counter, a sink or the like within it. What MJCF calls
         # a box is more often a shape than a carton.
         jointed = model.body_jntnum[body] > 0 and categories[body] is not DOOR
@@ -250,10 +250,6 @@ def _unread(model: mujoco.MjModel, top: np.ndarray, categories: list[Category | 
     return dropped
 
 
-def _free(model: mujoco.MjModel, body: int) -> bool:
-    return model.body_jntnum[body] == 1 and model.jnt_type[model.body_jntadr[body]] == _JOINT.mjJNT_FREE
-
-
 def _tops(model: mujoco.MjModel, categories: list[Category | None]) -> np.ndarray:
     """(nbody,) the body that each one is a part of: the world's children, and what is free or has a name within them.
 
@@ -277,7 +273,7 @@ def _mesh(model: mujoco.MjModel, geom: int, span_m: float) -> TexturedMesh | Non
     size, kind = model.geom_size[geom], _GEOM(model.geom_type[geom])  # a NumPy integer is `in` no tuple of kinds
     rgba, data = _rgba(model, geom), int(model.geom_dataid[geom])
     if kind == _GEOM.mjGEOM_MESH:
-        return _of_mesh(model, data, int(model.geom_matid[geom]), rgba)
+        return _of_mesh(model, geom, rgba)
     if kind == _GEOM.mjGEOM_HFIELD:
         rows, columns, first = (int(v[data]) for v in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
         x, y, high, _ = model.hfield_size[data]
@@ -299,18 +295,13 @@ def _rgba(model: mujoco.MjModel, geom: int) -> np.ndarray:
     return own if material < 0 or not np.allclose(own, DEFAULT_RGBA) else model.mat_rgba[material]
 
 
-def _of_mesh(model: mujoco.MjModel, mesh: int, material: int, rgba: np.ndarray) -> TexturedMesh:
+def _of_mesh(model: mujoco.MjModel, geom: int, rgba: np.ndarray) -> TexturedMesh:
     """Return a compiled mesh, with its material's texture where both have coordinates."""
-    vertices, faces, uv = mesh_of(model, mesh)
-    vertices, faces = vertices.astype(float), faces.astype(np.int64)
-    texture = -1
-    if material >= 0:
-        texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
-    if texture < 0 or uv is None or model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D:
+    vertices, faces, uv = mesh_of(model, model.geom_dataid[geom])
+    vertices, faces, image = vertices.astype(float), faces.astype(np.int64), geom_image(model, geom)
+    at = model.geom_matid[geom], mujoco.mjtTextureRole.mjTEXROLE_RGB
+    if image is None or uv is None or model.tex_type[model.mat_texid[at]] != mujoco.mjtTexture.mjTEXTURE_2D:
         return in_colour(TexturedMesh(vertices, faces, None, None), rgba)
-    height, width, channels = (int(v[texture]) for v in (model.tex_height, model.tex_width, model.tex_nchannel))
-    at = model.tex_adr[texture]
-    image = np.array(model.tex_data[at : at + height * width * channels], np.uint8).reshape(height, width, channels)
     # MuJoCo keeps images with their first row at the top and texture coordinates from there.
     image = np.clip(image[..., :3] * rgba[:3], 0, 255).astype(np.uint8)
     return TexturedMesh(vertices, faces, uv.astype(float) * [1.0, -1.0] + [0.0, 1.0], image)

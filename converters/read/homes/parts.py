@@ -102,11 +102,13 @@ def category_of(name: str) -> Category | None:
     """
     own = re.sub(r"(_[a-z]+_group)?(_(main|root))+$", "", name)
     words = [w.lower() for w in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", own) if len(w) > 1]
-    for first in range(len(words)):
-        found = KNOWN.get("".join(words[first:])) or KNOWN.get("".join(words[first:]).removesuffix("s"))
-        if found is not None:
-            return found
-    return None
+    return by_last_words(words, KNOWN)
+
+
+def by_last_words(words: list[str], table: Mapping[str, Any]) -> Any:
+    """Return the entry of as many last words as the table has one for, also in the plural; None without any."""
+    tails = ("".join(words[first:]) for first in range(len(words)))
+    return next((hit for tail in tails if (hit := table.get(tail) or table.get(tail.removesuffix("s")))), None)
 
 
 def home(source: SourceFolder, layout: str, parts: list[Part], floors_m: tuple[float, ...] = ()) -> RawScene:
@@ -136,8 +138,12 @@ def home(source: SourceFolder, layout: str, parts: list[Part], floors_m: tuple[f
         for i, (part, moving) in enumerate(zip(parts, moves, strict=True))
         if moving
     ]
-    _tell(source, parts, moves, carried)
-    licence, attribution = read_licence(source), read_attribution(source)
+    stay = [p.name for p, m, by in zip(parts, moves, carried, strict=True) if not (p.static or m) and by is None]
+    if stay:
+        names = ", ".join(sorted(stay)[:5])
+        source.note(f"{len(stay)} loose things stand on no furniture that moves, and stay: {names}")
+    if riders := sum(by is not None for by in carried):
+        source.note(f"{riders} things stand on furniture and move with it")
     return source.scene(
         layout,
         scan_of(mesh, labels),
@@ -145,8 +151,8 @@ def home(source: SourceFolder, layout: str, parts: list[Part], floors_m: tuple[f
         annotations=tuple(a for a, _ in pairs),
         floor_height_m=floors_m[0],
         storeys=tuple(Storey(z, None) for z in floors_m) if len(floors_m) > 1 else (),
-        licence=licence,
-        attribution=attribution,
+        licence=read_licence(source),
+        attribution=read_attribution(source),
         picture=tuple((shell.vertices, shell.faces) for shell in shells),
     )
 
@@ -175,21 +181,6 @@ def built_in(raw: RawScene, beside: Mapping[int, str]) -> RawScene:
         scan=dataclasses.replace(scan_of(whole, labels), furnished=raw.scan.furnished),
         picture=raw.picture + tuple((shell.vertices, shell.faces) for shell in shells),
     )
-
-
-def _tell(source: SourceFolder, parts: list[Part], moves: list[bool], carried: list[int | None]) -> None:
-    riders = sum(by is not None for by in carried)
-    stay = [
-        p.name
-        for p, moving, by in zip(parts, moves, carried, strict=True)
-        if not (p.static or moving or by is not None)
-    ]
-    if stay:
-        source.note(
-            f"{len(stay)} loose things stand on no furniture that moves, and stay: {', '.join(sorted(stay)[:5])}"
-        )
-    if riders:
-        source.note(f"{riders} things stand on furniture and move with it")
 
 
 def _bounds(part: Part) -> tuple[np.ndarray, np.ndarray]:

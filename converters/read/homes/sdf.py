@@ -17,7 +17,7 @@ from urllib.parse import unquote
 import numpy as np
 import trimesh
 
-from converters.geometry.faces import face_vectors
+from converters.geometry.faces import unit_normals
 from converters.read.files import SourceFolder, only_file, read_image
 from converters.read.homes.parts import LEVEL, Part, home
 from converters.read.meshes import UP_AXES, collada_frame, read_surface
@@ -37,7 +37,7 @@ from converters.records.errors import SceneRejected
 from converters.records.limits import PARTS, check_count
 from converters.records.raw import RawScene
 from interactive_nav_common.records import read_packaged
-from interactive_nav_common.rotations import matrix_from_quat, transform
+from interactive_nav_common.rotations import matrix_from_quat, transform, transformed
 
 
 @dataclasses.dataclass
@@ -269,7 +269,9 @@ class _Reader:
             for kind, found in shapes.items():
                 for element, mesh in self._shapes(model, link, kind):
                     matrix = grow @ model.place(element.find("pose"), at)
-                    level = element.find("geometry/plane") is not None and _looks_up(placed(mesh, pose @ matrix))
+                    level = element.find("geometry/plane") is not None and (
+                        unit_normals(transformed(mesh.vertices, pose @ matrix), mesh.faces)[0, 2] > LEVEL
+                    )
                     found.append((placed(mesh, matrix), pose @ matrix if level else None))
         planes = [at for _, at in shapes["collision"] if at is not None]
         for at in planes:
@@ -363,11 +365,6 @@ class _Reader:
             remedy = f"download that model and unpack it as {self.root / 'models' / head}" if fuel else remedy
             raise SceneRejected(f"{path}: names '{uri}', which is not in {self.source.root}; {remedy}")
         return bare
-
-
-def _looks_up(plane: TexturedMesh) -> bool:
-    normal = face_vectors(plane.vertices, plane.faces)[0]
-    return bool(normal[2] > LEVEL * np.linalg.norm(normal))
 
 
 def _key(name: str) -> str:

@@ -180,10 +180,11 @@ class _Drawing:
                     area = sum(shapely.area(room.plan) for room in bare)
                     self.source.note(f"{area:.1f} m2 within walls are in no room: taken for floor")
                 here = bare + here
-            through = [[p for e, p in shafts.items() if self._crosses(e, z)] for z in (base, base + high)]
-            made = level_parts(here, mine, openings, base, base + high, *(shapely.union_all(s) for s in through))
-            parts += made
-            if made and any(r.floor is not None for r in here):
+            span = base, base + high
+            through = [shapely.union_all([p for e, p in shafts.items() if self._crosses(e, z)]) for z in span]
+            level = level_parts(here, mine, openings, span, through)
+            parts += level
+            if level and any(r.floor is not None for r in here):
                 floors_m.add(base)
         for what, count in sorted((+self.dropped).items()):
             self.source.note(f"{count} {what}: dropped")
@@ -256,7 +257,7 @@ class _Drawing:
             self.source.note(f"{name}: its sliding or folding parts stay as drawn")
         solid = self.models.solid(e, surface) if (e.get("catalogId") or "").startswith(OURS) else None
         if e.tag == "doorOrWindow":
-            return self._door(e, name, pose, surface, group, solid)
+            return self._door(e, Part(name, pose, surface, solid, False), group)
         kind = kind_of(e.get("catalogId") or "", e.get("name") or "", height)
         if e.tag == "light":
             kind = kind if kind == "floor_lamp" else "other"
@@ -264,39 +265,28 @@ class _Drawing:
         held = e.get("movable") == "false" or kind == "structure"
         return [Part(name, pose, surface, solid, False, held=held, known_as=kind)]
 
-    def _door(
-        self,
-        e: ElementTree.Element,
-        name: str,
-        pose: np.ndarray,
-        surface: TexturedMesh,
-        group: np.ndarray,
-        solid: TexturedMesh | None,
-    ) -> list[Part]:
-        """Frame and leaves of a door, a window in one piece."""
+    def _door(self, e: ElementTree.Element, door: Part, group: np.ndarray) -> list[Part]:
+        """Return the frame and leaves of a door, whose faces are in a `group` each; a window in one piece."""
         sashes = e.findall("sash")
         foot, height = number(e, "elevation", 0.0) / 100, number(e, "height") / 100
+        fixed = dataclasses.replace(door, collision=None, static=True, held=True, known_as="structure")
         if not sashes or foot > DOOR_M[0] or height < DOOR_M[1]:
-            return [Part(name, pose, surface, None, True, held=True, known_as="structure")]
+            return [fixed]
         leaf = np.array([int(m[1]) if (m := LEAF.match(str(g))) else 0 for g in group])
         leaf[leaf > len(sashes)] = 0
-        made = []
+        leaves = []
         for k, sash in enumerate(sashes, 1):
             faces = np.flatnonzero(leaf == k)
-            own = _part_of(surface, faces) if len(faces) else _plain_leaf(e, sash, surface)
-            own = _beside(own, _axis(e, sash)[0], [_axis(e, s)[0] for s in sashes if s is not sash])
-            swing, hulls = _swing(e, sash, own.vertices), solid if len(sashes) == 1 else None
-            made.append(Part(f"{name} leaf {k}", pose, own, hulls, False, known_as="door", swing=swing))
+            flat = _part_of(door.surface, faces) if len(faces) else _plain_leaf(e, sash, door.surface)
+            flat = _beside(flat, _axis(e, sash)[0], [_axis(e, s)[0] for s in sashes if s is not sash])
+            swing, hulls = _swing(e, sash, flat.vertices), door.collision if len(sashes) == 1 else None
+            leaves.append(Part(f"{door.name} leaf {k}", door.pose, flat, hulls, False, known_as="door", swing=swing))
         if not leaf.any():
             self.source.note(f"{called(e)}: its model has no leaf of its own; flat leaves take its place")
-            return made
+            return leaves
         frame = np.flatnonzero(leaf == 0)
-        rest = (
-            [Part(name, pose, _part_of(surface, frame), None, True, held=True, known_as="structure")]
-            if len(frame)
-            else []
-        )
-        return rest + made
+        rest = dataclasses.replace(fixed, surface=_part_of(door.surface, frame)) if len(frame) else None
+        return leaves if rest is None else [rest, *leaves]
 
 
 def _lamp(e: ElementTree.Element, source: ElementTree.Element, pose: np.ndarray) -> Lamp:

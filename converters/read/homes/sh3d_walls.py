@@ -98,13 +98,12 @@ def read_walls(elements: list[ElementTree.Element], base_m: dict[str | None, flo
             raise SceneRejected(f"{called(element)}: is larger than {EXTENT_M:g} m; mend the drawing")
         share = np.linspace(0, 1, len(points))
         pieces.setdefault(name, [])
+        names = [element.get("wallAtStart"), *[name] * (len(points) - 2), element.get("wallAtEnd")]
         for k in range(len(points) - 1):
-            joins = [
-                element.get("wallAtStart") if k == 0 else name,
-                element.get("wallAtEnd") if k == len(points) - 2 else name,
-            ]
             some = np.maximum(tall[0] + share[k : k + 2] * (tall[1] - tall[0]), 0.0)
-            wall = Wall(element, points[k : k + 2], thick, some, base_m[element.get("level")], joins, np.zeros(0))
+            wall = Wall(
+                element, points[k : k + 2], thick, some, base_m[element.get("level")], names[k : k + 2], np.zeros(0)
+            )
             wall.corners = wall.square()
             pieces[name].append(len(walls))
             walls.append(wall)
@@ -283,16 +282,10 @@ def enclosed(walls: list[Wall], rooms: list[Room]) -> list[Room]:
 
 
 def level_parts(
-    rooms: list[Room],
-    walls: list[Wall],
-    openings: list[Opening],
-    floor_m: float,
-    ceiling_m: float,
-    shafts: Any,
-    above: Any,
+    rooms: list[Room], walls: list[Wall], openings: list[Opening], heights_m: tuple[float, float], shafts: list[Any]
 ) -> list[Part]:
-    """Floors and ceilings of one level; of rooms that overlap the later one is seen."""
-    sheet, taken, tops = Sheet(), shafts, above
+    """Return the floors and ceilings of one level, without the shafts in each; the later of two rooms hides the other."""
+    sheet, (taken, tops), (floor_m, ceiling_m) = Sheet(), shafts, heights_m
 
     def level(height: float) -> Callable[[np.ndarray], np.ndarray]:
         return lambda flat: np.column_stack([flat, np.full(len(flat), height)])
@@ -319,8 +312,8 @@ def level_parts(
                 assert nearest.floor is not None
                 sheet.add(sill, level(floor_m), fitted(nearest.floor, float(shapely.area(sill))))
                 taken = shapely.union(taken, sill)
-    made = sheet.part("floors and ceilings")
-    return [] if made is None else [made]
+    part = sheet.part("floors and ceilings")
+    return [] if part is None else [part]
 
 
 def opening_of(element: ElementTree.Element, base_m: float) -> Opening:
