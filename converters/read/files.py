@@ -1,4 +1,4 @@
-"""Paths in; meshes, images, JSON and hashes out; a failure is one `SceneRejected` line."""
+"""Read meshes, images and JSON, and hash them; a failure is one `SceneRejected` line."""
 
 import collections
 import contextlib
@@ -32,7 +32,7 @@ class SourceFolder:
     """A raw scene's folder; remembers the sha256 of every file that was read through it, and what was repaired."""
 
     def __init__(self, root: Path, strict: bool = False, remedy: str = "put a copy of the file there") -> None:
-        """Opens the folder; with `strict`, every repair is an error; `remedy` is for files that lie outside."""
+        """Open the folder; with `strict`, every repair is an error; `remedy` is for files that lie outside."""
         if not root.exists():
             raise SceneRejected(f"{root}: no such folder; give the folder that holds the raw scene")
         if not root.is_dir():
@@ -42,19 +42,19 @@ class SourceFolder:
         self.sha256: dict[str, str] = {}
         self.warnings: list[str] = []
         self.surfaces: dict[str, Any] = {}
-        """Path -> what `read_surface` made of it."""
+        """Path -> what `read_surface` returned."""
 
     def scene(self, layout: str, scan: ScanMesh, **more: Any) -> RawScene:
-        """The record of what was read, with the folder's name, hashes and warnings."""
+        """Return the record of what was read, with the folder's name, hashes and warnings."""
         about = {"name": self.root.resolve().name, "source_format": layout, "scan": scan}
         return RawScene(**about, **more, sources=dict(sorted(self.sha256.items())), warnings=tuple(self.warnings))
 
     def has(self, relative: str) -> bool:
-        """True when the file exists."""
+        """Return True when the file exists."""
         return os.path.isfile(self.root / relative)
 
     def use(self, relative: str, remedy: str) -> Path:
-        """Path of a file that must exist; its hash goes into the record."""
+        """Return the path of a file that must exist; its hash goes into the record."""
         path = self.root / relative
         if os.path.isfile(path) or os.path.islink(path):
             self.inside(path)
@@ -67,14 +67,14 @@ class SourceFolder:
         return path
 
     def relative(self, path: Path) -> str | None:
-        """The path relative to the folder, or None where it leads out of it."""
+        """Return the path relative to the folder, or None where it leads out of it."""
         try:
             return self.inside(path)
         except SceneRejected:
             return None
 
     def inside(self, path: Path) -> str:
-        """The path relative to the folder, links followed."""
+        """Return the path relative to the folder, links followed."""
         try:
             end, root = self.resolve(path), self.resolve(self.root)
         except (ValueError, OSError, RuntimeError) as error:  # Python 3.11 and 3.12 raise RuntimeError at a loop
@@ -85,7 +85,7 @@ class SourceFolder:
         return end.relative_to(root).as_posix()
 
     def note(self, message: str) -> None:
-        """Records something the user should know; it goes into scene.json, so it names no absolute path."""
+        """Record something the user should know; it goes into scene.json, so it names no absolute path."""
         message = printable(message)
         if message not in self.warnings:
             self.warnings.append(message)
@@ -96,7 +96,7 @@ class SourceFolder:
             self.note(f"{where} {count}{times}{what}")
 
     def repaired(self, message: str) -> None:
-        """Records a defect that was mended."""
+        """Record a defect that was mended."""
         if self.strict:
             raise SceneRejected(f"{self.root}: {message}; --strict refuses what would be repaired")
         self.note(message)
@@ -122,7 +122,7 @@ def only_file(
 
 
 def read_json(path: Path) -> Any:
-    """Decodes one JSON file."""
+    """Decode one JSON file."""
     return Reader(SceneRejected, "fetch the file again").json(path)
 
 
@@ -146,13 +146,13 @@ def read_labels(path: Path) -> np.ndarray:
 
 
 def read_image(path: Path, mode: str) -> np.ndarray:
-    """Reads an image as uint8: mode 'RGB' gives (h, w, 3), mode 'L' gives (h, w)."""
+    """Read an image as uint8: mode 'RGB' gives (h, w, 3), mode 'L' gives (h, w)."""
     with readable(path, SceneRejected, "fetch the file again", " as an image"), Image.open(path) as image:
         return np.asarray(image.convert(mode))
 
 
 def read_mesh(path: Path) -> trimesh.Trimesh:
-    """Reads a single mesh in file order (no vertices merged or moved)."""
+    """Read a single mesh in file order (no vertices merged or moved)."""
     with readable(path, SceneRejected, "fetch the file again", " as a mesh"):
         mesh = trimesh.load(path, process=False, force="mesh")
     assert isinstance(mesh, trimesh.Trimesh)
@@ -161,7 +161,7 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
 
 
 def check_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Refuses what no stage can use."""
+    """Refuse what no stage can use."""
     if len(vertices) == 0 or len(faces) == 0:
         raise SceneRejected(
             f"{path}: {len(vertices)} vertices and {len(faces)} faces, expected a triangle mesh; export its surface"
@@ -180,7 +180,7 @@ def check_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class ObjMesh:
-    """Content of an OBJ file, polygons cut into triangles."""
+    """Hold the content of an OBJ file, polygons cut into triangles."""
 
     vertices: np.ndarray
     """(n, 3) float64."""
@@ -213,7 +213,7 @@ def read_text(path: Path) -> str:
 
 
 def read_obj(path: Path) -> ObjMesh:
-    """Reads a polygon OBJ in its own vertex order (labels refer to it; mesh libraries reorder at seams)."""
+    """Read a polygon OBJ in its vertex order (labels refer to it; mesh libraries reorder at seams)."""
     positions: list[str] = []
     tints: dict[int, list[str]] = {}
     uvs: list[str] = []
@@ -282,8 +282,8 @@ def _corner_uv(path: Path, uv: np.ndarray, index: np.ndarray, corner: np.ndarray
 
 def _comma(text: str) -> str:
     """Return a hint where numbers are written with decimal commas."""
-    found = re.search(r"\d,\d", text)
-    return ": it has decimal commas, expected points, which exporters write under English number settings" * bool(found)
+    hint = ": it has decimal commas, expected points, which exporters write under English number settings"
+    return hint * bool(re.search(r"\d,\d", text))
 
 
 def _tinted(count: int, tints: dict[int, list[str]]) -> np.ndarray | None:
@@ -298,14 +298,14 @@ def _tinted(count: int, tints: dict[int, list[str]]) -> np.ndarray | None:
 
 
 def _from_the_end(word: str, n_vertices: int, n_uv: int) -> str:
-    """An OBJ corner with negative indices (-1 is the last one so far) made positive."""
+    """Return an OBJ corner whose negative indices (-1 is the last one so far) are positive."""
     parts = (word.split("/") + [""])[:2]
     counts = (n_vertices, n_uv)
     return "/".join(str(counts[k] + 1 + int(p)) if p.startswith("-") else p for k, p in enumerate(parts) if p or k == 0)
 
 
 def _corner_indices(corners: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
-    """(c,) vertex and (c,) texture indices, from 1; None where no corner has a texture coordinate.
+    """Return (c,) vertex and (c,) texture indices, from 1; None where no corner has a texture coordinate.
 
     Where some have none (faces of plain materials), they take the first: a plain colour is the same everywhere.
     """
@@ -322,11 +322,7 @@ def _corner_indices(corners: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _fans(sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cuts polygons into triangles around their first corner.
-
-    Returns:
-        (m, 3) indices into the list of corners, (m,) polygon of each triangle.
-    """
+    """Return (m, 3) corners of the triangles around each polygon's first corner, and the (m,) polygon of each."""
     first = np.cumsum(sizes) - sizes
     face = np.repeat(np.arange(len(sizes)), sizes - 2)
     step = np.arange(len(face)) - np.repeat(np.cumsum(sizes - 2) - (sizes - 2), sizes - 2)
@@ -335,7 +331,7 @@ def _fans(sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _unfold(vertices: np.ndarray, index: np.ndarray, corner: np.ndarray, face: np.ndarray) -> None:
-    """Cuts polygons anew, in place, whose fans cover what they do not: door frames, rings and other hollow outlines."""
+    """Cut polygons again, in place, whose fans cover what they do not: door frames, rings and other hollow outlines."""
     a, b, c = (vertices[index[corner[:, k]]] for k in range(3))
     normal = np.cross(b - a, c - a)
     whole = np.stack([np.bincount(face, normal[:, k]) for k in range(3)], axis=1)
@@ -352,8 +348,8 @@ def _unfold(vertices: np.ndarray, index: np.ndarray, corner: np.ndarray, face: n
 
 
 def _ears(outline: np.ndarray) -> np.ndarray | None:
-    """(n - 2, 3) triangles of a simple polygon (n, 2), counter-clockwise; None where it crosses itself."""
-    left, found = list(range(len(outline))), []
+    """Return (n - 2, 3) triangles of a simple polygon (n, 2), counter-clockwise; None where it crosses itself."""
+    left, ears = list(range(len(outline))), []
     while len(left) > 2:
         for k in range(len(left)):
             triple = left[k - 1], left[k], left[(k + 1) % len(left)]
@@ -363,16 +359,16 @@ def _ears(outline: np.ndarray) -> np.ndarray | None:
                 (q - p)[0] * (others - p)[:, 1] - (q - p)[1] * (others - p)[:, 0] for p, q in ((a, b), (b, c), (c, a))
             ]
             if (b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0] >= 0 and not (np.min(sides, axis=0) > 0).any():
-                found.append(triple)
+                ears.append(triple)
                 del left[k]
                 break
         else:
             return None
-    return np.array(found)
+    return np.array(ears)
 
 
 def as_number(text: str | None) -> float:
-    """A number; NaN where the text is none."""
+    """Return a number; NaN where the text is none."""
     try:
         return float(text or "")
     except ValueError:

@@ -1,4 +1,4 @@
-"""A raw Gibson folder in, `RawScene` out; labels, alignments and maps are taken where they are.
+"""Read a raw Gibson folder; labels, alignments and maps are taken where they are.
 
 Files of the release: iGibson 0.0.4, `dataset.md`; z up, metres, maps of 0.01 m a pixel whose middle is
 the world's origin. `floors.txt` has one height a line; number k of the map files counts them from the lowest.
@@ -30,9 +30,9 @@ MAP_SHARE = 0.5
 
 
 def read_gibson(root: Path, strict: bool = False) -> RawScene:
-    """Reads mesh, texture, labels, floor heights, maps, alignments and CAD models.
+    """Read mesh, texture, labels, floor heights, maps, alignments and CAD models.
 
-    Without labels, floor, walls and ceiling are told by shape; without alignments the scene has structure only.
+    Without labels, floor, walls and ceiling are recognised by shape; without alignments the scene has structure only.
     """
     source = SourceFolder(root, strict)
     mesh = read_scan_obj(source, MESH, "expected Gibson's textured z-up mesh")
@@ -61,7 +61,7 @@ def read_gibson(root: Path, strict: bool = False) -> RawScene:
 
 
 def building(source: SourceFolder, layout: str, mesh: TexturedMesh, labels, heights, cads, annotations) -> RawScene:
-    """The record of a Gibson building: joins what was read with maps, licence and hashes."""
+    """Return the record of a Gibson building: what was read with maps, licence and hashes."""
     floor = [mesh.vertices[(labels == FLOOR) & (np.abs(mesh.vertices[:, 2] - h) < STOREY_M / 2), :2] for h in heights]
     maps = [read_traversable(source, k, mesh.vertices[:, :2], floor[k]) for k in range(len(heights))]
     return source.scene(
@@ -78,7 +78,7 @@ def building(source: SourceFolder, layout: str, mesh: TexturedMesh, labels, heig
 
 
 def _furnished(path: Path) -> bool:
-    """Whether the mesh shows what is annotated: so it does unless the labels' file says otherwise."""
+    """Return whether the mesh shows what is annotated: it does unless the labels' file says otherwise."""
     with read_npz(path, SceneRejected, "expected labels as an NPZ, furnished as true or false") as arrays:
         value = np.asarray(arrays["furnished"]) if "furnished" in arrays.files else np.array(True)
     if value.dtype != bool or value.size != 1:
@@ -87,7 +87,7 @@ def _furnished(path: Path) -> bool:
 
 
 def read_floors(source: SourceFolder) -> tuple[float, ...]:
-    """Heights of the floors, m, lowest first."""
+    """Return the heights of the floors, m, lowest first."""
     path, heights = read_numbers(source, "floors.txt", "expected one floor height in metres a line")
     heights = sorted(heights)
     if not heights or not np.isfinite(heights).all() or max(map(abs, heights)) > 1e4:
@@ -101,7 +101,7 @@ def read_floors(source: SourceFolder) -> tuple[float, ...]:
 
 
 def read_windows(source: SourceFolder) -> tuple[Window, ...]:
-    """Boxes along x and y that windows fill; none without the file."""
+    """Return the boxes along x and y that windows fill; none without the file."""
     if not source.has(WINDOWS):
         return ()
     path, remedy = source.use(WINDOWS, ""), "expected a lower and an upper corner a line, x y z x y z in metres"
@@ -116,11 +116,9 @@ def read_windows(source: SourceFolder) -> tuple[Window, ...]:
 
 
 def read_traversable(source: SourceFolder, number: int, mesh_xy: np.ndarray, floor_xy: np.ndarray) -> GivenMap | None:
-    """A floor's own traversable map, less its obstacles; absent maps are computed from the mesh alone.
+    """Return a floor's traversable map less its obstacles; None without a file.
 
-    Args:
-        mesh_xy: (n, 2) vertices of the mesh, m.
-        floor_xy: (k, 2) those of this floor's floor.
+    It must fit the mesh, whose vertices are at `mesh_xy` (n, 2), those of this floor at `floor_xy` (k, 2), m.
     """
     name, obstacle_name = f"floor_trav_{number}.png", f"floor_{number}.png"
     if not source.has(name):
@@ -155,13 +153,13 @@ def read_traversable(source: SourceFolder, number: int, mesh_xy: np.ndarray, flo
 
 
 def read_attribution(source: SourceFolder) -> str:
-    """Whose the models are, as the folder's own file says."""
+    """Return whose the models are, as the folder's file says."""
     has = source.has(ATTRIBUTION)
     return source.use(ATTRIBUTION, "").read_text(encoding="utf-8", errors="replace") if has else ""
 
 
 def read_licence(source: SourceFolder) -> str:
-    """First 400 characters of the folder's LICENCE or LICENSE, on one line."""
+    """Return the first 400 characters of the folder's LICENCE or LICENSE, on one line."""
     licence = "unknown: the source folder has no LICENCE file"
     name = "LICENCE" if source.has("LICENCE") else "LICENSE"
     if source.has(name):

@@ -1,4 +1,4 @@
-"""A folder of the released interactive Gibson set in, `RawScene` out.
+"""Read a folder of the released interactive Gibson set.
 
 Layout (iGibson 0.0.4, `dataset.md`): `mesh_z_up_cleaned.obj` is the scan without the annotated furniture,
 `plane_z_up_<f>.obj` floor for the holes it left, `alignment_centered_<i>_<synset>.urdf` a piece of furniture
@@ -51,14 +51,14 @@ SAME_SHARE = 0.5
 
 
 def looks_like(root: Path) -> bool:
-    """True when the folder has the cleaned mesh and a furniture URDF."""
+    """Return True when the folder has the cleaned mesh and a furniture URDF."""
     return (root / MESH).is_file() and any(root.glob(f"{PREFIX}*.urdf"))
 
 
 def read_interactive_gibson(root: Path, strict: bool = False) -> RawScene:
-    """Reads cleaned mesh, floor planes, furniture, floor heights and maps.
+    """Read cleaned mesh, floor planes, furniture, floor heights and maps.
 
-    The furniture keeps its own mass, friction and collision meshes. A door's yaw is taken out of its mesh and
+    The furniture keeps its mass, friction and collision meshes. A door's yaw is taken out of its mesh and
     goes into its pose, so that the leaf lies along its body's x axis; its hinge is assumed at the edge that stands
     at a wall, and turns as far as walls let it.
     """
@@ -81,10 +81,10 @@ def read_interactive_gibson(root: Path, strict: bool = False) -> RawScene:
 
 
 def _furniture(source: SourceFolder, path: Path, structure: np.ndarray) -> tuple[Annotation, CadModel]:
-    """One piece of furniture and its model."""
+    """Return one piece of furniture and its model."""
     category = category_of_id(path.stem.rsplit("_", 1)[-1], f"{path}: category id is", CLASSES)
     name = path.name.replace(PREFIX, "pos")[: -len("urdf")] + "txt"
-    place, position = read_numbers(source, name, f"expected x y z of {path.name} in metres", lines=1)
+    place, position = read_numbers(source, name, f"expected x y z in metres, of {path.name}", lines=1)
     if len(position) != 3 or not np.isfinite(position).all():
         raise SceneRejected(f"{place}: holds {len(position)} numbers, expected x y z in metres, all finite")
     item = read_urdf(source, path.name, "")
@@ -104,14 +104,14 @@ def _furniture(source: SourceFolder, path: Path, structure: np.ndarray) -> tuple
 
 
 def leaf_turn(leaf: np.ndarray) -> np.ndarray:
-    """(3, 3) yaw that a door's leaf, (n, 3), is turned by from the x axis."""
+    """Return the (3, 3) yaw that a door's leaf, (n, 3), is turned by from the x axis."""
     box = upright_box(leaf)
     yaw = math.atan2(box.rotation[1, 0], box.rotation[0, 0])
     return yaw_matrix(yaw + math.pi / 2 if box.half[1] > box.half[0] else yaw)
 
 
 def assume_hinge(leaf: np.ndarray, pose: np.ndarray, structure: np.ndarray) -> ScannedHinge:
-    """The upright hinge of a door that came without one.
+    """Return the upright hinge of a door that came without one.
 
     Of the leaf's two ends the hinge is the one with more structure around it; the leaf turns both ways from where it
     stands until structure lies in it, by 120 degrees at most. What lies in the leaf as it stands is taken for the
@@ -133,9 +133,9 @@ def assume_hinge(leaf: np.ndarray, pose: np.ndarray, structure: np.ndarray) -> S
         point = (local - [end, across]) * [inward, 1.0]
         radius, angle = np.hypot(*point.T), np.arctan2(point[:, 1], point[:, 0])
         reach = (radius > NEAR_HINGE_M) & (radius < length + 0.02)
-        own = (np.abs(point[:, 1]) < half + 0.02) & (point[:, 0] > 0)
+        itself = (np.abs(point[:, 1]) < half + 0.02) & (point[:, 0] > 0)
         turns = np.arctan2(half, np.maximum(radius, half))  # a point stops the leaf this much before its middle line
-        stops = np.asarray(angle - np.sign(angle) * turns)[reach & ~own]
+        stops = np.asarray(angle - np.sign(angle) * turns)[reach & ~itself]
         # Three points make an obstacle; one or two are noise of the scan.
         most = [DOOR_MOST_RAD] * 3
         left, right = (np.sort([*some, *most])[2] for some in (stops[stops > 0], np.negative(stops[stops < 0])))
@@ -148,7 +148,7 @@ def assume_hinge(leaf: np.ndarray, pose: np.ndarray, structure: np.ndarray) -> S
 def _without_doubles(
     source: SourceFolder, annotations: tuple[Annotation, ...], cads: dict[str, CadModel]
 ) -> tuple[Annotation, ...]:
-    """Drops objects of one class that stand in an earlier one: the release annotates some furniture twice."""
+    """Drop objects of one class that stand in an earlier one: the release annotates some furniture twice."""
     kept: list[tuple[Annotation, np.ndarray, np.ndarray]] = []
     for annotation in annotations:
         placed = transformed(cads[annotation.cad_id].vertices, annotation.pose)
@@ -169,7 +169,7 @@ def _without_doubles(
 def _with_plane(
     source: SourceFolder, number: int, height_m: float, mesh: TexturedMesh, labels: np.ndarray
 ) -> tuple[TexturedMesh, np.ndarray]:
-    """The scan with the release's floor plane where it shows no floor and the floor's map has some."""
+    """Return the scan with the release's floor plane where it shows no floor and the floor's map has some."""
     name = f"plane_z_up_{number}.obj"
     if not source.has(name):
         source.note(f"{name} is absent: the floor under the furniture is patched from the floor around it")

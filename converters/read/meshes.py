@@ -29,7 +29,7 @@ from converters.read.obj import (
     scan_of,
     texels,
     textured_by_face,
-    use_found,
+    use_named,
 )
 from converters.read.surfaces import check_extent, floor_level, label_storeys, labelled, welded, with_split_corners
 from converters.records.errors import SceneRejected
@@ -85,7 +85,7 @@ class SourceResolver:
             if Path(key).suffix.lower() not in Image.registered_extensions() or (
                 read_texture(self.source, self.model, key) is not None
             ):
-                path = use_found(self.source, self.model.parent, key, self.model.name)
+                path = use_named(self.source, self.model.parent, key, self.model.name)
         except SceneRejected as refusal:
             self.refusal = self.refusal or refusal
             raise

@@ -1,4 +1,4 @@
-"""A textured OBJ and its MTL in, `TexturedMesh` (vertices in the file's own order, one image) out.
+"""Read a textured OBJ and its MTL as a `TexturedMesh`: vertices in the file's order, one image.
 
 Names of files that an OBJ or MTL gives are sought generously, for folders travel between machines; what is
 missing costs colour only and is a warning.
@@ -39,7 +39,7 @@ SMALL_IMAGE = 10_000
 
 
 def find_file(source: SourceFolder, folder: Path, name: str) -> Path | None:
-    """The file that a model names, sought also by its bare name (paths of another machine, letter case)."""
+    """Return the file that a model names, sought also by its bare name (paths of another machine, letter case)."""
     words = name.strip().strip('"').removeprefix("file://")
     bare = words.replace("\\", "/")
     names = dict.fromkeys(n for n in (bare, unquote(bare)) if n)
@@ -62,16 +62,16 @@ def _folded(name: str) -> str:
 
 
 def _is_there(path: Path) -> bool:
-    """A file or a link, a broken one too."""
+    """Return True for a file or a link, a broken one too."""
     return os.path.isfile(path) or os.path.islink(path)
 
 
-def use_found(source: SourceFolder, folder: Path, name: str, by: str) -> Path | None:
-    """The named file with its hash recorded; a warning where it stands under another name than the given one."""
-    found = find_file(source, folder, name)
-    if found is None:
+def use_named(source: SourceFolder, folder: Path, name: str, by: str) -> Path | None:
+    """Return the named file with its hash recorded; a warning where it stands under another name than the given one."""
+    path = find_file(source, folder, name)
+    if path is None:
         return None
-    relative = source.inside(found)
+    relative = source.inside(path)
     if source.relative(folder / unquote(name.strip())) != relative:
         source.repaired(f"{by}: names '{name.strip()}', which is not there; {relative} is taken")
     return source.use(relative, "")
@@ -86,8 +86,8 @@ def read_materials(
     """
     where = source.relative(obj) or obj.name
     each = [[n] if find_file(source, obj.parent, n) else n.split() for n in libraries]  # a line may name several
-    found = [use_found(source, obj.parent, name, where) for names in each for name in names]
-    paths = [p for p in found if p is not None]
+    named = [use_named(source, obj.parent, name, where) for names in each for name in names]
+    paths = [p for p in named if p is not None]
     if not paths and obj.with_suffix(".mtl").is_file():
         paths = [source.use(source.relative(obj.with_suffix(".mtl")) or "", "")]
     if not paths:
@@ -115,9 +115,9 @@ def read_materials(
 
 
 def read_texture(source: SourceFolder, by: Path, name: str) -> np.ndarray | None:
-    """The image (h, w, 3) uint8 that a material file or model names; None and a warning where there is none."""
+    """Return the image (h, w, 3) uint8 that a material file or model names; None and a warning where there is none."""
     where = source.relative(by) or by.name
-    path = use_found(source, by.parent, name, where)
+    path = use_named(source, by.parent, name, where)
     if path is None:
         lack = "lies outside of the source folder" if os.path.isfile(by.parent / name) else "is missing"
         source.repaired(f"{where}: names the texture '{name}', which {lack}; the material's plain colour is taken")
@@ -131,7 +131,7 @@ def read_texture(source: SourceFolder, by: Path, name: str) -> np.ndarray | None
 
 
 def parse_mtl(text: str) -> dict[str, tuple[tuple[int, int, int], str]]:
-    """Material -> its diffuse colour (0 to 255) and the name of its texture ('' without one)."""
+    """Return material -> its diffuse colour (0 to 255) and the name of its texture ('' without one)."""
     result: dict[str, tuple[tuple[int, int, int], str]] = {}
     name = None
     for line in text.splitlines():
@@ -255,7 +255,7 @@ def read_painted_obj(
 
 
 def read_scan_obj(source: SourceFolder, relative: str, remedy: str) -> TexturedMesh:
-    """Reads an OBJ with all its materials, their textures joined in one image; arguments as `read_painted_obj`."""
+    """Read an OBJ with all its materials, their textures joined in one image; arguments as `read_painted_obj`."""
     mesh, number, images = read_painted_obj(source, relative, remedy)
     if not images:
         return TexturedMesh(mesh.vertices, mesh.faces, None, None)
@@ -264,13 +264,13 @@ def read_scan_obj(source: SourceFolder, relative: str, remedy: str) -> TexturedM
 
 
 def scan_of(mesh: TexturedMesh, labels: np.ndarray) -> ScanMesh:
-    """A mesh with labels (n,) of its vertices; grey where it has no image."""
+    """Return a mesh with labels (n,) of its vertices; grey where it has no image."""
     grey = np.full((len(mesh.vertices), 3), GREY, np.uint8) if mesh.texture is None else None
     return ScanMesh(mesh.vertices, mesh.faces, labels, grey, mesh.corner_uv, mesh.texture)
 
 
 def texels(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """(n, 3) uint8 of an image (h, w, 3) at texture coordinates (n, 2); it repeats outside [0, 1]."""
+    """Return (n, 3) uint8 of an image (h, w, 3) at texture coordinates (n, 2); it repeats outside [0, 1]."""
     height, width = image.shape[:2]
     u, v = (uv % 1.0).T
     return image[
@@ -279,7 +279,7 @@ def texels(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 def join_textures(corner_uv: np.ndarray, number: np.ndarray, images: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Puts several images above one another and moves texture coordinates along.
+    """Put several images above one another and move texture coordinates along.
 
     `corner_uv`: (m, 3, 2), origin at the lower left of each face's own image; may leave [0, 1] (repeats).
     `number`: (m,) image of each face.
@@ -323,7 +323,7 @@ def in_colour(mesh: TexturedMesh, rgb: np.ndarray) -> TexturedMesh:
 
 
 def textured_by_face(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> TexturedMesh:
-    """A mesh with one colour a face, as an image with one 4 x 4 tile a colour."""
+    """Return a mesh with one colour a face, as an image with one 4 x 4 tile a colour."""
     palette, index = np.unique(np.asarray(colours, np.uint8), axis=0, return_inverse=True)
     side = math.ceil(math.sqrt(len(palette)))
     image = np.zeros((side * side, 3), np.uint8)
@@ -335,7 +335,7 @@ def textured_by_face(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarra
 
 
 def at_most(image: np.ndarray, side: int) -> np.ndarray:
-    """The image shrunk until no side is longer."""
+    """Return the image shrunk until no side is longer."""
     largest = max(image.shape[:2])
     if largest <= side:
         return image
@@ -344,7 +344,7 @@ def at_most(image: np.ndarray, side: int) -> np.ndarray:
 
 
 def join_meshes(*meshes: TexturedMesh) -> TexturedMesh:
-    """All meshes as one, in their order; images that are alike are kept once."""
+    """Return all meshes as one, in their order; images that are alike are kept once."""
     if len(meshes) == 1:
         return meshes[0]
     vertices, faces = stacked((m.vertices, m.faces) for m in meshes)

@@ -1,7 +1,7 @@
-"""A URDF of one rigid object in; its surface, convex pieces, mass and friction out.
+"""Read a URDF of one rigid object: its surface, convex pieces, mass and friction.
 
-Inertia is not read: released URDFs carry placeholders (1 kg m2 about every axis), and both mass and hulls are
-known, from which it follows.
+Inertia is not read: released URDFs carry placeholders (1 kg m2 about every axis), and it follows
+from mass and hulls.
 """
 
 import dataclasses
@@ -43,7 +43,7 @@ MOST_KINDS = 30
 
 @dataclasses.dataclass(frozen=True)
 class RigidObject:
-    """One rigid object, z up, in its own frame."""
+    """Hold one rigid object, z up, in its local frame."""
 
     name: str
     surface: TexturedMesh
@@ -56,7 +56,7 @@ class RigidObject:
 
 
 def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = False) -> RigidObject:
-    """Reads a URDF whose links, if several, hang together by fixed joints.
+    """Read a URDF whose links, if several, hang together by fixed joints.
 
     `hold`: take joints that move as fixed where they are at 0.
     """
@@ -99,7 +99,7 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = Fal
 
 
 def numbers(text: str | None, default: tuple[float, ...]) -> np.ndarray:
-    """As many numbers as the default has, from text."""
+    """Return as many numbers as the default has, from text."""
     values = np.array((text or "").split() or default, float)
     if values.shape != np.shape(default) or not np.isfinite(values).all() or np.abs(values).max(initial=0) > 1e8:
         raise ValueError(f"'{text}' is not {len(default)} usable numbers")
@@ -120,13 +120,13 @@ def count_unread(root: ElementTree.Element, table: dict[str, str], unread: Count
     while left:
         element, row = left.pop()
         used, _, more = table.get(row, "").partition("|")
-        known = {*used.split(), *more.split(), *table["any"].split()}
-        unread.update(f"{key}= of <{element.tag}>" for key in element.attrib if f"@{key}" not in known)
+        expected = {*used.split(), *more.split(), *table["any"].split()}
+        unread.update(f"{key}= of <{element.tag}>" for key in element.attrib if f"@{key}" not in expected)
         for child in element:
             inner = f"{row}/{child.tag}"
             if child.tag in used.split():
                 left.append((child, inner if inner in table else child.tag))
-            elif child.tag not in known:
+            elif child.tag not in expected:
                 unread[f"<{child.tag}> in <{element.tag}>"] += 1
 
 
@@ -140,7 +140,7 @@ def report_unread(source: SourceFolder, where: str, unread: Counter[str]) -> Non
 
 
 def _origin(element: ElementTree.Element) -> np.ndarray:
-    """(4, 4) of an element's `<origin>`; roll, pitch, yaw about fixed axes."""
+    """Return the (4, 4) of an element's `<origin>`; roll, pitch, yaw about fixed axes."""
     origin = element.find("origin")
     if origin is None:
         return np.eye(4)
@@ -151,7 +151,7 @@ def _origin(element: ElementTree.Element) -> np.ndarray:
 def _link_places(
     path: Path, root: ElementTree.Element, links: dict[str, ElementTree.Element], hold: bool
 ) -> dict[str, np.ndarray]:
-    """Link -> (4, 4) in the frame of the root link."""
+    """Return link -> (4, 4) in the frame of the root link."""
     if not links:
         raise SceneRejected(f"{path}: has no <link>, expected a URDF of one object")
     parents = {}
@@ -167,11 +167,11 @@ def _link_places(
         parents[str(child.get("link"))] = (str(parent.get("link")), _origin(joint))
     places = {}
     for name in links:
-        place, at, seen = np.eye(4), name, set()
+        place, at, visited = np.eye(4), name, set()
         while at in parents:
-            if at in seen:
+            if at in visited:
                 raise SceneRejected(f"{path}: its joints form a loop at link '{at}'")
-            seen.add(at)
+            visited.add(at)
             at, origin = parents[at]
             place = origin @ place
         places[name] = place
@@ -264,7 +264,7 @@ def rectangle(x_m: float, y_m: float) -> TexturedMesh:
 
 
 def placed(mesh: TexturedMesh, matrix: np.ndarray) -> TexturedMesh:
-    """The mesh moved by a (4, 4) matrix; one that mirrors turns the faces' order."""
+    """Return the mesh moved by a (4, 4) matrix; one that mirrors turns the faces' order."""
     faces = mesh.faces if np.linalg.det(matrix[:3, :3]) > 0 else mesh.faces[:, ::-1]
     corner_uv = mesh.corner_uv
     if faces is not mesh.faces and corner_uv is not None:
@@ -273,5 +273,5 @@ def placed(mesh: TexturedMesh, matrix: np.ndarray) -> TexturedMesh:
 
 
 def joined(meshes: list[TexturedMesh]) -> TexturedMesh | None:
-    """All meshes as one; None of none."""
+    """Return all meshes as one; None of none."""
     return join_meshes(*meshes) if meshes else None

@@ -19,7 +19,7 @@ import trimesh
 from PIL import Image
 
 from converters.read.files import SourceFolder, check_mesh
-from converters.read.obj import join_textures, read_texture, textured_by_face, use_found, wrapped
+from converters.read.obj import join_textures, read_texture, textured_by_face, use_named, wrapped
 from converters.records.errors import SceneRejected
 from converters.records.limits import NUMBERS, PIXELS, check_count
 from converters.records.visual import TexturedMesh
@@ -136,12 +136,12 @@ class _File:
         nodes, scenes = self.tree.get("nodes", []), self.tree.get("scenes", [])
         below = {child for node in nodes for child in node.get("children", [])}
         roots = scenes[self.tree.get("scene", 0)].get("nodes", []) if scenes else set(range(len(nodes))) - below
-        left, seen, found, faces = [(k, np.eye(4)) for k in roots], set(), [], 0
+        left, visited, meshes, faces = [(k, np.eye(4)) for k in roots], set(), [], 0
         while left:
             k, pose = left.pop()
-            if k in seen:
+            if k in visited:
                 continue
-            seen.add(k)
+            visited.add(k)
             pose = pose @ _pose(nodes[k])
             left += [(child, pose) for child in nodes[k].get("children", [])]
             if "mesh" not in nodes[k]:
@@ -153,11 +153,11 @@ class _File:
             mesh = self.tree["meshes"][nodes[k]["mesh"]]
             weights = nodes[k].get("weights", mesh.get("weights", []))
             for part in mesh["primitives"]:
-                for own in self._instances(nodes[k]):
-                    found += self._primitive(part, pose @ own, weights)
-                    faces += len(found[-1].faces) if found else 0
+                for copy in self._instances(nodes[k]):
+                    meshes += self._primitive(part, pose @ copy, weights)
+                    faces += len(meshes[-1].faces) if meshes else 0
                     check_count(self.path, faces, NUMBERS, "faces in its nodes", "simplify it")
-        return found
+        return meshes
 
     def _instances(self, node: Any) -> list[np.ndarray]:
         """Poses (4, 4) in a node's frame of the copies of its mesh."""
@@ -174,10 +174,10 @@ class _File:
         if match:
             data = unquote_to_bytes(item["uri"][match.end() :])
             return base64.b64decode(data) if match[1] else data
-        found = use_found(self.source, self.path.parent, item["uri"], self.where)
-        if found is None:
+        path = use_named(self.source, self.path.parent, item["uri"], self.where)
+        if path is None:
             raise SceneRejected(f"{self.path}: names the {what} '{item['uri']}', which is not there; put it there")
-        return found.read_bytes()
+        return path.read_bytes()
 
     def _view(self, k: int) -> bytes:
         """Return the bytes of a buffer view."""

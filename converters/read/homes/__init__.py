@@ -1,1 +1,1 @@
-"""Homes that others made for their simulators: placed parts instead of a scan."""
+"""Read homes of other simulators: placed parts instead of a scan."""

@@ -1,6 +1,6 @@
-"""Any MJCF home in (RoboCasa, MolmoSpaces, a scene of our own), `RawScene` out.
+"""Read any MJCF home: RoboCasa, MolmoSpaces, a scene of this project.
 
-MuJoCo itself reads and compiles it, after every file that it names was seen to lie in the source's folder. What hangs
+MuJoCo itself reads and compiles it, after a check that every file that it names lies in the source's folder. What hangs
 on a free joint is a part; what no joint lets move is structure, body by body; what hinges and slides carry is fixed to
 its piece, but for doors.
 """
@@ -30,7 +30,7 @@ from scenes_mjcf.look import geom_image, mesh_of
 NUMBER = re.compile(r"\+?\d+\.?\d*(e\+?\d+)?", re.IGNORECASE)
 FARTHEST_M = 1e4
 DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
-"""MuJoCo's own for geoms: any other colour takes the place of the material's."""
+"""MuJoCo's default for geoms: any other colour takes the place of the material's."""
 REMEDY = "put a copy of the file there, or give --root DIR, a folder that holds both"
 UNREAD = {
     **{"actuator": "nu", "sensor": "nsensor", "tendon": "ntendon", "equality": "neq", "flex": "nflex", "skin": "nskin"},
@@ -42,9 +42,9 @@ _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
 
 
 def mains_of(root: Path) -> list[Path]:
-    """The folder's own MJCF files: `scene.xml` where there is one, else all."""
-    found = [p for p in sorted(root.glob("*.xml")) if _tag(p) == "mujoco"]
-    return [p for p in found if p.name == "scene.xml"] or found
+    """Return the MJCF files of a folder: `scene.xml` where there is one, else all."""
+    files = [p for p in sorted(root.glob("*.xml")) if _tag(p) == "mujoco"]
+    return [p for p in files if p.name == "scene.xml"] or files
 
 
 def _tag(path: Path) -> str:
@@ -55,7 +55,7 @@ def _tag(path: Path) -> str:
 
 
 def read_mjcf(root: Path, strict: bool = False, chosen: Path | None = None, within: Path | None = None) -> RawScene:
-    """Reads a folder's only MJCF file, its `scene.xml`, or the chosen one."""
+    """Read a folder's only MJCF file, its `scene.xml`, or the chosen one."""
     source = SourceFolder(within or root, strict, REMEDY)
     main = chosen or only_file(root, mains_of(root), "MJCF files", "one or scene.xml; give the file of one")
     files = _Files(source)
@@ -68,7 +68,7 @@ def read_mjcf(root: Path, strict: bool = False, chosen: Path | None = None, with
 
 @dataclasses.dataclass
 class _Files:
-    """Makes one MJCF of a home's files, in which the full path of every file stands: MuJoCo reads what was checked."""
+    """Join a home's files into one MJCF with the full path of every file: MuJoCo reads what was checked."""
 
     source: SourceFolder
     models: dict[str, bytes] = dataclasses.field(default_factory=dict)
@@ -78,7 +78,7 @@ class _Files:
     """Elements of the largest model to attach."""
 
     def whole(self, path: Path) -> str:
-        """The text of an MJCF with its includes. Names mean what they mean to MuJoCo (its `xml_native_reader.cc`)."""
+        """Return the text of an MJCF with its includes; names mean what they do in MuJoCo's `xml_native_reader.cc`."""
         main = Path(os.path.abspath(path))
         root = self._parse(main)
         if root.tag != "mujoco":
@@ -93,9 +93,9 @@ class _Files:
         strip = False
         for compiler in root.iter("compiler"):
             strip = compiler.attrib.pop("strippath", str(strip)).lower() == "true"
-            own = {word: compiler.attrib.pop(word) for word in looked if word in compiler.attrib}
-            looked |= own
-            used |= (dict.fromkeys(looked, own["assetdir"]) if "assetdir" in own else {}) | own
+            stated = {word: compiler.attrib.pop(word) for word in looked if word in compiler.attrib}
+            looked |= stated
+            used |= (dict.fromkeys(looked, stated["assetdir"]) if "assetdir" in stated else {}) | stated
         for element, at in folder.items():
             for key, name in element.attrib.items():
                 if not key.startswith("file") or not name or element.tag == "include":
@@ -120,13 +120,13 @@ class _Files:
         return ElementTree.tostring(root, encoding="unicode")
 
     def _check_size(self, root: ElementTree.Element, path: Path) -> None:
-        """Refuses what would be too much to compile: images and height fields, and elements with their copies."""
+        """Refuse what would be too much to compile: images and height fields, and elements with their copies."""
         left, total = [(root, 1.0)], 0.0
         while left:
             element, times = left.pop()
-            told = {key: _first(element, key) for key in ("width", "height", "nrow", "ncol")}
-            cube = 6 * told["width"] ** 2 if element.tag == "texture" and element.get("type") != "2d" else 0.0
-            pixels = max(told["width"] * told["height"], told["nrow"] * told["ncol"], cube)
+            sizes = {key: _first(element, key) for key in ("width", "height", "nrow", "ncol")}
+            cube = 6 * sizes["width"] ** 2 if element.tag == "texture" and element.get("type") != "2d" else 0.0
+            pixels = max(sizes["width"] * sizes["height"], sizes["nrow"] * sizes["ncol"], cube)
             check_count(path, pixels, PIXELS, f"pixels in a <{element.tag}>", "make it smaller")
             copies = _first(element, "count", "params")
             total += times * copies + (self.heaviest if element.tag == "attach" else 0.0) * times
@@ -135,22 +135,27 @@ class _Files:
         self.heaviest = max(self.heaviest, total)
 
     def _include(
-        self, root: ElementTree.Element, at: Path, main: Path, seen: set[Path], folder: dict[ElementTree.Element, Path]
+        self,
+        root: ElementTree.Element,
+        at: Path,
+        main: Path,
+        done: set[Path],
+        folder: dict[ElementTree.Element, Path],
     ) -> None:
-        """Puts includes in their places: files below the main file's folder, or else below the including file's."""
+        """Put includes in their places: files below the main file's folder, or else below the including file's."""
         for parent in list(root.iter()):
             folder[parent] = at
             for k, child in reversed(list(enumerate(parent))):
                 name = child.get("file", "").replace("\\", "/")
                 if child.tag.lower() != "include" or len(child) or not name:
                     continue
-                found = _reduced(main / name)
-                found = found if os.path.exists(found) else _reduced(at / name)
-                if found in seen:
-                    raise SceneRejected(f"{found}: is included twice; does one include itself?")
-                seen.add(found)
-                inner = self._parse(found)
-                self._include(inner, found.parent, main, seen, folder)
+                path = _reduced(main / name)
+                path = path if os.path.exists(path) else _reduced(at / name)
+                if path in done:
+                    raise SceneRejected(f"{path}: is included twice; does one include itself?")
+                done.add(path)
+                inner = self._parse(path)
+                self._include(inner, path.parent, main, done, folder)
                 parent[k : k + 1] = list(inner)
 
     def _parse(self, path: Path) -> ElementTree.Element:
@@ -160,13 +165,13 @@ class _Files:
 
 
 def _first(element: ElementTree.Element, *keys: str) -> float:
-    """Product of an attribute's numbers that are larger than 1; 1 where it has none."""
+    """Return the product of an attribute's numbers that are larger than 1; 1 where it has none."""
     words = " ".join(element.get(key, "") for key in keys).split()
     return math.prod(float(word) for word in words if NUMBER.fullmatch(word) and float(word) > 1)
 
 
 def _reduced(path: Path) -> Path:
-    """The path without `..`, which MuJoCo takes away before it looks for links."""
+    """Return the path without `..`, which MuJoCo takes away before it looks for links."""
     return Path(os.path.normpath(path))
 
 
@@ -191,7 +196,7 @@ def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Part
         members = np.flatnonzero(top == body)
         pose = transform(matrix_from_quat(data.xquat[body]), data.xpos[body])
         back = np.linalg.inv(pose)
-        seen, solid = [], []
+        visible, solid = [], []
         for geom in np.flatnonzero(np.isin(model.geom_bodyid, members) & ~np.isin(range(model.ngeom), list(planes))):
             mesh = _mesh(model, int(geom), span)
             if mesh is None:
@@ -202,11 +207,12 @@ def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Part
             if collides:
                 solid.append((placed(mesh, at), float(model.geom_friction[geom, 0])))
             if model.geom_group[geom] < 3 and _rgba(model, int(geom))[3] > 0:
-                seen.append((placed(mesh, at), collides, int(model.geom_group[geom])))
+                visible.append((placed(mesh, at), collides, int(model.geom_group[geom])))
         # Where a body has a group of geoms to look at, those of other groups that it collides with are not drawn; the
-        # world's own geoms stand each for itself.
-        looks = {group for _, collides, group in seen if body == 0 or not collides} or {group for *_, group in seen}
-        surface = joined([m for m, _, group in seen if body == 0 or group in looks] or [m for m, _ in solid])
+        # world's geoms stand each for itself.
+        groups = {group for _, collides, group in visible if body == 0 or not collides}
+        looks = groups or {group for *_, group in visible}
+        surface = joined([m for m, _, group in visible if body == 0 or group in looks] or [m for m, _ in solid])
         if surface is None:
             continue
         free = model.body_jntnum[body] == 1 and model.jnt_type[model.body_jntadr[body]] == _JOINT.mjJNT_FREE
@@ -236,7 +242,7 @@ def _planes(model: mujoco.MjModel, data: mujoco.MjData) -> dict[int, Part]:
 
 
 def _unread(model: mujoco.MjModel, top: np.ndarray, categories: list[Category | None]) -> collections.Counter[str]:
-    """How often there is what is not read as it is."""
+    """Count what is not read as it is."""
     dropped = collections.Counter({f"{word}: dropped": int(getattr(model, count)) for word, count in UNREAD.items()})
     for joint, body in enumerate(model.jnt_bodyid):
         kind = _JOINT(model.jnt_type[joint])
@@ -251,7 +257,7 @@ def _unread(model: mujoco.MjModel, top: np.ndarray, categories: list[Category | 
 
 
 def _tops(model: mujoco.MjModel, categories: list[Category | None]) -> np.ndarray:
-    """(nbody,) the body that each one is a part of: the world's children, and what is free or has a name within them.
+    """Return (nbody,) the body that each is a part of: the world's children, and what is free or has a name in them.
 
     Drawers, lids, knobs and the doors of furniture are parts of what they hang on.
     """
@@ -269,7 +275,7 @@ def _tops(model: mujoco.MjModel, categories: list[Category | None]) -> np.ndarra
 
 
 def _mesh(model: mujoco.MjModel, geom: int, span_m: float) -> TexturedMesh | None:
-    """A geom's surface in its own frame; None for kinds without one. Planes without an end reach `span_m` far."""
+    """Return a geom's surface in its frame; None for kinds without one. Planes without an end reach `span_m` far."""
     size, kind = model.geom_size[geom], _GEOM(model.geom_type[geom])  # a NumPy integer is `in` no tuple of kinds
     rgba, data = _rgba(model, geom), int(model.geom_dataid[geom])
     if kind == _GEOM.mjGEOM_MESH:
@@ -290,9 +296,9 @@ def _mesh(model: mujoco.MjModel, geom: int, span_m: float) -> TexturedMesh | Non
 
 
 def _rgba(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Return a geom's colour: its own if it has one, or else its material's."""
-    own, material = model.geom_rgba[geom], int(model.geom_matid[geom])
-    return own if material < 0 or not np.allclose(own, DEFAULT_RGBA) else model.mat_rgba[material]
+    """Return a geom's colour, or else its material's."""
+    rgba, material = model.geom_rgba[geom], int(model.geom_matid[geom])
+    return rgba if material < 0 or not np.allclose(rgba, DEFAULT_RGBA) else model.mat_rgba[material]
 
 
 def _of_mesh(model: mujoco.MjModel, geom: int, rgba: np.ndarray) -> TexturedMesh:

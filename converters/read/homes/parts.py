@@ -1,4 +1,4 @@
-"""Placed parts of a home in; structure as a scan, furniture as models and annotations, out.
+"""Turn the placed parts of a home into a scan of its structure, and models and annotations of its furniture.
 
 Authors of simulated homes fix most furniture to the world to save time. Here a part moves if its name says that it is
 of a movable category and it is no larger than those are, whatever its source calls it; what stands on such a part moves
@@ -34,8 +34,8 @@ from scenes_mjcf.categories import CATEGORIES, Category
 
 ALIASES = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, str])
 """Names that others give to our categories."""
-KNOWN = {c.name.replace("_", ""): c for c in CATEGORIES.values() if c.name not in ("robot", "other")}
-KNOWN |= {word: CATEGORIES[of] for word, of in ALIASES.items()}
+BY_NAME = {c.name.replace("_", ""): c for c in CATEGORIES.values() if c.name not in ("robot", "other")}
+BY_NAME |= {word: CATEGORIES[of] for word, of in ALIASES.items()}
 OTHER_STRUCTURE, OTHER_FURNITURE = 38, 39
 """NYU40's words for what is built in and nothing else, and for what need not reach the ceiling."""
 TEXTURE_PX = 512
@@ -65,24 +65,24 @@ PLINTH_M, FLOOR_SHARE = 0.4, 0.25
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """One rigid thing."""
+    """Hold one rigid object."""
 
     name: str
     pose: np.ndarray
-    """(4, 4) own frame -> home, unscaled."""
+    """(4, 4) local frame -> home, unscaled."""
     surface: TexturedMesh
-    """Own frame, m."""
+    """Local frame, m."""
     collision: TexturedMesh | None
     static: bool
     mass_kg: float | None = None
     friction: float | None = None
     held: bool = False
     """It stays where it is whatever its name says."""
-    known_as: str = ""
-    """Category; empty: its name tells it."""
+    category_name: str = ""
+    """Name of its category; empty: the one that `name` says."""
     swing: tuple[np.ndarray, tuple[float, float]] | None = None
-    """Of a door's leaf: (3,) point of its upright hinge, own frame, and the angles (rad) that it turns by; None: they
-    are found."""
+    """Of a door's leaf: (3,) point of its upright hinge, local frame, and the angles (rad) that it turns by; None:
+    they are assumed."""
     low: bool = False
     """Built in, and no higher than it shows."""
     endless: bool = False
@@ -90,19 +90,19 @@ class Part:
 
     @property
     def category(self) -> Category | None:
-        """What it is, if that is known."""
-        return CATEGORIES[self.known_as] if self.known_as else category_of(self.name)
+        """Return the category, if there is one."""
+        return CATEGORIES[self.category_name] if self.category_name else category_of(self.name)
 
 
 def category_of(name: str) -> Category | None:
-    """The category that a part's name tells, by its last words: an English compound is what its last word says.
+    """Return the category that a part's name says by its last words: an English compound is what its last word says.
 
     `DeskPortrait` is no desk, `KitchenTable_01` a table. Numbers and single letters are not counted, nor is what
     RoboCasa adds: `stool_1_island_group_main` is a stool.
     """
-    own = re.sub(r"(_[a-z]+_group)?(_(main|root))+$", "", name)
-    words = [w.lower() for w in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", own) if len(w) > 1]
-    return by_last_words(words, KNOWN)
+    bare = re.sub(r"(_[a-z]+_group)?(_(main|root))+$", "", name)
+    words = [w.lower() for w in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", bare) if len(w) > 1]
+    return by_last_words(words, BY_NAME)
 
 
 def by_last_words(words: list[str], table: Mapping[str, Any]) -> Any:
@@ -112,7 +112,7 @@ def by_last_words(words: list[str], table: Mapping[str, Any]) -> Any:
 
 
 def home(source: SourceFolder, layout: str, parts: list[Part], floors_m: tuple[float, ...] = ()) -> RawScene:
-    """The record of a home that is made of parts."""
+    """Return the record of a home from its parts."""
     parts, floors_m = _on_floors(source, parts, floors_m)
     parts = _by_size(source, parts, weighed=layout == "sdf")
     bounds = [_bounds(part) for part in parts]
@@ -158,9 +158,9 @@ def home(source: SourceFolder, layout: str, parts: list[Part], floors_m: tuple[f
 
 
 def built_in(raw: RawScene, beside: Mapping[int, str]) -> RawScene:
-    """A source in which some of its pieces are structure, as they stand; a scan shows them already."""
-    told = [f"{raw.annotations[k].cad_id} (from {other})" for k, other in beside.items()]
-    words = f"{len(told)} pieces cannot be parted from what they stand in, and are built in: {', '.join(told)}"
+    """Return a source in which some pieces are structure, as they stand; a scan shows them already."""
+    places = [f"{raw.annotations[k].cad_id} (from {other})" for k, other in beside.items()]
+    words = f"{len(places)} pieces cannot be parted from what they stand in, and are built in: {', '.join(places)}"
     stay = tuple(a for k, a in enumerate(raw.annotations) if k not in beside)
     cads = {a.cad_id: raw.cads[a.cad_id] for a in stay}
     rest = dataclasses.replace(raw, annotations=stay, cads=cads, warnings=(*raw.warnings, words))
@@ -189,7 +189,7 @@ def _bounds(part: Part) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _shown(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The faces that look up, but for those below others by up to `SLAB_M`: the slab under a floor is no floor."""
+    """Return the faces that look up, less those below others by up to `SLAB_M`: the slab under a floor is no floor."""
     area = face_vectors(vertices, faces) / 2
     chosen = area[:, 2] > 0.95 * np.maximum(np.linalg.norm(area, axis=1), 1e-12)
     level = faces[chosen]
@@ -281,7 +281,7 @@ def _by_size(source: SourceFolder, parts: list[Part], weighed: bool) -> list[Par
                 part = dataclasses.replace(part, held=True)
                 changed["too large or heavy for furniture, and built in"].append(part.name)
             elif not fits:
-                part = dataclasses.replace(part, known_as="other")
+                part = dataclasses.replace(part, category_name="other")
                 changed["too large or heavy for their names, and of the category 'other'"].append(part.name)
         result.append(part)
     for what, names in changed.items():
@@ -298,7 +298,7 @@ def _small(mesh: TexturedMesh) -> TexturedMesh:
 
 
 def _moves(part: Part, low: np.ndarray, high: np.ndarray, floor_m: float) -> bool:
-    """True for furniture that stands on the floor."""
+    """Return True for furniture that stands on the floor."""
     category = part.category
     if category is not None and category.name == "door" and max((high - low)[:2]) > DOOR_MOST_M:
         return False
@@ -311,7 +311,7 @@ def _moves(part: Part, low: np.ndarray, high: np.ndarray, floor_m: float) -> boo
 def _carriers(
     bounds: list[tuple[np.ndarray, np.ndarray]], moves: list[bool], fast: list[bool], floor_m: np.ndarray
 ) -> list[int | None]:
-    """For each part the number of the movable one that it stands on, or lies in, if any; none for those `fast`."""
+    """Return for each part the number of the movable one that it stands on or in, if any; none for those `fast`."""
     carried: list[int | None] = [None] * len(bounds)
     movers = np.flatnonzero(moves)
     base, top = np.array([bounds[k] for k in movers]).reshape(-1, 2, 3).transpose(1, 0, 2) + [
@@ -330,10 +330,10 @@ def _carriers(
 def _furniture(
     source: SourceFolder, part: Part, riders: list[Part], structure: np.ndarray
 ) -> tuple[Annotation, CadModel]:
-    """One movable part with what stands on it."""
-    own = [(part, np.eye(4)), *((rider, np.linalg.inv(part.pose) @ rider.pose) for rider in riders)]
-    surface = join_meshes(*(placed(_small(p.surface), by) for p, by in own))
-    every = [_pieces(p, by) for p, by in own]
+    """Return the annotation and the model of one movable part with what stands on it."""
+    members = [(part, np.eye(4)), *((rider, np.linalg.inv(part.pose) @ rider.pose) for rider in riders)]
+    surface = join_meshes(*(placed(_small(p.surface), by) for p, by in members))
+    every = [_pieces(p, by) for p, by in members]
     pieces = None if None in every else tuple(piece for some in every for piece in some or ())
     pieces = None if pieces is None or len(pieces) > MAX_PIECES else pieces
     vertices, faces, keep = merge_vertices(surface.vertices, surface.faces)
@@ -358,7 +358,7 @@ def _furniture(
 
 
 def _pieces(part: Part, by: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], ...] | None:
-    """Convex pieces of a part's collision mesh, moved; None where there is none or it is not made of them."""
+    """Return the convex pieces of a part's collision mesh, moved; None where it has none or is not convex in parts."""
     if part.collision is None:
         return None
     solid = placed(part.collision, by)
@@ -367,7 +367,7 @@ def _pieces(part: Part, by: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], 
 
 
 def _mass(source: SourceFolder, part: Part, category: str) -> float | None:
-    """The part's own mass where it is plausible; else None, and the category's density gives it."""
+    """Return the part's mass where it is plausible; else None, and the category's density gives it."""
     material = CATEGORIES[category].material
     assert material is not None
     low, high = material.mass_range_kg

@@ -1,4 +1,4 @@
-"""A Gazebo world (SDF 1.4 to 1.12) with its models in, `RawScene` out.
+"""Read a Gazebo world (SDF 1.4 to 1.12) with its models.
 
 Layout: `worlds/<name>.world` (or `.sdf`, there or in the folder itself) and `models/<name>/` with `model.config` and
 the SDF that it names. Links of a model are one rigid part, but for level planes, which have no end. `sdf.yaml` lists
@@ -42,7 +42,7 @@ from interactive_nav_common.rotations import matrix_from_quat, transform, transf
 
 @dataclasses.dataclass
 class Model:
-    """A model, or the world, with its named frames and the models within it."""
+    """Hold a model, or the world, with its named frames and the models within it."""
 
     name: str
     element: ElementTree.Element
@@ -135,30 +135,30 @@ HEIGHTS = 256
 TABLES = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, dict[str, str]])
 FUEL = re.compile(r"https?://.*/models/([^/]+)(?:/(?:\d+|tip))?(?:/files)?(/.*)?")
 """The address of a model, or of a file of one, on Gazebo's server."""
-GAZEBOS_OWN = {
+BUILTIN = {
     "sun": ElementTree.fromstring("<sdf><light/></sdf>"),
     "groundplane": ElementTree.fromstring(
         "<sdf><model name='ground'><link><collision><geometry><plane/></geometry></collision></link></model></sdf>"
     ),
 }
-"""Models that Gazebo brings."""
+"""Models that come with Gazebo."""
 UNMOVED = ElementTree.Element("model")
 """A saved state without a pose."""
 
 
 def worlds_of(root: Path) -> list[Path]:
-    """World files of a folder."""
-    found = [p for folder in (root, root / "worlds") for p in folder.glob("*.world")]
-    return sorted(found or [p for folder in (root, root / "worlds") for p in folder.glob("*.sdf")])
+    """Return the world files of a folder."""
+    worlds = [p for folder in (root, root / "worlds") for p in folder.glob("*.world")]
+    return sorted(worlds or [p for folder in (root, root / "worlds") for p in folder.glob("*.sdf")])
 
 
 def root_of(world: Path) -> Path:
-    """The folder whose world a file is."""
+    """Return the folder whose world a file is."""
     return world.resolve().parents[1 if world.resolve().parent.name == "worlds" else 0]
 
 
 def read_sdf(root: Path, strict: bool = False, chosen: Path | None = None, within: Path | None = None) -> RawScene:
-    """Reads the only world of a folder, or the chosen one."""
+    """Read the only world of a folder, or the chosen one."""
     source = SourceFolder(within or root, strict)
     file = chosen or only_file(root, worlds_of(root), "worlds")
     reader = _Reader(source, root)
@@ -175,7 +175,7 @@ def read_sdf(root: Path, strict: bool = False, chosen: Path | None = None, withi
 
 @dataclasses.dataclass
 class _Reader:
-    """Walks a world; counts what it does not read."""
+    """Walk a world; count what is not read."""
 
     source: SourceFolder
     root: Path
@@ -192,23 +192,23 @@ class _Reader:
         model.add_frames()
         within = []
         for child in [*model.element, *model.element.findall("state/insertions/*")]:
-            found = (child, model.path) if child.tag == "model" else None
-            found = self._included(child, model.path) if child.tag == "include" else found
-            if found is not None:
-                inner, path = found
+            item = (child, model.path) if child.tag == "model" else None
+            item = self._included(child, model.path) if child.tag == "include" else item
+            if item is not None:
+                inner, path = item
                 name = (child.findtext("name") or inner.get("name") or path.parent.name).strip()
                 static = (child.findtext("static") or inner.findtext("static") or "").strip() in ("true", "1")
                 placement = child.findtext("placement_frame") or child.get("placement_frame")
                 pose = inner.find("pose") if child.find("pose") is None else child.find("pose")
-                made = self.tree(Model(name, inner, path, static or model.static), depth + 1)
-                within.append((made, pose, (placement or inner.get("placement_frame") or "").strip()))
+                filled = self.tree(Model(name, inner, path, static or model.static), depth + 1)
+                within.append((filled, pose, (placement or inner.get("placement_frame") or "").strip()))
         model.add_models(within)
         return model
 
     def parts(self, model: Model, pose: np.ndarray, state: ElementTree.Element) -> Iterator[Part]:
         """Return the parts of a model at a pose, and of all within it, where a saved state has moved them."""
         try:
-            yield from self._own(model, pose, state)
+            yield from self._of_links(model, pose, state)
         except ValueError as error:
             raise SceneRejected(f"{model.path}: '{model.name}': {error}") from error
         states = {element.get("name"): element for element in state.findall("model")}
@@ -225,12 +225,12 @@ class _Reader:
         """Return an included model and its file; None for a light."""
         uri = (element.findtext("uri") or "").strip()
         fuel = FUEL.fullmatch(uri)
-        own = GAZEBOS_OWN.get(_key(fuel[1] if fuel else uri.removeprefix("model://")))
-        if own is None:
+        root = BUILTIN.get(_key(fuel[1] if fuel else uri.removeprefix("model://")))
+        if root is None:
             path = self._model_file(self._find(uri, path))
-            own = parse_xml(self.source.use(self.source.inside(path), "expected SDF"), "SDF")
-        model = own.find("model")
-        if model is None and own.find("light") is None:
+            root = parse_xml(self.source.use(self.source.inside(path), "expected SDF"), "SDF")
+        model = root.find("model")
+        if model is None and root.find("light") is None:
             raise SceneRejected(f"{path}: has no <model>")
         if model is None:
             self.unread["<light> in <include>"] += 1
@@ -251,7 +251,7 @@ class _Reader:
             names = [e.text for e in config.findall("sdf") if e.text]
         return folder / (names[-1].strip() if names else "model.sdf")
 
-    def _own(self, model: Model, pose: np.ndarray, state: ElementTree.Element) -> Iterator[Part]:
+    def _of_links(self, model: Model, pose: np.ndarray, state: ElementTree.Element) -> Iterator[Part]:
         """Return the part that a model's links make, and its level planes, which have no end."""
         for joint in model.element.findall("joint"):
             if joint.get("type") != "fixed":
@@ -266,31 +266,31 @@ class _Reader:
             at = model.place(link.find("pose"), np.eye(4))
             if (place := moved.get(link.get("name"))) is not None:
                 at = np.linalg.inv(pose @ grow) @ model.matrix(place) @ grow
-            for kind, found in shapes.items():
+            for kind, meshes in shapes.items():
                 for element, mesh in self._shapes(model, link, kind):
                     matrix = grow @ model.place(element.find("pose"), at)
                     level = element.find("geometry/plane") is not None and (
                         unit_normals(transformed(mesh.vertices, pose @ matrix), mesh.faces)[0, 2] > LEVEL
                     )
-                    found.append((placed(mesh, matrix), pose @ matrix if level else None))
+                    meshes.append((placed(mesh, matrix), pose @ matrix if level else None))
         planes = [at for _, at in shapes["collision"] if at is not None]
         for at in planes:
             look = next(mesh for mesh, at in shapes["visual"] + shapes["collision"] if at is not None)
             at[:3, :3] = np.eye(3)
             yield Part(model.name, at, look, None, True, held=True, endless=True)
-        seen = joined([mesh for mesh, at in shapes["visual"] if at is None or not planes])
+        visual = joined([mesh for mesh, at in shapes["visual"] if at is None or not planes])
         solid = joined([mesh for mesh, at in shapes["collision"] if at is None])
         masses = [float(numbers(text, (0.0,))[0]) for link in links if (text := link.findtext("inertial/mass"))]
         mus = [c.findtext("surface/friction/ode/mu") for link in links for c in link.findall("collision")]
         friction = [mu for text in mus if text and 0 < (mu := float(numbers(text, (0.0,))[0])) <= 2]
-        surface, mass = seen or solid, sum(masses) if masses else None
+        surface, mass = visual or solid, sum(masses) if masses else None
         if surface is not None:
             yield Part(model.name, pose, surface, solid, model.static, mass, max(friction, default=None))
 
     def _shapes(
         self, model: Model, link: ElementTree.Element, kind: str
     ) -> Iterator[tuple[ElementTree.Element, TexturedMesh]]:
-        """Yield the visuals or collisions of a link with what they show, each in its own frame."""
+        """Yield the visuals or collisions of a link with their meshes, each in its local frame."""
         for element in link.findall(kind):
             shape = next((s for g in element.findall("geometry") for s in g), None)
             if shape is None:
@@ -328,7 +328,7 @@ class _Reader:
         return primitive(path, shape.tag, shape.findtext)
 
     def _coloured(self, mesh: TexturedMesh, element: ElementTree.Element) -> TexturedMesh:
-        """Return the mesh with its own colours, or else those that its material says."""
+        """Return the mesh with the colours of its file, or else of its material."""
         diffuse, emissive = element.findtext("material/diffuse"), element.findtext("material/emissive") or ""
         script = (element.findtext("material/script/name") or "").strip().removeprefix("Gazebo/")
         self.unread["<emissive> in <material>"] += any(digit in emissive for digit in "123456789")

@@ -1,4 +1,4 @@
-"""A home drawn in Sweet Home 3D (`.sh3d`, with the `Home.xml` of version 5.3 and later) in, `RawScene` out.
+"""Read a home drawn in Sweet Home 3D (`.sh3d`, with the `Home.xml` of version 5.3 and later).
 
 Walls, rooms, and what doors and windows cut out of them become structure, levels become storeys, door leaves on hinges
 swing, furniture is what its catalogue id or its name says.
@@ -65,9 +65,9 @@ AJAR_RAD = math.radians(10)
 """A leaf that is drawn farther from both ends of its swing stands ajar."""
 LOW_TABLE_M = 0.5
 LAMPS = 6
-"""Of a storey: MuJoCo's renderer draws eight lights, the headlight and the scene's own among them."""
+"""Of a storey: MuJoCo's renderer draws eight lights, the headlight and that of the scene among them."""
 OURS = "interactive_nav#"
-"""Ids of drawings that `converters.write.sh3d` makes: their categories are known."""
+"""Ids of drawings that `converters.write.sh3d` makes: their ids name categories."""
 BLOCKS = ("texturablebox", "texturablecylinder", "texturabletriangle", "texturablesphere", "texturablecone")
 """Ids, less what stands before #, of shapes that people build all kinds of things from."""
 _TABLES: dict[str, dict[str, Any]] = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, dict[str, Any]])
@@ -75,7 +75,7 @@ FOREIGN = {word: category for category, words in _TABLES["words"].items() for wo
 
 
 def read_sh3d(root: Path, strict: bool = False, chosen: Path | None = None) -> RawScene:
-    """Reads the only drawing of a folder, or the chosen one."""
+    """Read the only drawing of a folder, or the chosen one."""
     files = [root] if root.is_file() else [p for p in sorted(root.glob(f"*{ENDING}")) if p.is_file()]
     path = chosen or only_file(root, files, "drawings")
     with tempfile.TemporaryDirectory(prefix="sh3d-") as scratch:
@@ -94,30 +94,30 @@ def read_sh3d(root: Path, strict: bool = False, chosen: Path | None = None) -> R
 
 
 def kind_of(catalogue_id: str, name: str, height_m: float = 1.0) -> str:
-    """Category of a piece by its catalogue id, then by its name in some languages; `other` where none tells it."""
-    own = catalogue_id.rpartition("#")[2]
-    bare = re.sub("[^a-z]", "", own.lower())
+    """Return the category of a piece by its catalogue id, else by its name in some languages, else `other`."""
+    catalogued = catalogue_id.rpartition("#")[2]
+    bare = re.sub("[^a-z]", "", catalogued.lower())
     if bare in BLOCKS or "stair" in bare:
         return "structure"
-    found = _TABLES["ids"].get(bare) or next(
-        (c.name for words in (own, name) if (c := category_of(words)) is not None), None
+    kind = _TABLES["ids"].get(bare) or next(
+        (c.name for words in (catalogued, name) if (c := category_of(words)) is not None), None
     )
     plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode().lower()
-    for word in re.findall("[a-z]{3,}", plain) if found is None else ():
-        # In compounds of German and Dutch the last part tells what it is.
+    for word in re.findall("[a-z]{3,}", plain) if kind is None else ():
+        # In compounds of German and Dutch the last part says what it is.
         ends = (
             key
             for key in sorted(FOREIGN, key=len, reverse=True)
             if word == key or (len(key) > 4 and word.endswith(key))
         )
-        found = found or FOREIGN.get(next(ends, ""))
-    if found == "table" and height_m < LOW_TABLE_M and not catalogue_id.startswith(OURS):
+        kind = kind or FOREIGN.get(next(ends, ""))
+    if kind == "table" and height_m < LOW_TABLE_M and not catalogue_id.startswith(OURS):
         return "coffee_table"
-    return found or "other"
+    return kind or "other"
 
 
 class _Drawing:
-    """Walks a drawing; counts what it drops."""
+    """Walk a drawing; count what is dropped."""
 
     def __init__(self, source: SourceFolder, root: ElementTree.Element, budget: list[int]) -> None:
         self.source, self.root = source, root
@@ -138,8 +138,8 @@ class _Drawing:
         report_unread(source, "the drawing", unread)
 
     def scene(self) -> RawScene:
-        """All of it."""
-        walls = read_walls(list(self._seen("wall")), self.base_m, self.source.note)
+        """Return the whole home."""
+        walls = read_walls(list(self._visible("wall")), self.base_m, self.source.note)
         pieces = list(self._pieces())
         check_count(self.source.root, len(walls) + len(pieces), DRAWN, "walls and pieces of furniture")
         cutting = [e for e in pieces if e.tag == "doorOrWindow"]
@@ -156,13 +156,13 @@ class _Drawing:
             for board in e.findall("baseboard"):
                 side = (board.get("attribute") or "").removesuffix("SideBaseboard")
                 if side in looks and (size := metres(board, "thickness", "height", default=1.0)).min() > 0:
-                    own = self.models.look(board, "color", "texture", looks[side][0][:1, :1])
-                    boards[side] = (float(size[0]), float(size[1]), own)
+                    paint = self.models.look(board, "color", "texture", looks[side][0][:1, :1])
+                    boards[side] = (float(size[0]), float(size[1]), paint)
             part = wall_part(wall, openings, looks, boards)
             low = wall.height_m.max() < LOW_M
             parts += [] if part is None else [dataclasses.replace(part, low=low)]
         rooms, floors_m, bases = [], set(), sorted(set(self.base_m.values()))
-        for e in self._seen("room"):
+        for e in self._visible("room"):
             room = read_room(e, self.models.look)
             if room is None:
                 self.source.note(f"{called(e)}: its outline encloses nothing; it is left out")
@@ -190,14 +190,16 @@ class _Drawing:
             self.source.note(f"{count} {what}: dropped")
         if not floors_m:
             raise SceneRejected("has no room and no closed walls, expected a floor; draw a room")
-        storeys = _storeys(sorted(floors_m))
+        storeys: tuple[float, ...] = ()
+        for z in sorted(floors_m):
+            storeys += (z,) if not storeys or z - storeys[-1] > STOREY_M else ()
         places = [transformed(p.surface.vertices, p.pose) for p in parts]
         check_extent(str(self.source.root), np.vstack(places))
         lamps = self._brightest(storeys)
         return dataclasses.replace(home(self.source, "sh3d", parts, storeys), lamps=lamps, windows=windows)
 
     def _brightest(self, floors_m: tuple[float, ...]) -> tuple[Lamp, ...]:
-        """Of each storey the brightest lamps, as many as pictures have room for."""
+        """Return the brightest lamps of each storey, as many as pictures have room for."""
         ranked = sorted((lamp for lamp in self.lamps if lamp.colour.any()), key=lambda lamp: -float(lamp.colour.sum()))
         of = [int(storey_of(lamp.at[2], floors_m, 0.0)) for lamp in ranked]
         kept = [lamp for k, lamp in enumerate(ranked) if of[:k].count(of[k]) < LAMPS]
@@ -207,7 +209,7 @@ class _Drawing:
             )
         return tuple(kept)
 
-    def _seen(self, tag: str) -> Iterator[ElementTree.Element]:
+    def _visible(self, tag: str) -> Iterator[ElementTree.Element]:
         for e in self.root.findall(tag):
             if e.get("level") in self.hidden:
                 self.dropped[f"{tag}s on levels that are hidden"] += 1
@@ -217,9 +219,9 @@ class _Drawing:
                 yield e
 
     def _pieces(self) -> Iterator[ElementTree.Element]:
-        """Furniture that is seen, groups taken apart."""
+        """Yield the visible furniture, groups taken apart."""
         for tag in (*PIECES, "furnitureGroup"):
-            for top in self._seen(tag):
+            for top in self._visible(tag):
                 stack = [top]
                 while stack:
                     e = stack.pop()
@@ -243,7 +245,7 @@ class _Drawing:
         return foot < z_m - 0.1 and foot + number(e, "height") / 100 > z_m - 0.5
 
     def _piece(self, e: ElementTree.Element) -> list[Part]:
-        """One piece: furniture, or a door or window with its leaves apart."""
+        """Return the parts of one piece: furniture, or a door or window with its leaves apart."""
         surface, group = self.models.surface(e)
         if not len(surface.faces):
             return []
@@ -263,13 +265,13 @@ class _Drawing:
             kind = kind if kind == "floor_lamp" else "other"
             self.lamps += [_lamp(e, source, pose) for source in e.findall("lightSource")]
         held = e.get("movable") == "false" or kind == "structure"
-        return [Part(name, pose, surface, solid, False, held=held, known_as=kind)]
+        return [Part(name, pose, surface, solid, False, held=held, category_name=kind)]
 
     def _door(self, e: ElementTree.Element, door: Part, group: np.ndarray) -> list[Part]:
         """Return the frame and leaves of a door, whose faces are in a `group` each; a window in one piece."""
         sashes = e.findall("sash")
         foot, height = number(e, "elevation", 0.0) / 100, number(e, "height") / 100
-        fixed = dataclasses.replace(door, collision=None, static=True, held=True, known_as="structure")
+        fixed = dataclasses.replace(door, collision=None, static=True, held=True, category_name="structure")
         if not sashes or foot > DOOR_M[0] or height < DOOR_M[1]:
             return [fixed]
         leaf = np.array([int(m[1]) if (m := LEAF.match(str(g))) else 0 for g in group])
@@ -280,7 +282,8 @@ class _Drawing:
             flat = _part_of(door.surface, faces) if len(faces) else _plain_leaf(e, sash, door.surface)
             flat = _beside(flat, _axis(e, sash)[0], [_axis(e, s)[0] for s in sashes if s is not sash])
             swing, hulls = _swing(e, sash, flat.vertices), door.collision if len(sashes) == 1 else None
-            leaves.append(Part(f"{door.name} leaf {k}", door.pose, flat, hulls, False, known_as="door", swing=swing))
+            name = f"{door.name} leaf {k}"
+            leaves.append(Part(name, door.pose, flat, hulls, False, category_name="door", swing=swing))
         if not leaf.any():
             self.source.note(f"{called(e)}: its model has no leaf of its own; flat leaves take its place")
             return leaves
@@ -290,20 +293,12 @@ class _Drawing:
 
 
 def _lamp(e: ElementTree.Element, source: ElementTree.Element, pose: np.ndarray) -> Lamp:
-    """One source of light of a piece whose own frame (z up, front along -y) has a pose: (4, 4)."""
+    """Return one source of light of a piece whose local frame (z up, front along -y) has a pose (4, 4)."""
     x, y, z = (number(source, key) - shift for key, shift in (("x", 0.5), ("y", 0.5), ("z", 0.0)))
     side = -1.0 if e.get("modelMirrored") == "true" else 1.0
-    own = metres(e, "width", "depth", "height") * [side * x, y, z]
+    local = metres(e, "width", "depth", "height") * [side * x, y, z]
     shade = colour(source.get("color"), WHITE).ravel() / 255
-    return Lamp(pose[:3, :3] @ own + pose[:3, 3], shade * float(np.clip(number(e, "power", 0.5), 0.0, 1.0)))
-
-
-def _storeys(floors_m: list[float]) -> tuple[float, ...]:
-    found: list[float] = []
-    for z in floors_m:
-        if not found or z - found[-1] > STOREY_M:
-            found.append(z)
-    return tuple(found)
+    return Lamp(pose[:3, :3] @ local + pose[:3, 3], shade * float(np.clip(number(e, "power", 0.5), 0.0, 1.0)))
 
 
 def _footprint(e: ElementTree.Element) -> Any:
@@ -320,9 +315,9 @@ def _part_of(mesh: TexturedMesh, faces: np.ndarray) -> TexturedMesh:
 
 
 def _axis(e: ElementTree.Element, sash: ElementTree.Element) -> tuple[np.ndarray, np.ndarray, float]:
-    """Of a leaf in the door's own frame: (2,) hinge, its angles at the start and end of its swing, its width (m).
+    """Return a leaf's (2,) hinge in the door's frame, its angles at the start and end of its swing, its width (m).
 
-    Angles turn as the plan is seen: -90 degrees is towards the front.
+    Angles turn as in the plan: -90 degrees is towards the front.
     """
     width, depth = metres(e, "width", "depth")
     side = -1.0 if e.get("modelMirrored") == "true" else 1.0
@@ -332,7 +327,7 @@ def _axis(e: ElementTree.Element, sash: ElementTree.Element) -> tuple[np.ndarray
 
 
 def _beside(leaf: TexturedMesh, hinge: np.ndarray, others: list[np.ndarray]) -> TexturedMesh:
-    """A leaf that ends short of the middle between its hinge and the next: the rebates of double doors overlap."""
+    """Return a leaf that ends short of the middle between two hinges: the rebates of double doors overlap."""
     gaps = [other - hinge for other in others]
     gap = min(gaps, key=lambda g: float(g @ g), default=np.zeros(2))
     length = float(np.linalg.norm(gap))
@@ -346,7 +341,7 @@ def _beside(leaf: TexturedMesh, hinge: np.ndarray, others: list[np.ndarray]) -> 
 def _swing(
     e: ElementTree.Element, sash: ElementTree.Element, leaf: np.ndarray
 ) -> tuple[np.ndarray, tuple[float, float]]:
-    """Hinge of a leaf, and the angles that it turns by from where it is drawn."""
+    """Return the hinge of a leaf, and the angles that it turns by from where it is drawn."""
     at, angles, _ = _axis(e, sash)
     middle = (leaf.min(axis=0) + leaf.max(axis=0))[:2] / 2 - at
     drawn = math.atan2(middle[1], middle[0])
@@ -357,7 +352,7 @@ def _swing(
 
 
 def _plain_leaf(e: ElementTree.Element, sash: ElementTree.Element, like: TexturedMesh) -> TexturedMesh:
-    """A flat leaf as wide as the sash, shut, in the model's mean colour."""
+    """Return a flat leaf as wide as the sash, shut, in the model's mean colour."""
     at, angles, width = _axis(e, sash)
     along = np.array([math.cos(angles[0]), math.sin(angles[0])])
     across = along[::-1] * [-LEAF_M / 2, LEAF_M / 2]

@@ -39,7 +39,7 @@ def unpack(path: Path, folder: Path, budget: list[int] | None = None) -> None:
                 (folder / name).write_bytes(archive.read(item))
     except SceneRejected:
         raise
-    except Exception as error:  # damaged archives fail in zipfile, zlib or the file system, each in its own way
+    except Exception as error:  # damaged archives fail in zipfile, zlib or the file system
         reason = " ".join(str(error).replace(str(folder), "").split())[:200] or type(error).__name__
         raise SceneRejected(f"{path}: not readable as a Sweet Home 3D file ({reason}); save the home again") from None
 

@@ -1,6 +1,6 @@
-"""Models of a Sweet Home 3D drawing in; a piece of furniture's surface out: turned, sized, mirrored, coloured as drawn.
+"""Read the models of a Sweet Home 3D drawing: furniture is turned, sized, mirrored and coloured as drawn.
 
-Models are y up, front along +z. A piece's own frame is z up, front along -y, the middle of its base at the origin.
+Models are y up, front along +z. A piece's local frame is z up, front along -y, the middle of its base at the origin.
 """
 
 import dataclasses
@@ -41,7 +41,7 @@ PANE = "sweethome3d_window_pane"
 GLASS = np.array([176, 200, 214], np.uint8).reshape(1, 1, 3)
 LEAF = re.compile(r"sweethome3d_(?:opening|window_pane)_on_hinge_(\d{1,2})")
 HULLS = "hulls.obj"
-"""Beside a model in its folder: convex pieces to collide with, each a group with vertices of its own."""
+"""Beside a model in its folder: convex pieces to collide with, each a group that shares no vertex."""
 APART = 1e-4
 MOST_FACES = 2_000_000
 """Of all pieces together."""
@@ -49,7 +49,7 @@ MOST_FACES = 2_000_000
 
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """A model as its file has it, y up."""
+    """Hold a model as its file has it, y up."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -64,17 +64,17 @@ class Model:
 
 
 class Models:
-    """Reads models and images, each once."""
+    """Read models and images, each once."""
 
     def __init__(self, source: SourceFolder, budget: list[int]) -> None:
-        """Of the unpacked drawing `source`; `budget` bounds what archives within it may take."""
+        """Read from the unpacked drawing `source`; `budget` bounds what archives within it may take."""
         self.source, self.budget = source, budget
         self.models: dict[str, Model | None] = {}
         self.images: dict[str, np.ndarray | None] = {}
         self.faces = 0
 
     def model(self, element: ElementTree.Element) -> Model | None:
-        """The model of a piece; None and a word where it cannot be read."""
+        """Return the model of a piece; None and a report where it cannot be read."""
         name = element.get("model") or ""
         if name not in self.models:
             self.models[name] = self._attempt(element, "model", name, self._read, "a box stands for it")
@@ -119,7 +119,7 @@ class Models:
         return read_image(self.source.use(path, ""), "RGB")
 
     def look(self, element: ElementTree.Element, colour_key: str, texture: str, default: np.ndarray = WHITE) -> Look:
-        """Colour of an element, or its texture: the child `<texture attribute=...>`."""
+        """Return the colour of an element, or its texture: the child `<texture attribute=...>`."""
         plain = colour(element.get(colour_key), default)
         for child in element.findall("texture"):
             name = child.get("image") or ""
@@ -133,7 +133,7 @@ class Models:
         return plain, None
 
     def surface(self, element: ElementTree.Element) -> tuple[TexturedMesh, np.ndarray]:
-        """A piece's surface in its own frame, and the (m,) group of each face."""
+        """Return a piece's surface in its local frame, and the (m,) group of each face."""
         size = metres(element, "width", "height", "depth")
         if not (size >= 0).all() or not 0 < size.max() < EXTENT_M:
             raise SceneRejected(f"{called(element)}: is {100 * size} cm large; mend the drawing")
@@ -169,7 +169,7 @@ class Models:
         return dataclasses.replace(mesh, vertices=mesh.vertices - [0, 0, mesh.vertices[:, 2].min()]), group
 
     def solid(self, element: ElementTree.Element, surface: TexturedMesh) -> TexturedMesh | None:
-        """The hulls that a drawing of ours brings beside a piece's model, in the piece's frame; None without them."""
+        """Return the hulls beside a piece's model in a drawing of ours, in the piece's frame; None without any."""
         model, folder = self.model(element), (element.get("model") or "").rpartition("/")[0]
         path = model_path(self.source.root, f"{folder}/{HULLS}", self.budget) if folder else None
         if model is None or path is None or element.find("transformation") is not None:
@@ -177,8 +177,8 @@ class Models:
         mesh = read_obj(self.source.use(path, ""))
         check_count(path, len(mesh.faces), GEOMS, "faces", "simplify the hulls")
         # Sizes, turns and mirrors of the model are the hulls' as well.
-        own = np.column_stack([model.vertices[np.unique(model.faces)], np.ones(len(surface.vertices))])
-        placing = np.linalg.lstsq(own, surface.vertices, rcond=None)[0]
+        points = np.column_stack([model.vertices[np.unique(model.faces)], np.ones(len(surface.vertices))])
+        placing = np.linalg.lstsq(points, surface.vertices, rcond=None)[0]
         # Hulls that touch stay apart: each is drawn in by as little as that.
         vertices = np.column_stack([mesh.vertices, np.ones(len(mesh.vertices))]) @ placing
         for k in np.unique(mesh.group):
@@ -187,7 +187,7 @@ class Models:
         return TexturedMesh(vertices, mesh.faces, None, None)
 
     def _deformed(self, element: ElementTree.Element, model: Model) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices and faces of a model whose parts are opened, turned or slid as drawn."""
+        """Return the vertices and faces of a model whose parts are opened, turned or slid as drawn."""
         vertices, faces = model.vertices, model.faces
         for child in element.findall("transformation"):
             name = (child.get("name") or "?")[:60]
@@ -196,17 +196,17 @@ class Models:
             if len(matrix) != 12 or not np.linalg.det(matrix.reshape(3, 4)[:, :3]) > 0:
                 raise SceneRejected(f"{called(element)}: transformation is no matrix; mend the drawing")
             word = re.compile(rf"({re.escape(name)}|.*_on_{re.escape(name.removeprefix('sweethome3d_'))})(?!\d)")
-            own = np.flatnonzero([word.match(str(g)) is not None for g in model.group])
-            if not len(own):
+            chosen = np.flatnonzero([word.match(str(g)) is not None for g in model.group])
+            if not len(chosen):
                 self.source.note(f"{called(element)}: its model has no part {name!r}; it stays as modelled")
-            moved = vertices[faces[own]].reshape(-1, 3) @ matrix.reshape(3, 4)[:, :3].T + matrix.reshape(3, 4)[:, 3]
+            moved = vertices[faces[chosen]].reshape(-1, 3) @ matrix.reshape(3, 4)[:, :3].T + matrix.reshape(3, 4)[:, 3]
             faces = faces.copy()
-            faces[own] = len(vertices) + np.arange(len(moved)).reshape(-1, 3)
+            faces[chosen] = len(vertices) + np.arange(len(moved)).reshape(-1, 3)
             vertices = np.vstack([vertices, moved])
         return vertices, faces
 
     def _painted(self, element: ElementTree.Element, model: Model) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-        """Texture coordinates, image numbers and images of a model, in the piece's own colours."""
+        """Return the texture coordinates, image numbers and images of a model in the piece's colours."""
         images, numbers, uv = list(model.images), model.number.copy(), model.corner_uv
         pane = np.char.startswith(model.group.astype(str), PANE)
         whole, size = self.look(element, "color", "texture", GREYS)
@@ -219,16 +219,16 @@ class Models:
         for k, name in enumerate(model.materials):
             if name in changed:
                 images[k], size = changed[name]
-                own = np.flatnonzero(numbers == k)
-                if size is not None and len(own) and not np.ptp(uv[own], axis=(0, 1)).any():
+                chosen = np.flatnonzero(numbers == k)
+                if size is not None and len(chosen) and not np.ptp(uv[chosen], axis=(0, 1)).any():
                     uv = uv.copy()
-                    uv[own] = _by_place(model, element, own, size)
+                    uv[chosen] = _by_place(model, element, chosen, size)
         numbers[pane] = len(images)
         return uv, numbers, [*images, GLASS]
 
 
 def _by_place(model: Model, element: ElementTree.Element, faces: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """(k, 3, 2) of faces without coordinates of their own: by place across the face's main axis."""
+    """Return (k, 3, 2) of faces without texture coordinates: by place across the face's main axis."""
     span = np.maximum(np.ptp(model.vertices, axis=0), 1e-9)
     corners = model.vertices[model.faces[faces]] / span * metres(element, "width", "height", "depth")
     normal = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])).argmax(axis=1)
@@ -237,7 +237,7 @@ def _by_place(model: Model, element: ElementTree.Element, faces: np.ndarray, siz
 
 
 def _rotation(element: ElementTree.Element) -> np.ndarray:
-    """(3, 3) that turns the model's own axes upright; the identity where it is not given."""
+    """Return (3, 3) that turns the model's axes upright; the identity where it is not given."""
     words = (element.get("modelRotation") or "1 0 0 0 1 0 0 0 1").split()
     turn = np.array([parsed(element, "modelRotation", word) for word in words])
     turn = turn.reshape(3, 3) if len(turn) == 9 else np.zeros((3, 3))

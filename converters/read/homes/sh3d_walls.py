@@ -1,4 +1,4 @@
-"""Walls, rooms and openings of a Sweet Home 3D drawing in, built-in parts out.
+"""Build the structure of a Sweet Home 3D drawing from its walls, rooms and openings.
 
 Frame: metres, z up, x to the right of the plan, y against the plan's, which points down. The left side of a wall is to
 the left of one who walks from its start to its end.
@@ -34,7 +34,7 @@ SILL_M = 0.05
 
 @dataclasses.dataclass
 class Wall:
-    """A straight wall, or a piece of a round one."""
+    """Hold a straight wall, or a piece of a round one."""
 
     element: ElementTree.Element
     ends: np.ndarray
@@ -49,37 +49,37 @@ class Wall:
 
     @property
     def along(self) -> np.ndarray:
-        """(2,) unit."""
+        """Return the (2,) unit vector."""
         run = self.ends[1] - self.ends[0]
         return run / np.linalg.norm(run)
 
     @property
     def left(self) -> np.ndarray:
-        """(2,) unit, to the left."""
+        """Return the (2,) unit vector to the left."""
         return self.along[::-1] * [-1.0, 1.0]
 
     @property
     def length_m(self) -> float:
-        """Between its ends."""
+        """Return the distance between its ends."""
         return float(np.linalg.norm(self.ends[1] - self.ends[0]))
 
     def square(self) -> np.ndarray:
-        """(2, 2, 2) corners, as `corners`, of the wall cut off square at its ends."""
+        """Return (2, 2, 2) corners, as `corners`, of the wall cut off square at its ends."""
         return np.stack([self.ends + s * self.left * self.thickness_m / 2 for s in (1, -1)])
 
     def polygon(self) -> Any:
-        """Its footprint."""
+        """Return its footprint."""
         return shapely.Polygon([*self.corners[0], *self.corners[1][::-1]])
 
     def ray(self, end: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Away from one end: (2,) direction, (2,) points on the sides to its left and right."""
+        """Return from one end: (2,) direction away, (2,) points on the sides to its left and right."""
         away = self.along if end == 0 else -self.along
         left = away[::-1] * [-1.0, 1.0] * self.thickness_m / 2
         return away, self.ends[end] + left, self.ends[end] - left
 
 
 def read_walls(elements: list[ElementTree.Element], base_m: dict[str | None, float], note: Any) -> list[Wall]:
-    """The walls of a drawing, mitred where they are joined."""
+    """Return the walls of a drawing, mitred where they are joined."""
     walls: list[Wall] = []
     pieces: dict[str, list[int]] = {}
     for element in elements:
@@ -122,7 +122,7 @@ def read_walls(elements: list[ElementTree.Element], base_m: dict[str | None, flo
 
 
 def _round(start: np.ndarray, end: np.ndarray, extent: float) -> np.ndarray:
-    """(n, 2) points of a wall from start to end; a positive extent (rad) bulges to its left."""
+    """Return (n, 2) points of a wall from start to end; a positive extent (rad) bulges to its left."""
     extent = math.remainder(extent, 2 * math.tau)
     if abs(extent) < math.radians(1) or abs(math.sin(extent / 2)) < NEAR_M:
         return np.stack([start, end])
@@ -140,16 +140,16 @@ def _mitre(wall: Wall, end: int, other: Wall, other_end: int) -> None:
     cross = away[0] * turn[1] - away[1] * turn[0]
     if abs(cross) < 0.05:
         return
-    for mine, own, meets in ((0, left, other_right), (1, right, other_left)):
-        gap = meets - own
-        corner = own + away * (gap[0] * turn[1] - gap[1] * turn[0]) / cross
-        if np.linalg.norm(corner - own) <= 2 * max(wall.thickness_m, other.thickness_m):
+    for mine, foot, meets in ((0, left, other_right), (1, right, other_left)):
+        gap = meets - foot
+        corner = foot + away * (gap[0] * turn[1] - gap[1] * turn[0]) / cross
+        if np.linalg.norm(corner - foot) <= 2 * max(wall.thickness_m, other.thickness_m):
             wall.corners[mine if end == 0 else 1 - mine, end] = corner
 
 
 @dataclasses.dataclass(frozen=True)
 class Opening:
-    """What a door or window cuts out of walls."""
+    """Hold what a door or window cuts out of walls."""
 
     footprint: Any
     """Polygon in plan."""
@@ -164,13 +164,13 @@ class Opening:
     """(n, 2) in the unit square, y down; None: all of it."""
 
     def window(self) -> Window:
-        """The box that it fills."""
+        """Return the box that it fills."""
         sizes = np.array([self.width_m, shapely.area(self.footprint) / self.width_m, self.top_m - self.bottom_m])
         middle = np.array([*self.middle, (self.bottom_m + self.top_m) / 2])
         return Window(middle, sizes / 2, math.atan2(self.along[1], self.along[0]))
 
     def within(self, wall: Wall) -> Any:
-        """What it cuts out of a wall, in (along the wall, above its base); None: nothing."""
+        """Return what it cuts out of a wall, in (along the wall, above its base); None: nothing."""
         cosine = float(self.along @ wall.along)
         if abs(cosine) < PARALLEL or self.top_m <= wall.base_m:
             return None
@@ -211,7 +211,7 @@ def wall_part(
 
 
 def _side(wall: Wall, k: int, out_m: float) -> Callable[[np.ndarray], np.ndarray]:
-    """(n, 2) along and above a wall -> (n, 3) on its left (0) or right (1) side, or so far out of it."""
+    """Return (n, 2) along and above a wall -> (n, 3) on its left (0) or right (1) side, or so far out of it."""
     sign = 1 if k == 0 else -1
     ends = wall.corners[k] + sign * out_m * wall.left
     off = sign * (wall.thickness_m / 2 + out_m) * wall.left
@@ -225,7 +225,7 @@ def _side(wall: Wall, k: int, out_m: float) -> Callable[[np.ndarray], np.ndarray
 
 
 def _solid(sheet: Sheet, region: Any, sides: tuple[Any, Any], looks: dict[str, Look], top_m: float) -> None:
-    """What lies between two sides: both, and all edges but those that stand on the floor."""
+    """Add what lies between two sides: both, and all edges but those that stand on the floor."""
     for polygon in shapely.get_parts(region):
         if shapely.get_type_id(polygon) != 3 or shapely.area(polygon) < 1e-6:
             continue
@@ -246,7 +246,7 @@ def _solid(sheet: Sheet, region: Any, sides: tuple[Any, Any], looks: dict[str, L
 
 @dataclasses.dataclass(frozen=True)
 class Room:
-    """A room's outline and what is seen of it."""
+    """Hold a room's outline and what of it is visible."""
 
     name: str
     level: str | None
@@ -256,7 +256,7 @@ class Room:
 
 
 def read_room(element: ElementTree.Element, look: Callable[[ElementTree.Element, str, str], Look]) -> Room | None:
-    """A room; None where its outline encloses nothing."""
+    """Return a room; None where its outline encloses nothing."""
     points = [point(e) for e in element.findall("point")]
     plan = shapely.make_valid(shapely.Polygon(points)) if len(points) > 2 else shapely.Polygon()
     plan = shapely.union_all([p for p in shapely.get_parts(plan) if shapely.get_type_id(p) in (3, 6)])
@@ -284,7 +284,7 @@ def enclosed(walls: list[Wall], rooms: list[Room]) -> list[Room]:
 def level_parts(
     rooms: list[Room], walls: list[Wall], openings: list[Opening], heights_m: tuple[float, float], shafts: list[Any]
 ) -> list[Part]:
-    """Return the floors and ceilings of one level, without the shafts in each; the later of two rooms hides the other."""
+    """Return the floors and ceilings of one level, less the shafts in each; later rooms hide earlier ones."""
     sheet, (taken, tops), (floor_m, ceiling_m) = Sheet(), shafts, heights_m
 
     def level(height: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -317,7 +317,7 @@ def level_parts(
 
 
 def opening_of(element: ElementTree.Element, base_m: float) -> Opening:
-    """What a `<doorOrWindow>` cuts out: the part of its depth that lies in the wall, and a little more."""
+    """Return what a `<doorOrWindow>` cuts out: the part of its depth that lies in the wall, and a little more."""
     width, depth, height = metres(element, "width", "depth", "height")
     angle = -number(element, "angle", 0.0)
     along, back = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
