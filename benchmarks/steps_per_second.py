@@ -40,7 +40,7 @@ from interactive_nav_common.versions import commit, package_versions
 from interactive_nav_common.words import Parser, add_words, read_commands
 from train import config_io
 from train.runs.run import train_run
-from train.sweep.devices import gpu_listing
+from train.sweep.scheduler import gpu_listing
 
 RESULTS = Path("benchmarks/results")
 SCENE = "scenes_mjcf/apartment_0"

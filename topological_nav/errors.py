@@ -1,6 +1,7 @@
 """What can go wrong for a user of `topological_nav`: each error is one clear line (what, got, expected, remedy)."""
 
 import dataclasses
+import sys
 from collections.abc import Callable
 
 from interactive_nav_common.errors import UserError
@@ -41,3 +42,8 @@ class Host:
 
 ALONE = Host()
 """Shows nothing and never stops."""
+
+
+def say(line: str) -> None:
+    """Print a line to stderr, at once."""
+    print(line, file=sys.stderr, flush=True)

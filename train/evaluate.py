@@ -47,16 +47,6 @@ def _read_episodes(paths: Sequence[str], most: int | None) -> tuple[EpisodeFile,
     return dataclasses.replace(file, episodes=file.episodes[:most]), digest
 
 
-def _config_of_baselines(policies: Sequence[str], arguments: argparse.Namespace) -> TrainConfig:
-    """Return the default config, for policies that need no run folder."""
-    if LEARNED in policies or not arguments.scenes:
-        raise ConfigError(
-            "RUN_DIR is missing; without one, expected --scenes and --policies without learned, "
-            "for example --policies random,follower,avoider,namo:0.5"
-        )
-    return dataclasses.replace(TrainConfig(), run=dataclasses.replace(TrainConfig().run, name="baselines"))
-
-
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     return program(
@@ -99,7 +89,13 @@ def _wanted(
     words = [word for word in arguments.words if "=" in word]
     if folder:
         return config_to_play(folder, words, arguments.scenes, console)
-    config = config_io.apply_overrides(_config_of_baselines(policies, arguments), words)
+    if LEARNED in policies or not arguments.scenes:
+        raise ConfigError(
+            "RUN_DIR is missing; without one, expected --scenes and --policies without learned, "
+            "for example --policies random,follower,avoider,namo:0.5"
+        )
+    config = dataclasses.replace(TrainConfig(), run=dataclasses.replace(TrainConfig().run, name="baselines"))
+    config = config_io.apply_overrides(config, words)
     return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=scene_folders(arguments.scenes)))
 
 
@@ -188,11 +184,11 @@ def _run(arguments: argparse.Namespace, build_env: Callable[[EnvConfig], Any], k
                 console.print(f"until all have played: {place}; {out} stays as it is", highlight=False, soft_wrap=True)
         for path in (unfinished, paths_beside(unfinished)):
             path.unlink(missing_ok=True)
-        _tell(console, rows, config, player.env, out)
+        _report(console, rows, config, player.env, out)
     return 0
 
 
-def _tell(console: Console, rows: pa.Table, config: TrainConfig, env: Any, out: Path) -> None:
+def _report(console: Console, rows: pa.Table, config: TrainConfig, env: Any, out: Path) -> None:
     """Print the table of scores, and whether they are in doubt."""
     console.print(score_table(rows, f"{config.run.name}: {', '.join(scene.name for scene in env.scenes)}"))
     # A solve that met its iteration limit is inexact, not lost.

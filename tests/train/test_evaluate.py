@@ -19,8 +19,9 @@ from interactive_nav_common.config import replace
 from interactive_nav_common.errors import FileError, UserError
 from interactive_nav_common.rows import write_parquet
 from tests.train.toy_run import build_toy, toy_config
-from train import evaluate, figures
+from train import evaluate
 from train.config import RunConfig
+from train.figures import cli, curves
 from train.runs import checkpoint
 from train.runs.run import train_run
 from train.runs.run_folder import RunFolder, paths_beside
@@ -297,7 +298,7 @@ def test_damaged_files_are_one_line_for_figures(run, evaluated, tmp_path, capsys
     copy = tmp_path / "copy"
     shutil.copytree(run.path, copy)
     (copy / name).write_bytes(data)
-    assert figures.main([str(copy), "-o", str(tmp_path / "f")]) == (2 if message else 0)
+    assert cli.main([str(copy), "-o", str(tmp_path / "f")]) == (2 if message else 0)
     assert message in capsys.readouterr().err
 
 
@@ -328,17 +329,17 @@ def test_checkpoint_of_another_robot(run, tmp_path, capsys):
 
 
 def test_figures(run, evaluated, tmp_path, capsys):
-    assert figures.main([str(run.path), "-o", str(tmp_path / "f")]) == 0
+    assert cli.main([str(run.path), "-o", str(tmp_path / "f")]) == 0
     made = sorted(path.name for path in (tmp_path / "f").iterdir())
     assert made == ["frontier_toy.png", "learning_curves.png", "trajectories_toy.png"]
     assert all((tmp_path / "f" / name).stat().st_size > 10_000 for name in made)
     capsys.readouterr()
     (tmp_path / "empty").mkdir()
-    assert figures.main([str(tmp_path / "empty")]) == 2
+    assert cli.main([str(tmp_path / "empty")]) == 2
     assert "nothing to draw" in capsys.readouterr().err
 
 
 def test_curves_show_what_was_logged():
-    figure = figures.learning_curves({"a": [{"env_steps": 10, "episode/success": 0.25}, {"env_steps": 20}]})
+    figure = curves.learning_curves({"a": [{"env_steps": 10, "episode/success": 0.25}, {"env_steps": 20}]})
     (line,) = figure.axes[0].lines
     np.testing.assert_array_equal(line.get_xydata(), [[10, 0.25]])

@@ -15,8 +15,8 @@ from tests.train.synthetic import baseline_rows, paper_like, run_rows, write_res
 from train.figures import cli, curves, paths, scores, style, tables
 from train.figures.cli import chosen_split
 from train.runs.run_folder import paths_beside
-from train.scoring.claims import claims
 from train.scoring.rows import BY_CATEGORY, COLUMNS
+from train.scoring.statistics import claims
 
 
 def xy(line) -> np.ndarray:

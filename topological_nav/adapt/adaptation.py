@@ -1,13 +1,11 @@
-"""A network and images of another domain in, a network for that domain out: adversarial adaptation of the embedding.
+"""Adapt a network to images of another domain: adversarial adaptation of the embedding.
 
-Tzeng et al. 2017 (ADDA): a critic learns to tell the embeddings of source images from those of target images, which an
-extractor of its own makes that starts as the source's; in turn the extractor learns to be taken for the source's. The
+Tzeng et al. 2017 (ADDA): a critic learns to separate the embeddings of source images from those of target images, which
+a second extractor computes that starts as the source's; in turn that one learns to be taken for the source's. The
 source's extractor stays as it is. No label and no position of a target image is used.
 """
 
 import dataclasses
-import hashlib
-import json
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +17,7 @@ import numpy as np
 import optax
 
 from interactive_nav_common.config import to_dict
+from interactive_nav_common.rows import digest_of
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.data.dataset import RoomImages, load_rooms, read_header
 from topological_nav.data.domains import as_seen, preset
@@ -39,7 +38,7 @@ class Critic(nn.Module):
 
     @nn.compact
     def __call__(self, embeddings: jax.Array) -> jax.Array:
-        """[N, D] to [N] logits."""
+        """Map [N, D] to [N] logits."""
         x = embeddings
         for _ in range(2):
             x = nn.leaky_relu(nn.Dense(self.hidden)(x))
@@ -59,7 +58,7 @@ class Adapting:
 
 
 def embed_training(network: Network, variables: Any, images: jax.Array) -> tuple[jax.Array, Any]:
-    """Embeddings [N, D] by the batch's own statistics, and the running ones updated."""
+    """Return embeddings [N, D] by the batch's own statistics, and the running ones updated."""
     embeddings, new = network.apply(
         variables, images, method=lambda module, x: joined(module.body(normalised(x), True)), mutable=["batch_stats"]
     )
@@ -69,7 +68,7 @@ def embed_training(network: Network, variables: Any, images: jax.Array) -> tuple
 def make_adapting(
     network: Network, variables: dict[str, Any], size: int, config: AdaptConfig
 ) -> tuple[Adapting, Critic]:
-    """The target's extractor as the source's, and a fresh critic."""
+    """Return the target's extractor as the source's, and a fresh critic."""
     critic = Critic(config.hidden)
     shapes = jax.eval_shape(critic.init, jax.random.PRNGKey(0), jax.ShapeDtypeStruct((1, size), jnp.float32))
     weights = initial(shapes, config.seed)["params"]
@@ -80,9 +79,9 @@ def make_adapting(
 
 
 def adversarial_epoch(network: Network, critic: Critic, config: AdaptConfig):
-    """An epoch: for each batch of target images one update of the critic, then one of the extractor.
+    """Build an epoch: for each batch of target images one update of the critic, then one of the extractor.
 
-    Called with the source's embeddings [S, D] in place of labels. Means told: `loss` of the extractor, `critic_loss`,
+    Called with the source's embeddings [S, D] in place of labels. Its means: `loss` of the extractor, `critic_loss`,
     and `critic_accuracy`, before its update, where 0.5 means that the domains look alike.
     """
     tx, critic_tx = _optimisers(config)
@@ -116,7 +115,7 @@ def adversarial_epoch(network: Network, critic: Critic, config: AdaptConfig):
 
 
 def target_statistics(trained: Trained, images: np.ndarray, batch: int, passes: int = 3) -> Trained:
-    """The network with batch normalisation's running statistics of other images, its weights as they were.
+    """Return the network with batch normalisation's running statistics of other images, its weights as they were.
 
     Li et al. 2016 (AdaBN): the least that can be done, and a baseline for more. Images [N, H, W, 3] u8.
     """
@@ -139,7 +138,7 @@ def adapt_features(
     trained = load_trained(run)
     near, far = load_rooms(source), target_rooms(target, config)
     headers = [read_header(folder)[0] for folder in (source, target)]
-    data = {name: digest_of(header) for name, header in zip(("source", "target"), headers, strict=True)}
+    data = {name: digest_of(header, 12) for name, header in zip(("source", "target"), headers, strict=True)}
     with claimed(out, {"task": "features", **to_dict(config), "run": trained.about["digest"][:12], **data}):
         learned, unlabelled = (x.images[~x.test].reshape(-1, *x.images.shape[3:]) for x in (near, far))
         embedded = trained.embed(learned)
@@ -163,22 +162,17 @@ def adapt_features(
 
 
 def epoch_keys(config: AdaptConfig) -> jax.Array:
-    """Chance of all epochs of adaptation."""
+    """Return the key of all epochs of adaptation."""
     return jax.random.fold_in(jax.random.PRNGKey(config.seed), 3)
 
 
 def adapted_about(trained: Trained, config: AdaptConfig) -> dict[str, Any]:
-    """What network.json says of a network that was adapted from a trained one."""
+    """Return what network.json says of a network that was adapted from a trained one."""
     return {**trained.about, "adapted_from": trained.about["digest"], "domain": to_dict(preset(config.domain))}
 
 
-def digest_of(header: dict[str, Any]) -> str:
-    """Twelve digits that tell datasets apart, of their dataset.json."""
-    return hashlib.sha256(json.dumps(header, sort_keys=True).encode()).hexdigest()[:12]
-
-
 def target_rooms(folder: Path, config: AdaptConfig) -> RoomImages:
-    """The room images of a dataset as the target's camera sees them."""
+    """Return the room images of a dataset as the target's camera sees them."""
     rooms = load_rooms(folder)
     return dataclasses.replace(rooms, images=as_seen(rooms.images, preset(config.domain), ROOMS_STREAM))
 
@@ -186,7 +180,7 @@ def target_rooms(folder: Path, config: AdaptConfig) -> RoomImages:
 def localisation_between(
     node_network: Trained, node_rooms: RoomImages, query_network: Trained, query_rooms: RoomImages
 ) -> dict[str, Any]:
-    """Scores of queries of one domain on nodes of another, as `training.localisation` has them; and their number."""
+    """Score queries of one domain on nodes of another, see `training.localisation`; return their number too."""
     rows = localisation(node_network, node_rooms, query_network, query_rooms)
     if not rows:
         raise RunError("source and target have no scene in common with positions for training and for testing")

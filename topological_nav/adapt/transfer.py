@@ -19,13 +19,8 @@ import optax
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.config import to_dict
-from topological_nav.adapt.adaptation import (
-    PASSAGES_STREAM,
-    adapted_about,
-    digest_of,
-    epoch_keys,
-    target_rooms,
-)
+from interactive_nav_common.rows import digest_of
+from topological_nav.adapt.adaptation import PASSAGES_STREAM, adapted_about, epoch_keys, target_rooms
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.config import PITCHES
 from topological_nav.data.dataset import PassageImages, load_passages, read_header
@@ -63,7 +58,7 @@ def passage_configurations(
     need_task(trained.about, "passages", f"{run}:")
     learned, tested = _labelled(target, trained.about["lengths_m"], config)
     header, _ = read_header(target)
-    about = {"run": trained.about["digest"][:12], "target": digest_of(header)}
+    about = {"run": trained.about["digest"][:12], "target": digest_of(header, 12)}
     with claimed(out, {"task": "transfer", **to_dict(config), **about}):
         network, tx = trained.network, optax.adam(config.fine_tune_learning_rate)
         shape = (trained.about["data"]["height"], trained.about["data"]["width"])
@@ -95,11 +90,11 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
     scene = load_scene(scene_folder)
     header, data = read_header(target)
     rooms = target_rooms(target, config)
-    mine = rooms.scene == _index_of(scene, header, target)
-    nodes, held = mine & ~rooms.test, mine & rooms.test
+    here = rooms.scene == _index_of(scene, header, target)
+    nodes, held = here & ~rooms.test, here & rooms.test
     level = rooms.images[:, PITCHES.index("level")]
     shown, xy, label = level[nodes], rooms.xy_w[nodes], rooms.label[nodes]
-    room = label - rooms.label[mine].min()
+    room = label - rooms.label[here].min()
     if not len(near_pairs(xy, config.edge_m)):
         raise MapError(f"no two positions of '{scene.name}' in {target} are within {config.edge_m} m; collect more")
     about = {"settings": to_dict(config), "data": header["settings"], "domain": to_dict(preset(config.domain))}
@@ -113,7 +108,7 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
 
 
 def _index_of(scene: Scene, header: dict[str, Any], target: Path) -> int:
-    """Which scene of a dataset it is."""
+    """Return which scene of a dataset it is."""
     digests = [there["digest"] for there in header["scenes"]]
     if scene.digest not in digests:
         names = ", ".join(there["name"] for there in header["scenes"])
@@ -122,7 +117,7 @@ def _index_of(scene: Scene, header: dict[str, Any], target: Path) -> int:
 
 
 def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> tuple[PassageImages, PassageImages]:
-    """Target images to learn from and to test, as many free as blocked, no source in both."""
+    """Return target images to learn from and to test, as many free as blocked, no source in both."""
     passages = load_passages(target)
     if list(passages.lengths_m) != list(lengths_m):
         lengths = ",".join(f"{length:g}" for length in lengths_m)

@@ -3,18 +3,21 @@
 import argparse
 import dataclasses
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.config import overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import write_text
-from interactive_nav_common.jobs.progress import SafeConsole
+from interactive_nav_common.jobs.progress import SafeConsole, progress_bar
 from interactive_nav_common.rows import where
+from interactive_nav_common.signals import stop_signals
 from scenes_mjcf.sets import scene_folders
-from topological_nav.commands.progress import bar, say
 from topological_nav.config import PASSAGE_POLICY, RUNS, EvaluationConfig, ExportConfig, MapConfig, NavigatorConfig
+from topological_nav.errors import Host, Progress, Stopped, say
 from topological_nav.evaluate.contest import Contest, contest_scenes, play_contest, tracks_of
 from topological_nav.evaluate.scores import console_table, differences, markdown, summary
 from topological_nav.figures.journey import drive_episode, film
@@ -24,6 +27,41 @@ from topological_nav.maps.build import Built, build_map, forget
 from topological_nav.maps.graph import save_map
 from topological_nav.weights.export import export, size_lines
 from topological_nav.weights.packaged import choose, fitting_map
+
+
+@contextmanager
+def terminal() -> Iterator[Host]:
+    """Show lines on stdout, at once, and stop at a signal."""
+    with stop_signals() as stops:
+        yield Host(lambda line: print(line, flush=True), lambda: stops[0] if stops else 0)
+
+
+@contextmanager
+def bar(signals: list[int] | None = None) -> Iterator[Progress]:
+    """Show a bar with the time left on a terminal, a line every tenth elsewhere; raise `Stopped` before the end.
+
+    `signals` are those of a `stop_signals` around it; None: it collects them itself.
+    """
+    console = SafeConsole(stderr=True)
+    collected = stop_signals() if signals is None else nullcontext(signals)
+    with collected as stops, progress_bar(console, "starting") as update:
+        tenths = 0
+        # Neither compiling before the first step nor what an earlier run has done says how fast it goes.
+        first: tuple[float, int] | None = None
+
+        def report(what: str, done: int, total: int) -> None:
+            nonlocal tenths, first
+            first = first or (time.perf_counter(), done)
+            update(description=what, completed=done, total=total)
+            if not console.is_terminal and done * 10 // max(total, 1) > tenths:
+                tenths, (began, before), left = done * 10 // total, first, ""
+                if done > before:
+                    left = f", {(time.perf_counter() - began) / (done - before) * (total - done):.0f} s left"
+                console.print(f"{what}: {done:,} of {total:,}{left}", highlight=False, soft_wrap=True)
+            if stops and done < total:
+                raise Stopped(stops[0])
+
+        yield report
 
 
 def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: Sequence[str], out: Path):

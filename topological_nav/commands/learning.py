@@ -11,8 +11,7 @@ from scenes_mjcf.sets import scene_folders
 from topological_nav.adapt.adaptation import adapt_features, target_rooms
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.adapt.transfer import CONFIGURATIONS, collected_map, passage_configurations
-from topological_nav.commands.episodes import keep_map
-from topological_nav.commands.progress import bar, say, terminal
+from topological_nav.commands.episodes import bar, keep_map, terminal
 from topological_nav.config import (
     ADAPTED,
     DATASET,
@@ -31,7 +30,7 @@ from topological_nav.data.folders import folder_bytes
 from topological_nav.drives.dataset import draw_drives, simulate_drives, summary
 from topological_nav.drives.driving import embed_drives
 from topological_nav.drives.imitation import grid_table, train_grid, train_policy
-from topological_nav.errors import Host
+from topological_nav.errors import Host, say
 from topological_nav.figures.learning import (
     curves_figure,
     drives_figure,

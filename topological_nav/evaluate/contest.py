@@ -28,7 +28,7 @@ from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import write_arrays
 from interactive_nav_common.jobs.progress import SafeConsole
-from interactive_nav_common.rows import Columns, read_rows, write_parquet
+from interactive_nav_common.rows import Columns, digest_of, read_rows, write_parquet
 from interactive_nav_common.untrusted.reading import read_npz
 from interactive_nav_common.versions import versions
 from topological_nav.config import PASSAGE_POLICY, DataConfig, EvaluationConfig, MapConfig
@@ -114,17 +114,17 @@ class ContestScene:
 
     @functools.cached_property
     def space(self) -> FreeSpace:
-        """Free space for the robot."""
+        """Return the free space for the robot."""
         return free_space(self.scene, self.robot.height_m)
 
     @functools.cached_property
     def rooms(self):
-        """By the default way of clustering, so that episodes do not depend on networks."""
+        """Cluster by the default way of clustering, so that episodes do not depend on networks."""
         return scene_rooms(self.scene, self.space, DataConfig())
 
     @functools.cached_property
     def episodes(self) -> DrivenEpisodes:
-        """All episodes of the scene."""
+        """Draw all episodes of the scene."""
         config = self.contest.config
         return draw_episodes(self.scene.digest, self.space, self.rooms, count_of(self.scene, config), config)
 
@@ -139,7 +139,7 @@ class ContestScene:
 
     @functools.cached_property
     def map(self) -> TopologicalMap:
-        """The dense map."""
+        """Load or build the dense map."""
         if self.networks is None:
             return true_map(self.scene, self.space, self.rooms, MapConfig(), DataConfig())
         path = self.contest.map_files.get(self.scene.name) or self.contest.maps / f"{self.scene.name}.npz"
@@ -147,7 +147,7 @@ class ContestScene:
 
     @functools.cached_property
     def camera(self) -> Camera:
-        """What the navigator's sight understands."""
+        """Return the camera that the navigator's sight understands."""
         if self.networks is None:
             return pose_camera
         world = self.player.env.world
@@ -157,7 +157,7 @@ class ContestScene:
 
     @property
     def drawn(self) -> DataConfig:
-        """How the navigator's images are drawn: as the networks learned, by the map's engine and lens."""
+        """Return how the navigator's images are drawn: as the networks learned, by the map's engine and lens."""
         assert self.networks is not None
         of_map = {k: v for k, v in self.map.about.get("data", {}).items() if k in ("engine", "fov_deg")}
         drawn = overlay(self.networks.camera, of_map, "map")
@@ -165,19 +165,19 @@ class ContestScene:
         return drawn_for(drawn, self.contest.config.supersample)
 
     def map_of(self, contender: str) -> TopologicalMap:
-        """The map that a navigator goes by."""
+        """Return the map that a navigator goes by."""
         if contender != "sparse":
             return self.map
         return self.map.thinned(self.contest.config.thinned, self.contest.config.seed)
 
     def sight(self, graph: TopologicalMap) -> Sight:
-        """Networks, or the truth."""
+        """Return networks, or the truth."""
         if self.networks is None:
             return TrueSight(graph, self.space)
         return NetworkSight(graph, self.networks.localiser, self.networks.detector, self.contest.config.match)
 
     def navigator(self, contender: str) -> Navigator:
-        """Of the dense or the sparse map."""
+        """Return the navigator of the dense or the sparse map."""
         graph = self.map_of(contender)
         sight = self.sight(graph)
         return Navigator(graph, sight, local_policy(self.contest, sight, self.networks), self.contest.config)
@@ -196,7 +196,7 @@ class ContestScene:
         return NavigatorPlayer(self.player, config, self.navigator(name), self.camera)
 
     def request(self, contender: str) -> dict[str, Any]:
-        """Everything that decides the rows of a contender."""
+        """Return everything that decides the rows of a contender."""
         config = {k: v for k, v in to_dict(self.contest.config).items() if k not in UNDECIDING}
         request = {"scene": self.scene.digest, "robot": self.contest.robot, "contender": contender, "settings": config}
         if contender == "ppo":
@@ -224,7 +224,7 @@ class ContestScene:
 
 
 def local_policy(contest: Contest, sight: Sight, networks: Networks | None) -> LocalPolicy:
-    """What drives along edges; a trained policy sees through adapted networks where the navigator does."""
+    """Return what drives along edges; a trained policy sees through adapted networks where the navigator does."""
     if contest.truth and contest.policy != PASSAGE_POLICY:
         raise ConfigError(f"--policy {contest.policy} looks at images, --truth has none; leave one of them out")
     seeing = [(contest.localiser, networks.localiser), (contest.detector, networks.detector)] if networks else []
@@ -232,7 +232,7 @@ def local_policy(contest: Contest, sight: Sight, networks: Networks | None) -> L
 
 
 def _digest_of(policy: str) -> str:
-    """Of a policy's run folder's weights, '' for the baseline."""
+    """Return the digest of a policy's weights, '' for the baseline."""
     if policy == PASSAGE_POLICY:
         return ""
     files = sorted(
@@ -256,7 +256,7 @@ def _learned(run: Path, scene: Scene, config: EvaluationConfig) -> tuple[Player,
 
 
 def contest_scenes(contest: Contest) -> list[ContestScene]:
-    """The scenes, with the networks where somebody looks through them."""
+    """Return the scenes, with the networks where somebody looks through them."""
     navigates = not contest.truth and {"dense", "sparse"} & set(contest.contenders)
     networks = load_networks(contest.localiser, contest.detector) if navigates else None
     return [ContestScene(folder, contest, networks) for folder in contest.scenes]
@@ -267,7 +267,7 @@ CPU_BATCH = 8
 
 
 def play_contest(contest: Contest, scenes: Sequence[ContestScene], on_progress: Progress = lambda *_: None) -> pa.Table:
-    """Plays what is missing, and returns all rows."""
+    """Play what is missing, and return all rows."""
     # Everything that can be refused is refused before the first episode.
     plan = [(scene, name, _stem(scene, name)) for scene in scenes for name in contest.contenders]
     missing = [_missing(contest.out, stem, len(scene.episodes)) for scene, _, stem in plan]
@@ -302,8 +302,7 @@ COLUMNS = Columns(
 
 
 def _stem(scene: ContestScene, contender: str) -> str:
-    request = json.dumps(scene.request(contender), sort_keys=True)
-    return f"{scene.scene.name}-{contender}-{hashlib.sha256(request.encode()).hexdigest()[:8]}"
+    return f"{scene.scene.name}-{contender}-{digest_of(scene.request(contender))}"
 
 
 def _files(out: Path, stem: str) -> list[Path]:
@@ -311,13 +310,13 @@ def _files(out: Path, stem: str) -> list[Path]:
 
 
 def _missing(out: Path, stem: str, count: int) -> np.ndarray:
-    """Numbers of the episodes that no file has."""
+    """Return the numbers of the episodes that no file has."""
     there = _rows(out, stem, count)["episode"].to_numpy() if _files(out, stem) else np.zeros(0, int)
     return np.setdiff1d(np.arange(count), there)
 
 
 def _rows(out: Path, stem: str, count: int) -> pa.Table:
-    """Rows of the first `count` episodes: the files may have more, of a time when more were requested.
+    """Return rows of the first `count` episodes: the files may have more, of a time when more were requested.
 
     An episode that two commands played at the same time counts as the first of the files has it.
     """
@@ -356,7 +355,7 @@ def _write(
 
 
 def tracks_of(contest: Contest, scene: ContestScene, contender: str) -> dict[int, np.ndarray]:
-    """Episode number -> [t, 2] m, of what has been played."""
+    """Return episode number -> [t, 2] m, of what has been played."""
     tracks: dict[int, np.ndarray] = {}
     for path in sorted((contest.out / "tracks").glob(f"{_stem(scene, contender)}-*.npz")):
         with read_npz(path, RunError, "delete it and evaluate again") as stored:

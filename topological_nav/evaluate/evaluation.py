@@ -55,12 +55,12 @@ class DrivenEpisodes(Rows):
 
 
 def count_of(scene: Scene, config: EvaluationConfig) -> int:
-    """Episodes of a scene: as set, or by its floor's area."""
+    """Return the number of episodes of a scene: as set, or by its floor's area."""
     return config.episodes or int(np.clip(round(PER_M2 * scene.manifest.floor_area_m2), LEAST, MOST))
 
 
 def draw_episodes(digest: str, space: FreeSpace, rooms: Rooms, count: int, config: EvaluationConfig) -> DrivenEpisodes:
-    """Draws episodes: number i depends on seed and scene alone, however many there are.
+    """Draw episodes: number i depends on seed and scene alone, however many there are.
 
     Start and goal are uniform over free places, in different rooms, farther apart than `min_goal_m`, joined by a way.
     """
@@ -91,7 +91,7 @@ def draw_episodes(digest: str, space: FreeSpace, rooms: Rooms, count: int, confi
 
 
 def _shortest_m(space: FreeSpace, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
-    """[n] m: shortest ways between places [n, 2] over a grid of 16 directions, at most 2.7 % too long."""
+    """Return [n] m: shortest ways between places [n, 2] over a grid of 16 directions, at most 2.7 % too long."""
     free = space.clearance_m >= CONNECTED_M
     grid = PathGrid(free, np.ones(free.shape))
     ends = zip(space.cells(starts)[:, ::-1], space.cells(goals)[:, ::-1], strict=True)

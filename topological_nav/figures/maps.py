@@ -37,12 +37,12 @@ INK = 40.0
 """Paths drawn so many times over each other make a solid colour, however many there are."""
 
 
-def map_lines(axis: Axes, made: TopologicalMap, passable: float) -> None:
+def map_lines(axis: Axes, graph: TopologicalMap, passable: float) -> None:
     """Draw a map in the background: its nodes, and the edges that count as open."""
-    open_ = made.p >= passable
-    ways = np.stack([made.xy_w[made.edges[open_, 0]], made.xy_w[made.edges[open_, 1]]], 1)
+    open_ = graph.p >= passable
+    ways = np.stack([graph.xy_w[graph.edges[open_, 0]], graph.xy_w[graph.edges[open_, 1]]], 1)
     axis.add_collection(LineCollection(list(ways), colors="0.6", linewidths=0.5, zorder=1))
-    room_points(axis, made.xy_w, made.room, s=10, linewidths=0, zorder=2, alpha=0.8)
+    room_points(axis, graph.xy_w, graph.room, s=10, linewidths=0, zorder=2, alpha=0.8)
 
 
 def journeys_figure(
@@ -59,10 +59,10 @@ def journeys_figure(
     size = (width * columns, (width * extent[1] / extent[0] + 0.5) * lines)
     figure = plt.figure(figsize=size, layout="constrained")
     axes = scene_axes(figure, len(panels), columns)
-    for axis, (name, (made, tracks, rows)) in zip(axes, panels.items(), strict=True):
+    for axis, (name, (graph, tracks, rows)) in zip(axes, panels.items(), strict=True):
         floor_plan(axis, space)
-        if made is not None:
-            map_lines(axis, made, passable)
+        if graph is not None:
+            map_lines(axis, graph, passable)
         for wins, colour in ((True, WON), (False, LOST)):  # what was lost lies above
             mine = {number: row for number, row in rows.items() if bool(row["success"]) == wins}
             alpha = max(0.01, min(0.65, INK / max(len(mine), 1)))  # of less, eight bits show nothing
@@ -83,7 +83,7 @@ def journeys_figure(
     return figure
 
 
-def plan_picture(space: FreeSpace, made: TopologicalMap, passable: float, height: int) -> tuple[np.ndarray, Any]:
+def plan_picture(space: FreeSpace, graph: TopologicalMap, passable: float, height: int) -> tuple[np.ndarray, Any]:
     """Return a picture [height, W, 3] u8 of plan and map, W even, and a function from world points to its pixels."""
     extent = np.ptp(space.centres(0.0), axis=0) + 0.8
     width = int(round(height * extent[0] / extent[1] / 2)) * 2
@@ -91,7 +91,7 @@ def plan_picture(space: FreeSpace, made: TopologicalMap, passable: float, height
     axis = figure.add_axes((0, 0, 1, 1))
     floor_plan(axis, space)
     axis.set_aspect("auto")
-    map_lines(axis, made, passable)
+    map_lines(axis, graph, passable)
     memory = io.BytesIO()
     figure.savefig(memory, dpi=100, format="png")
     (x0, x1), (y0, y1) = axis.get_xlim(), axis.get_ylim()
@@ -172,25 +172,25 @@ def dataset_figure(folder: Path) -> Figure:
 
 def map_figure(built: Built, route: Route | None = None) -> Figure:
     """Draw a map over the floor plan, a route on top: edges from blocked to free, each direction on its own half."""
-    made = built.map
+    graph = built.map
     extent = np.ptp(built.space.centres(0.0), axis=0)
     figure, axis = plt.subplots(figsize=(7.2, 1.2 + 7.0 * extent[1] / extent[0]), layout="constrained")
     floor_plan(axis, built.space)
-    start, end = made.xy_w[made.edges[:, 0]], made.xy_w[made.edges[:, 1]]
-    order = np.argsort(made.p)
+    start, end = graph.xy_w[graph.edges[:, 0]], graph.xy_w[graph.edges[:, 1]]
+    order = np.argsort(graph.p)
     halves = LineCollection(list(np.stack([start, (start + end) / 2], 1)[order]), cmap=FREE, linewidths=1.1, zorder=2)
-    halves.set_array(made.p[order])
+    halves.set_array(graph.p[order])
     halves.set_clim(0.0, 1.0)
     axis.add_collection(halves)
-    room_points(axis, made.xy_w, made.room, s=130, linewidths=0, zorder=4)
-    axis.scatter(made.xy_w[:, 0], made.xy_w[:, 1], s=70, c="w", linewidths=0, zorder=4)
-    for node, xy in enumerate(made.xy_w):
-        if np.linalg.norm(made.xy_w[:node] - xy, axis=-1).min(initial=1.0) > 0.25:  # else one over the other
+    room_points(axis, graph.xy_w, graph.room, s=130, linewidths=0, zorder=4)
+    axis.scatter(graph.xy_w[:, 0], graph.xy_w[:, 1], s=70, c="w", linewidths=0, zorder=4)
+    for node, xy in enumerate(graph.xy_w):
+        if np.linalg.norm(graph.xy_w[:node] - xy, axis=-1).min(initial=1.0) > 0.25:  # else one over the other
             axis.text(xy[0], xy[1], str(node), ha="center", va="center", fontsize=6, zorder=5)
     if route is not None:
-        axis.plot(*made.xy_w[list(route.nodes)].T, color="k", linewidth=2.6, zorder=3)
+        axis.plot(*graph.xy_w[list(route.nodes)].T, color="k", linewidth=2.6, zorder=3)
     figure.colorbar(
         halves, ax=axis, label="probability that the way is free", orientation="horizontal", shrink=0.6, pad=0.01
     )
-    axis.set_title(f"{made.scene}: {len(made.xy_w)} nodes, {len(made.edges)} directed edges", fontsize=9)
+    axis.set_title(f"{graph.scene}: {len(graph.xy_w)} nodes, {len(graph.edges)} directed edges", fontsize=9)
     return figure

@@ -55,13 +55,13 @@ def make_learner(
 
 
 def variable_shapes(module: nn.Module, image_shape: tuple[int, int]) -> dict[str, Any]:
-    """`params` and `batch_stats` of a module as shapes; nothing is computed."""
+    """Return `params` and `batch_stats` of a module as shapes; nothing is computed."""
     key, image = jax.random.PRNGKey(0), jax.ShapeDtypeStruct((1, *image_shape, 3), jnp.uint8)
     return {"batch_stats": {}, **jax.eval_shape(lambda k, x: module.init(k, x, train=False), key, image)}
 
 
 def initial(shapes: dict[str, Any], seed: int) -> dict[str, Any]:
-    """First values of variables: the same on every device, and without a program to compile.
+    """Return first values of variables: the same on every device, and without a program to compile.
 
     Convolutions as in He et al. 2015 by outputs (sd root of 2 over fan out), dense layers by inputs (1 over root of
     fan in), scales and variances 1, everything else 0.
@@ -81,7 +81,7 @@ def initial(shapes: dict[str, Any], seed: int) -> dict[str, Any]:
 
 
 def with_backbone(learner: Learner, donor: dict[str, Any]) -> Learner:
-    """The learner with the backbone of other variables (`params`, `batch_stats`); raises ValueError if it differs."""
+    """Return the learner with the backbone of other variables (`params`, `batch_stats`); raise if it differs."""
     mine, theirs = learner.params["body"], donor["params"]["body"]
     shapes = [jax.tree.map(jnp.shape, tree) for tree in (mine, theirs)]
     if shapes[0] != shapes[1]:
@@ -95,7 +95,7 @@ def with_backbone(learner: Learner, donor: dict[str, Any]) -> Learner:
 def labelled_epoch(
     network: Network, tx: optax.GradientTransformation, batch: int, smoothing: float, augment: bool, scored: int = 0
 ) -> Epoch:
-    """An epoch of classification; images [N, H, W, 3] u8, labels [N] i32, of passages [N, outputs].
+    """Build an epoch of classification; images [N, H, W, 3] u8, labels [N] i32, of passages [N, outputs].
 
     The last, incomplete batch is left out: order changes every epoch, so every image has its turn.
     """
@@ -119,7 +119,7 @@ def labelled_epoch(
 
 
 def paired_epoch(module: Contrast, tx: optax.GradientTransformation, batch: int) -> Epoch:
-    """An epoch without labels: two views of each place, up to `VIEW_STEPS` headings apart and lit differently.
+    """Build an epoch without labels: two views of each place, up to `VIEW_STEPS` headings apart and lit differently.
 
     Images are [P, K, H, W, 3] u8, K headings of a place and pitch; every image is the first view once. Labels are
     not looked at.
@@ -146,7 +146,7 @@ def paired_epoch(module: Contrast, tx: optax.GradientTransformation, batch: int)
 
 
 def shuffled(key: jax.Array, count: int, batch: int) -> jax.Array:
-    """[U, batch] rows of an epoch's updates: all in random order, but for a last, incomplete batch."""
+    """Return [U, batch] rows of an epoch's updates: all in random order, but for a last, incomplete batch."""
     size = min(batch, count)
     return jax.random.permutation(key, count)[: count // size * size].reshape(-1, size)
 
@@ -207,7 +207,7 @@ def compiled_epoch(steps: Callable[..., Any], update: Callable[..., Any]) -> Epo
 
 
 def in_batches(function: Callable[[jax.Array], jax.Array], images: np.ndarray) -> np.ndarray:
-    """A compiled function's rows for any number of images [N, H, W, 3], a fixed number at a time; fewer are padded."""
+    """Return a compiled function's rows of images [N, H, W, 3], a fixed number at a time; fewer are padded."""
     sizes = EVALUATED if jax.default_backend() == "cpu" else DEVICE_EVALUATED
     rows, waiting, first = [], None, 0
     while first < len(images) or waiting is None:
@@ -223,7 +223,7 @@ def in_batches(function: Callable[[jax.Array], jax.Array], images: np.ndarray) -
 
 
 def padded_size(count: int) -> int:
-    """Rows of a batch that holds `count`: few sizes, because each is compiled. Powers of two, on accelerators of four,
+    """Return a batch size that holds `count`, of few, because each is compiled: powers of two, on accelerators of four,
     where little is faster than 16."""
     if jax.default_backend() == "cpu":
         return 1 << (count - 1).bit_length()

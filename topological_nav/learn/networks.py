@@ -23,7 +23,7 @@ class ResNet18(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array, train: bool) -> tuple[jax.Array, jax.Array]:
-        """Feature maps after the third stage (conv3_x) and the fifth (conv5_x): [N, h, w, 2 width], [.., 8 width]."""
+        """Return maps after the third (conv3_x) and the fifth stage (conv5_x): [N, h, w, 2 width], [.., 8 width]."""
         x = _conv(self.width, 7, 2)(x)
         x = nn.relu(_norm(train)(x))
         x = nn.max_pool(x, (3, 3), (2, 2), padding="SAME")
@@ -55,7 +55,7 @@ class AlexNet(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array, train: bool) -> tuple[jax.Array, jax.Array]:
-        """Feature maps of the third and the fifth convolution: [N, h, w, 6 width] and [N, h', w', 4 width]."""
+        """Return feature maps of the third and the fifth convolution: [N, h, w, 6 width] and [N, h', w', 4 width]."""
         del train
         maps = []
         for i, (factor, kernel, stride) in enumerate(((1, 11, 4), (3, 5, 1), (6, 3, 1), (4, 3, 1), (4, 3, 1))):
@@ -71,14 +71,14 @@ class Network(nn.Module):
 
     task: str
     """rooms: two layers with leaky ReLU; passages: an output a length, never more for a longer
-    one; after AlexNet its own two layers with dropout."""
+    one; after AlexNet two more layers with dropout."""
     backbone: str = "resnet18"
     width: int = 64
     hidden: int = 512
     outputs: int = 1
 
     def setup(self) -> None:
-        """Makes the parts; flax calls it."""
+        """Make the parts; flax calls it."""
         self.body = {"resnet18": ResNet18, "alexnet": AlexNet}[self.backbone](self.width)
         if self.task == "rooms":
             self.layers = [nn.Dense(self.hidden), nn.Dense(self.hidden)]
@@ -90,7 +90,7 @@ class Network(nn.Module):
         self.last = nn.Dense(self.outputs)
 
     def __call__(self, images: jax.Array, train: bool = False) -> jax.Array:
-        """Logits [N, outputs]; of passages they never rise."""
+        """Return logits [N, outputs]; of passages they never rise."""
         _, x = self.body(normalised(images), train)
         x = x.reshape(len(x), -1) if self.backbone == "alexnet" else x.mean((1, 2))
         for layer in self.layers:
@@ -102,7 +102,7 @@ class Network(nn.Module):
         return falling(x) if self.task == "passages" else x
 
     def embed(self, images: jax.Array) -> jax.Array:
-        """[N, D] f32: both feature maps max-pooled over space, each scaled to length 1, one after the other."""
+        """Return [N, D] f32: both feature maps max-pooled over space, each scaled to length 1, one after the other."""
         return joined(self.body(normalised(images), False))
 
 
@@ -114,7 +114,7 @@ class Contrast(nn.Module):
 
     @nn.compact
     def __call__(self, images: jax.Array, train: bool = True) -> jax.Array:
-        """[N, 8 width]."""
+        """Return [N, 8 width]."""
         body = {"resnet18": ResNet18, "alexnet": AlexNet}[self.backbone](self.width, name="body")
         _, x = body(normalised(images), train)
         x = nn.relu(_norm(train)(nn.Dense(8 * self.width)(x.mean((1, 2)))))
@@ -122,23 +122,23 @@ class Contrast(nn.Module):
 
 
 def falling(x: jax.Array) -> jax.Array:
-    """[N, L] to logits that fall from each to the next, by softplus of it: what is free to 2 m is free to 1 m."""
+    """Map [N, L] to logits that fall from each to the next, by softplus of it: what is free to 2 m is free to 1 m."""
     return x[:, :1] - jnp.cumsum(jnp.pad(nn.softplus(x[:, 1:]), ((0, 0), (1, 0))), 1)
 
 
 def joined(maps: tuple[jax.Array, jax.Array]) -> jax.Array:
-    """Two feature maps [N, h, w, c] to the localisation embedding [N, c1 + c2]; its length is the root of 2."""
+    """Join two feature maps [N, h, w, c] to the localisation embedding [N, c1 + c2]; its length is the root of 2."""
     parts = [m.max((1, 2)) for m in maps]
     return jnp.concatenate([p / jnp.maximum(jnp.linalg.norm(p, axis=-1, keepdims=True), _EPSILON) for p in parts], -1)
 
 
 def normalised(images: jax.Array) -> jax.Array:
-    """Grey levels 0 to 255, u8 or f32, to f32 about 0."""
+    """Scale grey levels 0 to 255, u8 or f32, to f32 about 0."""
     return (images.astype(jnp.float32) / 255.0 - 0.5) / 0.25
 
 
 def vicreg_loss(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Bardes et al. 2022, equation 6, weights 25, 25 and 1: two views' expansions [N, D] to a number."""
+    """Return the loss of two views' expansions [N, D]: Bardes et al. 2022, equation 6, weights 25, 25 and 1."""
     n, d = a.shape
     invariance = jnp.square(a - b).mean()
     spread, shared = jnp.float32(0.0), jnp.float32(0.0)
@@ -151,11 +151,7 @@ def vicreg_loss(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def augmented(key: jax.Array, images: jax.Array, flip: bool) -> jax.Array:
-    """Images [N, H, W, 3] u8 to f32, each with its own brightness, contrast, colour and shift.
-
-    Args:
-        images: grey levels 0 to 255.
-    """
+    """Vary brightness, contrast, colour and shift of each of the images [N, H, W, 3] u8; return f32, 0 to 255."""
     n, height, width, _ = images.shape
     key_gain, key_offset, key_shift, key_flip = jax.random.split(key, 4)
     x = images.astype(jnp.float32)

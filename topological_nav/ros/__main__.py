@@ -22,8 +22,8 @@ from interactive_nav_common.errors import UserError, missing, optional, reports_
 from interactive_nav_common.jobs.processes import GUARD
 from interactive_nav_common.signals import stop_signals
 from interactive_nav_common.words import Parser, add_words, read_commands
-from topological_nav.commands.progress import say
 from topological_nav.config import RUNS, NavigatorConfig
+from topological_nav.errors import say
 from topological_nav.ros.config import HeadingConfig, SimulatorConfig
 
 DRIVERS = {"heading": HeadingConfig, "topological": NavigatorConfig}

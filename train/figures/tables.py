@@ -10,8 +10,7 @@ import pyarrow.compute as pc
 from interactive_nav_common.rows import markdown, where
 from interactive_nav_common.statistics import estimate, over_episodes
 from train.figures import style
-from train.scoring.claims import Finding, claims
-from train.scoring.statistics import cells, learned_rows, objects_moved, run_means
+from train.scoring.statistics import Finding, cells, claims, learned_rows, objects_moved, run_means
 
 SPLITS = {"train": "seen", "test": "unseen"}
 COLUMNS = ("success", "P_eff = SPL = INS_1", "E_eff = INS_0", "INS_0.5")

@@ -14,11 +14,9 @@ from train.config_io import preset_names
 from train.runs.checkpoint import STEP
 from train.runs.run_folder import claim
 from train.sweep import spec
-from train.sweep.devices import Machine, find_gpus
-from train.sweep.folder import SweepFolder
-from train.sweep.scheduler import PROGRAMS, STAGES, Programs, Scheduler
+from train.sweep.folder import SweepDisplay, SweepFolder, status_table, totals
+from train.sweep.scheduler import PROGRAMS, STAGES, Machine, Programs, Scheduler, find_gpus
 from train.sweep.spec import SweepConfig
-from train.sweep.table import SweepDisplay, status_table, totals
 
 
 def parser() -> argparse.ArgumentParser:

@@ -11,9 +11,8 @@ import pytest
 
 from interactive_nav_common.statistics import correlation, estimate, p_text, paired_difference, welch
 from tests.train.synthetic import K_INTS, baseline_rows, paper_like, run_rows
-from train.scoring.claims import LARGE, MEDIUM, SMALL, claims
 from train.scoring.rows import BY_CATEGORY
-from train.scoring.statistics import contrast, run_means, train_test_contrast
+from train.scoring.statistics import LARGE, MEDIUM, SMALL, claims, contrast, run_means, train_test_contrast
 
 
 def test_a_run_counts_once_whatever_its_episodes():

@@ -14,9 +14,8 @@ from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.jobs.on_ray import RayLauncher
 from tests.train.sweep.test_sweep import FAKE, ROOT, running, set_fates, write_sweep
 from train.sweep import spec
-from train.sweep.folder import SweepFolder, last_line
+from train.sweep.folder import SweepDisplay, SweepFolder, last_line
 from train.sweep.scheduler import Scheduler
-from train.sweep.table import SweepDisplay
 
 pytestmark = pytest.mark.slow
 

@@ -22,11 +22,9 @@ from interactive_nav_common.jobs import processes as jobs
 from interactive_nav_common.locks import is_locked, take_lock
 from train.sweep import spec
 from train.sweep.__main__ import main
-from train.sweep.devices import Gpu, Machine, RunJob, find_gpus, parse_gpus
-from train.sweep.folder import RunState, SweepFolder, last_line
-from train.sweep.scheduler import Outcome, Scheduler
+from train.sweep.folder import RunState, SweepDisplay, SweepFolder, last_line, totals
+from train.sweep.scheduler import Gpu, Machine, Outcome, RunJob, Scheduler, find_gpus, parse_gpus
 from train.sweep.spec import LaunchConfig
-from train.sweep.table import SweepDisplay, totals
 
 FAKE = {stage: ("-m", "tests.train.sweep.fake", stage) for stage in ("train", "evaluate")}
 ROOT = Path(__file__).parents[3]
