@@ -22,7 +22,7 @@ from interactive_nav.physics.warp_callbacks import keep_collector_out
 from interactive_nav.physics.window import PhysicsWindow
 from interactive_nav.robots.spec import RobotState
 from interactive_nav.scenes.contacts import from_sensors, part_of_contacts, rolling_geoms, sensor_addresses
-from interactive_nav.scenes.layout import Layout
+from interactive_nav.scenes.slots import Layout
 from interactive_nav.scenes.world import World
 
 # Bits of MJX-Warp's OverflowType: constraint rows, their non-zeros, broadphase, narrowphase, convex collider,

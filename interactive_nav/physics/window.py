@@ -22,7 +22,7 @@ import numpy as np
 from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import PhysicsState
 from interactive_nav.physics.nearness import REACH_M, Measured, Nearness, widths_at
-from interactive_nav.scenes.layout import Layout
+from interactive_nav.scenes.slots import Layout
 from interactive_nav.scenes.spec import FEET, build_empty_spec
 from interactive_nav.scenes.world import World
 

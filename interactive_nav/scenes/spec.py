@@ -11,11 +11,10 @@ import numpy as np
 from interactive_nav.config import NavConfig, PhysicsConfig, TaskRules
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.contacts import add_contact_sensors, add_sensor
-from interactive_nav.scenes.layout import Layout, find_layout
 from interactive_nav.scenes.object_folders import ConvertedObject
 from interactive_nav.scenes.objects import SmallObject, add_boxes
 from interactive_nav.scenes.scene import Movable, Scene
-from interactive_nav.scenes.slots import Slot, parking_spot
+from interactive_nav.scenes.slots import Layout, Slot, find_layout, parking_spot
 
 _EMPTY_BOX = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1e-3, 1e-3, 1e-3])
 _TILTED = np.array([0.8, 0.36, 0.48, 0.0])

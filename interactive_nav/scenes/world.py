@@ -13,11 +13,10 @@ import numpy as np
 
 from interactive_nav.config import NavConfig
 from interactive_nav.robots import RobotSpec
-from interactive_nav.scenes.layout import Layout, find_layout
 from interactive_nav.scenes.object_folders import small_objects
 from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.scenes.scene import Scene
-from interactive_nav.scenes.slots import SlotTables, build_slot_tables, find_slots, parking_spot
+from interactive_nav.scenes.slots import Layout, SlotTables, build_slot_tables, find_layout, find_slots, parking_spot
 from interactive_nav.scenes.spec import build_spec
 from interactive_nav_common.errors import ConfigError
 from scenes_mjcf.schema import SceneError
