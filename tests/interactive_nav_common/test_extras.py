@@ -20,6 +20,7 @@ from interactive_nav.physics import resolve_backend
 from interactive_nav_common.errors import UserError, optional
 from interactive_nav_common.jobs.on_ray import RayLauncher
 from interactive_nav_common.untrusted.guard import guarded_server
+from topological_nav.ros.__main__ import need_ros
 from topological_nav.scenes.rendering import need_engine
 from train.runs.tracking import import_wandb
 
@@ -34,6 +35,7 @@ USES: list[tuple[str, str, Callable[[], Any]]] = [
     ("gymnasium", "gymnasium", lambda: importlib.import_module("interactive_nav.interop.sb3_env")),
     ("pybullet", "pybullet", lambda: BulletScene(None, None)),  # type: ignore[arg-type]
     ("ray", "ray", lambda: RayLauncher("auto")),
+    ("ros2", "rclpy", need_ros),
     ("view", "mjviser", lambda: view.choose_viewer("browser")),
     ("wandb", "wandb", import_wandb),
     ("warp", "warp", lambda: resolve_backend("warp")),
@@ -47,6 +49,8 @@ GUARDED = {
     "interactive_nav/physics/warp_callbacks.py": {"warp"},  # after `resolve_backend`, as the next
     "interactive_nav/sensing/meshes.py": {"warp"},
     "benchmarks/steps_per_second.py": {"warp"},  # if it is in use
+    "topological_nav/ros/messages.py": {"rclpy"},  # after `need_ros`, as the next
+    "topological_nav/ros/nodes.py": {"rclpy"},
 }
 """File -> what it may import with a statement."""
 

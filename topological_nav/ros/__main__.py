@@ -86,7 +86,7 @@ def _refuse_unused(arguments: argparse.Namespace) -> None:
         refuse_unused(arguments, options, "with --driver heading, only with --driver topological")
 
 
-def _need_ros() -> Any:
+def need_ros() -> Any:
     """Import rclpy, or say how to install it."""
     line = missing("topological_nav.ros", "rclpy (wheels exist for Python 3.11)", "ros2")
     for module in ("sensor_msgs.msg", "nav_msgs.msg", "geometry_msgs.msg", "rosgraph_msgs.msg", "std_msgs.msg"):
@@ -107,7 +107,7 @@ def _networks(arguments: argparse.Namespace) -> Any:
 
 def _all(arguments: argparse.Namespace, stops: list[int]) -> None:
     """Run both nodes until one ends; the other may then take `_GRACE_S` to end by itself."""
-    _need_ros()
+    need_ros()
     program = [sys.executable, "-c", GUARD, sys.executable, "-m", "topological_nav.ros"]
     bag = ["--bag", str(arguments.bag)] if arguments.bag else []
     words = {
@@ -140,7 +140,7 @@ def _all(arguments: argparse.Namespace, stops: list[int]) -> None:
 
 def _sim(arguments: argparse.Namespace, stops: list[int]) -> None:
     config = overridden(SimulatorConfig(), arguments.settings)
-    _need_ros()
+    need_ros()
     from topological_nav.ros.nodes import SimulatorNode, recording, ros_node
     from topological_nav.ros.simulator import Pace, RosSimulator
 
@@ -158,7 +158,7 @@ def _sim(arguments: argparse.Namespace, stops: list[int]) -> None:
 def _navigator(arguments: argparse.Namespace, stops: list[int]) -> None:
     config = overridden(DRIVERS[arguments.driver](), arguments.settings)
     chosen = _networks(arguments) if arguments.driver == "topological" else None
-    _need_ros()
+    need_ros()
     from topological_nav.ros import drivers
     from topological_nav.ros.nodes import NavigatorNode, ros_node
 
@@ -175,7 +175,7 @@ def _navigator(arguments: argparse.Namespace, stops: list[int]) -> None:
 
 def _check(arguments: argparse.Namespace, stops: list[int]) -> None:
     del arguments, stops
-    print(f"rclpy: {_need_ros().__file__}")
+    print(f"rclpy: {need_ros().__file__}")
 
 
 if __name__ == "__main__":
