@@ -1,24 +1,21 @@
-"""A seed in, a raw building folder out: a synthetic apartment in the raw Gibson layout."""
+"""Generate a raw building folder from a seed: a synthetic apartment in the raw Gibson layout."""
 
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from converters.generate.design.config import BuildingConfig, GenerationError
 from converters.generate.design.furnish import Effort, furnish_plan, no_place
-from converters.generate.design.instance import Instance
-from converters.generate.design.plan import Plan, make_plan
+from converters.generate.design.plan import Building, make_plan
 from converters.generate.design.space import floor_maps
 from converters.generate.homes.config import HomeConfig
 from converters.generate.homes.design import design_home
-from converters.generate.surface.annotate import annotate_items
 from converters.generate.surface.modelled import model_building
 from converters.generate.surface.scan import Scan, scan_building
 from converters.generate.surface.texture import Atlas, make_atlas
-from converters.generate.surface.write import LICENCE, write_cad, write_json, write_png, write_scan
+from converters.generate.surface.write import LICENCE, annotate_items, write_cad, write_json, write_png, write_scan
 from converters.library.store import attribution, read_index
 from converters.records.raw import ATTRIBUTION, WINDOWS
 from interactive_nav_common.files import part_folder, publish, write_text
@@ -32,40 +29,22 @@ Progress = Callable[[str, float], None]
 """Called with what is being done and the share (0..1) that is done."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Building:
-    """The truth behind a generated scan."""
-
-    plan: Plan
-    items: tuple[Instance, ...]
-    floor_height_m: float
-    """The floor in the scan's own frame."""
-    uses: tuple[str, ...] = ()
-    """What each room of a home is used as; empty: rooms are just rooms."""
-    measured: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """How full a home is, and how much of it is behind furniture."""
-
-
 def _streams(seed: int) -> list[np.random.Generator]:
-    """One random stream per stage, so that a change in one stage leaves the others alone."""
+    """Return a random stream per stage, so that a change in one stage leaves the others alone."""
     return [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
 
 
 def design_building(seed: int, config: BuildingConfig | HomeConfig | None = None, max_plans: int = 40) -> Building:
-    """Draws plan and furniture.
-
-    Args:
-        seed: 0 or more; the same seed gives the same building.
-
-    Returns:
-        The building.
-    """
+    """Draw plan and furniture; the same seed gives the same building."""
     if seed < 0:
         raise GenerationError(f"seed is {seed}: expected a whole number of 0 or more")
     cfg = (config or BuildingConfig()).validate()
     rng = _streams(seed)[0]
     if isinstance(cfg, HomeConfig):
-        return _design_home(seed, cfg, rng)
+        try:
+            return design_home(cfg, rng)
+        except GenerationError as error:
+            raise GenerationError(f"seed {seed}: {error}") from error
     floor_height_m = round(float(rng.uniform(*cfg.floor_height_m)), 3)
     effort = Effort()
     for _ in range(max_plans):
@@ -78,21 +57,10 @@ def design_building(seed: int, config: BuildingConfig | HomeConfig | None = None
     raise no_place(cfg, seed)
 
 
-def _design_home(seed: int, cfg: HomeConfig, rng: np.random.Generator) -> Building:
-    floor_height_m = round(float(rng.uniform(*cfg.shell.floor_height_m)), 3)
-    try:
-        home = design_home(cfg, rng)
-    except GenerationError as error:
-        raise GenerationError(f"seed {seed}: {error}") from error
-    must_push = {robot: round(share, 4) for robot, share in home.must_push_share.items()}
-    measured = {"furniture_share": round(home.furniture_share, 4), "must_push_share": must_push}
-    return Building(home.plan, home.items, floor_height_m, home.uses, measured)
-
-
 def render_building(
     building: Building, seed: int, config: BuildingConfig | HomeConfig, progress: Progress
 ) -> tuple[Scan, Atlas]:
-    """Scans and paints a building; of a home without artefacts its exact structure."""
+    """Scan and paint a building; of a home without artefacts its exact structure."""
     streams = _streams(seed)
     if isinstance(config, HomeConfig) and config.artefacts == "none":
         progress("painting", 0.1)
@@ -108,13 +76,9 @@ def render_building(
 def generate_building(
     out_dir: Path, seed: int, progress: Progress | None = None, config: BuildingConfig | HomeConfig | None = None
 ) -> None:
-    """Writes a raw building folder.
+    """Write a raw building folder, whole or not at all; the same seed and configuration give the same bytes.
 
-    It appears whole or not at all.
-
-    Args:
-        seed: 0 or more; the same seed and configuration give the same bytes.
-        progress: called with a stage's name and the share done, 0..1.
+    `progress` is called with a stage's name and the share done, 0..1.
     """
     out_dir = Path(out_dir)
     if out_dir.exists() and (not out_dir.is_dir() or any(out_dir.iterdir())):
@@ -122,16 +86,16 @@ def generate_building(
     existing = next(p for p in out_dir.absolute().parents if p.exists())
     if not existing.is_dir():
         raise GenerationError(f"{out_dir}: {existing} is a file, expected a folder; name a place inside a folder")
-    tell = progress or (lambda stage, share: None)
+    report = progress or (lambda stage, share: None)
     cfg = (config or BuildingConfig()).validate()
     with part_folder(out_dir, overwrite=True) as work:
-        tell("drawing the plan", 0.0)
+        report("drawing the plan", 0.0)
         building = design_building(seed, cfg)
-        scan, atlas = render_building(building, seed, cfg, tell)
-        tell("writing", 0.85)
+        scan, atlas = render_building(building, seed, cfg, report)
+        report("writing", 0.85)
         _write(work, building, scan, atlas, seed, cfg)
         publish({work: out_dir}, overwrite=False)
-    tell("done", 1.0)
+    report("done", 1.0)
 
 
 def _write(

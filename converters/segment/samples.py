@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from converters.generate import BuildingConfig, GenerationError, HomeConfig, design_building, render_building
-from converters.generate.design.instance import Instance
 from converters.generate.homes.config import home_config
-from converters.generate.models.cad import HOME_TEST_MODELS, HOME_TRAIN_MODELS, TEST_MODELS, TRAIN_MODELS
+from converters.generate.models.cad import HOME_TEST_MODELS, HOME_TRAIN_MODELS, TEST_MODELS, TRAIN_MODELS, Instance
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.scan import NYU40 as LABELS
 from converters.generate.surface.scan import smooth_noise

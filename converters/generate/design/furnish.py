@@ -1,4 +1,4 @@
-"""A floor plan in, furniture out: which CAD model stands where, how large and which way it faces.
+"""Furnish a floor plan: choose which CAD model stands where, how large it is and which way it faces.
 
 Frame: scan x, y; heights above the floor. Footprints never overlap; doorways, the sweep of the door leaves
 and enough floor to drive into every room stay free; some chairs narrow a doorway on purpose, so that pushing
@@ -6,18 +6,72 @@ one aside pays.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import shapely
 
 from converters.generate.design.config import BuildingConfig, GenerationError
-from converters.generate.design.doors import DOOR_BOTTOM_M, door_leaf, wall_behind_m
-from converters.generate.design.instance import Instance, place
-from converters.generate.design.plan import Plan, Rect, doorway_zone
+from converters.generate.design.plan import Doorway, Plan, doorway_zone
 from converters.generate.design.space import GRID_M, free_grid, passes, room_mask, rooms_joined, without
-from converters.generate.models.cad import CadModel, Models
+from converters.generate.models.cad import CadModel, Instance, LeafHinge, Models, place
 from interactive_nav_common.grids import clearance
+
+DOOR_GAP_M = 0.02
+"""Between leaf and jamb, each side."""
+DOOR_BOTTOM_M = (0.006, 0.010)
+"""Between leaf and floor."""
+AJAR_RAD = math.radians(3.0)
+"""A leaf stands at least this far from the end of its swing."""
+
+
+def door_leaf(
+    doorway: Doorway, model: CadModel, high_side: bool, high_jamb: bool, open_rad: float, plan: Plan, lift_m: float,
+    wall_gap_m: float = 0.08, proud_m: float = 0.0,
+) -> tuple[Instance, shapely.Polygon]:  # fmt: skip
+    """Hang an open leaf into a doorway; return it, and the floor that it sweeps from closed to fully open.
+
+    The hinge line is the leaf's edge at the jamb, `proud_m` before the wall's face on the side it opens to: into the
+    room on the high side of the doorway's axis where `high_side`. Closed, the leaf lies inside the opening.
+    """
+    axis, along = doorway.axis, 1 - doorway.axis
+    closed, into, hinge = np.zeros(2), np.zeros(2), np.empty(2)
+    closed[along] = -1.0 if high_jamb else 1.0
+    into[axis] = 1.0 if high_side else -1.0
+    hinge[axis] = doorway.rect.span(axis)[int(high_side)]
+    hinge[along] = doorway.rect.span(along)[int(high_jamb)] + closed[along] * DOOR_GAP_M
+    hinge += proud_m * into
+    # Opening turns `closed` towards `into`; the sign says which way round that is, seen from above.
+    sign = float(np.sign(closed[0] * into[1] - closed[1] * into[0]))
+    width, height = doorway.width_m - 2 * DOOR_GAP_M, doorway.height_m - 0.02 - lift_m
+    extents = 2 * model.half_extents
+    scale = np.array([width / extents[0], height / extents[1], model.unit_m])
+    corner = plan.rooms[doorway.rooms[int(high_side)]].span(along)[int(high_jamb)]
+    # The wall beside the hinge stops the leaf: behind it only the margin to the corner is left.
+    behind_m = abs(corner - hinge[along]) - wall_gap_m
+    most = math.pi / 2 + math.asin(min(max(behind_m, 0.0) / width, 0.5))
+    open_rad = min(open_rad, most - AJAR_RAD)
+    # The first part is the leaf itself: the bounding box has the handles in it.
+    slab = model.parts[0].vertices[:, 2]
+    face_z = float(float(slab.mean()) - sign * float(np.ptp(slab) / 2))
+    origin = (float(model.bounds[0, 0]), float(model.bounds[0, 1]), face_z)
+    yaw = math.atan2(closed[1], closed[0]) + sign * open_rad
+    yaw = math.atan2(math.sin(yaw), math.cos(yaw))
+    swing = (-open_rad, most - open_rad) if sign > 0 else (-(most - open_rad), open_rad)
+    at_origin = Instance(model, scale, yaw, np.zeros(3))
+    offset = at_origin.to_floor(np.array([origin]))[0]
+    position = np.array([hinge[0] - offset[0], hinge[1] - offset[1], lift_m - scale[1] * model.bounds[0, 1]])
+    leaf = Instance(model, scale, yaw, position, LeafHinge((0.0, 1.0, 0.0), origin, swing))
+    angles = math.atan2(closed[1], closed[0]) + sign * np.linspace(0.0, most, 24)
+    fan = hinge + (width + 0.04) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return leaf, shapely.Polygon([hinge, *fan]).buffer(0.03)
+
+
+def wall_behind_m(doorway: Doorway, high_side: bool, high_jamb: bool, plan: Plan) -> float:
+    """Return the distance from the jamb to the room's side wall behind the hinge."""
+    along, end = 1 - doorway.axis, int(high_jamb)
+    return abs(plan.rooms[doorway.rooms[int(high_side)]].span(along)[end] - doorway.rect.span(along)[end])
+
 
 SIDE_WALL_M = 0.35
 """A side wall this close behind the hinge leaves no way through behind an open leaf."""
@@ -30,7 +84,7 @@ class Effort:
         self.places = places
 
     def spend(self, places: int) -> bool:
-        """Takes from what is left; False where nothing is."""
+        """Take from what is left; return False where nothing is."""
         self.places -= places
         return self.places > 0
 
@@ -40,28 +94,26 @@ CHECK_PLACES = 25
 
 
 class _Room:
-    """What is taken so far: mutable, private to one furnishing attempt."""
+    """Hold what is taken so far: mutable, private to one furnishing attempt."""
 
     def __init__(self, plan: Plan, cfg: BuildingConfig, effort: Effort):
         self.plan = plan
         self.effort = effort
-        self.rooms = [shapely.box(r.x0, r.y0, r.x1, r.y1) for r in plan.rooms]
-        self.taken = [shapely.box(f.rect.x0, f.rect.y0, f.rect.x1, f.rect.y1) for f in plan.fixtures]
-        self.kept_free = [_poly(doorway_zone(d, 0.75)) for d in plan.doorways]
+        self.rooms = [room.polygon for room in plan.rooms]
+        self.taken = [fixture.rect.polygon for fixture in plan.fixtures]
+        self.zones = [doorway_zone(d, 0.75).polygon for d in plan.doorways]
+        self.sweeps: list[shapely.Polygon] = []
         self.placed: list[Instance] = []
         self.room_of: list[int] = []
         self.models = Models(cfg.models, cfg.scale_jitter)
 
     def fits(self, item: Instance, room: int, gap_m: float = 0.06, zones: bool = True) -> bool:
         shape = item.footprint
-        if not self.effort.spend(1):
+        if not self.effort.spend(1) or not self.rooms[room].buffer(-0.03).contains(shape):
             return False
-        if not self.rooms[room].buffer(-0.03).contains(shape):
+        if _meets(shape.buffer(gap_m), self.taken) or _meets(shape, self.sweeps):
             return False
-        grown = shape.buffer(gap_m)
-        if any(grown.intersects(t) for t in self.taken):
-            return False
-        return not (zones and any(shape.intersects(z) for z in self.kept_free))
+        return not (zones and _meets(shape, self.zones))
 
     def add(self, item: Instance, room: int) -> None:
         self.placed.append(item)
@@ -69,14 +121,14 @@ class _Room:
         self.taken.append(item.footprint)
 
 
-def _poly(rect: Rect) -> shapely.Polygon:
-    return shapely.box(rect.x0, rect.y0, rect.x1, rect.y1)
+def _meets(shape: shapely.Polygon, others: Iterable[shapely.Polygon]) -> bool:
+    return any(shape.intersects(other) for other in others)
 
 
 def _against_wall(
     state: _Room, room: int, model: CadModel, scale: np.ndarray, rng: np.random.Generator
 ) -> Instance | None:
-    """Tries places with the back to a wall."""
+    """Try places with the back to a wall."""
     r = state.plan.rooms[room]
     width, depth = 2 * model.half_extents[0] * scale[0], 2 * model.half_extents[2] * scale[2]
     for _ in range(60):
@@ -84,9 +136,9 @@ def _against_wall(
         facing = side * math.pi / 2  # into the room: +x, +y, -x, -y
         off = depth / 2 + rng.uniform(0.04, 0.10)
         along = rng.uniform(width / 2 + 0.05, max(r.size[1 - side % 2] - width / 2 - 0.05, width / 2 + 0.06))
-        x = (r.x0 + off, r.x0 + along, r.x1 - off, r.x0 + along)[side]
-        y = (r.y0 + along, r.y0 + off, r.y0 + along, r.y1 - off)[side]
-        item = place(model, scale, np.array([x, y]), facing + rng.normal(0, 0.02))
+        xy = np.array([r.x0 + along, r.y0 + along])
+        xy[side % 2] = (r.x0 + off, r.y0 + off, r.x1 - off, r.y1 - off)[side]
+        item = place(model, scale, xy, facing + rng.normal(0, 0.02))
         if state.fits(item, room):
             return item
     return None
@@ -95,7 +147,7 @@ def _against_wall(
 def _in_the_open(
     state: _Room, room: int, model: CadModel, scale: np.ndarray, rng: np.random.Generator
 ) -> Instance | None:
-    """Tries places anywhere in a room, mostly square to its walls."""
+    """Try places anywhere in a room, mostly square to its walls."""
     r = state.plan.rooms[room]
     for _ in range(80):
         xy = np.array([rng.uniform(r.x0, r.x1), rng.uniform(r.y0, r.y1)])
@@ -109,7 +161,7 @@ def _in_the_open(
 def _seat_at(
     state: _Room, host: Instance, room: int, model: CadModel, scale: np.ndarray, rng: np.random.Generator
 ) -> Instance | None:
-    """Tries places for a chair before a table or desk, facing it; at a desk only on its front."""
+    """Try places for a chair before a table or desk, facing it; at a desk only on its front."""
     depth = 2 * model.half_extents[2] * scale[2]
     half = host.model.half_extents * host.scale
     centre = host.to_floor(host.model.center[None])[0, :2]
@@ -118,9 +170,9 @@ def _seat_at(
     for _ in range(6):
         for turn in turns:
             away = front + turn
-            reach = (half[2] if round(turn / (math.pi / 2)) % 2 == 0 else half[0]) + depth / 2 + rng.uniform(0.07, 0.16)
-            spread = 0.25 * (half[0] if round(turn / (math.pi / 2)) % 2 == 0 else half[2])
-            slide = rng.uniform(-spread, spread)
+            deep, wide = half[[2, 0]] if round(turn / (math.pi / 2)) % 2 == 0 else half[[0, 2]]
+            reach = deep + depth / 2 + rng.uniform(0.07, 0.16)
+            slide = rng.uniform(-0.25 * wide, 0.25 * wide)
             xy = centre + reach * np.array([math.cos(away), math.sin(away)])
             xy += slide * np.array([-math.sin(away), math.cos(away)])
             item = place(model, scale, xy, away + math.pi + rng.normal(0, 0.12))
@@ -132,7 +184,7 @@ def _seat_at(
 def _narrow(
     state: _Room, cfg: BuildingConfig, gap_m: tuple[float, float], rng: np.random.Generator, used: set[int], local: bool
 ) -> Instance | None:
-    """Tries to put a chair before a doorway so that the way through narrows to the wanted gap."""
+    """Try to put a chair before a doorway so that the passage narrows to the wanted gap."""
     plan = state.plan
     low, high = gap_m
     before = free_grid(plan, state.placed)
@@ -152,8 +204,7 @@ def _narrow(
             xy[d.axis] += (1 if side else -1) * (half + rng.uniform(0.3, 0.75))
             xy[1 - d.axis] += rng.uniform(-0.6, 0.6)
             item = place(model, scale, xy, rng.uniform(-math.pi, math.pi))
-            sweeps = state.kept_free[len(plan.doorways) :]
-            if not state.fits(item, d.rooms[side], zones=False) or any(item.footprint.intersects(s) for s in sweeps):
+            if not state.fits(item, d.rooms[side], zones=False):
                 continue
             state.effort.spend(CHECK_PLACES)
             room_m = clearance(without(before, [item]) & here, GRID_M)
@@ -165,7 +216,7 @@ def _narrow(
 
 
 def _hang_leaf(state: _Room, k: int, cfg: BuildingConfig, rng: np.random.Generator) -> Instance | None:
-    """Tries to hang a leaf into doorway k where its sweep meets nothing."""
+    """Try to hang a leaf into doorway k where its sweep meets nothing."""
     plan, d = state.plan, state.plan.doorways[k]
     model, _ = state.models.draw("door", rng)
     for side, jamb in rng.permutation([(0, 0), (0, 1), (1, 0), (1, 1)]):
@@ -178,12 +229,11 @@ def _hang_leaf(state: _Room, k: int, cfg: BuildingConfig, rng: np.random.Generat
         lift_m = rng.uniform(*DOOR_BOTTOM_M)
         gaps_m = cfg.leaf_wall_gap_m, cfg.leaf_proud_m
         leaf, sweep = door_leaf(d, model, bool(side), bool(jamb), opened, plan, lift_m, *gaps_m)
-        if any(sweep.intersects(t) for t in (*state.taken, *state.kept_free[len(plan.doorways) :])):
+        if _meets(sweep, (*state.taken, *state.sweeps)):
             continue
-        others = [z for j, z in enumerate(state.kept_free[: len(plan.doorways)]) if j != k]
-        if cfg.leaves_at_walls and any(leaf.footprint.intersects(z) for z in others):
+        if cfg.leaves_at_walls and _meets(leaf.footprint, (z for j, z in enumerate(state.zones) if j != k)):
             continue
-        state.kept_free.append(sweep)
+        state.sweeps.append(sweep)
         state.add(leaf, room)
         return leaf
     return None
@@ -192,7 +242,7 @@ def _hang_leaf(state: _Room, k: int, cfg: BuildingConfig, rng: np.random.Generat
 def _hang_leaves(
     state: _Room, count: int, cfg: BuildingConfig, rng: np.random.Generator, first: Sequence[int] = ()
 ) -> bool:
-    """Hangs leaves into doorways, those of rooms `first` before others; False where fewer than `count` fit."""
+    """Hang leaves into doorways, those of rooms `first` before others; return False where fewer than `count` fit."""
     leaves = 0
     order = rng.permutation(len(state.plan.doorways))
     for k in sorted(order, key=lambda k: not set(first) & set(state.plan.doorways[k].rooms)):
@@ -206,24 +256,21 @@ def _hang_leaves(
 def hang_doors(
     plan: Plan, cfg: BuildingConfig, rng: np.random.Generator, first: Sequence[int] = ()
 ) -> tuple[list[tuple[Instance, int]], list[shapely.Polygon]] | None:
-    """Hangs as many leaves as a plan has doorways for, up to the higher number of `cfg.n_doors`.
+    """Hang as many leaves as a plan has doorways for, up to `cfg.n_doors`; doorways of the rooms `first` come first.
 
-    Doorways of the rooms `first` get theirs before others.
-
-    Returns:
-        Each leaf with the room that it opens into, and the floor that they sweep; None where too few fit.
+    Return each leaf with the room that it opens into, and the floor that they sweep; None where too few fit.
     """
     state = _Room(plan, cfg, Effort())
     low, high = (min(n, len(plan.doorways)) for n in cfg.n_doors)
     if not _hang_leaves(state, high, cfg, rng, first) and len(state.placed) < low:
         return None
-    return list(zip(state.placed, state.room_of, strict=True)), state.kept_free[len(plan.doorways) :]
+    return list(zip(state.placed, state.room_of, strict=True)), state.sweeps
 
 
 def _attempt(
     plan: Plan, cfg: BuildingConfig, rng: np.random.Generator, effort: Effort
 ) -> tuple[list[Instance], list[Instance]] | None:
-    """One try: all furniture, and the blockers among it."""
+    """Try once; return all furniture, and the blockers among it."""
     state = _Room(plan, cfg, effort)
     ranges = {c: getattr(cfg, f"n_{c}s") for c in ("chair", "table", "desk", "sofa", "door")}
     count = {c: int(rng.integers(low, high + 1)) for c, (low, high) in ranges.items()}
@@ -278,18 +325,14 @@ def _attempt(
 def furnish_plan(
     plan: Plan, cfg: BuildingConfig, rng: np.random.Generator, effort: Effort, max_tries: int = 10
 ) -> list[Instance] | None:
-    """Places the furniture.
-
-    Returns:
-        Doors, sofas, desks, tables, chairs; None where this plan cannot take them.
-    """
+    """Place doors, sofas, desks, tables and chairs; return None where this plan cannot take them."""
     for _ in range(max_tries):
-        found = _attempt(plan, cfg, rng, effort)
+        placed = _attempt(plan, cfg, rng, effort)
         if effort.places <= 0:
             return None
-        if found is None:
+        if placed is None:
             continue
-        items, blockers = found
+        items, blockers = placed
         blocking = {id(b) for b in blockers}
         standing = [i for i in items if id(i) not in blocking]
         if rooms_joined(free_grid(plan, standing), plan, cfg.robot_radius_m + 0.02):
@@ -298,9 +341,9 @@ def furnish_plan(
 
 
 def no_place(cfg: BuildingConfig, seed: int) -> GenerationError:
-    """The error for a building that cannot take its furniture."""
+    """Return the error for a building that cannot take its furniture."""
     return GenerationError(
-        f"seed {seed}: no way found to furnish {cfg.n_rooms} rooms on {cfg.floor_area_m2} m2 with up to "
+        f"seed {seed}: no way to furnish {cfg.n_rooms} rooms on {cfg.floor_area_m2} m2 with up to "
         f"{cfg.n_chairs[1]} chairs, {cfg.n_tables[1]} tables, {cfg.n_desks[1]} desks, {cfg.n_sofas[1]} "
         f"sofas and {cfg.n_doors[1]} doors: ask for fewer, or for more area"
     )

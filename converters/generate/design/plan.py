@@ -1,4 +1,4 @@
-"""A configuration and a random stream in, a floor plan out: rooms, walls, doorways, windows, cupboards.
+"""Draw a floor plan from a configuration and a random stream: rooms, walls, doorways, windows, cupboards.
 
 Frame: x, y of the scan (z up), metres; heights are above the floor. All horizontal coordinates are whole
 centimetres, so that a map of 1 cm a pixel shows the walls exactly.
@@ -8,31 +8,19 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import networkx as nx
 import numpy as np
+import shapely
 
 from converters.generate.design.config import BuildingConfig, GenerationError
-from converters.generate.design.instance import Instance
-from converters.generate.design.parts import Parts
+from converters.generate.models.cad import Instance
 
 CM = 0.01
 DOORWAY_MARGIN_M = 0.12
 """Least wall left between a doorway and the corner of a room."""
-
-
-@dataclasses.dataclass(frozen=True)
-class PlanBox:
-    """An axis-aligned box."""
-
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-
-    @property
-    def rect(self) -> Rect:
-        """Its footprint."""
-        return Rect(self.low[0], self.low[1], self.high[0], self.high[1])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,20 +32,68 @@ class Rect:
     x1: float
     y1: float
 
+    @classmethod
+    def across(cls, axis: int, low: float, high: float, start: float, end: float) -> Rect:
+        """Return the rectangle from `low` to `high` along an axis and from `start` to `end` along the other."""
+        return cls(low, start, high, end) if axis == 0 else cls(start, low, end, high)
+
+    def span(self, axis: int) -> tuple[float, float]:
+        """Return the lowest and the highest coordinate along an axis."""
+        return (self.x0, self.x1) if axis == 0 else (self.y0, self.y1)
+
     @property
     def size(self) -> tuple[float, float]:
-        """Extent along x and y."""
+        """Return the extent along x and y."""
         return self.x1 - self.x0, self.y1 - self.y0
 
     @property
     def area_m2(self) -> float:
-        """Area."""
+        """Return the area."""
         return self.size[0] * self.size[1]
 
     @property
     def centre(self) -> tuple[float, float]:
-        """Centre."""
+        """Return the centre."""
         return (self.x0 + self.x1) / 2, (self.y0 + self.y1) / 2
+
+    @property
+    def polygon(self) -> shapely.Polygon:
+        """Return it as a polygon."""
+        return shapely.box(self.x0, self.y0, self.x1, self.y1)
+
+    def grown(self, x_m: float, y_m: float) -> Rect:
+        """Return a rectangle that reaches so much farther along x and y, both ways."""
+        return Rect(self.x0 - x_m, self.y0 - y_m, self.x1 + x_m, self.y1 + y_m)
+
+    def overlaps(self, other: Rect) -> bool:
+        """Return whether the two have floor in common."""
+        return self.x0 < other.x1 and other.x0 < self.x1 and self.y0 < other.y1 and other.y0 < self.y1
+
+    def sides(self) -> list[tuple[int, int, float, float, float]]:
+        """Return its four walls: axis, sign of the direction inwards, coordinate of the face, start and end."""
+        return [
+            (axis, way, face, *self.span(1 - axis))
+            for axis in (0, 1)
+            for way, face in zip((1, -1), self.span(axis), strict=True)
+        ]
+
+
+@dataclasses.dataclass(frozen=True)
+class PlanBox:
+    """An axis-aligned box."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    @classmethod
+    def over(cls, rect: Rect, low_m: float, high_m: float) -> PlanBox:
+        """Return the box above a rectangle between two heights."""
+        return cls((rect.x0, rect.y0, low_m), (rect.x1, rect.y1, high_m))
+
+    @property
+    def rect(self) -> Rect:
+        """Return its footprint."""
+        return Rect(self.low[0], self.low[1], self.high[0], self.high[1])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +110,7 @@ class Doorway:
 
     @property
     def width_m(self) -> float:
-        """Clear width."""
+        """Return the clear width."""
         return self.rect.size[1 - self.axis]
 
 
@@ -101,56 +137,62 @@ class Plan:
     """Furniture that stays: part of the static structure as the fixtures are."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Building:
+    """Hold the truth behind a generated scan."""
+
+    plan: Plan
+    items: tuple[Instance, ...]
+    """What can be moved; of a home the door leaves first."""
+    floor_height_m: float
+    """The floor in the scan's own frame."""
+    uses: tuple[str, ...] = ()
+    """What each room of a home is used as, keys of `converters.generate.homes.design.USES`; empty: just rooms."""
+    measured: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """How much of a home's floor furniture covers (`furniture_share`), and how much of it is behind furniture: robot ->
+    share of the pairs of places between which it has no path round the movables (`must_push_share`)."""
+
+
 def snap(value: float) -> float:
-    """Rounds to a whole centimetre."""
+    """Round to a whole centimetre."""
     return round(value / CM) * CM
 
 
-@dataclasses.dataclass(frozen=True)
-class _Wall:
-    axis: int
-    """The wall is thin along this axis."""
-    rect: Rect
+Wall = tuple[int, Rect]
+"""The axis along which a stretch of wall is thin, and its footprint."""
 
 
-def _cut(rect: Rect, axis: int, at: float, thick: float) -> tuple[Rect, _Wall, Rect]:
-    """Cuts a rectangle across `axis`: what lies below `at`, a wall, and the rest."""
-    if axis == 0:
-        return (
-            Rect(rect.x0, rect.y0, at, rect.y1),
-            _Wall(0, Rect(at, rect.y0, at + thick, rect.y1)),
-            Rect(at + thick, rect.y0, rect.x1, rect.y1),
-        )
-    return (
-        Rect(rect.x0, rect.y0, rect.x1, at),
-        _Wall(1, Rect(rect.x0, at, rect.x1, at + thick)),
-        Rect(rect.x0, at + thick, rect.x1, rect.y1),
-    )
+def _cut(rect: Rect, axis: int, at: float, thick: float) -> tuple[Rect, Wall, Rect]:
+    """Cut a rectangle across `axis` into what lies below `at`, a wall, and the rest."""
+    (low, high), along = rect.span(axis), rect.span(1 - axis)
+    wall = Rect.across(axis, at, at + thick, *along)
+    return Rect.across(axis, low, at, *along), (axis, wall), Rect.across(axis, at + thick, high, *along)
 
 
-def _split(rect: Rect, parts: Parts, cfg: BuildingConfig, rng: np.random.Generator) -> tuple[list[Rect], list[_Wall]]:
-    """Cuts a rectangle into rooms, always across its longer side (mostly)."""
-    n = len(parts.weights)
+def _split(
+    rect: Rect, weights: Sequence[float], spread: float, cfg: BuildingConfig, rng: np.random.Generator
+) -> tuple[list[Rect], list[Wall]]:
+    """Cut a rectangle into rooms, mostly across its longer side; `make_plan` describes weights and spread."""
+    n = len(weights)
     if n == 1:
         return [rect], []
     width, depth = rect.size
     axis = int(depth > width) if rng.random() < 0.85 else int(rng.random() < 0.5)
     n_low = n // 2 if rng.random() < 0.5 else n - n // 2
-    few, many = parts.cut(n_low)
-    share = parts.share(n_low) + rng.uniform(-parts.spread, parts.spread)
-    low_edge = (rect.x0, rect.y0)[axis]
+    share = sum(weights[:n_low]) / sum(weights) + rng.uniform(-spread, spread)
     thick = snap(rng.uniform(*cfg.wall_thickness_m))
-    low, wall, high = _cut(rect, axis, snap(low_edge + share * rect.size[axis] - thick / 2), thick)
-    rooms_low, walls_low = _split(low, few, cfg, rng)
-    rooms_high, walls_high = _split(high, many, cfg, rng)
+    low, wall, high = _cut(rect, axis, snap(rect.span(axis)[0] + share * rect.size[axis] - thick / 2), thick)
+    rooms_low, walls_low = _split(low, weights[:n_low], spread, cfg, rng)
+    rooms_high, walls_high = _split(high, weights[n_low:], spread, cfg, rng)
     return rooms_low + rooms_high, [wall, *walls_low, *walls_high]
 
 
 def _layout(
-    cfg: BuildingConfig, rng: np.random.Generator, parts: Parts | None
-) -> tuple[Rect, list[Rect], list[_Wall], int | None]:
-    """One try at rooms and inner walls; raises nothing, the caller checks the rooms."""
-    n = int(rng.integers(cfg.n_rooms[0], cfg.n_rooms[1] + 1)) if parts is None else len(parts.weights)
+    cfg: BuildingConfig, rng: np.random.Generator, weights: Sequence[float] | None, spread: float
+) -> tuple[Rect, list[Rect], list[Wall], int | None]:
+    """Draw rooms and inner walls once; the caller checks the rooms."""
+    weights = weights or (1.0,) * int(rng.integers(cfg.n_rooms[0], cfg.n_rooms[1] + 1))
+    n = len(weights)
     area = rng.uniform(*cfg.floor_area_m2)
     aspect = rng.uniform(1.0, 1.6)
     width, depth = snap(np.sqrt(area * aspect)), snap(np.sqrt(area / aspect))
@@ -159,50 +201,46 @@ def _layout(
     x0, y0 = snap(-width / 2 + rng.uniform(-0.7, 0.7)), snap(-depth / 2 + rng.uniform(-0.7, 0.7))
     inside = Rect(x0, y0, snap(x0 + width), snap(y0 + depth))
     if n < cfg.corridor_from_rooms:
-        rooms, walls = _split(inside, parts or Parts.even(n), cfg, rng)
+        rooms, walls = _split(inside, weights, spread, cfg, rng)
         return inside, rooms, walls, None
-    parts = Parts(parts.weights[1:], parts.spread) if parts is not None else Parts.even(n - 1)
     across = int(width >= depth)
     thick = snap(rng.uniform(*cfg.wall_thickness_m))
     clear = snap(cfg.corridor_width_m)
     n_low = (n - 1) // 2
     span = inside.size[across] - clear - 2 * thick
-    few, many = parts.cut(n_low)
-    share = parts.share(n_low) + rng.uniform(-parts.spread / 2, parts.spread / 2)
-    at = snap((inside.x0, inside.y0)[across] + span * share)
+    few, many = weights[1 : 1 + n_low], weights[1 + n_low :]
+    share = sum(few) / sum(weights[1:]) + rng.uniform(-spread / 2, spread / 2)
+    at = snap(inside.span(across)[0] + span * share)
     low, wall_low, rest = _cut(inside, across, at, thick)
     corridor, wall_high, high = _cut(rest, across, snap(at + thick + clear), thick)
-    rooms_low, walls_low = _split(low, few, cfg, rng)
-    rooms_high, walls_high = _split(high, many, cfg, rng)
+    rooms_low, walls_low = _split(low, few, spread, cfg, rng)
+    rooms_high, walls_high = _split(high, many, spread, cfg, rng)
     return inside, [corridor, *rooms_low, *rooms_high], [wall_low, wall_high, *walls_low, *walls_high], 0
 
 
-def _shared(a: Rect, b: Rect, walls: Iterable[_Wall]) -> tuple[int, Rect] | None:
-    """The stretch of wall between rooms a (low side) and b (high side), with the wall's thin axis."""
-    for wall in walls:
-        axis, r = wall.axis, wall.rect
-        along = 1 - axis
-        a_edge, b_edge = (a.x1, a.y1)[axis], (b.x0, b.y0)[axis]
-        if abs(a_edge - (r.x0, r.y0)[axis]) > CM / 2 or abs(b_edge - (r.x1, r.y1)[axis]) > CM / 2:
+def _shared(a: Rect, b: Rect, walls: Iterable[Wall]) -> Wall | None:
+    """Return the stretch of wall between rooms a (low side) and b (high side)."""
+    for axis, wall in walls:
+        faces = a.span(axis)[1], b.span(axis)[0]
+        if any(abs(face - edge) > CM / 2 for face, edge in zip(faces, wall.span(axis), strict=True)):
             continue
-        start = max((a.x0, a.y0)[along], (b.x0, b.y0)[along], (r.x0, r.y0)[along])
-        end = min((a.x1, a.y1)[along], (b.x1, b.y1)[along], (r.x1, r.y1)[along])
-        if end - start > 0:
-            return axis, Rect(a_edge, start, b_edge, end) if axis == 0 else Rect(start, a_edge, end, b_edge)
+        starts, ends = zip(*(rect.span(1 - axis) for rect in (a, b, wall)), strict=True)
+        if min(ends) - max(starts) > 0:
+            return axis, Rect.across(axis, *faces, max(starts), min(ends))
     return None
 
 
 def _doorways(
     rooms: list[Rect],
-    walls: list[_Wall],
+    walls: list[Wall],
     corridor: int | None,
     cfg: BuildingConfig,
     rng: np.random.Generator,
     door_height: float,
 ) -> list[Doorway] | None:
-    """Doorways that join all rooms, and some more; None where the plan does not allow that."""
+    """Draw doorways that join all rooms, and some more; return None where the plan does not allow that."""
     graph = nx.Graph()
-    shared_walls: dict[tuple[int, int], tuple[int, Rect]] = {}
+    shared_walls: dict[tuple[int, int], Wall] = {}
     graph.add_nodes_from(range(len(rooms)))
     need = cfg.doorway_width_m[1] + 2 * DOORWAY_MARGIN_M
     for i, j in itertools.permutations(range(len(rooms)), 2):
@@ -221,7 +259,7 @@ def _doorways(
     for (i, j), (axis, rect) in sorted(shared_walls.items()):
         if (i, j) not in tree and (j, i) not in tree and rng.random() >= cfg.loop_probability:
             continue
-        start, end = ((rect.y0, rect.y1), (rect.x0, rect.x1))[axis]
+        start, end = rect.span(1 - axis)
         width = rng.uniform(*cfg.doorway_width_m)
         if rng.random() < 0.4:
             width += rng.uniform(0, cfg.archway_extra_m)
@@ -232,59 +270,36 @@ def _doorways(
         if cfg.corner_doorways and rng.random() < cfg.corner_doorways:
             margin = min(cfg.corner_margin_m, (end - start - width) / 2)
             at = snap(start + margin if rng.random() < 0.5 else end - margin - width)
-        hole = Rect(rect.x0, at, rect.x1, at + width) if axis == 0 else Rect(at, rect.y0, at + width, rect.y1)
-        chosen.append(Doorway((i, j), axis, hole, door_height))
+        chosen.append(Doorway((i, j), axis, Rect.across(axis, *rect.span(axis), at, at + width), door_height))
     return chosen
 
 
-def _wall_boxes(wall: Rect, axis: int, doorways: list[Doorway], height: float) -> list[PlanBox]:
-    """The pieces of one wall around its doorways, and the pieces above them."""
-    along = 1 - axis
-    holes = []
-    for d in doorways:
-        same = d.axis == axis and abs((d.rect.x0, d.rect.y0)[axis] - (wall.x0, wall.y0)[axis]) < CM / 2
-        if same and (wall.x0, wall.y0)[along] < (d.rect.x0, d.rect.y0)[along] < (wall.x1, wall.y1)[along]:
-            holes.append(d)
-    holes.sort(key=lambda d: (d.rect.x0, d.rect.y0)[along])
+def _wall_boxes(wall: Wall, doorways: list[Doorway], height: float) -> list[PlanBox]:
+    """Return the pieces of one wall around its doorways, and the pieces above them."""
+    axis, rect = wall
+    deep, (at, last) = rect.span(axis), rect.span(1 - axis)
+    holes = [(*d.rect.span(1 - axis), d) for d in doorways if d.axis == axis]
+    boxes = []
 
     def piece(start: float, end: float, base: float) -> PlanBox:
-        if axis == 0:
-            return PlanBox((wall.x0, start, base), (wall.x1, end, height))
-        return PlanBox((start, wall.y0, base), (end, wall.y1, height))
+        return PlanBox.over(Rect.across(axis, *deep, start, end), base, height)
 
-    boxes, at = [], (wall.x0, wall.y0)[along]
-    for d in holes:
-        start, end = (d.rect.x0, d.rect.y0)[along], (d.rect.x1, d.rect.y1)[along]
-        boxes += [piece(at, start, 0.0), piece(start, end, d.height_m)]
-        at = end
-    return [*boxes, piece(at, (wall.x1, wall.y1)[along], 0.0)]
-
-
-def _sides(room: Rect) -> list[tuple[int, int, float, float, float]]:
-    """The four walls of a room: (axis, sign of the way into the room, coordinate of the face, start, end)."""
-    return [
-        (0, 1, room.x0, room.y0, room.y1),
-        (0, -1, room.x1, room.y0, room.y1),
-        (1, 1, room.y0, room.x0, room.x1),
-        (1, -1, room.y1, room.x0, room.x1),
-    ]
-
-
-def _overlap(a: Rect, b: Rect) -> bool:
-    return a.x0 < b.x1 and b.x0 < a.x1 and a.y0 < b.y1 and b.y0 < a.y1
+    for start, end, d in sorted(holes, key=lambda hole: hole[0]):
+        if abs(d.rect.span(axis)[0] - deep[0]) < CM / 2 and rect.span(1 - axis)[0] < start < last:
+            boxes += [piece(at, start, 0.0), piece(start, end, d.height_m)]
+            at = end
+    return [*boxes, piece(at, last, 0.0)]
 
 
 def doorway_zone(doorway: Doorway, reach_m: float, side_m: float = 0.05) -> Rect:
-    """The doorway and the floor before it on both sides, which must stay free of fixtures and furniture."""
-    r = doorway.rect
-    grow = (reach_m, side_m) if doorway.axis == 0 else (side_m, reach_m)
-    return Rect(r.x0 - grow[0], r.y0 - grow[1], r.x1 + grow[0], r.y1 + grow[1])
+    """Return the doorway and the floor before it on both sides, which stay free of fixtures and furniture."""
+    return doorway.rect.grown(*((reach_m, side_m) if doorway.axis == 0 else (side_m, reach_m)))
 
 
 def _fixtures(
     rooms: list[Rect], doorways: list[Doorway], cfg: BuildingConfig, rng: np.random.Generator
 ) -> list[PlanBox]:
-    """Cupboards and counters in corners of rooms, away from doorways."""
+    """Draw cupboards and counters in corners of rooms, away from doorways."""
     wanted = int(rng.integers(cfg.n_static[0], cfg.n_static[1] + 1))
     boxes: list[PlanBox] = []
     zones = [doorway_zone(d, 1.05, 0.15) for d in doorways]
@@ -294,16 +309,15 @@ def _fixtures(
             break
         if min(room.size) < 1.8:
             continue
-        axis, way, face, start, end = _sides(room)[rng.integers(4)]
+        axis, way, face, start, end = room.sides()[rng.integers(4)]
         counter = rng.random() < 0.5
         length = snap(min(rng.uniform(1.2, 2.0) if counter else rng.uniform(0.8, 1.3), end - start))
         depth, height = (0.60, 0.90) if counter else (0.45, snap(rng.uniform(1.6, 2.1)))
         at = start if rng.random() < 0.5 else end - length
         lo, hi = sorted((face, face + way * depth))
-        rect = Rect(lo, at, hi, at + length) if axis == 0 else Rect(at, lo, at + length, hi)
-        if any(_overlap(rect, z) for z in zones) or any(_overlap(rect, b.rect) for b in boxes):
-            continue
-        boxes.append(PlanBox((rect.x0, rect.y0, 0.0), (rect.x1, rect.y1, height)))
+        rect = Rect.across(axis, lo, hi, at, at + length)
+        if not any(rect.overlaps(other) for other in (*zones, *(b.rect for b in boxes))):
+            boxes.append(PlanBox.over(rect, 0.0, height))
     return boxes
 
 
@@ -315,11 +329,11 @@ def _windows(
     cfg: BuildingConfig,
     rng: np.random.Generator,
 ) -> list[PlanBox]:
-    """Windows in outer walls, each before one room, none behind a cupboard."""
+    """Draw windows in outer walls, each before one room, none behind a cupboard."""
     wanted = int(rng.integers(cfg.n_windows[0], cfg.n_windows[1] + 1))
-    outer_faces = {(0, 1): inside.x0, (0, -1): inside.x1, (1, 1): inside.y0, (1, -1): inside.y1}
+    outer_faces = {(axis, way): face for axis, way, face, *_ in inside.sides()}
     sides = [
-        s for room in rooms for s in _sides(room)
+        s for room in rooms for s in room.sides()
         if abs(s[2] - outer_faces[s[0], s[1]]) < CM / 2 and s[4] - s[3] > 1.6
     ]  # fmt: skip
     boxes: list[PlanBox] = []
@@ -330,25 +344,24 @@ def _windows(
         width = snap(rng.uniform(0.8, min(1.5, end - start - 0.6)))
         at = snap(rng.uniform(start + 0.3, max(start + 0.3, end - 0.3 - width)))
         lo, hi = sorted((face, face - way * thick))
-        rect = Rect(lo, at, hi, at + width) if axis == 0 else Rect(at, lo, at + width, hi)
-        near = Rect(rect.x0 - 0.3, rect.y0 - 0.3, rect.x1 + 0.3, rect.y1 + 0.3)
-        if not any(_overlap(near, f.rect) for f in fixtures):
-            boxes.append(PlanBox((rect.x0, rect.y0, 0.9), (rect.x1, rect.y1, 2.05)))
+        rect = Rect.across(axis, lo, hi, at, at + width)
+        if not any(rect.grown(0.3, 0.3).overlaps(f.rect) for f in fixtures):
+            boxes.append(PlanBox.over(rect, 0.9, 2.05))
     return boxes
 
 
-def make_plan(cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 2000, parts: Parts | None = None) -> Plan:
-    """Draws a plan.
+def make_plan(
+    cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 2000,
+    weights: Sequence[float] | None = None, spread: float = 0.1,
+) -> Plan:  # fmt: skip
+    """Draw a plan whose rooms are all joined by doorways.
 
-    Args:
-        parts: how large each room is against the others, the corridor's weight (if there is to be one) first, which
-            does not count; default: as many as `cfg` says, about equal.
-
-    Returns:
-        A plan whose rooms are all joined by doorways.
+    `weights` are the rooms' areas against each other, in the order in which they lie, the corridor's (if there is to be
+    one) first, which does not count; default: as many as `cfg` says, equal. A cut is up to the share `spread` of the
+    side away from where the weights have it.
     """
     for _ in range(max_tries):
-        inside, rooms, walls, corridor = _layout(cfg, rng, parts)
+        inside, rooms, walls, corridor = _layout(cfg, rng, weights, spread)
         plain = [r for i, r in enumerate(rooms) if i != corridor]
         if min(min(r.size) for r in plain) < cfg.min_room_side_m or max(max(r.size) / min(r.size) for r in plain) > 2.3:
             continue
@@ -358,14 +371,13 @@ def make_plan(cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 20
             continue
         height = snap(rng.uniform(*cfg.wall_height_m))
         thick = snap(cfg.wall_thickness_m[1])
-        outer = Rect(*(snap(v) for v in (inside.x0 - thick, inside.y0 - thick, inside.x1 + thick, inside.y1 + thick)))
-        boxes = [b for w in walls for b in _wall_boxes(w.rect, w.axis, doorways, height)]
-        boxes += [
-            PlanBox((outer.x0, outer.y0, 0.0), (inside.x0, outer.y1, height)),
-            PlanBox((inside.x1, outer.y0, 0.0), (outer.x1, outer.y1, height)),
-            PlanBox((inside.x0, outer.y0, 0.0), (inside.x1, inside.y0, height)),
-            PlanBox((inside.x0, inside.y1, 0.0), (inside.x1, outer.y1, height)),
-        ]
+        outer = Rect(*map(snap, dataclasses.astuple(inside.grown(thick, thick))))
+        boxes = [b for w in walls for b in _wall_boxes(w, doorways, height)]
+        around = (
+            Rect(outer.x0, outer.y0, inside.x0, outer.y1), Rect(inside.x1, outer.y0, outer.x1, outer.y1),
+            Rect(inside.x0, outer.y0, inside.x1, inside.y0), Rect(inside.x0, inside.y1, inside.x1, outer.y1),
+        )  # fmt: skip
+        boxes += [PlanBox.over(rect, 0.0, height) for rect in around]
         fixtures = _fixtures(rooms, doorways, cfg, rng)
         windows = _windows(inside, plain, fixtures, thick, cfg, rng)
         return Plan(
@@ -373,6 +385,6 @@ def make_plan(cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 20
             height, door_height,
         )  # fmt: skip
     raise GenerationError(
-        f"no plan found in {max_tries} tries for {cfg.n_rooms} rooms on {cfg.floor_area_m2} m2: "
+        f"no plan in {max_tries} tries for {cfg.n_rooms} rooms on {cfg.floor_area_m2} m2: "
         "fewer rooms, more area or a smaller min_room_side_m would make it possible"
     )

@@ -1,14 +1,15 @@
-"""Draw grids of free floor from a plan and furniture, and find what a disc can reach on them.
+"""Draw grids of free floor from a plan and furniture, and compute what a disc can reach on them.
 
-Grids are (n, n) bool, rows along +y and columns along +x, cells of `GRID_M`, the scan frame's origin in the
-middle.
+Grids are (n, n) bool, rows along +y and columns along +x, cells of `GRID_M`, the scan frame's origin in the middle.
 """
+
+import dataclasses
 
 import numpy as np
 import shapely
 
-from converters.generate.design.instance import Instance
 from converters.generate.design.plan import CM, Plan, Rect
+from converters.generate.models.cad import Instance
 from interactive_nav_common.grids import clearance, label, largest_component
 
 BAND_M = (0.02, 1.2)
@@ -18,44 +19,40 @@ MARGIN_M = 0.5
 
 
 def image_size(plan: Plan) -> int:
-    """Side of the square map images in pixels: even, so that the origin lies on a pixel corner."""
-    o = plan.outer
-    half_m = max(abs(o.x0), abs(o.y0), abs(o.x1), abs(o.y1)) + MARGIN_M
+    """Return the side of the square map images in pixels: even, so that the origin lies on a pixel corner."""
+    half_m = np.abs(dataclasses.astuple(plan.outer)).max() + MARGIN_M
     return 2 * int(np.ceil(half_m / CM - 1e-6))
 
 
-def fill(image: np.ndarray, rect: Rect, value) -> None:
-    """Sets the pixels whose centres lie in a rectangle (scan frame); writes into `image`."""
-    half = image.shape[0] // 2
-    c0, r0, c1, r1 = (round(v / CM) + half for v in (rect.x0, rect.y0, rect.x1, rect.y1))
-    image[r0:r1, c0:c1] = value
-
-
 def floor_maps(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
-    """Draws both maps.
-
-    Returns:
-        `floor_0` and `floor_trav_0`, each (size, size) uint8 of 0 and 255, row = y / 0.01 + size / 2.
-    """
+    """Draw `floor_0` and `floor_trav_0`, each (size, size) uint8 of 0 and 255, row = y / 0.01 + size / 2."""
     size = image_size(plan)
+    half = size // 2
     obstacles = np.full((size, size), 255, np.uint8)
     traversable = np.zeros((size, size), np.uint8)
+
+    def pixels(rect: Rect) -> tuple[slice, slice]:
+        c0, r0, c1, r1 = (round(v / CM) + half for v in dataclasses.astuple(rect))
+        return slice(r0, r1), slice(c0, c1)
+
     for rect in (*plan.rooms, *(d.rect for d in plan.doorways)):
-        fill(traversable, rect, 255)
+        traversable[pixels(rect)] = 255
     for box in (*plan.walls, *plan.fixtures):
         if box.low[2] < BAND_M[1] and box.high[2] > BAND_M[0]:
-            fill(obstacles, box.rect, 0)
-            fill(traversable, box.rect, 0)
-    half = size // 2
+            obstacles[pixels(box.rect)] = traversable[pixels(box.rect)] = 0
+    middles = (np.arange(size) - half + 0.5) * CM
     for item in plan.built_in:
         for outline in item.outlines(BAND_M):
-            x0, y0, x1, y1 = outline.bounds
-            c0, r0, c1, r1 = (int(np.floor(v / CM)) + half + k for v, k in ((x0, 0), (y0, 0), (x1, 1), (y1, 1)))
-            xs, ys = np.meshgrid((np.arange(c0, c1) - half + 0.5) * CM, (np.arange(r0, r1) - half + 0.5) * CM)
-            inside = shapely.contains_xy(outline, xs, ys)
-            obstacles[r0:r1, c0:c1][inside] = 0
-            traversable[r0:r1, c0:c1][inside] = 0
+            block(obstacles, outline, middles)
+            block(traversable, outline, middles)
     return obstacles, traversable
+
+
+def block(grid: np.ndarray, shape: shapely.Geometry, middles: np.ndarray) -> None:
+    """Set the cells with their middle in a shape to 0; `middles` (n,) are the coordinates along either axis."""
+    x0, y0, x1, y1 = shape.bounds
+    columns, rows = (slice(*np.searchsorted(middles, ends)) for ends in ((x0, x1), (y0, y1)))
+    grid[rows, columns][shapely.contains_xy(shape, *np.meshgrid(middles[columns], middles[rows]))] = 0
 
 
 GRID_M = 0.05
@@ -64,11 +61,11 @@ GRID_M = 0.05
 def static_grid(plan: Plan) -> np.ndarray:
     """Return (n, n) bool, True where the static map is free."""
     trav = floor_maps(plan)[1] > 0
-    step = round(GRID_M / 0.01)
+    step = round(GRID_M / CM)
     n = trav.shape[0] // (2 * step) * 2
-    half = trav.shape[0] // 2
-    keep = slice(half - n // 2 * step, half + n // 2 * step)
-    return np.asarray(trav[keep, keep].reshape(n, step, n, step).all(axis=(1, 3)))
+    border = (trav.shape[0] - n * step) // 2
+    inside = trav[border : border + n * step, border : border + n * step]
+    return np.asarray(inside.reshape(n, step, n, step).all(axis=(1, 3)))
 
 
 def cell_centres(grid: np.ndarray) -> np.ndarray:
@@ -79,15 +76,9 @@ def cell_centres(grid: np.ndarray) -> np.ndarray:
 
 def without(grid: np.ndarray, items: list[Instance]) -> np.ndarray:
     """Return a copy of the grid with the footprints of the furniture blocked."""
-    centres = cell_centres(grid)
-    grid = grid.copy()
+    middles, grid = cell_centres(grid), grid.copy()
     for item in items:
-        shape = item.footprint.buffer(GRID_M * 0.35)
-        x0, y0, x1, y1 = shape.bounds
-        columns = slice(*np.searchsorted(centres, (x0, x1)))
-        rows = slice(*np.searchsorted(centres, (y0, y1)))
-        xs, ys = np.meshgrid(centres[columns], centres[rows])
-        grid[rows, columns] &= ~shapely.contains_xy(shape, xs, ys)
+        block(grid, item.footprint.buffer(GRID_M * 0.35), middles)
     return grid
 
 
@@ -109,11 +100,6 @@ def rooms_joined(grid: np.ndarray, plan: Plan, radius_m: float, least_m2: float 
 
 
 def passes(room_m: np.ndarray, masks: list[np.ndarray], width_m: float) -> bool:
-    """Return whether a disc `width_m` wide gets from one mask to the other.
-
-    `room_m`: (n, n) clearance.
-    `masks`: two of (n, n) bool.
-    `width_m`: the disc's diameter.
-    """
+    """Return whether a disc `width_m` wide gets from one of two masks to the other, given the clearance `room_m`."""
     region = label(room_m >= width_m / 2)[0]
     return bool(set(np.unique(region[masks[0]])) & set(np.unique(region[masks[1]])) - {0})

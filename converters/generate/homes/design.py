@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from converters.generate.design.config import BuildingConfig, GenerationError
-from converters.generate.design.instance import Instance
-from converters.generate.design.parts import Parts
-from converters.generate.design.plan import Plan, Rect, make_plan
+from converters.generate.design.plan import Building, Plan, Rect, make_plan
 from converters.generate.design.space import rooms_joined, static_grid
 from converters.generate.homes.config import HomeConfig
 from converters.generate.homes.furnish import WIDE_M, Full, furnish_home
@@ -20,7 +18,7 @@ from interactive_nav_common.records import read_packaged
 
 @dataclasses.dataclass(frozen=True)
 class RoomUse:
-    """What a room of one use is like."""
+    """Describe rooms of one use."""
 
     weight: float
     """Area against that of the other rooms."""
@@ -48,7 +46,7 @@ EVENER = 0.75
 
 
 def programme(n_rooms: int, rng: np.random.Generator) -> list[str]:
-    """The uses of so many rooms, corridor not counted, in the order in which they lie."""
+    """Draw the uses of so many rooms, corridor not counted, in the order in which they lie."""
     uses: list[str] = list(FIRST[:n_rooms])
     if n_rooms == 3 and rng.random() < 0.5:
         uses[2] = "kitchen"
@@ -61,13 +59,13 @@ def programme(n_rooms: int, rng: np.random.Generator) -> list[str]:
 
 
 def touching(a: Rect, b: Rect) -> bool:
-    """True where two rooms share a stretch of wall wide enough for a doorway."""
+    """Return whether two rooms share a stretch of wall wide enough for a doorway."""
     gap_x, gap_y = max(a.x0 - b.x1, b.x0 - a.x1), max(a.y0 - b.y1, b.y0 - a.y1)
     return (gap_x < 0.3 and gap_y < -0.8) or (gap_y < 0.3 and gap_x < -0.8)
 
 
 def _misfit(rooms: list[Rect], uses: list[str], near: np.ndarray) -> float:
-    """How badly uses suit rooms: areas off by a factor, sides too short, no neighbour of the right use."""
+    """Return how badly uses suit rooms: areas off by a factor, sides too short, no neighbour of the right use."""
     total, weight = sum(r.area_m2 for r in rooms), sum(USES[u].weight for u in uses)
     cost = 0.0
     for k, (room, name) in enumerate(zip(rooms, uses, strict=True)):
@@ -81,11 +79,7 @@ def _misfit(rooms: list[Rect], uses: list[str], near: np.ndarray) -> float:
 
 
 def assign_uses(plan: Plan, wanted: list[str]) -> tuple[list[str], float]:
-    """Says what each room of a plan is used as.
-
-    Returns:
-        The use of each room, key of `USES`, and how badly it suits, 0 being perfect.
-    """
+    """Return the use of each room of a plan, key of `USES`, and how badly they suit, 0 being perfect."""
     plain = [k for k in range(len(plan.rooms)) if k != plan.corridor]
     rooms, uses = [plan.rooms[k] for k in plain], list(wanted)
     near = np.array([[touching(a, b) for b in rooms] for a in rooms])
@@ -99,13 +93,13 @@ def assign_uses(plan: Plan, wanted: list[str]) -> tuple[list[str], float]:
             cost = _misfit(rooms, changed, near)
             if cost < best - 1e-9:
                 uses, best, better = changed, cost, True
-    found = dict(zip(plain, uses, strict=True))
-    return [found.get(k, "hall") for k in range(len(plan.rooms))], best
+    use_of = dict(zip(plain, uses, strict=True))
+    return [use_of.get(k, "hall") for k in range(len(plan.rooms))], best
 
 
 def home_plan(cfg: BuildingConfig, rng: np.random.Generator) -> tuple[Plan, list[str]]:
-    """The plan of a home, and the use of each of its rooms."""
-    found, refused = [], None
+    """Draw the plan of a home, and the use of each of its rooms."""
+    drawn, refused = [], None
     for k in range(PROGRAMMES):
         n = int(rng.integers(cfg.n_rooms[0], cfg.n_rooms[1] + 1))
         corridor = n >= cfg.corridor_from_rooms
@@ -113,18 +107,18 @@ def home_plan(cfg: BuildingConfig, rng: np.random.Generator) -> tuple[Plan, list
         lying = [wanted[i] for i in rng.permutation(len(wanted))] if k % 2 else wanted
         weights = (*([1.0] * corridor), *(USES[use].weight ** EVENER for use in lying))
         try:
-            plan = make_plan(cfg, rng, LAYOUTS, Parts(weights, 0.06))
+            plan = make_plan(cfg, rng, LAYOUTS, weights, 0.06)
         except GenerationError as error:
             refused = error
             continue
         uses, misfit = assign_uses(plan, lying)
-        found.append((misfit, k, plan, uses))
-        if len(found) == PLANS:
+        drawn.append((misfit, k, plan, uses))
+        if len(drawn) == PLANS:
             break
-    if not found:
+    if not drawn:
         assert refused is not None
         raise refused
-    _, _, plan, uses = min(found, key=lambda f: f[:2])
+    _, _, plan, uses = min(drawn, key=lambda f: f[:2])
     return plan, uses
 
 
@@ -134,25 +128,9 @@ MOST_FULL, LARGE_M2 = 2, 150.0
 """Of these, plans into which less fits than asked for: one is enough where it is so large, for each takes its time."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Furnished:
-    """A furnished home."""
-
-    plan: Plan
-    """Its built-in furniture is in it."""
-    uses: tuple[str, ...]
-    """Of the plan's rooms: keys of `converters.generate.homes.design.USES`."""
-    items: tuple[Instance, ...]
-    """What can be moved, door leaves first."""
-    furniture_share: float
-    """Share of the floor inside of the walls that furniture covers, seen from above."""
-    must_push_share: dict[str, float]
-    """Robot -> share of the pairs of places between which it finds no way round the movables."""
-
-
-def design_home(cfg: HomeConfig, rng: np.random.Generator) -> Furnished:
-    """Draws and furnishes a home, its shares as asked for."""
-    cfg.validate()
+def design_home(cfg: HomeConfig, rng: np.random.Generator) -> Building:
+    """Draw and furnish a home, its shares as the configuration demands."""
+    floor_height_m = round(float(rng.uniform(*cfg.shell.floor_height_m)), 3)
     refused: GenerationError | None = None
     full = 0
     for _ in range(MOST_PLANS):
@@ -172,6 +150,8 @@ def design_home(cfg: HomeConfig, rng: np.random.Generator) -> Furnished:
             refused = GenerationError("built-in furniture bars a room: ask for more area or fewer rooms")
             continue
         movable = tuple(s.item for s in standing if not s.built_in)
-        return Furnished(plan, tuple(uses), movable, home.floor.share, shares)
+        must_push = {robot: round(share, 4) for robot, share in shares.items()}
+        measured = {"furniture_share": round(home.floor.share, 4), "must_push_share": must_push}
+        return Building(plan, movable, floor_height_m, tuple(uses), measured)
     assert refused is not None
     raise refused

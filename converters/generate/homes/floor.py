@@ -1,4 +1,4 @@
-"""What stands in a home and what must stay free, on a raster: where a group fits is looked up for all places at once.
+"""Keep what stands in a home and what must stay free on a raster: look up where a group fits, all places at once.
 
 Rasters are (rows, columns), rows along +y and columns along +x, cells of `CELL_M`, cell [0, 0] at the lower left
 corner of the building's outline.
@@ -6,14 +6,14 @@ corner of the building's outline.
 
 import dataclasses
 import math
+from collections.abc import Iterable
 
 import numpy as np
 import shapely
 
-from converters.generate.design.instance import Instance
 from converters.generate.design.plan import Plan, Rect, doorway_zone
-from converters.generate.homes.arrange import Arrangement
-from converters.generate.homes.groups import LOW_M
+from converters.generate.homes.arrange import LOW_M, Arrangement
+from converters.generate.models.cad import Instance
 from converters.geometry.density import ROBOTS
 from interactive_nav_common.grids import clearance, label
 from scenes_mjcf.categories import CATEGORIES
@@ -35,7 +35,7 @@ STRANDED_M2 = 0.2
 
 @dataclasses.dataclass
 class Standing:
-    """A piece that stands. `floor` says where; mutable, as pieces are moved into passages."""
+    """Describe a piece that stands; mutable, as pieces are moved into passages."""
 
     item: Instance
     room: int
@@ -50,13 +50,13 @@ class Standing:
 
     @property
     def built_in(self) -> bool:
-        """It is part of the building."""
+        """Return whether it is part of the building."""
         return not CATEGORIES[self.item.model.category].is_object
 
 
 @dataclasses.dataclass(frozen=True)
 class Places:
-    """Where a group could stand: one place a row."""
+    """Hold where a group could stand: one place a row."""
 
     origin: np.ndarray
     """(n, 2) of the group's frame."""
@@ -67,7 +67,7 @@ class Places:
 
 
 class Floor:
-    """The floor of a home. Mutable, private to one home."""
+    """Hold the floor of a home. Mutable, private to one home."""
 
     def __init__(self, plan: Plan, sweeps: list[shapely.Polygon]):
         self.plan = plan
@@ -98,41 +98,39 @@ class Floor:
         self.front = np.zeros(self.shape, bool)
         """Before furniture that one steps up to."""
         self.glass = np.zeros(self.shape, bool)
-        for r in (box.rect for box in plan.windows):
-            strip = Rect(r.x0 - WINDOW_STRIP_M, r.y0 - WINDOW_STRIP_M, r.x1 + WINDOW_STRIP_M, r.y1 + WINDOW_STRIP_M)
-            self.glass[self.cells(strip)] = True
+        for box in plan.windows:
+            self.glass[self.cells(box.rect.grown(WINDOW_STRIP_M, WINDOW_STRIP_M))] = True
         self.standing: list[Standing] = []
 
     def cells(self, rect: Rect) -> tuple[slice, slice]:
-        """Rows and columns of the cells whose middles lie in a rectangle."""
+        """Return the rows and columns of the cells whose middles lie in a rectangle."""
         edges = (np.array([rect.y0, rect.y1, rect.x0, rect.x1]) - self.low[[1, 1, 0, 0]]) / CELL_M
         r0, r1, c0, c1 = np.maximum(np.round(edges), 0).astype(int)
         return slice(r0, r1), slice(c0, c1)
 
     def raster(self, shapes: list[shapely.Geometry]) -> tuple[tuple[slice, slice], np.ndarray]:
-        """The window of cells around shapes, and which of them have their middle inside of one."""
+        """Return the window of cells around shapes, and which of them have their middle inside of one."""
         bounds = np.array([s.bounds for s in shapes])
         x0, y0 = bounds[:, :2].min(axis=0)
         x1, y1 = bounds[:, 2:].max(axis=0)
-        window = self.cells(Rect(x0 - CELL_M, y0 - CELL_M, x1 + CELL_M, y1 + CELL_M))
+        window = self.cells(Rect(x0, y0, x1, y1).grown(CELL_M, CELL_M))
         window = tuple(slice(s.start, min(s.stop, n)) for s, n in zip(window, self.shape, strict=True))
         return (window[0], window[1]), self.rastered(shapes, (window[0], window[1]))
 
     def rastered(self, shapes: list[shapely.Geometry], window: tuple[slice, slice]) -> np.ndarray:
-        """Which cells of a window have their middle inside of a shape."""
+        """Return which cells of a window have their middle inside of a shape."""
         ys, xs = (
             (np.arange(s.start, s.stop) + 0.5) * CELL_M + low for s, low in zip(window, self.low[::-1], strict=True)
         )
-        grid = np.meshgrid(xs, ys)
-        inside = np.zeros(grid[0].shape, bool)
+        inside = np.zeros((len(ys), len(xs)), bool)
         for shape in shapes:
-            inside |= shapely.contains_xy(shape, *grid)
+            inside |= shapely.contains_xy(shape, *np.meshgrid(xs, ys))
         return inside
 
     # -- what stands ----------------------------------------------------
 
     def add(self, item: Instance, room: int, group: str) -> Standing:
-        """Stands a piece on the floor."""
+        """Stand a piece on the floor."""
         window, shadow = self.raster(item.outlines())
         below = {
             robot: self.rastered(item.outlines((-math.inf, disc.height_m)), window) for robot, disc in ROBOTS.items()
@@ -143,7 +141,7 @@ class Floor:
         return piece
 
     def cover(self, piece: Standing, by: int) -> None:
-        """Counts a piece in (1) or out (-1) of what is covered."""
+        """Count a piece in (1) or out (-1) of what is covered."""
         self.covered[piece.window] += np.where(piece.shadow, np.uint8(by % 256), np.uint8(0))
         for robot, below in piece.below.items():
             self.below[robot][piece.window] += np.where(below, np.uint8(by % 256), np.uint8(0))
@@ -151,34 +149,34 @@ class Floor:
             self.fixed[piece.window] |= piece.shadow
 
     def remove(self, piece: Standing) -> None:
-        """Takes away a piece that is not built in."""
+        """Take away a piece that is not built in."""
         assert not piece.built_in
         self.standing = [s for s in self.standing if s is not piece]
         self.cover(piece, -1)
 
     def free(self, robot: str) -> np.ndarray:
-        """(rows, columns) bool: floor on which nothing is in a robot's way."""
+        """Return (rows, columns) bool: floor on which nothing is in a robot's way."""
         return self.inside & (self.below[robot] == 0)
 
     @property
     def floor_cells(self) -> int:
-        """Cells inside of the walls, doorways included."""
+        """Return the number of cells inside of the walls, doorways included."""
         return int(self.inside.sum())
 
     @property
     def share(self) -> float:
-        """Share of the floor that furniture covers."""
+        """Return the share of the floor that furniture covers."""
         return float((self.covered[self.inside] > 0).sum() / self.floor_cells)
 
     def room_share(self, room: int) -> float:
-        """The same of one room."""
+        """Return the same of one room."""
         here = self.covered[self.cells(self.plan.rooms[room])]
         return float((here > 0).mean())
 
     # -- where groups fit -----------------------------------------------
 
     def _room_sums(self, room: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Lower left corner of a room's window and running sums of what hinders there."""
+        """Return the lower left corner of a room's window and running sums of what hinders there."""
         rows, columns = self.cells(self.plan.rooms[room])
         window = slice(max(rows.start - 8, 0), rows.stop + 8), slice(max(columns.start - 8, 0), columns.stop + 8)
         layers = {"wall": self.room[window] != room, "taken": self.covered[window] > 0, "kept": self.kept[window],
@@ -187,7 +185,7 @@ class Floor:
         return np.array([window[1].start, window[0].start]) * CELL_M + self.low, sums
 
     def places(self, arrangement: Arrangement, room: int, rng: np.random.Generator) -> Places:
-        """All places of a room where a group might stand, before looking at what stands there."""
+        """Return all places of a room where a group might stand, before looking at what stands there."""
         r, at = self.plan.rooms[room], arrangement.group.at
         if at in ("free", "anywhere"):
             n = (int(r.size[0] / STEP_M / 2), int(r.size[1] / STEP_M / 2))
@@ -197,21 +195,20 @@ class Floor:
             near = np.stack([np.minimum(origin[:, 0] - r.x0, r.x1 - origin[:, 0]),
                              np.minimum(origin[:, 1] - r.y0, r.y1 - origin[:, 1])], axis=1)  # fmt: skip
             return Places(origin, side, near)
-        found = []
-        left, right = arrangement.pieces[0].half_m[0], arrangement.pieces[0].half_m[0]
+        rows, half = [], arrangement.pieces[0].half_m[0]
         for side in range(4):
             length = r.size[1 - side % 2]
-            along = np.arange(left + 0.01, length - right, STEP_M)
-            along = np.append(along, max(length - right - 0.01, 0.0))
-            x = (np.full_like(along, r.x0), r.x0 + along, np.full_like(along, r.x1), r.x0 + along)[side]
-            y = (r.y0 + along, np.full_like(along, r.y0), r.y0 + along, np.full_like(along, r.y1))[side]
-            found.append((np.stack([x, y], 1), np.full(len(along), side), np.stack([along, length - along], 1)))
-        return Places(*(np.concatenate(part) for part in zip(*found, strict=True)))
+            along = np.arange(half + 0.01, length - half, STEP_M)
+            along = np.append(along, max(length - half - 0.01, 0.0))
+            origin = np.stack([r.x0 + along, r.y0 + along], 1)
+            origin[:, side % 2] = (r.x0, r.y0, r.x1, r.y1)[side]
+            rows.append((origin, np.full(len(along), side), np.stack([along, length - along], 1)))
+        return Places(*(np.concatenate(part) for part in zip(*rows, strict=True)))
 
     def hindered(
         self, boxes: np.ndarray, places: Places, low: np.ndarray, sums: np.ndarray, gap_m: float = 0.0
     ) -> np.ndarray:
-        """(n,) how many cells of a layer lie in a rectangle of the group's frame, for all places."""
+        """Return (n,) how many cells of a layer lie in a rectangle of the group's frame, for all places."""
         c, s = np.array([1, 0, -1, 0])[places.side], np.array([0, 1, 0, -1])[places.side]
         corners = [places.origin + np.stack([s * u + c * v, -c * u + s * v], 1) for u, v in (boxes[:2], boxes[2:])]
         lowest, highest = np.minimum(*corners) - gap_m - low, np.maximum(*corners) + gap_m - low
@@ -223,29 +220,27 @@ class Floor:
         return sums[r1, c1] - sums[r0, c1] - sums[r1, c0] + sums[r0, c0] + out
 
     def fitting(self, arrangement: Arrangement, room: int, places: Places, strict: bool = True) -> np.ndarray:
-        """(n, pieces) bool: which pieces of a group have room at each place."""
+        """Return (n, pieces) bool: which pieces of a group have room at each place."""
         low, sums = self._room_sums(room)
+
+        def clear(box: np.ndarray, layers: Iterable[str], gap_m: float = 0.0) -> np.ndarray:
+            return np.all([self.hindered(box, places, low, sums[layer], gap_m) == 0 for layer in layers], axis=0)
+
         fits = np.ones((len(places.side), len(arrangement.pieces)), bool)
         for k, piece in enumerate(arrangement.pieces):
             box = np.array(piece.corners_m)
             # A scan's annotations are a centimetre off: what stood in an alcove without play would be wedged there.
             beside = 0.0 if piece.built_in else GAP_M
-            fits[:, k] = self.hindered(box + [-beside, 0, beside, 0], places, low, sums["wall"]) == 0
-            fits[:, k] &= self.hindered(box, places, low, sums["taken"], GAP_M) == 0
-            fits[:, k] &= self.hindered(box, places, low, sums["swept"]) == 0
-            if strict:
-                fits[:, k] &= self.hindered(box, places, low, sums["kept"]) == 0
-                fits[:, k] &= self.hindered(box, places, low, sums["front"]) == 0
             high = piece.size_m[1] > LOW_M and piece.model.category != "sink"  # a tap may stand before a window
-            if high and (piece.size_m[0] > 0.4 or piece.built_in):
-                fits[:, k] &= self.hindered(box, places, low, sums["glass"]) == 0
+            high &= piece.size_m[0] > 0.4 or piece.built_in
+            fits[:, k] = clear(box + [-beside, 0, beside, 0], ["wall"]) & clear(box, ["taken"], GAP_M)
+            fits[:, k] &= clear(box, ["swept", *(("kept", "front") if strict else ()), *(("glass",) if high else ())])
         if arrangement.front is not None and strict:
-            for layer in ("wall", "taken"):
-                fits[:, 0] &= self.hindered(np.array(arrangement.front), places, low, sums[layer]) == 0
+            fits[:, 0] &= clear(np.array(arrangement.front), ("wall", "taken"))
         return fits
 
     def before_window(self, arrangement: Arrangement, places: Places, room: int) -> np.ndarray:
-        """(n,) share of the anchor's width that stands before a window."""
+        """Return (n,) the share of the anchor's width that stands before a window."""
         low, sums = self._room_sums(room)
         half = arrangement.pieces[0].half_m[0]
         strip = np.array([-half, 0.0, half, WINDOW_STRIP_M - 2 * CELL_M])
@@ -254,14 +249,12 @@ class Floor:
     # -- whether one still gets through ---------------------------------
 
     def reach(self, room: int, radius_m: float, boxes: list[Rect] | None = None) -> tuple[bool, float]:
-        """What a disc reaches of a room with the furniture where it stands.
+        """Return what a disc reaches of a room with the furniture where it stands.
 
-        Returns:
-            Whether it gets from each doorway of the room to each other one inside of the room, and the area, m2, in
-            which its middle could be but to which it does not get from there.
+        That is whether it gets from each doorway of the room to each other one inside of the room, and the area, m2, in
+        which its middle could be but to which it does not get from there.
         """
-        r = self.plan.rooms[room]
-        rows, columns = self.cells(Rect(r.x0 - BEYOND_M, r.y0 - BEYOND_M, r.x1 + BEYOND_M, r.y1 + BEYOND_M))
+        rows, columns = self.cells(self.plan.rooms[room].grown(BEYOND_M, BEYOND_M))
         corner = np.array([rows.start, columns.start])
 
         def here(rect: Rect) -> tuple[slice, slice]:
@@ -269,12 +262,12 @@ class Floor:
             y, x = (slice(max(s.start - low, 0), min(max(s.stop - low, 0), n)) for s, low, n in window)
             return y, x
 
-        own = self.room[rows, columns] == room
-        free = own.copy()
+        inside = self.room[rows, columns] == room
+        free = inside.copy()
         doorways = [d for d in self.plan.doorways if room in d.rooms]
         for doorway in doorways:  # the floor behind a doorway counts as free
             free[here(doorway_zone(doorway, BEYOND_M, 0.0))] = True
-        free &= ~own | (self.covered[rows, columns] == 0)
+        free &= ~inside | (self.covered[rows, columns] == 0)
         for box in boxes or []:
             free[here(box)] = False
         region = label(clearance(free, CELL_M) >= radius_m)[0]

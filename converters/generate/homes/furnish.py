@@ -1,4 +1,4 @@
-"""A home's plan in, its floor with furniture out: what each room's use asks for, then more until it is full enough."""
+"""Furnish a home's plan: what each room's use demands first, then more until it is full enough."""
 
 import dataclasses
 import math
@@ -10,10 +10,19 @@ import numpy as np
 from converters.generate.design.config import GenerationError
 from converters.generate.design.furnish import hang_doors
 from converters.generate.design.plan import Plan, Rect
-from converters.generate.homes.arrange import Arrangement, Piece, Showroom, arrange, on_floor, stand
+from converters.generate.homes.arrange import (
+    PLENTY_M2,
+    TABLES,
+    Arrangement,
+    Piece,
+    RoomSet,
+    arrange,
+    on_floor,
+    stand,
+)
 from converters.generate.homes.config import SHARE_TOLERANCE, HomeConfig
 from converters.generate.homes.floor import CELL_M, STRANDED_M2, Floor, Places
-from converters.generate.homes.groups import PLENTY_M2, TABLES, RoomSet
+from converters.generate.models.cad import Models
 from converters.geometry.density import ROBOTS
 
 LOOKS = 8
@@ -37,31 +46,31 @@ WIDE_M = max(disc.radius_m for disc in ROBOTS.values()) + 0.02
 
 
 class Full(GenerationError):
-    """Less furniture than asked for fits into a plan."""
+    """Report that less furniture fits into a plan than is wanted."""
 
 
 @dataclasses.dataclass
 class Home:
-    """A home while it is furnished. Mutable, private to one attempt."""
+    """Hold a home while it is furnished. Mutable, private to one attempt."""
 
     cfg: HomeConfig
     plan: Plan
     uses: list[str]
     floor: Floor
-    show: Showroom
+    models: Models
     rng: np.random.Generator
 
     @property
     def narrow_m(self) -> float:
-        """Radius of the disc that gets to every room with the furniture as it stands."""
+        """Return the radius of the disc that gets to every room with the furniture as it stands."""
         return self.cfg.shell.robot_radius_m + 0.02
 
     def count(self, group: str, room: int) -> int:
-        """How many anchors of a group stand in a room."""
+        """Return how many anchors of a group stand in a room."""
         return sum(s.group == group and s.room == room for s in self.floor.standing)
 
     def takes(self, categories: Sequence[str], room: int) -> bool:
-        """True where these pieces more are not more of a kind than a room and a home have."""
+        """Return whether with these pieces more there are no more of a kind than a room and a home have."""
         larger = max(self.floor.floor_cells * CELL_M**2 / PLENTY_M2, 1.0)
         for category, more in Counter(c for c in categories if c in TABLES.most).items():
             here = [s.room == room for s in self.floor.standing if s.item.model.category == category]
@@ -71,10 +80,10 @@ class Home:
         return True
 
     def lacking(self) -> str:
-        """The first room without what it needs, and what that is; empty where there is none."""
+        """Return the first room without what it needs, and what that is; empty where there is none."""
         for room, use in enumerate(self.uses):
             have = {s.item.model.category for s in self.floor.standing if s.room == room}
-            without = [c for c in TABLES.rooms[use].needs if self.show.has(c) and c not in have]
+            without = [c for c in TABLES.rooms[use].needs if self.models.has(c) and c not in have]
             if without:
                 return f"the {use} of {self.plan.rooms[room].area_m2:.1f} m2 has no place for: {', '.join(without)}"
         return ""
@@ -83,7 +92,7 @@ class Home:
 def _preference(
     arrangement: Arrangement, places: Places, floor: Floor, room: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """(n,) how much a group likes each place."""
+    """Return (n,) how much a group likes each place."""
     liking = rng.uniform(0.0, 0.6, len(places.side))
     at, half = arrangement.group.at, arrangement.pieces[0].half_m[0]
     if at == "corner":
@@ -101,24 +110,14 @@ def _preference(
 
 
 def _on_floor(corners: tuple[float, float, float, float], origin: np.ndarray, side: int) -> Rect:
-    """A rectangle u0, v0, u1, v1 of a group's frame, on the floor."""
+    """Return a rectangle u0, v0, u1, v1 of a group's frame, on the floor."""
     a, b = (on_floor(origin, side * math.pi / 2, *corner) for corner in (corners[:2], corners[2:]))
     (x0, y0), (x1, y1) = np.minimum(a, b), np.maximum(a, b)
     return Rect(x0, y0, x1, y1)
 
 
-def _boxes(arrangement: Arrangement, fits: np.ndarray, origin: np.ndarray, side: int) -> list[Rect]:
-    """Bounding rectangles of the pieces that fit."""
-    there = [piece for piece, here in zip(arrangement.pieces, fits, strict=True) if here]
-    return [_on_floor(piece.corners_m, origin, side) for piece in there]
-
-
 def settle(home: Home, name: str, arrangement: Arrangement, room: int, radius_m: float) -> bool:
-    """Finds the place that a group likes best of those where it fits and the disc still gets round it.
-
-    Returns:
-        True where it stands now.
-    """
+    """Stand a group in the best place where it fits and the disc still gets round; return whether there is one."""
     floor, rng = home.floor, home.rng
     ranked = []
     for way in (arrangement, arrangement.mirrored()):
@@ -133,29 +132,21 @@ def settle(home: Home, name: str, arrangement: Arrangement, room: int, radius_m:
     ranked.sort(key=lambda r: -r[0])
     joined, stranded_m2 = floor.reach(room, radius_m) if ranked else (True, 0.0)
     for _, way, origin, side, fits in ranked[:LOOKS]:
-        boxes = _boxes(way, fits, origin, side)
+        boxes = [_on_floor(p.corners_m, origin, side) for p, here in zip(way.pieces, fits, strict=True) if here]
         still, cut_off_m2 = floor.reach(room, radius_m, boxes)
         if (still or not joined) and cut_off_m2 <= stranded_m2 + STRANDED_M2:
-            _stand_group(home, name, way, origin, side, fits, room)
+            for k, piece in enumerate(way.pieces):
+                if fits[k]:
+                    group = name if k == 0 else f"{name}: {piece.model.category}"
+                    floor.add(stand(piece, origin, side * math.pi / 2), room, group)
+            if way.front is not None:
+                floor.front[floor.cells(_on_floor(way.front, origin, side))] = True
             return True
     return False
 
 
-def _stand_group(
-    home: Home, name: str, way: Arrangement, origin: np.ndarray, side: int, fits: np.ndarray, room: int
-) -> None:
-    """Stands the pieces that fit, and keeps the floor before the anchor free."""
-    floor = home.floor
-    facing = side * math.pi / 2
-    for k, piece in enumerate(way.pieces):
-        if fits[k]:
-            floor.add(stand(piece, origin, facing), room, name if k == 0 else f"{name}: {piece.model.category}")
-    if way.front is not None:
-        floor.front[floor.cells(_on_floor(way.front, origin, side))] = True
-
-
 def _few(home: Home, arrangement: Arrangement, room: int) -> Arrangement | None:
-    """A group without the pieces that are too many of a kind; None where it needs one of them."""
+    """Return a group without the pieces that are too many of a kind; None where it needs one of them."""
     kept: list[Piece] = []
     for piece in arrangement.pieces:
         if home.takes([p.model.category for p in (*kept, piece)], room):
@@ -166,17 +157,16 @@ def _few(home: Home, arrangement: Arrangement, room: int) -> Arrangement | None:
 
 
 def try_group(home: Home, name: str, room: int, radius_m: float) -> bool:
-    """Tries to stand a group in a room, with several models and shorter rows.
+    """Try to stand a group in a room, with several models and shorter rows; return whether it stands.
 
-    Returns:
-        False where it does not fit, or is more than the share asked for or than rooms have of a kind.
+    It does not where it does not fit, or is more than the wanted share or than rooms have of a kind.
     """
     if not home.takes([TABLES.groups[name].anchor if name in TABLES.groups else name], room):
         return False
     rows = any(s.relation == "next" for s in TABLES.groups[name].satellites) if name in TABLES.groups else False
     most = home.cfg.furniture_share + SHARE_TOLERANCE / 2
     for fewer in range(FEWEST + 1 if rows else REDRAWS if name in TABLES.groups else 1):
-        arrangement = arrange(name, home.show, home.rng, fewer if rows else 0)
+        arrangement = arrange(name, home.models, home.rng, fewer if rows else 0)
         arrangement = arrangement and _few(home, arrangement, room)
         if arrangement is None:
             return False
@@ -188,7 +178,7 @@ def try_group(home: Home, name: str, room: int, radius_m: float) -> bool:
 
 
 def _room_set(home: Home, room: int) -> RoomSet:
-    """What a room has; the living room has the table where there is no dining room and the kitchen is small."""
+    """Return what a room has; the living room has the table where there is no dining room and the kitchen is small."""
     use = home.uses[room]
     chosen = TABLES.rooms[use]
     if use == "living" and "dining" not in home.uses:
@@ -199,7 +189,7 @@ def _room_set(home: Home, room: int) -> RoomSet:
 
 
 def stand_base(home: Home) -> None:
-    """Stands what each room's use asks for, the most important pieces of all rooms first."""
+    """Stand what each room's use demands, the most important pieces of all rooms first."""
     rng = home.rng
     sets = [_room_set(home, k) for k in range(len(home.uses))]
     for level in range(max(len(s.base) for s in sets)):
@@ -210,20 +200,13 @@ def stand_base(home: Home) -> None:
                     _ = try_group(home, name, int(room), WIDE_M) or try_group(home, name, int(room), home.narrow_m)
     for _ in home.plan.windows:
         for room in range(len(sets)):
-            if home.count("radiator", room) < sum(_at_window(home.plan, room)):
+            near = home.plan.rooms[room].grown(0.3, 0.3)
+            if home.count("radiator", room) < sum(w.rect.overlaps(near) for w in home.plan.windows):
                 try_group(home, "radiator", room, home.narrow_m)
 
 
-def _at_window(plan: Plan, room: int) -> list[bool]:
-    r = plan.rooms[room]
-    return [
-        w.rect.x0 < r.x1 + 0.3 and r.x0 < w.rect.x1 + 0.3 and w.rect.y0 < r.y1 + 0.3 and r.y0 < w.rect.y1 + 0.3
-        for w in plan.windows
-    ]
-
-
 def stand_clutter(home: Home) -> None:
-    """Lays small things about, so many for each ten square metres."""
+    """Put small objects about, so many for each ten square metres."""
     rng, cfg = home.rng, home.cfg
     areas = np.array([r.area_m2 for r in home.plan.rooms])
     count = int(round(rng.uniform(*cfg.clutter_per_10_m2) * areas.sum() / 10))
@@ -232,8 +215,8 @@ def stand_clutter(home: Home) -> None:
 
 
 def clutter_category(home: Home, room: int) -> str | None:
-    """A category of what lies about in a room; None where there are no models of any."""
-    odds = [(c, w) for c, w in TABLES.rooms[home.uses[room]].clutter if home.show.has(c) and home.takes([c], room)]
+    """Draw a category of what lies about in a room; return None where there are no models of any."""
+    odds = [(c, w) for c, w in TABLES.rooms[home.uses[room]].clutter if home.models.has(c) and home.takes([c], room)]
     if not odds:
         return None
     weights = np.array([w for _, w in odds])
@@ -246,7 +229,7 @@ def _clutter(home: Home, room: int) -> bool:
 
 
 def grow(home: Home) -> None:
-    """Adds furniture to the rooms that are emptiest for their use until the share is met."""
+    """Add furniture to the rooms that are emptiest for their use until the share is met."""
     rng, cfg, floor = home.rng, home.cfg, home.floor
     tired: set[tuple[int, str]] = set()
     radius_m = WIDE_M
@@ -285,14 +268,14 @@ def grow(home: Home) -> None:
 
 
 def furnish_home(plan: Plan, uses: list[str], cfg: HomeConfig, rng: np.random.Generator) -> Home:
-    """Furnishes a plan, whose rooms have these uses; the home has its furniture on its floor."""
+    """Furnish a plan, whose rooms have these uses."""
     lacking = ""
     for _ in range(MOST_BASES):
         doors = hang_doors(plan, cfg.shell, rng, [k for k, use in enumerate(uses) if use in PRIVATE])
         if doors is None:
             raise GenerationError(f"n_doors is {cfg.shell.n_doors}: too few doorways have a wall for a leaf to rest at")
         leaves, sweeps = doors
-        home = Home(cfg, plan, uses, Floor(plan, sweeps), Showroom(cfg.shell.models, cfg.shell.scale_jitter), rng)
+        home = Home(cfg, plan, uses, Floor(plan, sweeps), Models(cfg.shell.models, cfg.shell.scale_jitter), rng)
         for leaf, room in leaves:
             home.floor.add(leaf, room, "door")
         stand_base(home)

@@ -1,7 +1,7 @@
-"""A furnished home in; the same home with passages narrowed or cleared until as much must be pushed as asked for, out.
+"""Narrow or clear the passages of a furnished home until as much must be pushed as is wanted.
 
 A bounded search: one light piece is taken from where it stands and put into a passage or out of the way, what is then
-reached is measured, and the piece stays there where that is nearer to the ranges asked for.
+reached is measured, and the piece stays there where that is nearer to the wanted ranges.
 """
 
 import dataclasses
@@ -11,12 +11,11 @@ from collections.abc import Callable
 import numpy as np
 
 from converters.generate.design.config import GenerationError
-from converters.generate.design.instance import place
-from converters.generate.homes.arrange import Arrangement, Piece
+from converters.generate.homes.arrange import TABLES, Arrangement, Group, Piece
 from converters.generate.homes.config import SHARE_TOLERANCE, Range
 from converters.generate.homes.floor import CELL_M, Standing
 from converters.generate.homes.furnish import Home, clutter_category, settle
-from converters.generate.homes.groups import TABLES, Group
+from converters.generate.models.cad import place
 from converters.geometry.density import ROBOTS, Ways, must_push_shares
 from interactive_nav_common.grids import clearance
 
@@ -43,18 +42,18 @@ LEAST_GAIN = 1e-4
 
 @dataclasses.dataclass(frozen=True)
 class Shares:
-    """Shares of pairs between which a robot must push, for a disc a little smaller than it and one a little larger."""
+    """Hold shares of pairs between which a robot must push, for a disc a little smaller than it and one larger."""
 
     least: float
     most: float
 
     def miss(self, wanted: Range) -> float:
-        """How far they lie from a range: gaps that are nearly as wide as the robot count for neither side."""
+        """Return how far they lie from a range: gaps that are nearly as wide as the robot count for neither side."""
         return max(wanted[0] - self.least, self.most - wanted[1], 0.0)
 
 
 class Passages:
-    """A home's floor as robots see it. Mutable, private to one search."""
+    """Hold a home's floor as robots see it. Mutable, private to one search."""
 
     def __init__(self, home: Home):
         self.home = home
@@ -68,13 +67,13 @@ class Passages:
         self.shares = self.measure(self.room_m)
 
     def measure(self, room_m: dict[str, np.ndarray]) -> dict[str, Shares]:
-        """Robot -> shares of pairs between which it must push, given the clearance."""
+        """Return the shares of pairs between which each robot must push, given the clearance."""
         return {
             robot: Shares(*(way.must_push_share(room_m[robot]) for way in ways)) for robot, ways in self.ways.items()
         }
 
     def room_after(self, standing: list[Standing]) -> dict[str, np.ndarray]:
-        """`room_m` as the furniture stands now, where it stood as listed when that was measured."""
+        """Return `room_m` as the furniture stands now, where it stood as listed when that was measured."""
         floor, reach = self.home.floor, math.ceil(FAR_M / CELL_M)
         out = {robot: room_m.copy() for robot, room_m in self.room_m.items()}
         gone, come = _changed(standing, floor.standing)
@@ -89,16 +88,16 @@ class Passages:
         return out
 
     def miss(self, shares: dict[str, Shares] | None = None) -> float:
-        """How far shares (those measured last) lie from what is asked for, summed."""
+        """Return how far shares (those measured last) lie from the wanted ranges, summed."""
         shares = shares or self.shares
         return sum(shares[robot].miss(wanted) for robot, wanted in self.home.cfg.must_push.items())
 
     def light(self) -> list[Standing]:
-        """What can be moved: light pieces, seats round tables among them."""
+        """Return what can be moved: light pieces, seats round tables among them."""
         return [s for s in self.home.floor.standing if s.item.model.category in TABLES.light]
 
     def trial(self, change: Callable[[], bool]) -> bool:
-        """Keeps a change of what stands where that is nearer to what is asked for; undoes it otherwise."""
+        """Keep a change of what stands where if it brings the shares nearer to the wanted ranges; undo it otherwise."""
         floor, cfg = self.home.floor, self.home.cfg
         shares, standing, room_m = self.shares, list(floor.standing), self.room_m
         if change() and floor.share > cfg.furniture_share - SHARE_TOLERANCE:
@@ -114,7 +113,7 @@ class Passages:
         return False
 
     def narrowing(self, rng: np.random.Generator) -> tuple[np.ndarray, int] | None:
-        """A random place in a passage, half of the time before a doorway, and its room."""
+        """Return a random place in a passage, half of the time before a doorway, and its room."""
         floor, plan = self.home.floor, self.home.plan
         if rng.random() < 0.5:
             d = plan.doorways[rng.integers(len(plan.doorways))]
@@ -126,8 +125,8 @@ class Passages:
         room_m = self.room_m[sorted(self.ways)[rng.integers(len(self.ways))]]
         # The ridge of the clearance: as far from what stands left as from what stands right.
         ridge = (room_m > PASSAGE_M[0]) & (room_m < PASSAGE_M[1]) & (floor.room >= 0)
-        ridge &= _ridge(room_m)
-        cells = np.argwhere(ridge)
+        across = [np.maximum(*(np.roll(room_m, way, axis) for way in (1, -1))) for axis in (0, 1)]
+        cells = np.argwhere(ridge & (room_m >= np.minimum(*across)))
         if not len(cells):
             return None
         row, column = cells[rng.integers(len(cells))]
@@ -136,25 +135,13 @@ class Passages:
 
 
 def _changed(before: list[Standing], now: list[Standing]) -> tuple[list[Standing], list[Standing]]:
-    """Pieces that stood and no longer do, and those that did not and now do."""
+    """Return pieces that stood and no longer do, and those that did not and now do."""
     was, stands = {id(s) for s in before}, {id(s) for s in now}
     return [s for s in before if id(s) not in stands], [s for s in now if id(s) not in was]
 
 
-def _ridge(room_m: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool: cells that are at least as clear as both neighbours across, along rows or columns."""
-    out = np.zeros(room_m.shape, bool)
-    for axis in (0, 1):
-        out |= (room_m >= np.roll(room_m, 1, axis)) & (room_m >= np.roll(room_m, -1, axis))
-    return out
-
-
 def adjust(home: Home) -> dict[str, float]:
-    """Moves light pieces until the shares that must be pushed lie in the ranges asked for.
-
-    Returns:
-        Robot -> share of pairs between which it must push.
-    """
+    """Move light pieces until the shares that must be pushed lie in the wanted ranges; return them by robot."""
     rng, passages = home.rng, Passages(home)
     wanted = home.cfg.must_push
     in_vain = 0
@@ -170,9 +157,9 @@ def adjust(home: Home) -> dict[str, float]:
             _clear(home, passages)
         in_vain = in_vain + 1 if passages.shares is shares else 0
     floor = home.floor
-    told = must_push_shares(floor.inside & ~floor.fixed, {robot: floor.free(robot) for robot in ROBOTS}, CELL_M)
-    if passages.miss() < LEAST_GAIN and all(low <= told[robot] <= high for robot, (low, high) in wanted.items()):
-        return told
+    measured = must_push_shares(floor.inside & ~floor.fixed, {robot: floor.free(robot) for robot in ROBOTS}, CELL_M)
+    if passages.miss() < LEAST_GAIN and all(low <= measured[robot] <= high for robot, (low, high) in wanted.items()):
+        return measured
     missed = [robot for robot in wanted if passages.shares[robot].miss(wanted[robot]) >= LEAST_GAIN] or list(wanted)
     got = ", ".join(
         f"must_push_{k} is {list(wanted[k])}, got {passages.shares[k].least:.3f} to {passages.shares[k].most:.3f}"
@@ -185,7 +172,7 @@ def adjust(home: Home) -> dict[str, float]:
 
 
 def _narrow(home: Home, passages: Passages) -> None:
-    """Tries one light piece in a passage."""
+    """Try one light piece in a passage."""
     rng, floor = home.rng, home.floor
     place_at = passages.narrowing(rng)
     if place_at is None:
@@ -197,7 +184,7 @@ def _narrow(home: Home, passages: Passages) -> None:
         piece = alone[rng.integers(len(alone))]
         model, scale = piece.item.model, piece.item.scale
     elif category in TABLES.light and floor.share < home.cfg.furniture_share + SHARE_TOLERANCE / 2:
-        model, scale = home.show.draw(category, rng)
+        model, scale = home.models.draw(category, rng)
     else:
         return
     item = place(model, scale, xy, float(rng.uniform(-math.pi, math.pi)))
@@ -218,7 +205,7 @@ def _narrow(home: Home, passages: Passages) -> None:
 
 
 def _clear(home: Home, passages: Passages) -> None:
-    """Tries to put one light piece that bars a way to where its room, or another, has place for it."""
+    """Try to put one light piece that bars a passage to where its room, or another, has space for it."""
     rng, floor = home.rng, home.floor
     light = passages.light()
     if not light:

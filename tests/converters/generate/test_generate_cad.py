@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from converters.generate.design.config import BuildingConfig
-from converters.generate.design.instance import place
 from converters.generate.design.plan import make_plan
 from converters.generate.models.cad import (
     HOME_TEST_MODELS,
@@ -18,11 +17,19 @@ from converters.generate.models.cad import (
     TEST_MODELS,
     TRAIN_MODELS,
     cad_model,
+    place,
 )
 from converters.generate.models.parts import MATERIALS, bar, box
-from converters.generate.surface.scan import Scan, building_solids
+from converters.generate.surface.scan import (
+    Scan,
+    Volume,
+    building_solids,
+    fuse,
+    solid_from_box,
+    solid_from_mesh,
+    surface_nets,
+)
 from converters.generate.surface.texture import pack_rows, paint
-from converters.generate.surface.volume import Volume, fuse, solid_from_box, solid_from_mesh, surface_nets
 from converters.generate.surface.write import write_cad
 from converters.read.annotations import read_cad
 from converters.read.files import SourceFolder

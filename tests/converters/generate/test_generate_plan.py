@@ -13,10 +13,9 @@ import shapely
 from scipy import ndimage
 
 from converters.generate import Building, BuildingConfig, GenerationError, design_building
-from converters.generate.design.doors import DOOR_GAP_M
-from converters.generate.design.instance import Instance, place
+from converters.generate.design.furnish import DOOR_GAP_M
 from converters.generate.design.space import GRID_M, floor_maps, free_grid, image_size, passes, room_mask, static_grid
-from converters.generate.models.cad import TEST_MODELS, cad_model
+from converters.generate.models.cad import TEST_MODELS, Instance, cad_model, place
 from interactive_nav_common.grids import clearance
 
 SEEDS = range(8)
@@ -213,8 +212,8 @@ def test_a_large_test_building_uses_held_out_models_only(seed):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"floor_area_m2": (9.0, 9.0)}, "no plan found"),
-        ({"n_sofas": (12, 12), "n_chairs": (30, 30)}, "no way found to furnish"),
+        ({"floor_area_m2": (9.0, 9.0)}, "no plan in"),
+        ({"n_sofas": (12, 12), "n_chairs": (30, 30)}, "no way to furnish"),
         ({"n_rooms": (4, 3)}, "n_rooms is (4, 3)"),
         ({"voxel_m": -1.0}, "voxel_m is -1.0"),
         ({"models": ("chair_throne",)}, "unknown CAD models"),

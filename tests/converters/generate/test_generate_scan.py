@@ -15,9 +15,8 @@ from scipy.spatial.transform import Rotation
 
 import converters.generate as generate
 from converters.generate import BuildingConfig, GenerationError, design_building, generate_building
-from converters.generate.surface.annotate import SCAN_TO_WORLD, pose_in_world
-from converters.generate.surface.scan import NYU40, building_solids, nearest_solids, seen_from
-from converters.generate.surface.volume import fuse, solid_from_box
+from converters.generate.surface.scan import NYU40, building_solids, fuse, nearest_solids, seen_from, solid_from_box
+from converters.generate.surface.write import SCAN_TO_WORLD, pose_in_world
 from interactive_nav_common.errors import FileError
 
 SEED = 3

@@ -17,16 +17,14 @@ from scipy import ndimage
 
 from converters.generate import Building, BuildingConfig, GenerationError, HomeConfig, design_building
 from converters.generate.design.furnish import Effort, furnish_plan
-from converters.generate.design.instance import Instance
 from converters.generate.design.plan import Plan, Rect, make_plan
 from converters.generate.homes import design, furnish, passages
-from converters.generate.homes.arrange import Showroom, apart, arrange, stand
+from converters.generate.homes.arrange import TABLES, apart, arrange, draw_set, stand
 from converters.generate.homes.config import MOST_SHARE, TIERS, home_config, home_fields
 from converters.generate.homes.design import USES, assign_uses, home_plan, programme
 from converters.generate.homes.floor import Floor
 from converters.generate.homes.furnish import Home, furnish_home
-from converters.generate.homes.groups import TABLES
-from converters.generate.models.cad import HOME_TRAIN_MODELS, LIBRARY
+from converters.generate.models.cad import HOME_TRAIN_MODELS, LIBRARY, Instance, Models
 from converters.geometry.density import ROBOTS
 from scenes_mjcf.categories import CATEGORIES
 from tests.converters.generate.test_generate_plan import polygon, turned
@@ -296,7 +294,7 @@ def test_bed_heads_wardrobes_and_bookcases_have_a_wall_behind(seed):
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("name", ["dining table", "small table", "desk"])
 def test_chairs_face_their_table_and_go_under_it_where_parts_allow(name, seed):
-    group = arrange(name, Showroom(HOME_TRAIN_MODELS, 0.08), np.random.default_rng(seed))
+    group = arrange(name, Models(HOME_TRAIN_MODELS, 0.08), np.random.default_rng(seed))
     assert group is not None
     host, *seats = [stand(p, np.zeros(2), 0.3) for p in group.pieces if p.model.category in ("table", "desk", "chair")]
     assert len(seats) == 1 if name == "desk" else 1 <= len(seats) <= 6
@@ -374,8 +372,8 @@ def test_doors_turn_freely(seed, tier):
 
 
 def test_a_seat_under_a_table_top_is_apart_from_it_and_one_in_its_leg_is_not():
-    show, rng = Showroom(("table_apron", "chair_slat"), 0.0), np.random.default_rng(0)
-    table, chair = stand(show.piece("table", rng), np.zeros(2), 0.0), show.piece("chair", rng)
+    draw = draw_set(Models(("table_apron", "chair_slat"), 0.0), np.random.default_rng(0))
+    table, chair = stand(draw("table"), np.zeros(2), 0.0), draw("chair")
     depth = (table.footprint.bounds[2] - table.footprint.bounds[0]) / 2 + chair.size_m[2] / 2
     assert apart(table, stand(chair, np.array([depth - 0.12, 0.0]), math.pi))
     assert not apart(table, stand(chair, np.array([depth - 0.40, 0.0]), math.pi))
@@ -427,8 +425,8 @@ def test_tables_name_what_there_is():
 def test_a_floor_counts_what_is_put_down_and_taken_away():
     plan = make_plan(BuildingConfig(), np.random.default_rng(0))
     floor = Floor(plan, [])
-    show, rng = Showroom(HOME_TRAIN_MODELS, 0.0), np.random.default_rng(0)
-    item = stand(show.piece("sofa", rng), np.array(plan.rooms[0].centre), 0.4)
+    draw = draw_set(Models(HOME_TRAIN_MODELS, 0.0), np.random.default_rng(0))
+    item = stand(draw("sofa"), np.array(plan.rooms[0].centre), 0.4)
     assert floor.share == 0.0
     sofa = floor.add(item, 0, "sofa")
     area_m2 = sum(r.area_m2 for r in plan.rooms) + sum(d.rect.area_m2 for d in plan.doorways)
@@ -452,5 +450,5 @@ def test_too_much_furniture_of_the_plain_kind_is_refused_within_bounded_work():
 
 @pytest.mark.heavy
 def test_the_whole_of_that_ends_with_one_line():
-    with pytest.raises(GenerationError, match="no way found to furnish .7, 7. rooms"):
+    with pytest.raises(GenerationError, match="no way to furnish .7, 7. rooms"):
         design_building(0, CROWDED)
