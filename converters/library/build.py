@@ -55,7 +55,7 @@ _ESCAPE = re.compile(r"\\(?:u([0-9a-fA-F]{4})|(.))")
 
 
 @dataclasses.dataclass(frozen=True)
-class Piece:
+class CatalogueModel:
     """One piece of furniture of a catalogue."""
 
     library: str
@@ -82,7 +82,7 @@ class Catalogue:
 
     path: Path
     licence: str
-    pieces: tuple[Piece, ...]
+    pieces: tuple[CatalogueModel, ...]
 
 
 def parse_properties(data: bytes) -> dict[str, str]:
@@ -104,7 +104,7 @@ def _number(of: dict[str, str], key: str, where: str) -> float:
     return value
 
 
-def _piece(library: str, of: dict[str, str], where: str, names: set[str]) -> Piece:
+def _piece(library: str, of: dict[str, str], where: str, names: set[str]) -> CatalogueModel:
     model = of.get("model", "").lstrip("/")
     if model not in names:
         raise SceneRejected(f"{where}: its model '{model}' is not in the archive; fetch the library again")
@@ -118,7 +118,7 @@ def _piece(library: str, of: dict[str, str], where: str, names: set[str]) -> Pie
     turn = np.array([_number({"modelRotation": w}, "modelRotation", where) for w in words])
     if turn.shape != (9,) or not np.allclose(turn.reshape(3, 3) @ turn.reshape(3, 3).T, np.eye(3), atol=1e-3):
         raise SceneRejected(f"{where}: modelRotation is {of['modelRotation']!r}, expected the 9 numbers of a rotation")
-    return Piece(
+    return CatalogueModel(
         library,
         of.get("name", ""),
         model,
@@ -148,7 +148,7 @@ def read_catalogue(path: Path) -> Catalogue:
     return Catalogue(path, whole.get("license", ""), tuple(pieces))
 
 
-def unpack_model(catalogue: Catalogue, piece: Piece, folder: Path) -> Path:
+def unpack_model(catalogue: Catalogue, piece: CatalogueModel, folder: Path) -> Path:
     """Write a piece's model with what lies beside it into an empty folder; return the model's path."""
     home = PurePosixPath(piece.model).parent
     try:
@@ -183,10 +183,10 @@ class Chosen:
     """A piece and what it is to be."""
 
     catalogue: Catalogue
-    piece: Piece
+    piece: CatalogueModel
     category: str
     split: str
-    riders: tuple[tuple[Catalogue, Piece], ...] = ()
+    riders: tuple[tuple[Catalogue, CatalogueModel], ...] = ()
     """What stands on it."""
 
     @property
@@ -218,7 +218,7 @@ def read_selection(catalogues: Sequence[Catalogue], path: Path = SELECTION) -> t
     return tuple(chosen)
 
 
-def as_catalogued(surface: TexturedMesh, piece: Piece, where: str) -> TexturedMesh:
+def as_catalogued(surface: TexturedMesh, piece: CatalogueModel, where: str) -> TexturedMesh:
     """Return the surface turned and scaled as its catalogue says, the middle of its base at the origin."""
     if not len(surface.faces):
         raise SceneRejected(f"{where}: has no face; choose another model")
@@ -236,7 +236,7 @@ def _standing(points: np.ndarray, foot_m: float) -> np.ndarray:
     return np.vstack([points, level])
 
 
-def _surface(catalogue: Catalogue, piece: Piece) -> TexturedMesh:
+def _surface(catalogue: Catalogue, piece: CatalogueModel) -> TexturedMesh:
     with tempfile.TemporaryDirectory(prefix="library-") as folder:
         path = unpack_model(catalogue, piece, Path(folder))
         surface = read_surface(SourceFolder(path.parent), path.name, "")

@@ -33,7 +33,7 @@ HULL_DECIMALS = 5
 
 
 @dataclasses.dataclass(frozen=True)
-class Look:
+class Appearance:
     """Which files show a body."""
 
     mesh: str
@@ -48,7 +48,7 @@ class Look:
 class Assets:
     """Names of the files that bodies, by name, are built from."""
 
-    looks: dict[str, Look]
+    looks: dict[str, Appearance]
     hulls: dict[str, tuple[str, ...]]
     """Mesh of each hull; its file has the same name."""
 
@@ -97,7 +97,7 @@ def _tidy(values: np.ndarray) -> np.ndarray:
 
 
 def _add_movable(
-    spec: mujoco.MjSpec, placed: PlacedObject, physical: Physical, look: Look | None, hulls: tuple[str, ...]
+    spec: mujoco.MjSpec, placed: PlacedObject, physical: Physical, look: Appearance | None, hulls: tuple[str, ...]
 ) -> None:
     body = spec.worldbody.add_body(
         name=placed.name, pos=_tidy(placed.position_w), quat=np.round(placed.quaternion_w, 9)
@@ -148,7 +148,7 @@ def _add_box(
     body.add_geom(spec.find_default(kind), name=name, type=geom, friction=friction, **place)
 
 
-def _add_look(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, look: Look) -> None:
+def _add_look(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, look: Appearance) -> None:
     """Add a textured visual geom; reuse meshes, textures and materials of other bodies."""
     mesh_name = f"{name}_visual" if look.scale != ONE else f"{look.mesh}_visual"
     if mesh_name == f"{name}_visual":
@@ -187,7 +187,7 @@ def share_assets(parts: SceneParts) -> Assets:
         key = tuple(np.ascontiguousarray(v).tobytes() for v in (visual.faces, visual.uv, visual.uv_faces))
         first, mesh = meshes.setdefault(key, (name, visual))
         scale = _scale_between(mesh, visual)
-        looks[name] = Look(name, ONE, image) if scale is None else Look(first, scale, image)
+        looks[name] = Appearance(name, ONE, image) if scale is None else Appearance(first, scale, image)
     for placed in parts.objects:
         for i, hull in enumerate(placed.hulls_b):
             key = (np.round(hull.vertices, HULL_DECIMALS) + 0.0).tobytes(), hull.faces.tobytes()
@@ -257,7 +257,7 @@ def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[OrientedBox, ...], lit: 
         spec.visual.headlight.ambient = [LIT_AMBIENT] * 3
 
 
-def _add_structure(spec: mujoco.MjSpec, parts: SceneParts, look: Look | None) -> None:
+def _add_structure(spec: mujoco.MjSpec, parts: SceneParts, look: Appearance | None) -> None:
     """Add the cleaned scan as a picture, and the wall boxes."""
     structure = spec.worldbody.add_body(name="structure")
     if look is not None:

@@ -26,7 +26,7 @@ from train.config import OffPolicyConfig
 from train.learners import networks, replay_buffer
 from train.learners.actor_critic import ActorCritic
 from train.learners.learner import Snapshot, Update, all_finite, episode_sums, reset_envs
-from train.learners.replay_buffer import Replay
+from train.learners.replay_buffer import ReplayBuffer
 
 
 @flax.struct.dataclass
@@ -34,7 +34,7 @@ class OffPolicyData:
     """Holds all that acting changes: environments, replay and noise."""
 
     env_state: Any
-    replay: Replay
+    replay: ReplayBuffer
     noise: Any
     """State of the exploration noise, leaves [envs, ...]."""
 
@@ -87,7 +87,9 @@ def collect(
     return jax.lax.scan(step, data, jax.random.split(key, agent.config.steps_per_update))
 
 
-def learn(agent: ActorCritic, learner: Any, replay: Replay, key: jax.Array) -> tuple[Any, dict[str, jax.Array], Any]:
+def learn(
+    agent: ActorCritic, learner: Any, replay: ReplayBuffer, key: jax.Array
+) -> tuple[Any, dict[str, jax.Array], Any]:
     """Take gradient steps, if the replay is full enough.
 
     Returns:
@@ -150,7 +152,7 @@ def start(agent: ActorCritic, env: Env, seed: int) -> Snapshot:
     return Snapshot(0, jax.jit(agent.init)(key_networks, key_updates), data)
 
 
-def check_memory(config: OffPolicyConfig, replay: Replay, section: str) -> None:
+def check_memory(config: OffPolicyConfig, replay: ReplayBuffer, section: str) -> None:
     """Raise `ConfigError` where the replay, or one of such shapes, takes more than `replay_limit_gb`."""
     if replay_buffer.nbytes(replay) > config.replay_limit_gb * 1e9:
         images = isinstance(replay.observation, Mapping)

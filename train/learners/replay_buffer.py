@@ -20,7 +20,7 @@ from train.learners.networks import PIXELS
 
 
 @flax.struct.dataclass
-class Replay:
+class ReplayBuffer:
     """The ring."""
 
     observation: Any
@@ -39,7 +39,7 @@ class Replay:
     """() i32: slots written so far, at most all."""
 
 
-def init(slots: int, observation: Any, action_size: int, vector_dtype: str = "float32") -> Replay:
+def init(slots: int, observation: Any, action_size: int, vector_dtype: str = "float32") -> ReplayBuffer:
     """Return an empty ring.
 
     Args:
@@ -55,7 +55,7 @@ def init(slots: int, observation: Any, action_size: int, vector_dtype: str = "fl
     else:
         rings = ring("", observation)
     envs = jax.tree.leaves(observation)[0].shape[0]
-    return Replay(
+    return ReplayBuffer(
         observation=rings,
         action=jnp.zeros((slots, envs, action_size)),
         reward=jnp.zeros((slots, envs)),
@@ -66,12 +66,12 @@ def init(slots: int, observation: Any, action_size: int, vector_dtype: str = "fl
     )
 
 
-def nbytes(replay: Replay) -> int:
+def nbytes(replay: ReplayBuffer) -> int:
     """Return the memory of a ring, or of one with the shapes that `jax.eval_shape` computes, bytes."""
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(replay))
 
 
-def describe(replay: Replay) -> str:
+def describe(replay: ReplayBuffer) -> str:
     """Return a line about a ring's memory; as `nbytes`."""
     slots, envs = replay.reward.shape
     total, transitions = nbytes(replay), slots * envs
@@ -82,8 +82,8 @@ def describe(replay: Replay) -> str:
 
 
 def insert(
-    replay: Replay, observation: Any, action: jax.Array, reward: jax.Array, done: jax.Array, truncated: jax.Array
-) -> Replay:
+    replay: ReplayBuffer, observation: Any, action: jax.Array, reward: jax.Array, done: jax.Array, truncated: jax.Array
+) -> ReplayBuffer:
     """Return the ring with one step of every environment in place of its oldest.
 
     Args:
@@ -101,7 +101,7 @@ def insert(
             x = jnp.clip(x, -65504.0, 65504.0)
         return ring.at[at].set(x.astype(ring.dtype))
 
-    return Replay(
+    return ReplayBuffer(
         observation=jax.tree.map(write, replay.observation, observation),
         action=write(replay.action, action),
         reward=write(replay.reward, reward),
@@ -112,12 +112,12 @@ def insert(
     )
 
 
-def size(replay: Replay) -> jax.Array:
+def size(replay: ReplayBuffer) -> jax.Array:
     """Return () i32: transitions in the ring, including those that cannot be drawn yet."""
     return replay.filled * replay.reward.shape[1]
 
 
-def sample(replay: Replay, key: jax.Array, batch_size: int, n_steps: int, discounting: float) -> types.Transition:
+def sample(replay: ReplayBuffer, key: jax.Array, batch_size: int, n_steps: int, discounting: float) -> types.Transition:
     """Draw transitions uniformly, with replacement, from all that have `n_steps` younger slots.
 
     A transition covers `n_steps` steps, or fewer where the episode ends. For m steps of discount g it holds

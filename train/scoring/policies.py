@@ -109,7 +109,7 @@ def need_twist(robot: RobotSpec, who: str) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class PlannedRoute:
     """A path to the goal for one episode."""
 
     path_w: np.ndarray
@@ -131,7 +131,7 @@ class Planner(HostPolicy):
         need_twist(env.robot, "policy avoider" if weight is None else "policy namo")
         self._env, self._weight = env, weight
         self._ways = Ways(env, weight)
-        self._plans: dict[int, Plan] = {}
+        self._plans: dict[int, PlannedRoute] = {}
         self.no_path = 0
         """Plans without a path."""
         self.plans = 0
@@ -158,16 +158,16 @@ class Planner(HostPolicy):
         return np.asarray(self._env.robot.drive(linear, angular, np), np.float32)
 
     @staticmethod
-    def _stale(plan: Plan, pos: np.ndarray, objects: np.ndarray) -> bool:
+    def _stale(plan: PlannedRoute, pos: np.ndarray, objects: np.ndarray) -> bool:
         moved = np.linalg.norm(objects - plan.object_pos_w, axis=-1).max(initial=0.0) > MOVED_M
         off = len(plan.path_w) > 0 and np.linalg.norm(plan.path_w - pos, axis=-1).min() > 0.15
         return bool(moved or off)
 
-    def _plan(self, scene: int, qpos, pos, goal, objects, step: int) -> Plan:
+    def _plan(self, scene: int, qpos, pos, goal, objects, step: int) -> PlannedRoute:
         path = self._ways.way(scene, qpos, pos, goal)
         self.plans += 1
         self.no_path += not len(path)
-        return Plan(path, objects.copy(), step)
+        return PlannedRoute(path, objects.copy(), step)
 
     def _steer(self, path: np.ndarray, pos: np.ndarray, yaw: float) -> tuple[float, float]:
         """Return linear (m/s) and angular (rad/s) velocity towards a point a little ahead on the path."""

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from converters.read.files import SourceFolder, only_file, read_json
-from converters.read.homes.parts import Part, home
+from converters.read.homes.parts import HomePart, home
 from converters.read.meshes import SUFFIXES, read_surface
 from converters.read.obj import TexturedMesh
 from converters.read.urdf import placed, read_urdf
@@ -76,9 +76,9 @@ class _Reader:
             if path.suffix.lower() in (*SUFFIXES, ".json", ".urdf"):
                 self._files[path.name].append(path)
         self._classes = self._lexicon()
-        self._assets: dict[tuple[str, str], Part] = {}
+        self._assets: dict[tuple[str, str], HomePart] = {}
 
-    def parts(self, path: Path) -> Iterator[Part]:
+    def parts(self, path: Path) -> Iterator[HomePart]:
         """Yield the stage, rigid and articulated objects of a scene."""
         scene = self._table(path)
         local = _value(scene, "translation_origin", "", path).lower() == "asset_local"
@@ -102,7 +102,7 @@ class _Reader:
         """Count the keys that are not read."""
         self.dropped.update(f"{_short(key)[1:-1]} (not read)" for key in about if key not in KEYS[kind].split())
 
-    def _part(self, instance: dict[str, Any], kind: str, local: bool, path: Path) -> Part:
+    def _part(self, instance: dict[str, Any], kind: str, local: bool, path: Path) -> HomePart:
         self._count(instance, "instance")
         name = _value(instance, "template_name", "", path)
         if not name:
@@ -127,14 +127,14 @@ class _Reader:
             asset, pose=turn @ pose @ turn.T, surface=placed(asset.surface, upright), collision=solid, static=static
         )
 
-    def _asset(self, name: str, kind: str, path: Path) -> Part:
+    def _asset(self, name: str, kind: str, path: Path) -> HomePart:
         """Return a stage or an object with y up, at its centre of mass: the file's, or the middle of its box."""
         if (name, kind) not in self._assets:
             read = self._articulated if kind == ARTICULATED else self._rigid
             self._assets[name, kind] = read(name, kind, path)
         return self._assets[name, kind]
 
-    def _rigid(self, name: str, kind: str, path: Path) -> Part:
+    def _rigid(self, name: str, kind: str, path: Path) -> HomePart:
         config = self._find(name, (kind,))
         if config is None:
             model = self._find(name, SUFFIXES)
@@ -160,9 +160,9 @@ class _Reader:
         label = self._classes.get(number, "")
         title = Path(name).name + (f"_{label}" if label else "")
         friction = friction if 0 < friction <= 2 else None
-        return Part(title, transform(np.eye(3), origin), render, collision, False, mass, friction)
+        return HomePart(title, transform(np.eye(3), origin), render, collision, False, mass, friction)
 
-    def _articulated(self, name: str, kind: str, path: Path) -> Part:
+    def _articulated(self, name: str, kind: str, path: Path) -> HomePart:
         """Read a URDF with its joints where they are at 0."""
         urdf = self._find(name, (".urdf",))
         config = self._find(name, (kind,))
@@ -174,7 +174,7 @@ class _Reader:
         body = read_urdf(self.source, self.source.inside(urdf), "", hold=True)
         solid = TexturedMesh(*body.collision, None, None)
         # read_urdf keeps the file's frame, and Habitat's URDFs have y up as its other assets have.
-        return Part(Path(name).name, np.eye(4), body.surface, solid, False, body.mass_kg, body.friction)
+        return HomePart(Path(name).name, np.eye(4), body.surface, solid, False, body.mass_kg, body.friction)
 
     def _mesh(self, about: dict[str, Any], key: str, config: Path) -> TexturedMesh | None:
         name = _value(about, key, "", config)

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from converters.read.files import SourceFolder, only_file
-from converters.read.homes.parts import LEVEL, Part, category_of, home
+from converters.read.homes.parts import LEVEL, HomePart, category_of, home
 from converters.read.obj import TexturedMesh, in_colour
 from converters.read.urdf import SHAPES, height_field, joined, parse_xml, placed, rectangle, solid
 from converters.records.errors import SceneRejected
@@ -175,7 +175,7 @@ def _reduced(path: Path) -> Path:
     return Path(os.path.normpath(path))
 
 
-def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Part]:
+def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[HomePart]:
     data = mujoco.MjData(model)
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, data, 0)
@@ -223,12 +223,12 @@ def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Part
         friction = max((f for _, f in solid), default=0.0)
         name, mass = model.body(body).name or f"body_{body}", float(model.body_mass[members].sum()) or None
         friction = friction if 0 < friction <= 2 else None
-        parts.append(Part(name, pose, surface, joined([m for m, _ in solid]), not free, mass, friction, held))
+        parts.append(HomePart(name, pose, surface, joined([m for m, _ in solid]), not free, mass, friction, held))
     source.note_counts(f"{path.name}:", +dropped)
     return parts
 
 
-def _planes(model: mujoco.MjModel, data: mujoco.MjData) -> dict[int, Part]:
+def _planes(model: mujoco.MjModel, data: mujoco.MjData) -> dict[int, HomePart]:
     """Return the level planes, which collide without an end whatever the size that they are drawn in, by their geom."""
     planes = {}
     for geom in np.flatnonzero(model.geom_type == int(_GEOM.mjGEOM_PLANE)):
@@ -237,7 +237,7 @@ def _planes(model: mujoco.MjModel, data: mujoco.MjData) -> dict[int, Part]:
         if at[2, 2] > LEVEL and collides:
             mesh = _mesh(model, int(geom), 1.0)
             assert mesh is not None
-            planes[int(geom)] = Part("plane", at, mesh, None, True, held=True, endless=True)
+            planes[int(geom)] = HomePart("plane", at, mesh, None, True, held=True, endless=True)
     return planes
 
 

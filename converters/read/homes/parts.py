@@ -64,7 +64,7 @@ PLINTH_M, FLOOR_SHARE = 0.4, 0.25
 
 
 @dataclasses.dataclass(frozen=True)
-class Part:
+class HomePart:
     """Hold one rigid object."""
 
     name: str
@@ -111,7 +111,7 @@ def by_last_words(words: list[str], table: Mapping[str, Any]) -> Any:
     return next((hit for tail in tails if (hit := table.get(tail) or table.get(tail.removesuffix("s")))), None)
 
 
-def home(source: SourceFolder, layout: str, parts: list[Part], floors_m: tuple[float, ...] = ()) -> RawScene:
+def home(source: SourceFolder, layout: str, parts: list[HomePart], floors_m: tuple[float, ...] = ()) -> RawScene:
     """Return the record of a home from its parts."""
     parts, floors_m = _on_floors(source, parts, floors_m)
     parts = _by_size(source, parts, weighed=layout == "sdf")
@@ -183,7 +183,7 @@ def built_in(raw: RawScene, beside: Mapping[int, str]) -> RawScene:
     )
 
 
-def _bounds(part: Part) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(part: HomePart) -> tuple[np.ndarray, np.ndarray]:
     points = transformed(part.surface.vertices, part.pose)
     return points.min(axis=0), points.max(axis=0)
 
@@ -206,8 +206,8 @@ def _shown(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _on_floors(
-    source: SourceFolder, parts: list[Part], floors_m: tuple[float, ...]
-) -> tuple[list[Part], tuple[float, ...]]:
+    source: SourceFolder, parts: list[HomePart], floors_m: tuple[float, ...]
+) -> tuple[list[HomePart], tuple[float, ...]]:
     """Return the parts with what shows of a plane without an end, and the heights of the floors.
 
     The plane reaches as far as all other parts. It is the floor unless others, a little higher, cover so much of it
@@ -260,7 +260,7 @@ def triangles(polygon: Any) -> list[np.ndarray]:
     return [shapely.get_coordinates(shapely.orient_polygons(t))[:3] for t in parts if shapely.area(t) > 1e-9]
 
 
-def _by_size(source: SourceFolder, parts: list[Part], weighed: bool) -> list[Part]:
+def _by_size(source: SourceFolder, parts: list[HomePart], weighed: bool) -> list[HomePart]:
     """Return the parts as their sizes and masses allow: a name alone makes no furniture of a wall.
 
     A static part whose size or mass is none of its category's is built in; a loose one is of the category `other`, or
@@ -289,7 +289,7 @@ def _by_size(source: SourceFolder, parts: list[Part], weighed: bool) -> list[Par
     return result
 
 
-def _whole(parts: list[Part]) -> TexturedMesh | None:
+def _whole(parts: list[HomePart]) -> TexturedMesh | None:
     return joined([placed(TexturedMesh(p.surface.vertices, p.surface.faces, None, None), p.pose) for p in parts])
 
 
@@ -297,7 +297,7 @@ def _small(mesh: TexturedMesh) -> TexturedMesh:
     return mesh if mesh.texture is None else dataclasses.replace(mesh, texture=at_most(mesh.texture, TEXTURE_PX))
 
 
-def _moves(part: Part, low: np.ndarray, high: np.ndarray, floor_m: float) -> bool:
+def _moves(part: HomePart, low: np.ndarray, high: np.ndarray, floor_m: float) -> bool:
     """Return True for furniture that stands on the floor."""
     category = part.category
     if category is not None and category.name == "door" and max((high - low)[:2]) > DOOR_MOST_M:
@@ -328,7 +328,7 @@ def _carriers(
 
 
 def _furniture(
-    source: SourceFolder, part: Part, riders: list[Part], structure: np.ndarray
+    source: SourceFolder, part: HomePart, riders: list[HomePart], structure: np.ndarray
 ) -> tuple[Annotation, CadModel]:
     """Return the annotation and the model of one movable part with what stands on it."""
     members = [(part, np.eye(4)), *((rider, np.linalg.inv(part.pose) @ rider.pose) for rider in riders)]
@@ -357,7 +357,7 @@ def _furniture(
     return Annotation(name, cad_id, pose, hinge=hinge), cad
 
 
-def _pieces(part: Part, by: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], ...] | None:
+def _pieces(part: HomePart, by: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], ...] | None:
     """Return the convex pieces of a part's collision mesh, moved; None where it has none or is not convex in parts."""
     if part.collision is None:
         return None
@@ -366,7 +366,7 @@ def _pieces(part: Part, by: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], 
     return convex_pieces(vertices, faces)
 
 
-def _mass(source: SourceFolder, part: Part, category: str) -> float | None:
+def _mass(source: SourceFolder, part: HomePart, category: str) -> float | None:
     """Return the part's mass where it is plausible; else None, and the category's density gives it."""
     material = CATEGORIES[category].material
     assert material is not None

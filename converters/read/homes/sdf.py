@@ -19,7 +19,7 @@ import trimesh
 
 from converters.geometry.faces import unit_normals
 from converters.read.files import SourceFolder, only_file, read_image
-from converters.read.homes.parts import LEVEL, Part, home
+from converters.read.homes.parts import LEVEL, HomePart, home
 from converters.read.meshes import UP_AXES, collada_frame, read_surface
 from converters.read.obj import GREY, TexturedMesh, find_file, in_colour
 from converters.read.urdf import (
@@ -41,14 +41,14 @@ from interactive_nav_common.rotations import matrix_from_quat, transform, transf
 
 
 @dataclasses.dataclass
-class Model:
+class SdfModel:
     """Hold a model, or the world, with its named frames and the models within it."""
 
     name: str
     element: ElementTree.Element
     path: Path
     static: bool = False
-    models: list["Model"] = dataclasses.field(default_factory=list)
+    models: list["SdfModel"] = dataclasses.field(default_factory=list)
     pose: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(4))
     """(4, 4) in the frame of the model or world that it is in."""
     given: dict[str, tuple[str, np.ndarray]] = dataclasses.field(default_factory=dict)
@@ -66,7 +66,7 @@ class Model:
                 pose = child.find("pose")
                 self.given[child.get("name") or ""] = _frame(pose) or on.strip(), self.matrix(pose)
 
-    def add_models(self, models: list[tuple["Model", ElementTree.Element | None, str]]) -> None:
+    def add_models(self, models: list[tuple["SdfModel", ElementTree.Element | None, str]]) -> None:
         """Add models within; each pose is that of a frame in the model, or of the model itself."""
         for model, pose, placement in models:
             self.given[model.name] = _frame(pose), self.matrix(pose) @ np.linalg.inv(model.frame(placement))
@@ -167,7 +167,7 @@ def read_sdf(root: Path, strict: bool = False, chosen: Path | None = None, withi
         raise SceneRejected(f"{file}: has no <world>; give a world, not a model")
     count_unread(world, TABLES["read"], reader.unread)
     saved = world.find("state")
-    tree = reader.tree(Model("world", world, file))
+    tree = reader.tree(SdfModel("world", world, file))
     parts = list(reader.parts(tree, np.eye(4), UNMOVED if saved is None else saved))
     report_unread(source, file.name, reader.unread)
     return home(source, "sdf", parts)
@@ -183,7 +183,7 @@ class _Reader:
     unread: collections.Counter[str] = dataclasses.field(default_factory=collections.Counter)
     read: int = 0
 
-    def tree(self, model: Model, depth: int = 0) -> Model:
+    def tree(self, model: SdfModel, depth: int = 0) -> SdfModel:
         """Return a model, or the world, filled with its frames and all models within it."""
         if depth > DEEPEST:
             raise SceneRejected(f"{model.path}: models lie {DEEPEST} deep in models; does one include itself?")
@@ -200,12 +200,12 @@ class _Reader:
                 static = (child.findtext("static") or inner.findtext("static") or "").strip() in ("true", "1")
                 placement = child.findtext("placement_frame") or child.get("placement_frame")
                 pose = inner.find("pose") if child.find("pose") is None else child.find("pose")
-                filled = self.tree(Model(name, inner, path, static or model.static), depth + 1)
+                filled = self.tree(SdfModel(name, inner, path, static or model.static), depth + 1)
                 within.append((filled, pose, (placement or inner.get("placement_frame") or "").strip()))
         model.add_models(within)
         return model
 
-    def parts(self, model: Model, pose: np.ndarray, state: ElementTree.Element) -> Iterator[Part]:
+    def parts(self, model: SdfModel, pose: np.ndarray, state: ElementTree.Element) -> Iterator[HomePart]:
         """Return the parts of a model at a pose, and of all within it, where a saved state has moved them."""
         try:
             yield from self._of_links(model, pose, state)
@@ -251,7 +251,7 @@ class _Reader:
             names = [e.text for e in config.findall("sdf") if e.text]
         return folder / (names[-1].strip() if names else "model.sdf")
 
-    def _of_links(self, model: Model, pose: np.ndarray, state: ElementTree.Element) -> Iterator[Part]:
+    def _of_links(self, model: SdfModel, pose: np.ndarray, state: ElementTree.Element) -> Iterator[HomePart]:
         """Return the part that a model's links make, and its level planes, which have no end."""
         for joint in model.element.findall("joint"):
             if joint.get("type") != "fixed":
@@ -277,7 +277,7 @@ class _Reader:
         for at in planes:
             look = next(mesh for mesh, at in shapes["visual"] + shapes["collision"] if at is not None)
             at[:3, :3] = np.eye(3)
-            yield Part(model.name, at, look, None, True, held=True, endless=True)
+            yield HomePart(model.name, at, look, None, True, held=True, endless=True)
         visual = joined([mesh for mesh, at in shapes["visual"] if at is None or not planes])
         solid = joined([mesh for mesh, at in shapes["collision"] if at is None])
         masses = [float(numbers(text, (0.0,))[0]) for link in links if (text := link.findtext("inertial/mass"))]
@@ -285,10 +285,10 @@ class _Reader:
         friction = [mu for text in mus if text and 0 < (mu := float(numbers(text, (0.0,))[0])) <= 2]
         surface, mass = visual or solid, sum(masses) if masses else None
         if surface is not None:
-            yield Part(model.name, pose, surface, solid, model.static, mass, max(friction, default=None))
+            yield HomePart(model.name, pose, surface, solid, model.static, mass, max(friction, default=None))
 
     def _shapes(
-        self, model: Model, link: ElementTree.Element, kind: str
+        self, model: SdfModel, link: ElementTree.Element, kind: str
     ) -> Iterator[tuple[ElementTree.Element, TexturedMesh]]:
         """Yield the visuals or collisions of a link with their meshes, each in its local frame."""
         for element in link.findall(kind):

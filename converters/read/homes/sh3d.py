@@ -22,9 +22,9 @@ import shapely
 from converters.geometry.boxes import convex_hull
 from converters.geometry.faces import compacted
 from converters.read.files import SourceFolder, only_file
-from converters.read.homes.parts import Part, category_of, home
+from converters.read.homes.parts import HomePart, category_of, home
 from converters.read.homes.sh3d_archive import called, colour, metres, number, point, read_xml, unpack
-from converters.read.homes.sh3d_models import LEAF, WHITE, Models, mean_colour, yaw_pose
+from converters.read.homes.sh3d_models import LEAF, WHITE, DrawnModels, mean_colour, yaw_pose
 from converters.read.homes.sh3d_walls import (
     HEIGHT_M,
     LOW_M,
@@ -121,7 +121,7 @@ class _Drawing:
 
     def __init__(self, source: SourceFolder, root: ElementTree.Element, budget: list[int]) -> None:
         self.source, self.root = source, root
-        self.models = Models(source, budget)
+        self.models = DrawnModels(source, budget)
         self.dropped: collections.Counter[str] = collections.Counter()
         self.named: collections.Counter[str] = collections.Counter()
         self.lamps: list[Lamp] = []
@@ -244,7 +244,7 @@ class _Drawing:
         foot = self._base(e) + number(e, "elevation", 0.0) / 100
         return foot < z_m - 0.1 and foot + number(e, "height") / 100 > z_m - 0.5
 
-    def _piece(self, e: ElementTree.Element) -> list[Part]:
+    def _piece(self, e: ElementTree.Element) -> list[HomePart]:
         """Return the parts of one piece: furniture, or a door or window with its leaves apart."""
         surface, group = self.models.surface(e)
         if not len(surface.faces):
@@ -259,15 +259,15 @@ class _Drawing:
             self.source.note(f"{name}: its sliding or folding parts stay as drawn")
         solid = self.models.solid(e, surface) if (e.get("catalogId") or "").startswith(OURS) else None
         if e.tag == "doorOrWindow":
-            return self._door(e, Part(name, pose, surface, solid, False), group)
+            return self._door(e, HomePart(name, pose, surface, solid, False), group)
         kind = kind_of(e.get("catalogId") or "", e.get("name") or "", height)
         if e.tag == "light":
             kind = kind if kind == "floor_lamp" else "other"
             self.lamps += [_lamp(e, source, pose) for source in e.findall("lightSource")]
         held = e.get("movable") == "false" or kind == "structure"
-        return [Part(name, pose, surface, solid, False, held=held, category_name=kind)]
+        return [HomePart(name, pose, surface, solid, False, held=held, category_name=kind)]
 
-    def _door(self, e: ElementTree.Element, door: Part, group: np.ndarray) -> list[Part]:
+    def _door(self, e: ElementTree.Element, door: HomePart, group: np.ndarray) -> list[HomePart]:
         """Return the frame and leaves of a door, whose faces are in a `group` each; a window in one piece."""
         sashes = e.findall("sash")
         foot, height = number(e, "elevation", 0.0) / 100, number(e, "height") / 100
@@ -283,7 +283,7 @@ class _Drawing:
             flat = _beside(flat, _axis(e, sash)[0], [_axis(e, s)[0] for s in sashes if s is not sash])
             swing, hulls = _swing(e, sash, flat.vertices), door.collision if len(sashes) == 1 else None
             name = f"{door.name} leaf {k}"
-            leaves.append(Part(name, door.pose, flat, hulls, False, category_name="door", swing=swing))
+            leaves.append(HomePart(name, door.pose, flat, hulls, False, category_name="door", swing=swing))
         if not leaf.any():
             self.source.note(f"{called(e)}: its model has no leaf of its own; flat leaves take its place")
             return leaves

@@ -17,7 +17,7 @@ import trimesh
 
 from converters.geometry.faces import compacted
 from converters.read.files import SourceFolder, read_image, read_obj
-from converters.read.homes.parts import Part, triangles
+from converters.read.homes.parts import HomePart, triangles
 from converters.read.homes.sh3d_archive import called, colour, metres, model_path, number, parsed
 from converters.read.meshes import read_surface
 from converters.read.obj import GREYS, TexturedMesh, distinct, join_textures, read_painted_obj
@@ -48,7 +48,7 @@ MOST_FACES = 2_000_000
 
 
 @dataclasses.dataclass(frozen=True)
-class Model:
+class DrawnModel:
     """Hold a model as its file has it, y up."""
 
     vertices: np.ndarray
@@ -63,17 +63,17 @@ class Model:
     """(m,) name of each face's group."""
 
 
-class Models:
+class DrawnModels:
     """Read models and images, each once."""
 
     def __init__(self, source: SourceFolder, budget: list[int]) -> None:
         """Read from the unpacked drawing `source`; `budget` bounds what archives within it may take."""
         self.source, self.budget = source, budget
-        self.models: dict[str, Model | None] = {}
+        self.models: dict[str, DrawnModel | None] = {}
         self.images: dict[str, np.ndarray | None] = {}
         self.faces = 0
 
-    def model(self, element: ElementTree.Element) -> Model | None:
+    def model(self, element: ElementTree.Element) -> DrawnModel | None:
         """Return the model of a piece; None and a report where it cannot be read."""
         name = element.get("model") or ""
         if name not in self.models:
@@ -96,7 +96,7 @@ class Models:
             reason = str(error).replace(f"{self.source.root}/", "")
             self.source.repaired(f"{called(element)}: its {kind} {name[:60]!r} {reason}; {instead}")
 
-    def _read(self, path: str) -> Model:
+    def _read(self, path: str) -> DrawnModel:
         ending = Path(path).suffix.lower()
         if ending in (".3ds", ".kmz", ".lwo", ".lws"):
             raise SceneRejected(f"is in the format {ending}, expected OBJ or COLLADA")
@@ -106,14 +106,14 @@ class Models:
             image = WHITE if mesh.texture is None else mesh.texture
             none = np.zeros(len(mesh.faces), np.int64)
             back = mesh.vertices @ Y_UP_TO_Z_UP
-            return Model(back, mesh.faces, uv, none, [image], ("",), np.full(len(none), ""))
+            return DrawnModel(back, mesh.faces, uv, none, [image], ("",), np.full(len(none), ""))
         mesh, number, images = read_painted_obj(
             self.source, path, "", lambda n: colour(f"ff{BUILT_IN.get(re.sub(r'[.][0-9]+$', '', n), '')}", GREYS)
         )
         check_count(path, len(mesh.faces), GEOMS, "faces", "simplify the model")
         assert mesh.corner_uv is not None
         names, groups = (*mesh.materials, "", "")[: len(images)], np.array((*mesh.groups, ""))
-        return Model(mesh.vertices, mesh.faces, mesh.corner_uv, number, images, names, groups[mesh.group])
+        return DrawnModel(mesh.vertices, mesh.faces, mesh.corner_uv, number, images, names, groups[mesh.group])
 
     def _image(self, path: str) -> np.ndarray:
         return read_image(self.source.use(path, ""), "RGB")
@@ -186,7 +186,7 @@ class Models:
             vertices[of] += APART * (vertices[of].mean(axis=0) - vertices[of])
         return TexturedMesh(vertices, mesh.faces, None, None)
 
-    def _deformed(self, element: ElementTree.Element, model: Model) -> tuple[np.ndarray, np.ndarray]:
+    def _deformed(self, element: ElementTree.Element, model: DrawnModel) -> tuple[np.ndarray, np.ndarray]:
         """Return the vertices and faces of a model whose parts are opened, turned or slid as drawn."""
         vertices, faces = model.vertices, model.faces
         for child in element.findall("transformation"):
@@ -205,7 +205,9 @@ class Models:
             vertices = np.vstack([vertices, moved])
         return vertices, faces
 
-    def _painted(self, element: ElementTree.Element, model: Model) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    def _painted(
+        self, element: ElementTree.Element, model: DrawnModel
+    ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
         """Return the texture coordinates, image numbers and images of a model in the piece's colours."""
         images, numbers, uv = list(model.images), model.number.copy(), model.corner_uv
         pane = np.char.startswith(model.group.astype(str), PANE)
@@ -227,7 +229,7 @@ class Models:
         return uv, numbers, [*images, GLASS]
 
 
-def _by_place(model: Model, element: ElementTree.Element, faces: np.ndarray, size: np.ndarray) -> np.ndarray:
+def _by_place(model: DrawnModel, element: ElementTree.Element, faces: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Return (k, 3, 2) of faces without texture coordinates: by place across the face's main axis."""
     span = np.maximum(np.ptp(model.vertices, axis=0), 1e-9)
     corners = model.vertices[model.faces[faces]] / span * metres(element, "width", "height", "depth")
@@ -278,7 +280,7 @@ class Sheet:
             self.uv.append(np.zeros((3, 2)))
             self.look.append(image)
 
-    def part(self, name: str) -> Part | None:
+    def part(self, name: str) -> HomePart | None:
         """Return all of it as a built-in part; None of nothing."""
         if not self.corners:
             return None
@@ -287,7 +289,7 @@ class Sheet:
             np.arange(3 * len(self.corners)).reshape(-1, 3),
             *join_textures(np.array(self.uv), *distinct(self.look)),
         )
-        return Part(name, np.eye(4), mesh, None, True, held=True)
+        return HomePart(name, np.eye(4), mesh, None, True, held=True)
 
 
 def _tiles(region: Any, size: np.ndarray | None) -> Iterator[tuple[Any, np.ndarray]]:

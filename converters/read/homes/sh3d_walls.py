@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from converters.read.homes.parts import Part
+from converters.read.homes.parts import HomePart
 from converters.read.homes.sh3d_archive import called, metres, number, outline, point
 from converters.read.homes.sh3d_models import WHITE, Look, Sheet, fitted
 from converters.records.errors import SceneRejected
@@ -191,7 +191,7 @@ class Opening:
 
 def wall_part(
     wall: Wall, openings: list[Opening], looks: dict[str, Look], boards: dict[str, tuple[float, float, Look]]
-) -> Part | None:
+) -> HomePart | None:
     """Return a wall without its openings, with its `boards`: side -> thickness and height, m, and look."""
     sheet = Sheet()
     ends = np.array([0.0, wall.length_m])
@@ -283,7 +283,7 @@ def enclosed(walls: list[Wall], rooms: list[Room]) -> list[Room]:
 
 def level_parts(
     rooms: list[Room], walls: list[Wall], openings: list[Opening], heights_m: tuple[float, float], shafts: list[Any]
-) -> list[Part]:
+) -> list[HomePart]:
     """Return the floors and ceilings of one level, less the shafts in each; later rooms hide earlier ones."""
     sheet, (taken, tops), (floor_m, ceiling_m) = Sheet(), shafts, heights_m
 

@@ -15,7 +15,7 @@ from converters.geometry.simplify import Surface, simplify_within
 from converters.library.build import (
     MOST_FACES,
     SELECTION,
-    Piece,
+    CatalogueModel,
     as_catalogued,
     make_model,
     on_top,
@@ -103,7 +103,7 @@ def test_simplification_keeps_every_part_within_its_error():
 def test_a_piece_takes_its_catalogues_size():
     corners = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 4], [9, 9, 9]])  # the last is in no face
     faces = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3]])
-    piece = Piece("L", "n", "n.obj", (0.5, 0.9, 0.6), np.eye(3), "c")
+    piece = CatalogueModel("L", "n", "n.obj", (0.5, 0.9, 0.6), np.eye(3), "c")
     mesh = as_catalogued(TexturedMesh(corners, faces, None, None), piece, "n")
     np.testing.assert_allclose(mesh.vertices.min(axis=0), [-0.25, 0.0, -0.3])
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [0.5, 0.9, 0.6])

@@ -31,7 +31,7 @@ def reward(time: int, env: int) -> float:
     return 1.0 + time + 0.125 * env
 
 
-def fill(history: list[Step]) -> replay_buffer.Replay:
+def fill(history: list[Step]) -> replay_buffer.ReplayBuffer:
     """The ring after a history; observations and actions say which step they are of."""
     replay = replay_buffer.init(SLOTS, VECTORS, 1)
     for time, step in enumerate(history):
