@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import platformdirs
 
 from interactive_nav_common.errors import FileError, UserError, regular
 from interactive_nav_common.locks import is_locked, release, take_lock
@@ -28,9 +29,8 @@ LONGEST_NAME = 100
 
 
 def cache_folder() -> Path:
-    """Return `$INTERACTIVE_NAV_CACHE`, else `$XDG_CACHE_HOME/interactive_nav`, else `~/.cache/interactive_nav`."""
-    override = os.environ.get("INTERACTIVE_NAV_CACHE")
-    return Path(override or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "interactive_nav")
+    """Return `$INTERACTIVE_NAV_CACHE`, else the platform's cache folder: `~/.cache/interactive_nav` on Linux."""
+    return Path(os.environ.get("INTERACTIVE_NAV_CACHE") or platformdirs.user_cache_path("interactive_nav"))
 
 
 def check_name(name: str, what: str, error: type[UserError] = FileError) -> str:
