@@ -31,7 +31,7 @@ from rich.console import Console
 import interactive_nav
 from interactive_nav.physics import resolve_backend
 from interactive_nav.physics.nearness import widths_at
-from interactive_nav.physics.tiers import KINDS, propose_tiers
+from interactive_nav.physics.mjx_batch import KINDS, propose_tiers
 from interactive_nav.physics.window import PhysicsWindow
 from interactive_nav.task.sharding import ShardedEnv
 from interactive_nav.task.wrappers import AutoResetEnv

@@ -190,36 +190,29 @@ class PhysicsWindow:
         xpos = self._xpos.at[self._wall_rows].set(self._wall_tables["xpos"][scene, walls])
         return xpos, self._xmat.at[self._wall_rows].set(self._wall_tables["xmat"][scene, walls])
 
-    def _addresses(self, chosen: tuple[jax.Array, ...]) -> list[tuple[Any, Any, Any, Any]]:
-        """Return (window's qpos, world's qpos, window's qvel, world's qvel) addresses of the robot and each group."""
-        inner, outer = self.layout, self.world.layout
-        q, v = np.arange(inner.robot_nq), np.arange(inner.robot_nv)
-        addresses: list[tuple[Any, Any, Any, Any]] = [
-            (inner.robot_qpos + q, outer.robot_qpos + q, inner.robot_qvel + v, outer.robot_qvel + v)
-        ]
-        for group, index in zip(self.groups, chosen, strict=True):
-            (q_in, q_out), (v_in, v_out) = ((group.rows[name], group.outer[name]) for name in ("qpos0", "dof_damping"))
-            addresses.append((q_in, jnp.asarray(q_out)[index], v_in, jnp.asarray(v_out)[index]))
+    def _addresses(self, chosen: tuple[jax.Array, ...]) -> list[tuple[jax.Array, jax.Array]]:
+        """Return addresses in the window and in the world of the robot and each group: of qpos, then of qvel."""
+        inner, outer, addresses = self.layout, self.world.layout, []
+        for name, field, count in (("robot_qpos", "qpos0", inner.robot_nq), ("robot_qvel", "dof_damping", inner.robot_nv)):
+            robot = (jnp.arange(count) + getattr(of, name) for of in (inner, outer))
+            here = [jnp.ravel(group.rows[field]) for group in self.groups]
+            there = [jnp.asarray(group.outer[field])[i].ravel() for group, i in zip(self.groups, chosen, strict=True)]
+            addresses.append(tuple(jnp.concatenate([own, *rest]) for own, rest in zip(robot, (here, there), strict=True)))
         return addresses
 
     def enter(self, state: PhysicsState, chosen: tuple[jax.Array, ...]) -> PhysicsState:
         """Return the window's state out of the world's."""
-        qpos = jnp.zeros(self.model.nq, jnp.float32)
-        qvel = warm = jnp.zeros(self.model.nv, jnp.float32)
-        for q_in, q_out, v_in, v_out in self._addresses(chosen):
-            qpos = qpos.at[q_in].set(state.qpos[q_out])
-            qvel = qvel.at[v_in].set(state.qvel[v_out])
-            warm = warm.at[v_in].set(state.qacc_warmstart[v_out])
-        return PhysicsState(qpos, qvel, warm)
+        (q_in, q_out), (v_in, v_out) = self._addresses(chosen)
+        qpos, still = jnp.zeros(self.model.nq, jnp.float32), jnp.zeros(self.model.nv, jnp.float32)
+        qvel, warm = (still.at[v_in].set(x[v_out]) for x in (state.qvel, state.qacc_warmstart))
+        return PhysicsState(qpos.at[q_in].set(state.qpos[q_out]), qvel, warm)
 
     def leave(self, state: PhysicsState, inner: PhysicsState, chosen: tuple[jax.Array, ...]) -> PhysicsState:
         """Return the world's new state: what is outside of the window stays, at rest."""
-        qpos, qvel, warm = state.qpos, jnp.zeros_like(state.qvel), jnp.zeros_like(state.qacc_warmstart)
-        for q_in, q_out, v_in, v_out in self._addresses(chosen):
-            qpos = qpos.at[q_out].set(inner.qpos[q_in])
-            qvel = qvel.at[v_out].set(inner.qvel[v_in])
-            warm = warm.at[v_out].set(inner.qacc_warmstart[v_in])
-        return PhysicsState(qpos, qvel, warm)
+        (q_in, q_out), (v_in, v_out) = self._addresses(chosen)
+        still = jnp.zeros_like(state.qvel)
+        qvel, warm = (still.at[v_out].set(x[v_in]) for x in (inner.qvel, inner.qacc_warmstart))
+        return PhysicsState(state.qpos.at[q_out].set(inner.qpos[q_in]), qvel, warm)
 
     def spread_forces(self, forces: jax.Array, chosen: tuple[jax.Array, ...]) -> jax.Array:
         """Spread [..., window slots + 1, 3] forces to [..., world slots + 1, 3], the structure last; 0 elsewhere."""

@@ -10,13 +10,13 @@ import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 from interactive_nav.robots.files import read_file
-from interactive_nav.robots.spec import ControlLaw, RobotCamera, RobotSpec, TwistMap, check_mode, set_servo, wheel_twist
+from interactive_nav.robots.spec import ControlLaw, RobotCamera, RobotSpec, TwistMap, check_mode, set_servo
 from interactive_nav_common.errors import ConfigError
 
 FOLDER = Path(__file__).parent / "mjcf"
@@ -78,31 +78,28 @@ class WheeledBase:
     """MJCF or URDF; none: the builtin file of the robot's name."""
 
     @property
+    def wheel_rows(self) -> tuple[tuple[float, float], ...]:
+        """Return [wheels] rad/s per m/s of the base, and per rad/s: rows of a `TwistMap.matrix`."""
+        radius, sides = self.wheel_radius_m, (joint.side for joint in self.joints if joint.side)
+        return tuple((1.0 / radius, side * self.track_m / (2.0 * radius)) for side in sides)
+
+    @property
     def modes(self) -> tuple[str, ...]:
         """Return the control modes, `native` first."""
         whole = ("whole_body",) if self.whole_body else ()
         return ("native", *whole, "twist", "velocity", "position", "torque")
 
 
-@dataclasses.dataclass(frozen=True)
-class _Action:
+class _Action(NamedTuple):
     name: str
     low: float
     high: float
-    gain: dict[int, float]
-    """Joint index -> control per unit of command."""
-
-
-@dataclasses.dataclass(frozen=True)
-class _Limits:
-    """Of one joint, from the file."""
-
-    range: tuple[float, float] | None
-    effort: float
+    gain: np.ndarray
+    """[J] controls of the joints per unit of command."""
 
 
 def attach(world: mujoco.MjSpec, child: mujoco.MjSpec, prefix: str) -> None:
-    """Attach a robot to a world, its names prefixed, and pairs its rolling geoms with the floor."""
+    """Attach a robot to a world, its names prefixed, and pair its rolling geoms with the floor."""
     rolling = [
         (g.name, list(g.friction), int(g.condim))
         for g in child.geoms
@@ -141,34 +138,37 @@ def half_extents(model: mujoco.MjModel, geom: int) -> np.ndarray:
     return np.abs(model.geom_aabb[geom, :3]) + model.geom_aabb[geom, 3:]
 
 
-def _limits(child: mujoco.MjSpec, joint: Joint) -> _Limits:
+def _limits(child: mujoco.MjSpec, joint: Joint) -> tuple[tuple[float, float] | None, float]:
+    """Return a joint's range in the file, None where it has none, and its torque limit."""
     driven = child.joint(joint.name)
     low, high = (float(v) for v in driven.range)
     effort = float(driven.actfrcrange[1])
     if not effort > 0:
         raise ConfigError(f"joint '{joint.name}' has no torque limit (actuatorfrcrange), expected a positive one")
-    return _Limits((low, high) if low < high else None, effort)
+    return (low, high) if low < high else None, effort
 
 
-def _set_mode(actuator: Any, mode: str, joint: Joint, limits: _Limits, low_high: tuple[float, float] | None) -> None:
+def _set_mode(actuator: Any, kind: str, joint: Joint, effort: float, low_high: tuple[float, float] | None) -> None:
     """Turn an actuator into a position servo, velocity servo or motor; the file has its native one."""
     stiff, damp = float(actuator.gainprm[0]), -float(actuator.biasprm[2])
-    if joint.side:
-        stiff = _WHEEL_STIFFNESS * damp
-        kv = damp
-    else:
-        kv = limits.effort / (_SPEED_ERROR * joint.max_speed)
-    set_servo(actuator, {"position": (stiff, damp), "velocity": (0.0, kv), "torque": None}[mode], low_high)
+    speed = damp if joint.side else effort / (_SPEED_ERROR * joint.max_speed)
+    stiff = _WHEEL_STIFFNESS * damp if joint.side else stiff
+    set_servo(actuator, {"position": (stiff, damp), "velocity": (0.0, speed), "torque": None}[kind], low_high)
 
 
-def _affine_law(
-    matrix: np.ndarray, offset: np.ndarray, relative: np.ndarray, address: np.ndarray, yaw_gain: float
-) -> ControlLaw:
+def _law(base: WheeledBase, mode: str, child: mujoco.MjSpec, actions: list[_Action]) -> ControlLaw | None:
     """Return the law controls = matrix @ command + offset, plus the joint's position where the command is an advance.
 
-    With a yaw gain the command is a twist, whose turn is raised by the gain times its error.
+    With a yaw gain a commanded turn is raised by the gain times its error. None: the command is the controls.
     """
-    moved = bool(relative.any())
+    joints, model = base.joints, child.copy().compile()
+    matrix = np.stack([action.gain for action in actions], 1)
+    offset = np.where(matrix.any(1), 0.0, [joint.home for joint in joints])
+    relative = np.asarray([float(mode == "position" and joint.side != 0) for joint in joints])
+    address = np.asarray([model.joint(joint.name).qposadr[0] for joint in joints])
+    moved, yaw_gain = bool(relative.any()), base.yaw_gain if mode == "twist" else 0.0
+    if np.array_equal(matrix, np.eye(len(joints))) and not moved:
+        return None
 
     def law(command, state, xp):
         if yaw_gain:
@@ -183,133 +183,57 @@ def _affine_law(
     return law
 
 
-class _Mode:
-    """One control mode: servo kind per joint, actions, joints that are held at home."""
+def _mode(base: WheeledBase, mode: str, limits: list[tuple[Any, float]]) -> tuple[list[str], list[_Action]]:
+    """Return the servo of each joint (position, velocity or torque) and the actions of a control mode."""
+    joints, alone = base.joints, np.eye(len(base.joints))
+    wheels, names = [i for i, joint in enumerate(joints) if joint.side], [joint.name for joint in joints]
+    servos, actions = ["position"] * len(joints), []
 
-    def __init__(self, base: WheeledBase, limits: list[_Limits]):
-        self.base, self.limits = base, limits
-        self.kind = ["position"] * len(base.joints)
-        self.actions: list[_Action] = []
-        self.relative: set[int] = set()
+    def drive(i: int, kind: str, *native: float) -> None:
+        joint, (span, effort), advance = joints[i], limits[i], joints[i].max_speed * _ADVANCE_S
+        place = ("advance rad", -advance, advance) if joint.side else (joint.unit, *(span or (-math.pi, math.pi)))
+        unit, low, high = {
+            "torque": ("N" if joint.unit == "m" else "N m", -effort, effort),
+            "velocity": (f"{joint.unit}/s", -joint.max_speed, joint.max_speed),
+            "position": place,
+        }[kind]
+        servos[i] = kind
+        actions.append(_Action(f"{joint.label} {unit}", *(native or (low, high)), alone[i]))
 
-    def _each(self, indices, kind: str) -> None:
-        for i in indices:
-            joint, limit = self.base.joints[i], self.limits[i]
-            self.kind[i] = kind
-            if kind == "torque":
-                unit = "N" if joint.unit == "m" else "N m"
-                action = _Action(f"{joint.label} {unit}", -limit.effort, limit.effort, {i: 1.0})
-            elif kind == "velocity":
-                action = _Action(f"{joint.label} {joint.unit}/s", -joint.max_speed, joint.max_speed, {i: 1.0})
-            elif joint.side:
-                self.relative.add(i)
-                advance = joint.max_speed * _ADVANCE_S
-                action = _Action(f"{joint.label} advance rad", -advance, advance, {i: 1.0})
-            else:
-                low, high = limit.range or (-math.pi, math.pi)
-                action = _Action(f"{joint.label} {joint.unit}", low, high, {i: 1.0})
-            self.actions.append(action)
-
-    def _wheels(self) -> None:
-        low, high = self.base.native
-        unit = "N m" if self.base.native_torque else "rad/s"
-        for i in self.wheels:
-            self.kind[i] = "torque" if self.base.native_torque else "velocity"
-            self.actions.append(_Action(f"{self.base.joints[i].label} {unit}", low, high, {i: 1.0}))
-
-    @property
-    def wheels(self) -> list[int]:
-        return [i for i, joint in enumerate(self.base.joints) if joint.side]
-
-    def choose(self, mode: str) -> None:
-        base = self.base
-        if mode in ("velocity", "position", "torque"):
-            self._each(range(len(base.joints)), mode)
-        elif mode == "twist":
-            rows = wheel_twist(base.wheel_radius_m, base.track_m, tuple(base.joints[i].side for i in self.wheels))
-            for i in self.wheels:
-                self.kind[i] = "velocity"
-            least = -base.max_linear_m_s if base.min_linear_m_s is None else base.min_linear_m_s
-            linear = {i: row[0] for i, row in zip(self.wheels, rows, strict=True)}
-            angular = {i: row[1] for i, row in zip(self.wheels, rows, strict=True)}
-            self.actions = [
-                _Action("forward m/s", least, base.max_linear_m_s, linear),
-                _Action("turn rad/s", -base.max_angular_rad_s, base.max_angular_rad_s, angular),
-            ]
-        else:
-            self._wheels()
-        if mode == "whole_body":
-            index = {joint.name: i for i, joint in enumerate(base.joints)}
-            self._each([index[name] for name in base.whole_body], "velocity")
-            if base.gripper:
-                fingers = [index[name] for name in base.gripper]
-                low, high = self.limits[fingers[0]].range or (0.0, 0.0)
-                self.actions.append(_Action("finger opening m", low, high, dict.fromkeys(fingers, 1.0)))
-
-    def twist_map(self, mode: str) -> TwistMap | None:
-        base = self.base
-        if mode == "twist":
-            rows: tuple[tuple[float, float], ...] = ((1.0, 0.0), (0.0, 1.0))
-        elif mode in ("position", "torque") or (mode in ("native", "whole_body") and base.native_torque):
-            return None
-        else:
-            driven = wheel_twist(base.wheel_radius_m, base.track_m, tuple(base.joints[i].side for i in self.wheels))
-            rows = driven + ((0.0, 0.0),) * (len(self.actions) - len(driven))
-        return TwistMap(rows, base.max_linear_m_s, base.max_angular_rad_s)
-
-    def law(self, mode: str) -> ControlLaw | None:
-        count = len(self.base.joints)
-        matrix = np.zeros((count, len(self.actions)), np.float64)
-        for a, action in enumerate(self.actions):
-            for i, gain in action.gain.items():
-                matrix[i, a] = gain
-        driven = {i for action in self.actions for i in action.gain}
-        offset = np.asarray([0.0 if i in driven else joint.home for i, joint in enumerate(self.base.joints)])
-        if matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, np.eye(count)) and not self.relative:
-            return None
-        relative = np.asarray([float(i in self.relative) for i in range(count)])
-        gain = self.base.yaw_gain if mode == "twist" else 0.0
-        return _affine_law(matrix, offset, relative, self.qpos_address, gain)
-
-    qpos_address: np.ndarray = np.zeros(0, np.int64)
-    """[joints] addresses among the robot's qpos."""
-
-    def set_servos(self, child: mujoco.MjSpec) -> None:
-        bounds: dict[int, tuple[float, float]] = {}
-        if self.actions and not self.relative:
-            for action in self.actions:
-                for i, gain in action.gain.items():
-                    if gain == 1.0 and len(action.gain) == 1:
-                        bounds[i] = (action.low, action.high)
-        for i, joint in enumerate(self.base.joints):
-            if i not in bounds and not joint.side and self.limits[i].range and self.kind[i] == "position":
-                bounds[i] = self.limits[i].range  # type: ignore[assignment]
-            _set_mode(child.actuator(joint.name), self.kind[i], joint, self.limits[i], bounds.get(i))
+    if mode == "twist":
+        gains, least = np.zeros((len(joints), 2)), base.min_linear_m_s
+        gains[wheels] = base.wheel_rows
+        for i in wheels:
+            servos[i] = "velocity"
+        least = -base.max_linear_m_s if least is None else least
+        actions.append(_Action("forward m/s", least, base.max_linear_m_s, gains[:, 0]))
+        actions.append(_Action("turn rad/s", -base.max_angular_rad_s, base.max_angular_rad_s, gains[:, 1]))
+    for i in range(len(joints)) if mode in ("velocity", "position", "torque") else ():
+        drive(i, mode)
+    for i in wheels if mode in ("native", "whole_body") else ():
+        drive(i, "torque" if base.native_torque else "velocity", *base.native)
+    if mode == "whole_body":
+        for name in base.whole_body:
+            drive(names.index(name), "velocity")
+        if base.gripper:
+            fingers = [names.index(name) for name in base.gripper]
+            actions.append(_Action("finger opening m", *(limits[fingers[0]][0] or (0.0, 0.0)), alone[fingers].sum(0)))
+    return servos, actions
 
 
-def _load(base: WheeledBase, base_body: str, prepare: Callable[[mujoco.MjSpec], None] | None) -> mujoco.MjSpec:
-    """Return the robot's file, parsed and prepared; it has a joint and an actuator of each driven joint's name."""
-    path = base.path or FOLDER / f"{base.name}.xml"
-    child = read_file(path, base_body)
-    if prepare is not None:
-        prepare(child)
-    missing = [j.name for j in base.joints if child.joint(j.name) is None or child.actuator(j.name) is None]
-    if missing:
-        raise ConfigError(f"robot file {path}: no joint and actuator named '{missing[0]}'")
-    return child
-
-
-def _mode(base: WheeledBase, child: mujoco.MjSpec, control_mode: str) -> _Mode:
-    mode = _Mode(base, [_limits(child, joint) for joint in base.joints])
-    mode.choose(control_mode)
-    compiled = child.copy().compile()
-    mode.qpos_address = np.asarray([compiled.joint(j.name).qposadr[0] for j in base.joints])
-    return mode
+def _twist_map(base: WheeledBase, mode: str, num_actions: int) -> TwistMap | None:
+    """Return how the commands of a control mode move the base."""
+    rows = ((1.0, 0.0), (0.0, 1.0))
+    if mode in ("position", "torque") or (mode in ("native", "whole_body") and base.native_torque):
+        return None
+    if mode != "twist":
+        rows = base.wheel_rows + ((0.0, 0.0),) * (num_actions - len(base.wheel_rows))
+    return TwistMap(rows, base.max_linear_m_s, base.max_angular_rad_s)
 
 
 def wheeled_robot(
-    base: WheeledBase,
     control_mode: str,
+    base: WheeledBase,
     prepare: Callable[[mujoco.MjSpec], None] | None = None,
     *,
     base_body: str = "base",
@@ -326,31 +250,44 @@ def wheeled_robot(
     """
     check_mode(base.name, control_mode, base.modes)
     prefix = f"{base.name}_"
-    child = _load(base, base_body, prepare)
-    mode = _mode(base, child, control_mode)
+    path, joints = base.path or FOLDER / f"{base.name}.xml", base.joints
+    child = read_file(path, base_body)
+    if prepare is not None:
+        prepare(child)
+    missing = [j.name for j in joints if child.joint(j.name) is None or child.actuator(j.name) is None]
+    if missing:
+        raise ConfigError(f"robot file {path}: no joint and actuator named '{missing[0]}'")
+    limits = [_limits(child, joint) for joint in joints]
+    servos, actions = _mode(base, control_mode, limits)
     free = next(j.name for j in child.body(base_body).joints)
 
     def add_to(world: mujoco.MjSpec) -> None:
-        robot = _load(base, base_body, prepare)
-        mode.set_servos(robot)
+        robot = child.copy()
+        of_joint = zip(joints, servos, limits, strict=True)
+        bounds = [span if kind == "position" and not joint.side else None for joint, kind, (span, _) in of_joint]
+        for action in actions if control_mode != "position" else ():  # in which wheels advance from where they are
+            if np.count_nonzero(action.gain) == 1 and action.gain.max() == 1.0:
+                bounds[int(action.gain.argmax())] = action.low, action.high
+        for joint, kind, (_, effort), low_high in zip(joints, servos, limits, bounds, strict=True):
+            _set_mode(robot.actuator(joint.name), kind, joint, effort, low_high)
         attach(world, robot, prefix)
 
-    wheels = rolling or tuple(child.joint(j.name).parent.name for j in base.joints if j.side)
+    wheels = rolling or tuple(child.joint(j.name).parent.name for j in joints if j.side)
     return RobotSpec(
         name=base.name,
         add_to=add_to,
         base_body=f"{prefix}{base_body}",
         base_joint=f"{prefix}{free}",
-        actuators=tuple(f"{prefix}{joint.name}" for joint in base.joints),
-        action_low=tuple(a.low for a in mode.actions),
-        action_high=tuple(a.high for a in mode.actions),
-        action_names=tuple(a.name for a in mode.actions),
+        actuators=tuple(f"{prefix}{joint.name}" for joint in joints),
+        action_low=tuple(a.low for a in actions),
+        action_high=tuple(a.high for a in actions),
+        action_names=tuple(a.name for a in actions),
         camera=dataclasses.replace(camera, body=f"{prefix}{camera.body}"),
-        home_qpos=tuple((f"{prefix}{j.name}", j.home) for j in base.joints if j.home),
+        home_qpos=tuple((f"{prefix}{j.name}", j.home) for j in joints if j.home),
         rolling_bodies=tuple(f"{prefix}{name}" for name in wheels),
         control_mode=control_mode,
         control_modes=base.modes,
-        control=mode.law(control_mode),
-        twist=mode.twist_map(control_mode),
+        control=_law(base, control_mode, child, actions),
+        twist=_twist_map(base, control_mode, len(actions)),
         **{"spawn_height_m": 0.0, **figures},
     )

@@ -91,14 +91,6 @@ def _sides(left_wheels: tuple[str, ...], right_wheels: tuple[str, ...]) -> dict[
     return dict.fromkeys(left_wheels, -1) | dict.fromkeys(right_wheels, 1)
 
 
-def _other_joints(child: mujoco.MjSpec, speeds: Mapping[str, float], home: Mapping[str, float]) -> tuple[Joint, ...]:
-    slide = mujoco.mjtJoint.mjJNT_SLIDE
-    return tuple(
-        Joint(name, speed, home.get(name, 0.0), unit="m" if child.joint(name).type == slide else "rad")
-        for name, speed in speeds.items()
-    )
-
-
 def _base(
     name: str,
     path: Path,
@@ -163,19 +155,15 @@ def _factory(
     change(read_file(base.path, base_body))
     build = functools.partial(
         wheeled_robot,
-        base,
+        base=base,
         prepare=quietly,
         base_body=base_body,
         rolling=(*(w.body for w in facts.wheels), *casters),
         spawn_height_m=-facts.bottom_m,
+        camera=RobotCamera(base_body, (0, 0, 0)),
+        **dict.fromkeys(("body_width_m", "footprint_radius_m", "height_m"), 0.0),
     )
-    figures = {
-        "body_width_m": 0.0,
-        "footprint_radius_m": 0.0,
-        "height_m": 0.0,
-        "camera": RobotCamera(base_body, (0, 0, 0)),
-    }
-    low, high, reach, mass = _outline(build("native", **figures))  # type: ignore[arg-type]
+    low, high, reach, mass = _outline(build("native"))
     size = (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2]))
     build = functools.partial(
         build,
@@ -244,7 +232,8 @@ def from_file(
         find(child, path, "joint", joint)
     strip(child, path, base_body)
     facts = _read_facts(child, path, base_body, sides)
-    others = _other_joints(child, driven, home or {})
+    units = {j.name: "m" if j.type == mujoco.mjtJoint.mjJNT_SLIDE else "rad" for j in child.joints}
+    others = tuple(Joint(j, speed, dict(home or {}).get(j, 0.0), unit=units[j]) for j, speed in driven.items())
     base = _base(name, path, facts, max_wheel_speed_rad_s, others, track_m, max_linear_m_s, max_angular_rad_s)
     change = functools.partial(complete, path, facts, base, base_body, casters, limits, dict(home or {}))
     return _factory(base, facts, base_body, casters, change, camera, body_width_m)

@@ -189,6 +189,7 @@ def legged_robot(legs: Legged, control_mode: str = "native", **figures: Any) -> 
     joint_mode = legs.native if control_mode == "native" else control_mode
     twist = control_mode == "twist"
     low, high = _command_range(legs, joint_mode)
+    row = vars(legged_row(legs.name))
     fields: dict[str, Any] = {
         "action_low": low,
         "action_high": high,
@@ -207,5 +208,5 @@ def legged_robot(legs: Legged, control_mode: str = "native", **figures: Any) -> 
         control_modes=legs.modes,
         control_every_substep=twist,
         twist=TwistMap(((1.0, 0.0), (0.0, 1.0)), legs.max_linear_m_s, legs.max_angular_rad_s) if twist else None,
-        **(fields | legged_row(legs.name).figures("legs", "gait") | figures),
+        **(fields | {name: row[name] for name in row.keys() - {"legs", "gait"}} | figures),
     )

@@ -18,8 +18,7 @@ import numpy as np
 
 from interactive_nav.robots.factory import from_file
 from interactive_nav.robots.files import compiled, read_file, warn
-from interactive_nav.robots.joints import FLOOR_M
-from interactive_nav.robots.repair import slip_torque_n_m, strip
+from interactive_nav.robots.repair import FLOOR_M, slip_torque_n_m, strip
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import write_text, writing

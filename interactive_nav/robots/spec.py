@@ -50,11 +50,6 @@ class TwistMap:
     max_angular_rad_s: float
 
 
-def wheel_twist(wheel_radius_m: float, track_m: float, sides: tuple[int, ...]) -> tuple[tuple[float, float], ...]:
-    """Return rows of a `TwistMap.matrix` for wheels on the left (-1) and right (+1) of a differential or skid steer."""
-    return tuple((1.0 / wheel_radius_m, side * track_m / (2.0 * wheel_radius_m)) for side in sides)
-
-
 def check_mode(robot: str, mode: str, modes: tuple[str, ...]) -> None:
     """Raise ConfigError for a control mode that the robot does not have."""
     if mode not in modes:
@@ -64,7 +59,7 @@ def check_mode(robot: str, mode: str, modes: tuple[str, ...]) -> None:
 def set_servo(
     actuator: mujoco.MjsActuator, gains: tuple[float, float] | None, control_range: tuple[float, float] | None
 ) -> None:
-    """Turn an actuator a servo of its joint, or a motor.
+    """Turn an actuator into a servo of its joint, or a motor.
 
     Args:
         gains: stiffness and damping; without stiffness the control is a velocity, else a position; None: a force.
@@ -187,7 +182,3 @@ class Figures:
     size_m: tuple[float, float, float]
     drive_type: str
     source: str
-
-    def figures(self, *others: str) -> dict[str, Any]:
-        """Return the figures by name, without the row's other columns."""
-        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in others}

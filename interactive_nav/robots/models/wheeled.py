@@ -24,7 +24,7 @@ class _Row(Figures):
 
 
 WHEELED = {
-    row.base.name: functools.partial(wheeled_robot, row.base, **row.figures("base"))
+    row.base.name: functools.partial(wheeled_robot, **vars(row))
     for row in read_packaged(Path(__file__).with_suffix(".yaml"), tuple[_Row, ...])
 }
 """Name -> control mode -> spec."""

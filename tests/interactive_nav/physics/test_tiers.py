@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from interactive_nav.config import NavConfig, WindowTier, parse_window_tiers
-from interactive_nav.physics import PhysicsState, make_physics, tiers
-from interactive_nav.physics.tiers import TieredPhysics, assign, propose_tiers, tier_sizes
+from interactive_nav.physics import PhysicsState, make_physics, mjx_batch
+from interactive_nav.physics.mjx_batch import TieredPhysics, assign, propose_tiers, tier_sizes
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
@@ -108,7 +108,7 @@ def engines(world):
     tiered = make_physics(world, NavConfig.of(windows=("0.75 1 0 0 2",), **config))
     assert isinstance(tiered, TieredPhysics)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tiers, "LEAST_ENVS", 8)
+        patch.setattr(mjx_batch, "LEAST_ENVS", 8)
         step, state, scene = jax.jit(jax.vmap(tiered.step)), *_start(world)
         step(scene, state, jnp.zeros((8, 2)))  # compiled while small batches are sorted
         yield tiered, step, jax.jit(make_physics(world, NavConfig.of(**config)).step_batch)
@@ -147,7 +147,7 @@ def test_those_without_room_are_counted(world, engines):
 @pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="needs the package warp-lang")
 def test_warp_steps_two_windows_in_one_program(world, monkeypatch):
     """Each with buffers of its own, and in the order of the batch."""
-    monkeypatch.setattr(tiers, "LEAST_ENVS", 8)
+    monkeypatch.setattr(mjx_batch, "LEAST_ENVS", 8)
     config = NavConfig.of(backend="warp", num_objects=1, windows=("0.75 1 0 0 2",), **ALL)
     tiered = make_physics(world, config)
     assert isinstance(tiered, TieredPhysics)

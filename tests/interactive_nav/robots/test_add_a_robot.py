@@ -84,7 +84,7 @@ def test_a_model_and_a_row_add_a_wheeled_robot(tmp_path, monkeypatch, registry):
     (row,) = [row for row in rows if row["base"]["name"] == "turtlebot"]
     row["base"] |= {"name": "puck", "max_linear_m_s": 0.5}
     (row,) = read_packaged(_write(tmp_path, yaml.safe_dump([row]), "wheeled.yaml"), tuple[wheeled._Row, ...])
-    robots._FACTORIES["puck"] = functools.partial(build.wheeled_robot, row.base, **row.figures("base"))
+    robots._FACTORIES["puck"] = functools.partial(build.wheeled_robot, **vars(row))
     assert "puck" in robots.robot_names()
     scene = write_room(tmp_path / "room", (4.0, 3.0), ())
     env = interactive_nav.make("puck", [scene], num_objects=0, control_mode="twist", backend="native")

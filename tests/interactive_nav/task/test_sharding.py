@@ -162,11 +162,11 @@ from pathlib import Path
 import interactive_nav
 import jax, jax.numpy as jnp
 from interactive_nav.config import NavConfig
-from interactive_nav.physics import make_physics, tiers
+from interactive_nav.physics import make_physics, mjx_batch
 from interactive_nav.task.sharding import ShardedEnv
 from tests.interactive_nav.physics import test_tiers as toy
 
-tiers.LEAST_ENVS = 4
+mjx_batch.LEAST_ENVS = 4
 world = toy.world_in(Path(sys.argv[1]))
 physics = make_physics(world, NavConfig.of(backend="jax", num_objects=1, windows=("0.75 1 0 0 2",), **toy.ALL))
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from interactive_nav.robots import get_robot
-from interactive_nav.robots.spec import TwistMap, wheel_twist
+from interactive_nav.robots.spec import TwistMap
 from interactive_nav.task.rollout import episode_keys
 from interactive_nav_common.errors import UserError
 from tests.train.toy_env import ToyConfig, ToyEnv
@@ -22,7 +22,7 @@ ROBOT = dataclasses.replace(
     get_robot("turtlebot"),
     action_low=(-10.0, -10.0),
     action_high=(30.0, 30.0),
-    twist=TwistMap(wheel_twist(0.05, 0.2, (-1, 1)), 1.5, 5.0),
+    twist=TwistMap(((20.0, -2.0), (20.0, 2.0)), 1.5, 5.0),
 )
 
 
@@ -45,7 +45,7 @@ def test_steering_by_hand(target_b, wheels_rad_s):
 
 
 def test_a_slow_robot_is_not_asked_for_more_than_it_can():
-    slow = dataclasses.replace(ROBOT, twist=TwistMap(wheel_twist(0.05, 0.2, (-1, 1)), 0.25, 1.0))
+    slow = dataclasses.replace(ROBOT, twist=TwistMap(((20.0, -2.0), (20.0, 2.0)), 0.25, 1.0))
     # Straight ahead at 0.25 m/s: 5 rad/s; on the spot at 1 rad/s: -+0.1 / 0.05 = -+2 rad/s.
     np.testing.assert_allclose(steer(slow, jnp.array([1.0, 0.0])), [-0.25, -0.25], atol=1e-6)
     np.testing.assert_allclose(steer(slow, jnp.array([0.0, 1.0])), [-0.6, -0.4], atol=1e-6)
