@@ -30,11 +30,10 @@ from rich.console import Console
 
 import interactive_nav
 from interactive_nav.physics import resolve_backend
-from interactive_nav.physics.nearness import widths_at
 from interactive_nav.physics.mjx_batch import KINDS, propose_tiers
+from interactive_nav.physics.nearness import widths_at
 from interactive_nav.physics.window import PhysicsWindow
-from interactive_nav.task.sharding import ShardedEnv
-from interactive_nav.task.wrappers import AutoResetEnv
+from interactive_nav.task.wrappers import AutoResetEnv, ShardedEnv
 from interactive_nav.types import FAILURES
 from interactive_nav_common.versions import commit, package_versions
 from interactive_nav_common.words import Parser, add_words, read_commands

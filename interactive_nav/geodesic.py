@@ -159,11 +159,11 @@ _CELLS_APART = 2**0.5
 """The middles of two points' cells lie at most this much farther apart than the points, in cells."""
 
 
-def sees(free: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def sees(room: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return which pairs of points see each other over free cells.
 
     Args:
-        free: [R, C] bool.
+        room: [R, C] `clearance` in cells, 0 where a cell is not free.
         a: [P, 2] points (column, row) in cells.
         b: [P, 2] likewise.
 
@@ -171,19 +171,17 @@ def sees(free: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         [P] bool. Halving: the middle first, so that most blocked pairs cost a few samples; a part that lies
         within what is certainly free around its middle is not halved further.
     """
-    free = np.pad(free, 1)
-    columns = free.shape[1]
-    flat, clear = free.ravel(), clearance(free, 1.0).ravel()
-    step = b - a
+    room = np.pad(room, 1)
+    columns, clear, step = room.shape[1], room.ravel(), b - a
     length = np.linalg.norm(step, axis=-1)
     out = np.ones(len(a), bool)
-    low, high = -1.0, np.asarray(free.shape[::-1], float) - 2.0
+    low, high = -1.0, np.asarray(room.shape[::-1], float) - 2.0
     pair, middle, half = np.arange(len(a)), np.full(len(a), 0.5), 0.5
     while len(pair):
         at = np.clip(a[pair] + middle[:, None] * step[pair], low, high)
         cell = np.floor(at).astype(np.intp) + 1
         index = cell[:, 1] * columns + cell[:, 0]
-        out[pair[~flat[index]]] = False
+        out[pair[clear[index] == 0]] = False
         reach = length[pair] * half
         open_ = out[pair] & (2 * reach > _SIGHT_STEP) & (reach + _CELLS_APART >= clear[index])
         pair, middle, half = pair[open_], middle[open_], half / 2
@@ -192,7 +190,7 @@ def sees(free: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _visible_corners(
-    free: np.ndarray, points: np.ndarray, corners: np.ndarray, into: np.ndarray, slack: float
+    room: np.ndarray, points: np.ndarray, corners: np.ndarray, into: np.ndarray, slack: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return pairs (point, corner) in sight of which a shortest path may bend at the corner.
 
@@ -207,17 +205,16 @@ def _visible_corners(
         part = points[begin : begin + block]
         towards = (part[:, None] - corners[None]) * into[None]
         i, j = np.nonzero(~(towards < -slack).all(-1) & ~(towards > slack).all(-1))
-        ok = sees(free, part[i], corners[j])
+        ok = sees(room, part[i], corners[j])
         firsts.append(begin + i[ok])
         seconds.append(j[ok])
     return np.concatenate(firsts), np.concatenate(seconds)
 
 
-def _nodes(free: np.ndarray, ratio: int) -> tuple[np.ndarray, np.ndarray]:
+def _nodes(room: np.ndarray, ratio: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the node of each coarse cell, `ratio` x `ratio` fine ones, and the nodes' points [n, 2] in fine cells."""
-    rows, columns = (-(-n // ratio) for n in free.shape)
-    margin = np.zeros((rows * ratio, columns * ratio))
-    margin[: free.shape[0], : free.shape[1]] = clearance(free, 1.0)
+    rows, columns = (-(-n // ratio) for n in room.shape)
+    margin = np.pad(room, [(0, n * ratio - m) for n, m in zip((rows, columns), room.shape, strict=True)])
     # The node of a cell is the middle of that of its fine cells that lies farthest from what is blocked.
     split = margin.reshape(rows, ratio, columns, ratio).swapaxes(1, 2).reshape(rows, columns, -1)
     best = split.argmax(-1)
@@ -252,10 +249,11 @@ def corner_graph(free: np.ndarray, fine_m: float, cell_m: float, origin_w: tuple
     free = largest_component(_without_pinches(np.asarray(free, bool)))
     if not free.any():
         raise ValueError("free has no free cell, expected at least one")
-    node_of_cell, points = _nodes(free, ratio)
+    room = clearance(free, 1.0)
+    node_of_cell, points = _nodes(room, ratio)
     corners, into = _corners(free)
     count = len(corners)
-    i, j = _visible_corners(free, corners, corners, into, 2 * _INSET)
+    i, j = _visible_corners(room, corners, corners, into, 2 * _INSET)
     both = scipy.sparse.csr_matrix((np.ones(len(i)), (i, j)), shape=(count, count))
     both = scipy.sparse.coo_matrix(both.multiply(both.T))
     i, j = both.row[both.row != both.col], both.col[both.row != both.col]
@@ -267,7 +265,7 @@ def corner_graph(free: np.ndarray, fine_m: float, cell_m: float, origin_w: tuple
         following = np.where(previous.T < 0, np.arange(count)[:, None], previous.T)
     else:
         distance, following = np.zeros((0, 0)), np.zeros((0, 0))
-    i, j = _visible_corners(free, points, corners, into, ratio)
+    i, j = _visible_corners(room, points, corners, into, ratio)
     per_node = np.bincount(i, minlength=len(points))
     visible = np.full((len(points), max(int(per_node.max()), 1)), count, np.int64)
     visible[i, np.arange(len(i)) - np.repeat(np.cumsum(per_node) - per_node, per_node)] = j

@@ -20,12 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import interactive_nav
-from interactive_nav.interop.gym_steps import NONFINITE_ACTIONS, reset_where, step
 from interactive_nav.interop.torch_bridge import to_jax, to_torch
 from interactive_nav.pictures.camera import ThirdPerson
 from interactive_nav.robots import robot_names
 from interactive_nav.task.env import InteractiveNav
-from interactive_nav.task.wrappers import reset_all, scene_of_slot
+from interactive_nav.task.wrappers import NONFINITE_ACTIONS, reset_all, reset_where, scene_of_slot, step_all
 from interactive_nav_common.errors import ConfigError, MissingPackage, missing
 from scenes_mjcf.robot_facts import title
 
@@ -122,7 +121,31 @@ def _to_numpy(tree: Any) -> Any:
     return jax.tree.map(np.array, tree)
 
 
-class InteractiveNavEnv(gymnasium.Env):
+class _Playing:
+    """Holds what one environment and a batch have alike: the environment, its camera and the present state."""
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
+    _state: Any = None
+
+    def _make(self, robot: str, scenes: Sequence[str], render_mode: str | None, settings: dict[str, Any]) -> None:
+        self.env = interactive_nav.make(robot, scenes, **settings)
+        modes = self.metadata["render_modes"]
+        if render_mode is not None and render_mode not in modes:
+            raise ConfigError(f"render_mode is {render_mode!r}, expected one of {', '.join(modes)} or none")
+        self.render_mode, self._camera = render_mode, ThirdPerson(self.env)
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.env.dt)}
+
+    def _check_begun(self) -> None:
+        _refuse_fork()
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("step was called before reset")
+
+    def _frames(self) -> tuple[np.ndarray, ...] | None:
+        rendered = self.render_mode is not None and self._state is not None
+        return self._camera.frames(self._state) if rendered else None
+
+
+class InteractiveNavEnv(_Playing, gymnasium.Env):
     """One environment.
 
     Observation: float32 (29,) by default, see `interactive_nav.sensing.observation`; a dictionary where it has images.
@@ -133,8 +156,6 @@ class InteractiveNavEnv(gymnasium.Env):
     (`env.metric_names`: success, path_efficiency, effort_efficiency, ins_0.5, ...).
     `reset(options={"start": EpisodeStart})` plays a given episode.
     """
-
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
 
     def __init__(
         self,
@@ -157,21 +178,18 @@ class InteractiveNavEnv(gymnasium.Env):
             ConfigError: as `interactive_nav.make`, or a slot without that choice or that choice without a slot.
         """
         if _forked() and _SPACES:  # Gymnasium's worker passes on what its first `reset` raises, but nothing from here
-            self._state, self.render_mode = None, render_mode
+            self.render_mode = render_mode
             self.observation_space, self.action_space = _SPACES  # pyright: ignore[reportAttributeAccessIssue]
             return
         _refuse_fork()
-        self.env = interactive_nav.make(robot, scenes, **settings)
+        self._make(robot, scenes, render_mode, settings)
         kept = _checked_slot(self.env, slot)
-        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.env.dt)}
-        self.render_mode, self._camera = _checked_render_mode(render_mode), ThirdPerson(self.env)
         self.observation_space = observation_space_of(self.env)
         self.action_space = action_space_of(self.env)
         _SPACES[:] = self.observation_space, self.action_space
         self._reset = jax.jit(lambda key: self.env.reset(key, kept))
         self._reset_to = jax.jit(self.env.reset_to)
         self._step = jax.jit(self.env.step)
-        self._state: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Draw an episode; with a seed, always the same sequence of episodes from here on."""
@@ -185,9 +203,7 @@ class InteractiveNavEnv(gymnasium.Env):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Advance by one control period."""
-        _refuse_fork()
-        if self._state is None:
-            raise gymnasium.error.ResetNeeded("step was called before reset")
+        self._check_begun()
         action = np.asarray(action, np.float32)
         self._state = state = self._step(self._state, jnp.asarray(action))
         done, truncated = bool(state.done > 0), bool(state.info["truncation"] > 0)
@@ -199,11 +215,11 @@ class InteractiveNavEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """Return a (rows, columns, 3) u8 third-person view of the present state; None without a render mode."""
-        rendered = self.render_mode is not None and self._state is not None
-        return self._camera.frames(self._state)[0] if rendered else None
+        frames = self._frames()
+        return frames and frames[0]
 
 
-class InteractiveNavVectorEnv(VectorEnv):
+class InteractiveNavVectorEnv(_Playing, VectorEnv):
     """N environments stepped by one compiled program.
 
     `autoreset_mode` says what follows an episode's end (https://farama.org/Vector-Autoreset-Mode):
@@ -245,14 +261,9 @@ class InteractiveNavVectorEnv(VectorEnv):
         if arrays not in ARRAYS:
             raise ConfigError(f"arrays is {arrays!r}, expected one of {', '.join(ARRAYS)}")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.env = interactive_nav.make(robot, scenes, **settings)
+        self._make(robot, scenes, render_mode, settings)
         self.num_envs, self.arrays = num_envs, arrays
-        self.render_mode, self._camera = _checked_render_mode(render_mode), ThirdPerson(self.env)
-        self.metadata = {
-            **InteractiveNavEnv.metadata,
-            "render_fps": round(1.0 / self.env.dt),
-            "autoreset_mode": self.autoreset_mode,
-        }
+        self.metadata["autoreset_mode"] = self.autoreset_mode
         self.single_observation_space = observation_space_of(self.env)
         self.single_action_space = action_space_of(self.env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -260,8 +271,7 @@ class InteractiveNavVectorEnv(VectorEnv):
         self._reset = jax.jit(functools.partial(reset_all, self.env))
         self._reset_to = jax.jit(jax.vmap(self.env.reset_to))
         self._reset_where = jax.jit(functools.partial(reset_where, self.env))
-        self._step = jax.jit(functools.partial(step, self.env, self.autoreset_mode))
-        self._state: Any = None
+        self._step = jax.jit(functools.partial(step_all, self.env, self.autoreset_mode.name))
         self._ended = jnp.zeros(num_envs, bool)
 
     def reset(
@@ -296,9 +306,7 @@ class InteractiveNavVectorEnv(VectorEnv):
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Advance by one control period; see the class for what follows an episode's end."""
-        _refuse_fork()
-        if self._state is None:
-            raise gymnasium.error.ResetNeeded("step was called before reset")
+        self._check_begun()
         if self.autoreset_mode is AutoresetMode.DISABLED and bool(self._ended.any()):
             raise gymnasium.error.ResetNeeded(
                 f"episodes of environments {np.flatnonzero(self._ended).tolist()} are over: "
@@ -314,8 +322,7 @@ class InteractiveNavVectorEnv(VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return a third-person view of each environment; None without a render mode."""
-        rendered = self.render_mode is not None and self._state is not None
-        return self._camera.frames(self._state) if rendered else None
+        return self._frames()
 
     def _keys(self, seed: int | Sequence[int | None] | None) -> jax.Array:
         n = self.num_envs
@@ -385,13 +392,6 @@ def _checked_slot(env: InteractiveNav, slot: int | None) -> jax.Array | None:
             "slot=I, make a batch (gymnasium.make_vec), or set scene_choice='episode'"
         )
     return scene_of_slot(env, jnp.asarray(slot or 0, jnp.int32))
-
-
-def _checked_render_mode(mode: str | None) -> str | None:
-    modes = InteractiveNavEnv.metadata["render_modes"]
-    if mode is not None and mode not in modes:
-        raise ConfigError(f"render_mode is {mode!r}, expected one of {', '.join(modes)} or none")
-    return mode
 
 
 register_envs()

@@ -15,7 +15,6 @@ import numpy as np
 from jax import custom_batching
 
 from interactive_nav.config import TaskRules
-from interactive_nav.scenes.contacts import combine
 
 
 def _flatten(tree: Any, outer: int, inner: int) -> Any:
@@ -149,9 +148,15 @@ def summarise_forces(
 
     Args:
         force_w: [..., substeps, M + 1, 3] net force on each slot, the structure last, N.
+        contacts: of `from_sensors`, leaves [..., substeps, (3)]; None: no option asks.
     """
     each = xp.sqrt((force_w**2).sum(-1)).max(-2)
-    force, body = combine(force_w.sum(-2), contacts, options.force_part, options.force_sum, xp)
+    vector = force_w.sum(-2) if contacts is None or options.force_part == "full" else contacts[0]
+    length = xp.sqrt((vector**2).sum(-1))
+    if contacts is not None and options.force_sum == "contacts":
+        length = contacts[1]
+    force = length[..., -1] if options.force_sum == "last_substep" else length.mean(-1)
+    body = xp.zeros_like(force) if contacts is None else contacts[2].max(-1)
     values = {
         "force_n": force,
         "slot_force_n": each[..., :-1],

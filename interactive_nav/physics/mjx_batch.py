@@ -1,8 +1,9 @@
 """Step with both implementations of MuJoCo MJX: `warp` (NVIDIA) and `jax` (any XLA device).
 
 Environments differ only in model fields: each fills the slots of one small model from its scene's tables
-(`window.py`). The engine's data is rebuilt from a template at every control step, so only `PhysicsState` is carried. `TieredPhysics` steps each part of a batch in the smallest window
-that holds it: a step costs as the degrees of freedom of its model do, and most environments need few.
+(`window.py`). The engine's data is rebuilt from a template at every control step, so only `PhysicsState` is carried.
+A step costs as the degrees of freedom of its model do, and most environments need few: `TieredPhysics` steps each part
+of a batch in the smallest window that holds it.
 """
 
 import abc
@@ -21,7 +22,6 @@ from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, sum
 from interactive_nav.physics.nearness import Measured
 from interactive_nav.physics.warp_callbacks import keep_collector_out
 from interactive_nav.physics.window import PhysicsWindow
-from interactive_nav.robots.spec import RobotState
 from interactive_nav.scenes.contacts import from_sensors, part_of_contacts, rolling_geoms, sensor_addresses
 from interactive_nav.scenes.slots import Layout
 from interactive_nav.scenes.world import World
@@ -79,12 +79,7 @@ class MjxPhysics(Physics):
         """
 
     def _controlled(self, data: mjx.Data, command: jax.Array, time_s: jax.Array) -> mjx.Data:
-        layout = self.window.layout
-        robot = RobotState(
-            data.qpos[layout.robot_qpos : layout.robot_qpos + layout.robot_nq],
-            data.qvel[layout.robot_qvel : layout.robot_qvel + layout.robot_nv],
-            time_s,
-        )
+        robot = self.window.layout.robot_state(data.qpos, data.qvel, time_s)
         ctrl = self._world.robot.controls(command, robot, jnp)
         return data.replace(ctrl=jnp.asarray(ctrl, jnp.float32))
 

@@ -18,7 +18,6 @@ from mujoco.batch import Batch
 
 from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces
-from interactive_nav.robots.spec import RobotState
 from interactive_nav.scenes.contacts import from_sensors, sensor_addresses
 from interactive_nav.scenes.world import World
 
@@ -174,14 +173,10 @@ class NativePhysics(Physics):
     def _advance(self, pool: _Pool, command: np.ndarray, time_s: np.ndarray) -> tuple[Any, Any]:
         """Run the substeps and return sensor readings [N, substeps, ...] and the most solver iterations [N]."""
         rounds = self._config.substeps if self._robot.control_every_substep else 1
-        sensed, layout = [], self._layout
-        iterations = np.zeros(len(command), np.int64)
+        sensed, iterations = [], np.zeros(len(command), np.int64)
         for k in range(rounds):
-            robot = RobotState(
-                pool.state_qpos[:, layout.robot_qpos : layout.robot_qpos + layout.robot_nq],
-                pool.state_qvel[:, layout.robot_qvel : layout.robot_qvel + layout.robot_nv],
-                time_s + k * self._models[0].opt.timestep,
-            )
+            now_s = time_s + k * self._models[0].opt.timestep
+            robot = self._layout.robot_state(pool.state_qpos, pool.state_qvel, now_s)
             pool.state_ctrl[:] = np.nan_to_num(self._robot.controls(command, robot, np))
             record = pool.batch.rollout(
                 self._config.substeps // rounds, record=("sensordata", "solver_niter", "nisland")

@@ -12,7 +12,6 @@ import copy
 import dataclasses
 import functools
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -193,11 +192,16 @@ class PhysicsWindow:
     def _addresses(self, chosen: tuple[jax.Array, ...]) -> list[tuple[jax.Array, jax.Array]]:
         """Return addresses in the window and in the world of the robot and each group: of qpos, then of qvel."""
         inner, outer, addresses = self.layout, self.world.layout, []
-        for name, field, count in (("robot_qpos", "qpos0", inner.robot_nq), ("robot_qvel", "dof_damping", inner.robot_nv)):
+        for name, field, count in (
+            ("robot_qpos", "qpos0", inner.robot_nq),
+            ("robot_qvel", "dof_damping", inner.robot_nv),
+        ):
             robot = (jnp.arange(count) + getattr(of, name) for of in (inner, outer))
             here = [jnp.ravel(group.rows[field]) for group in self.groups]
             there = [jnp.asarray(group.outer[field])[i].ravel() for group, i in zip(self.groups, chosen, strict=True)]
-            addresses.append(tuple(jnp.concatenate([own, *rest]) for own, rest in zip(robot, (here, there), strict=True)))
+            addresses.append(
+                tuple(jnp.concatenate([first, *rest]) for first, rest in zip(robot, (here, there), strict=True))
+            )
         return addresses
 
     def enter(self, state: PhysicsState, chosen: tuple[jax.Array, ...]) -> PhysicsState:

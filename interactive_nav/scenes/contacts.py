@@ -112,25 +112,3 @@ def from_sensors(data: Any, addresses: tuple[np.ndarray, np.ndarray], part: str,
     norm = norm - rolling_norm if part == "normal" else norm
     # Differences of equal sums leave rounding behind.
     return vector - rolling_vector, xp.maximum(norm, 0.0), xp.maximum(touch - rolling_touch, 0.0)
-
-
-def combine(
-    net_w: Any, contacts: tuple[Any, Any, Any] | None, force_part: str, force_sum: str, xp: Any
-) -> tuple[Any, Any]:
-    """Return the options' F_t and the force of what touches.
-
-    Args:
-        net_w: [..., substeps, 3] the robot's full contact force on all but the floor, N.
-        contacts: of `from_sensors`, leaves [..., substeps, (3)]; None: no option asks.
-
-    Returns:
-        F_t [...], and [...] the largest force, over the substeps, of parts that do not roll on anything but the floor.
-    """
-    vector = net_w
-    if contacts is not None and force_part == "normal":
-        vector = contacts[0]
-    length = xp.sqrt((vector**2).sum(-1))
-    if contacts is not None and force_sum == "contacts":
-        length = contacts[1]
-    force = length[..., -1] if force_sum == "last_substep" else length.mean(-1)
-    return force, xp.zeros_like(force) if contacts is None else contacts[2].max(-1)

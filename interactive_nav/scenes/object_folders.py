@@ -75,18 +75,12 @@ def load_object(folder: str | Path) -> ConvertedObject:
     if category not in CATEGORIES:
         raise SceneError(f"{folder}: category is '{category}', expected one of {', '.join(CATEGORIES)}")
     movable = _standing(read_movable(model, xml, name, category, friction))
-    boxes = tuple(
-        Box(_numbers(row[:3]), _numbers(row[7:10]), _numbers(row[3:7]))  # type: ignore[arg-type]
-        for row in movable.boxes
-    )
+    rows = movable.boxes.tolist()
+    boxes = tuple(Box(tuple(row[:3]), tuple(row[7:]), tuple(row[3:7])) for row in rows)  # type: ignore[arg-type]
     about_physics = movable, hull_sources(xml).get(name, [])
     return ConvertedObject(
         name, category, class_id(category), movable.mass_kg, friction, boxes, RGBA, (), sha256, *about_physics
     )
-
-
-def _numbers(values: np.ndarray) -> tuple[float, ...]:
-    return tuple(float(v) for v in values)
 
 
 def _standing(movable: Movable) -> Movable:

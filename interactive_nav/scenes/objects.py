@@ -247,12 +247,6 @@ def pick(num_objects: int, split: str = "train", variant: int = 0) -> tuple[Smal
     return tuple(chosen)
 
 
-_GEOM = {
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-}
 _HALF = math.sqrt(0.5)
 _TURN = {"z": (1.0, 0.0, 0.0, 0.0), "x": (_HALF, 0.0, _HALF, 0.0), "y": (_HALF, -_HALF, 0.0, 0.0)}
 
@@ -283,7 +277,7 @@ def add_shapes(body: mujoco.MjsBody, obj: SmallObject, name: str) -> None:
     for i, shape in enumerate(obj.shapes):
         body.add_geom(
             name=f"{name}_visual_{i}",
-            type=_GEOM[shape.kind],
+            type=getattr(mujoco.mjtGeom, f"mjGEOM_{shape.kind.upper()}"),
             pos=shape.centre_m,
             quat=_TURN[shape.axis],
             size=(*shape.size_m, 0.0, 0.0)[:3],

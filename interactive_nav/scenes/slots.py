@@ -3,11 +3,13 @@
 import dataclasses
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from interactive_nav.robots import RobotSpec
+from interactive_nav.robots.spec import RobotState
 from interactive_nav.scenes.objects import SmallObject, body_names
 from interactive_nav.scenes.scene import Movable, Scene
 from interactive_nav_common.rotations import matrix_from_quat
@@ -142,6 +144,11 @@ class Layout:
     def num_slots(self) -> int:
         """Return M."""
         return len(self.slot_kind)
+
+    def robot_state(self, qpos: Any, qvel: Any, time_s: Any) -> RobotState:
+        """Return the robot's part of states [..., nq] and [..., nv]."""
+        q, v = self.robot_qpos, self.robot_qvel
+        return RobotState(qpos[..., q : q + self.robot_nq], qvel[..., v : v + self.robot_nv], time_s)
 
 
 def find_layout(model: mujoco.MjModel, robot: RobotSpec, slots: list[tuple[str, str]]) -> Layout:

@@ -8,16 +8,18 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from interactive_nav.config import NavConfig, PhysicsConfig, TaskRules
+from interactive_nav.config import NavConfig
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.contacts import add_contact_sensors, add_sensor
 from interactive_nav.scenes.object_folders import ConvertedObject
 from interactive_nav.scenes.objects import SmallObject, add_boxes
-from interactive_nav.scenes.scene import Movable, Scene
+from interactive_nav.scenes.scene import Hinge, Movable, Scene
 from interactive_nav.scenes.slots import Layout, Slot, find_layout, parking_spot
 
 _EMPTY_BOX = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1e-3, 1e-3, 1e-3])
 _TILTED = np.array([0.8, 0.36, 0.48, 0.0])
+_FLOATS = 1.0
+"""Share of its weight that an empty slot's body is relieved of."""
 FEET = 12
 """Points of each movable object that can touch the floor."""
 _FOOT_RADIUS_M = 2e-3
@@ -82,47 +84,35 @@ def _add_feet(body: mujoco.MjsBody, name: str, boxes: np.ndarray, hidden_m: np.n
         )
 
 
+def _nothing(slot: int, kind: str) -> Movable:
+    """Return what stands in an empty slot, at its parking spot.
+
+    It is off-centre and turned: MuJoCo gives a body whose frame is its inertia's a sparser mass matrix, and the models'
+    structure must be equal.
+    """
+    # The friction is not 0: MJX-JAX makes a row of constraints only for joints whose model has friction.
+    hinge = Hinge(np.array([0, 0, 1]), np.zeros(3), None, damping=0.1, frictionloss=1e-6) if kind == "hinge" else None
+    inertia, pos, level = np.array([0.01, 0.012, 0.014]), np.array([*parking_spot(slot), 2.0]), np.array([1, 0, 0, 0])
+    return Movable("", "", 1.0, inertia, np.full(3, 1e-3), _TILTED, pos, level, 0.5, np.zeros((0, 10)), (), hinge)
+
+
 def _add_movable(
-    spec: mujoco.MjSpec,
-    name: str,
-    movable: Movable | None,
-    n_boxes: int,
-    kind: str,
-    park: int,
-    collision: str,
-    padded: bool,
+    spec: mujoco.MjSpec, name: str, movable: Movable, n_boxes: int, collision: str, gravcomp: float = 0.0
 ) -> None:
-    x, y = parking_spot(park)
-    if movable is None:
-        body = spec.worldbody.add_body(name=name, pos=[x, y, 2.0])
-        # Off-centre and turned: MuJoCo gives a body whose frame is its inertia's a sparser mass matrix, and the
-        # models' structure must be equal.
-        mass, inertia, com, iquat = 1.0, np.array([0.01, 0.012, 0.014]), np.full(3, 1e-3), _TILTED
-        boxes, friction = np.zeros((0, 10)), 0.5
-    else:
-        body = spec.worldbody.add_body(name=name, pos=movable.pos_w, quat=movable.quat_w)
-        mass, inertia, com, iquat = movable.mass_kg, movable.inertia, movable.com_m, movable.inertia_quat
-        if np.abs(com).max() < 1e-6:
-            com = com + 1e-6
-        boxes, friction = movable.boxes, movable.friction
-    if padded:
-        # An empty slot floats in place. The tiny value keeps the models' structure equal.
-        body.gravcomp = 1.0 if movable is None else 1e-9
+    body = spec.worldbody.add_body(name=name, pos=movable.pos_w, quat=movable.quat_w, gravcomp=gravcomp)
+    boxes, friction, com = movable.boxes, movable.friction, movable.com_m
+    if np.abs(com).max() < 1e-6:
+        com = com + 1e-6
     body.explicitinertial = True
-    body.mass, body.inertia, body.ipos, body.iquat = mass, inertia, com, iquat
-    if kind == "hinge":
-        hinge = movable.hinge if movable else None
+    body.mass, body.inertia, body.ipos, body.iquat = movable.mass_kg, movable.inertia, com, movable.inertia_quat
+    if hinge := movable.hinge:
         joint = body.add_joint(name=f"{name}_joint", type=mujoco.mjtJoint.mjJNT_HINGE)
-        joint.axis = hinge.axis if hinge else [0, 0, 1]
-        joint.pos = hinge.anchor_m if hinge else [0, 0, 0]
-        joint.limited = True
-        joint.range = hinge.range_rad if hinge and hinge.range_rad else (-math.pi, math.pi)
-        joint.damping = [hinge.damping if hinge else 0.1, 0, 0]
-        # Not 0: MJX-JAX makes a row of constraints only for joints whose model has friction.
-        joint.frictionloss = hinge.frictionloss if hinge else 1e-6
+        joint.axis, joint.pos, joint.frictionloss = hinge.axis, hinge.anchor_m, hinge.frictionloss
+        joint.limited, joint.range = True, hinge.range_rad or (-math.pi, math.pi)
+        joint.damping = [hinge.damping, 0, 0]
     else:
         body.add_freejoint(name=f"{name}_joint")
-    if collision == "hulls" and movable is not None and movable.hulls:
+    if collision == "hulls" and movable.hulls:
         for i, vertices in enumerate(movable.hulls):
             spec.add_mesh(name=f"{name}_mesh_{i}", uservert=np.asarray(vertices, float).ravel())
             body.add_geom(
@@ -145,7 +135,7 @@ def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject, park: int, coll
     x, y = parking_spot(park)
     if isinstance(obj, ConvertedObject):
         parked = dataclasses.replace(obj.movable, pos_w=np.array([x, y, 0.0]))
-        _add_movable(spec, name, parked, len(obj.boxes), "small", park, collision, padded=False)
+        _add_movable(spec, name, parked, len(obj.boxes), collision)
         return
     body = spec.worldbody.add_body(name=name, pos=[x, y, 0.0])
     body.add_freejoint(name=f"{name}_joint")
@@ -162,20 +152,12 @@ def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
     option.timestep = config.sim_dt_s
     option.gravity = [0, 0, -9.81]
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}[
-        config.cone
-    ]
+    option.cone = getattr(mujoco.mjtCone, f"mjCONE_{config.cone.upper()}")
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.iterations = config.solver_iterations
     option.ls_iterations = 20
-    spec.worldbody.add_geom(
-        name="floor",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[0, 0, 0.1],
-        friction=[FLOOR_FRICTION, 0.005, 0.0001],
-        contype=0,
-        conaffinity=_FLOOR,
-    )
+    plane = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [0, 0, 0.1], "friction": [FLOOR_FRICTION, 0.005, 0.0001]}
+    spec.worldbody.add_geom(name="floor", contype=0, conaffinity=_FLOOR, **plane)
     robot.add_to(spec)
     if config.symmetric_actions:
         for actuator in spec.actuators:
@@ -186,17 +168,8 @@ def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
         if geom.name != "floor" and (geom.contype or geom.conaffinity):
             geom.contype |= _FLOOR | (_CEILING if robot.kind == "flying" else 0)
     if robot.kind == "flying":
-        spec.worldbody.add_geom(
-            name="ceiling",
-            type=mujoco.mjtGeom.mjGEOM_PLANE,
-            pos=[0, 0, CEILING_M],
-            quat=[0, 1, 0, 0],
-            size=[0, 0, 0.1],
-            friction=[FLOOR_FRICTION, 0.005, 0.0001],
-            contype=0,
-            conaffinity=_CEILING,
-            group=4,
-        )
+        above = {"pos": [0, 0, CEILING_M], "quat": [0, 1, 0, 0], "group": 4}
+        spec.worldbody.add_geom(name="ceiling", contype=0, conaffinity=_CEILING, **plane, **above)
     return spec
 
 
@@ -210,10 +183,8 @@ def build_empty_spec(
     spec = _empty_spec(robot, config)
     named = [(f"{kind}_{i}", kind) for i, (kind, _) in enumerate(slots)]
     for i, ((name, kind), (_, n_boxes)) in enumerate(zip(named, slots, strict=True)):
-        _add_movable(spec, name, None, n_boxes, "hinge" if kind == "hinge" else "free", i, "boxes", padded=True)
-    _add_structure(spec, np.zeros((0, 10)), n_walls)
-    _add_sensors(spec, robot, named, config)
-    _soften(spec, robot, config)
+        _add_movable(spec, name, _nothing(i, kind), n_boxes, "boxes", _FLOATS)
+    _finish(spec, robot, np.zeros((0, 10)), n_walls, named, config)
     model = spec.compile()
     return spec, model, find_layout(model, robot, named)
 
@@ -229,30 +200,27 @@ def build_spec(
             _add_small(spec, slot.name, body, i, collision)
             continue
         n_boxes = max(len(m.boxes) for m in slot.bodies if m is not None)
-        _add_movable(spec, slot.name, body, n_boxes, slot.kind, i, collision, None in slot.bodies)
-    _add_structure(spec, scenes[scene_index].walls, max(len(s.walls) for s in scenes))
-    _add_sensors(spec, robot, [(slot.name, slot.kind) for slot in slots], config)
-    _soften(spec, robot, config)
+        # The tiny value keeps the models' structure equal.
+        gravcomp = _FLOATS if body is None else 1e-9 if None in slot.bodies else 0.0
+        _add_movable(spec, slot.name, body or _nothing(i, slot.kind), n_boxes, collision, gravcomp)
+    named, most = [(slot.name, slot.kind) for slot in slots], max(len(s.walls) for s in scenes)
+    _finish(spec, robot, scenes[scene_index].walls, most, named, config)
     return spec
 
 
-def _soften(spec: mujoco.MjSpec, robot: RobotSpec, physics: PhysicsConfig) -> None:
-    for geom in spec.geoms:
-        geom.solref = [physics.contact_time_constant_s, 1.0]
-    if robot.contact_time_constant_s is not None:
-        for geom in spec.body(robot.base_body).find_all("geom"):
-            geom.solref = [robot.contact_time_constant_s, 1.0]
-            geom.solmix = 1e6  # a contact's is the mean of both geoms', weighted by this: the robot's holds
-
-
-def _add_structure(spec: mujoco.MjSpec, walls: np.ndarray, count: int) -> None:
+def _finish(
+    spec: mujoco.MjSpec,
+    robot: RobotSpec,
+    walls: np.ndarray,
+    count: int,
+    slots: list[tuple[str, str]],
+    config: NavConfig,
+) -> None:
+    """Add `count` walls and the sensors of slots (name, kind), and make all contacts as soft as the settings say."""
     structure = spec.worldbody.add_body(name="structure")
     for i in range(count):
         row = walls[i] if i < len(walls) else _EMPTY_BOX + np.array([0, 0, -5.0 - 0.01 * i, 0, 0, 0, 0, 0, 0, 0])
         _add_box(structure, row, f"wall_{i}", 0.5)
-
-
-def _add_sensors(spec: mujoco.MjSpec, robot: RobotSpec, slots: list[tuple[str, str]], rules: TaskRules) -> None:
     # Net force of the robot's subtree on a body: 3 numbers, world frame.
     numbers, subtree = (1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1), mujoco.mjtObj.mjOBJ_XBODY
     for i, (name, kind) in enumerate(slots):
@@ -261,5 +229,11 @@ def _add_sensors(spec: mujoco.MjSpec, robot: RobotSpec, slots: list[tuple[str, s
             # A door leaf hangs in its frame: they touch by design.
             spec.add_exclude(bodyname1=name, bodyname2="structure")
     add_sensor(spec, "force_structure", subtree, robot.base_body, "structure", numbers)
-    if rules.needs_contacts:
+    if config.needs_contacts:
         add_contact_sensors(spec, robot, [*(name for name, _ in slots), "structure"])
+    for geom in spec.geoms:
+        geom.solref = [config.contact_time_constant_s, 1.0]
+    if robot.contact_time_constant_s is not None:
+        for geom in spec.body(robot.base_body).find_all("geom"):
+            geom.solref = [robot.contact_time_constant_s, 1.0]
+            geom.solmix = 1e6  # a contact's is the mean of both geoms', weighted by this: the robot's holds

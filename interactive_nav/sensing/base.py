@@ -120,10 +120,6 @@ class Renderer(abc.ABC):
         drawn = (scene, qpos, camera) if look is None else (scene, qpos, camera, look)
         return one_of_batch(functools.partial(self.images_batch, names), drawn)
 
-    def render(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
-        """Draw one environment's `render_batch`; under any number of `vmap`s all are drawn in one call."""
-        return one_of_batch(self.render_batch, (scene, qpos, camera))
-
 
 class BoxRenderer(Renderer):
     """Draws the tables' boxes and the floor."""

@@ -2,19 +2,33 @@
 
 Brax's auto-reset returns each environment's first state again, so an environment would repeat one
 episode for ever, and what the task keeps in `info` would leak into it.
+
+    env = ShardedEnv(AutoResetEnv(interactive_nav.make(...)))       # all devices, of all processes
+    state = jax.jit(env.reset)(jax.random.split(key, num_envs))     # leaves are sharded along their first axis
+
+Environments are independent, so nothing is exchanged between devices in `reset` and `step`; what a learner computes
+from the sharded arrays (means, gradients) XLA reduces over the devices by itself. Several machines or processes: call
+`start_distributed` first in each of them, before anything else uses JAX.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import State, Wrapper
+import numpy as np
+from brax.envs.base import Env, State, Wrapper
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav_common.errors import ConfigError
 
+AXIS = "i"
+"""Name of the mesh's axis, as in Brax."""
+NONFINITE_ACTIONS = "nonfinite_actions"
+"""Entries of a step's action that are no finite number; the environment takes 0 for them."""
 DRAW_SHARE = 16
 """New episodes are drawn for this fraction of the batch at a time."""
 
@@ -57,6 +71,38 @@ def draw_where(env: InteractiveNav, current: tuple, over: jax.Array) -> tuple:
         return current, pending.at[index].set(False, mode="drop")
 
     return jax.lax.while_loop(lambda carry: carry[1].any(), some, (current, over))[0]
+
+
+def _where(mask: jax.Array, new: Any, old: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)
+
+
+def reset_where(env: InteractiveNav, state: Any, keys: jax.Array, mask: jax.Array) -> Any:
+    """Start new episodes where `mask`."""
+    info = state.info
+    physics, nav, rng = draw_where(env, (state.pipeline_state, info["nav"], _where(mask, keys, info["rng"])), mask)
+    of_step = (state.reward, state.done, state.metrics, info["truncation"], info["time_out"])
+    reward, done, metrics, truncation, time_out = jax.tree.map(lambda x: jnp.where(mask, 0.0, x), of_step)
+    info = {**info, "nav": nav, "rng": rng, "truncation": truncation, "time_out": time_out}
+    new = state.replace(pipeline_state=physics, reward=reward, done=done, metrics=metrics, info=info)
+    return new.replace(obs=_where(mask, jax.vmap(env.observe)(new).obs, state.obs))
+
+
+def step_all(
+    env: InteractiveNav, mode: str, state: Any, actions: jax.Array, ended: jax.Array
+) -> tuple[Any, jax.Array, tuple[Any, ...]]:
+    """Return the state after a step and, where Gymnasium's mode has it, a reset; which episodes were over before, so
+    that nothing but a reset was done; and observation, reward, terminated, truncated and metrics."""
+    stepped = new = jax.vmap(env.step)(state, actions)
+    same = mode == "SAME_STEP"
+    if mode != "DISABLED":
+        due, keys = (stepped.done > 0, stepped.info["rng"]) if same else (ended, state.info["rng"])
+        new = jax.lax.cond(due.any(), lambda s: reset_where(env, s, keys, due), lambda s: s, stepped)
+    reported = new if mode == "NEXT_STEP" else stepped
+    truncated = reported.info["truncation"] > 0
+    over = ended if mode == "NEXT_STEP" else jnp.zeros_like(ended)
+    metrics = {**reported.metrics, NONFINITE_ACTIONS: (~jnp.isfinite(actions)).sum(-1).astype(jnp.float32)}
+    return new, over, (reported.obs, reported.reward, (reported.done > 0) & ~truncated, truncated, metrics)
 
 
 def wrap_for_brax_training(
@@ -169,3 +215,49 @@ class AutoResetEnv(Wrapper):
         }
         # Observed once, after new episodes have begun: images cost as much as physics.
         return jax.vmap(self.env.observe)(stepped.replace(pipeline_state=physics, info=info))
+
+
+class ShardedEnv(Wrapper):
+    """Steps equal shares of a batch on each device."""
+
+    def __init__(self, env: Env, devices: Sequence[Any] | None = None):
+        """Wrap an environment."""
+        super().__init__(env)
+        self.mesh = Mesh(np.asarray(devices if devices is not None else jax.devices()), (AXIS,))
+        self.sharding = NamedSharding(self.mesh, PartitionSpec(AXIS))
+        spec = PartitionSpec(AXIS)
+        self._reset = jax.shard_map(env.reset, mesh=self.mesh, in_specs=(spec, spec), out_specs=spec, check_vma=False)
+        self._step = jax.shard_map(env.step, mesh=self.mesh, in_specs=(spec, spec), out_specs=spec, check_vma=False)
+
+    @property
+    def num_devices(self) -> int:
+        """Return the number of devices that share the batch."""
+        return self.mesh.size
+
+    def reset(self, rng: jax.Array) -> State:
+        """Return N states for [N, 2] keys."""
+        if rng.shape[0] % self.num_devices:
+            raise ConfigError(
+                f"{rng.shape[0]} environments over {self.num_devices} devices, expected a multiple: "
+                f"take {self.num_devices * max(1, rng.shape[0] // self.num_devices)}"
+            )
+        # Each device sees its share alone: it must be given which environments these are.
+        whole = rng, jnp.arange(rng.shape[0])
+        return self._reset(*(jax.lax.with_sharding_constraint(x, self.sharding) for x in whole))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Return the states that follow N states and [N, A] actions."""
+        return self._step(state, jax.lax.with_sharding_constraint(action, self.sharding))
+
+
+def start_distributed(coordinator: str, num_processes: int, process_id: int) -> None:
+    """Join processes, on one machine or several, into one JAX program.
+
+    Every process runs the same script with another `process_id`; afterwards `jax.devices()` are the devices
+    of all of them and `ShardedEnv` spreads over all.
+    """
+    if not 0 <= process_id < num_processes:
+        raise ConfigError(f"process_id is {process_id}, expected 0 to {num_processes - 1}")
+    if not coordinator.rpartition(":")[2].isdigit():
+        raise ConfigError(f"coordinator is {coordinator!r}, expected host:port such as 10.0.0.1:1234")
+    jax.distributed.initialize(coordinator, num_processes, process_id)

@@ -45,7 +45,6 @@ USES: list[tuple[str, str, Callable[[], Any]]] = [
 GUARDED = {
     "docs/program_help.py": {"sphinx"},  # which imports it
     "interactive_nav/interop/gym_env.py": {"gymnasium"},  # says the line
-    "interactive_nav/interop/gym_steps.py": {"gymnasium"},  # for types
     "interactive_nav/physics/warp_callbacks.py": {"warp"},  # after `resolve_backend`, as the next
     "interactive_nav/sensing/meshes.py": {"warp"},
     "benchmarks/steps_per_second.py": {"warp"},  # if it is in use

@@ -13,7 +13,7 @@ import pytest
 from mujoco import mjx
 
 import interactive_nav
-from interactive_nav.config import NavConfig
+from interactive_nav.config import NavConfig, TaskRules
 from interactive_nav.physics import (
     PhysicsState,
     StepSignals,
@@ -26,7 +26,6 @@ from interactive_nav.physics import (
 )
 from interactive_nav.physics import native as native_backend
 from interactive_nav.robots import get_robot
-from interactive_nav.scenes.contacts import combine
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
 from interactive_nav.task.wrappers import AutoResetEnv
@@ -80,7 +79,8 @@ class Run:
         """[T, N] F_t under the options."""
         # The sum of the normal forces' norms, wheels exempt, is what touches.
         norms = self.contacts[2] if part == "normal" else self.contacts[1]
-        return combine(self.force_w.sum(-2), (self.contacts[0], norms, self.contacts[2]), part, how, np)[0]
+        contacts, options = (self.contacts[0], norms, self.contacts[2]), TaskRules(force_part=part, force_sum=how)  # type: ignore[arg-type]
+        return base.summarise_forces(self.force_w, np, contacts, options)["force_n"]
 
 
 def trajectory(world, backend, settings=CONTACTS):

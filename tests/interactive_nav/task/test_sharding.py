@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from interactive_nav.task.sharding import ShardedEnv, start_distributed
+from interactive_nav.task.wrappers import ShardedEnv, start_distributed
 from interactive_nav_common.errors import UserError
 from tests.toys import write_room
 
@@ -20,7 +20,7 @@ ONE_PROCESS = """
 import sys
 import interactive_nav
 import jax, jax.numpy as jnp, numpy as np
-from interactive_nav.task.sharding import ShardedEnv
+from interactive_nav.task.wrappers import ShardedEnv
 from interactive_nav.task.wrappers import AutoResetEnv
 
 env = AutoResetEnv(interactive_nav.make("turtlebot", [sys.argv[1]], backend="native", num_objects=1,
@@ -50,7 +50,7 @@ print("equal")
 TWO_PROCESSES = """
 import sys
 import interactive_nav
-from interactive_nav.task.sharding import ShardedEnv, start_distributed
+from interactive_nav.task.wrappers import ShardedEnv, start_distributed
 start_distributed(sys.argv[2], 2, int(sys.argv[3]))
 import jax, jax.numpy as jnp
 from interactive_nav.task.wrappers import AutoResetEnv
@@ -129,7 +129,7 @@ class _Told:
 
 TOLD = """
 import jax
-from interactive_nav.task.sharding import ShardedEnv
+from interactive_nav.task.wrappers import ShardedEnv
 from tests.interactive_nav.task.test_sharding import _Told
 print(ShardedEnv(_Told()).reset(jax.random.split(jax.random.PRNGKey(0), 4)).tolist())
 """
@@ -163,7 +163,7 @@ import interactive_nav
 import jax, jax.numpy as jnp
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import make_physics, mjx_batch
-from interactive_nav.task.sharding import ShardedEnv
+from interactive_nav.task.wrappers import ShardedEnv
 from tests.interactive_nav.physics import test_tiers as toy
 
 mjx_batch.LEAST_ENVS = 4
