@@ -214,15 +214,15 @@ def write_video(
     steps = [*range(0, compositor.replay.num_steps, every), compositor.replay.num_steps]
     rate = 1.0 / (compositor.replay.control_dt_s * every)
     write = write_mp4 if path.suffix == ".mp4" else _write_frames
+
+    def frames() -> Iterator[np.ndarray]:
+        for i, step in enumerate(steps):
+            yield compositor.frame(step)
+            on_progress(i + 1)
+
     with whole_file(path) as partial:
-        write(_counted(compositor, steps, on_progress), partial, rate, _HOLD_S)
+        write(frames(), partial, rate, _HOLD_S)
     return len(steps)
-
-
-def _counted(compositor: Compositor, steps: list[int], on_progress: Callable[[int], None]) -> Iterator[np.ndarray]:
-    for i, step in enumerate(steps):
-        yield compositor.frame(step)
-        on_progress(i + 1)
 
 
 def write_mp4(frames: Iterable[np.ndarray], path: Path, rate: float, hold_s: float = 0.0) -> int:

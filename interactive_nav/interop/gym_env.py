@@ -216,7 +216,7 @@ class InteractiveNavEnv(_Playing, gymnasium.Env):
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """Return a (rows, columns, 3) u8 third-person view of the present state; None without a render mode."""
         frames = self._frames()
-        return frames and frames[0]
+        return frames[0] if frames else None
 
 
 class InteractiveNavVectorEnv(_Playing, VectorEnv):

@@ -11,6 +11,7 @@ import zlib
 import jax
 import jax.numpy as jnp
 
+from interactive_nav.config import TaskRules
 from interactive_nav.navigation.lookup import geodesic_at, goal_field
 from interactive_nav.types import EpisodeStart, SceneTables
 
@@ -119,11 +120,8 @@ def draw_episode(
     tables: SceneTables,
     small_radius_m: jax.Array,
     robot_radius_m: float,
-    min_goal_distance_m: float,
-    max_goal_distance_m: float,
+    rules: TaskRules,
     scene: jax.Array | None = None,
-    goal_clear: bool = True,
-    random_yaw: bool = True,
 ) -> EpisodeStart:
     """Draw scene, start, goal and small objects uniformly (paper section IV).
 
@@ -134,8 +132,6 @@ def draw_episode(
     Args:
         small_radius_m: [k] radii of the small objects' footprints.
         scene: [] i32; None: drawn.
-        goal_clear: keep small objects off the robot's footprint at the goal.
-        random_yaw: turn small objects at random; else yaw 0.
 
     Returns:
         The episode's start. Nothing touches: small objects keep clear of the robot at the start, at the goal
@@ -144,9 +140,9 @@ def draw_episode(
     key_scene, key_start, key_goal, key_yaw, key_place, key_turn = jax.random.split(key, 6)
     if scene is None:
         scene = jax.random.randint(key_scene, (), 0, tables.rest_qpos.shape[0])
-    start_xy, goal_xy = _draw_pair(key_start, key_goal, tables, scene, min_goal_distance_m, max_goal_distance_m)
-
-    kept_free = [start_xy, goal_xy] if goal_clear else [start_xy]
+    distances_m = rules.min_goal_distance_m, rules.max_goal_distance_m
+    start_xy, goal_xy = _draw_pair(key_start, key_goal, tables, scene, *distances_m)
+    kept_free = [start_xy, goal_xy] if rules.goal_clear else [start_xy]
     small_xy, small_placed = place_small(key_place, tables, scene, small_radius_m, kept_free, robot_radius_m)
     turn = jax.random.uniform(key_turn, small_radius_m.shape, minval=-jnp.pi, maxval=jnp.pi)
     return EpisodeStart(
@@ -155,6 +151,6 @@ def draw_episode(
         start_yaw_rad=jax.random.uniform(key_yaw, (), minval=-jnp.pi, maxval=jnp.pi),
         goal_xy_w=goal_xy,
         small_xy_w=small_xy,
-        small_yaw_rad=turn if random_yaw else jnp.zeros_like(turn),
+        small_yaw_rad=turn if rules.random_object_yaw else jnp.zeros_like(turn),
         small_placed=small_placed,
     )

@@ -189,7 +189,7 @@ def _mode(base: WheeledBase, mode: str, limits: list[tuple[Any, float]]) -> tupl
     wheels, names = [i for i, joint in enumerate(joints) if joint.side], [joint.name for joint in joints]
     servos, actions = ["position"] * len(joints), []
 
-    def drive(i: int, kind: str, *native: float) -> None:
+    def drive(i: int, kind: str, native: tuple[float, float] | None = None) -> None:
         joint, (span, effort), advance = joints[i], limits[i], joints[i].max_speed * _ADVANCE_S
         place = ("advance rad", -advance, advance) if joint.side else (joint.unit, *(span or (-math.pi, math.pi)))
         unit, low, high = {
@@ -197,8 +197,8 @@ def _mode(base: WheeledBase, mode: str, limits: list[tuple[Any, float]]) -> tupl
             "velocity": (f"{joint.unit}/s", -joint.max_speed, joint.max_speed),
             "position": place,
         }[kind]
-        servos[i] = kind
-        actions.append(_Action(f"{joint.label} {unit}", *(native or (low, high)), alone[i]))
+        servos[i], (low, high) = kind, native or (low, high)
+        actions.append(_Action(f"{joint.label} {unit}", low, high, alone[i]))
 
     if mode == "twist":
         gains, least = np.zeros((len(joints), 2)), base.min_linear_m_s
@@ -211,13 +211,14 @@ def _mode(base: WheeledBase, mode: str, limits: list[tuple[Any, float]]) -> tupl
     for i in range(len(joints)) if mode in ("velocity", "position", "torque") else ():
         drive(i, mode)
     for i in wheels if mode in ("native", "whole_body") else ():
-        drive(i, "torque" if base.native_torque else "velocity", *base.native)
+        drive(i, "torque" if base.native_torque else "velocity", base.native)
     if mode == "whole_body":
         for name in base.whole_body:
             drive(names.index(name), "velocity")
         if base.gripper:
             fingers = [names.index(name) for name in base.gripper]
-            actions.append(_Action("finger opening m", *(limits[fingers[0]][0] or (0.0, 0.0)), alone[fingers].sum(0)))
+            low, high = limits[fingers[0]][0] or (0.0, 0.0)
+            actions.append(_Action("finger opening m", low, high, alone[fingers].sum(0)))
     return servos, actions
 
 

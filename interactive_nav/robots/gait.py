@@ -148,24 +148,17 @@ def gait_law(legs: Legged) -> ControlLaw:
     return law
 
 
-def _command_range(legs: Legged, mode: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return commands at action -1 and +1: positions of the joints, or what is symmetric: action 0 stands."""
-    if mode == "position":
-        return tuple(low for low, _ in legs.ranges), tuple(high for _, high in legs.ranges)
-    most = legs.torque_nm
-    if mode == "velocity":
-        most = (legs.max_speed_rad_s,) * len(legs.joints)
-    elif mode == "twist":
-        most = (legs.max_linear_m_s, legs.max_angular_rad_s)
-    return tuple(-m for m in most), most
-
-
-def _action_names(legs: Legged, mode: str) -> tuple[str, ...]:
-    """Return the actions' names with their units."""
+def _commands(legs: Legged, mode: str) -> list[tuple[str, float, float]]:
+    """Return each action's name with its unit and its command at -1 and +1, which but for positions are symmetric:
+    action 0 stands."""
     if mode == "twist":
-        return ("forward m/s", "turn rad/s")
-    unit = {"position": "rad", "velocity": "rad/s"}.get(mode, "N m")
-    return tuple(f"{joint.split('_', 1)[1]} {unit}" for joint in legs.joints)
+        speeds = ("forward m/s", legs.max_linear_m_s), ("turn rad/s", legs.max_angular_rad_s)
+        return [(name, -most, most) for name, most in speeds]
+    unit, ends = "N m", tuple((-most, most) for most in legs.torque_nm)
+    if mode in ("position", "velocity"):
+        most = legs.max_speed_rad_s
+        unit, ends = ("rad", legs.ranges) if mode == "position" else ("rad/s", ((-most, most),) * len(legs.joints))
+    return [(f"{joint.split('_', 1)[1]} {unit}", *end) for joint, end in zip(legs.joints, ends, strict=True)]
 
 
 def _add_to(legs: Legged, mode: str, world: mujoco.MjSpec) -> None:
@@ -188,12 +181,12 @@ def legged_robot(legs: Legged, control_mode: str = "native", **figures: Any) -> 
     check_mode(legs.name, control_mode, legs.modes)
     joint_mode = legs.native if control_mode == "native" else control_mode
     twist = control_mode == "twist"
-    low, high = _command_range(legs, joint_mode)
+    names, low, high = zip(*_commands(legs, joint_mode), strict=True)
     row = vars(legged_row(legs.name))
     fields: dict[str, Any] = {
         "action_low": low,
         "action_high": high,
-        "action_names": _action_names(legs, joint_mode),
+        "action_names": names,
         "home_qpos": tuple(zip(legs.joints, legs.home, strict=True)),
         "control": gait_law(legs) if twist else None,
     }

@@ -5,6 +5,7 @@ them; else it is invisible to itself.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import flax.struct
@@ -55,9 +56,7 @@ class Links:
         """Return world frames of the base and the rest, [..., 3], m, and [..., 3, 3], for `qpos` [..., nq]."""
         at = self.base_qpos
 
-        def constant(value: np.ndarray) -> jax.Array:
-            return jnp.broadcast_to(jnp.asarray(value, qpos.dtype), (*qpos.shape[:-1], *value.shape))
-
+        constant = functools.partial(repeated, qpos)
         frames = [(qpos[..., at : at + 3], matrix_from_quat(qpos[..., at + 3 : at + 7]))]
         for link in self.rest:
             pos, axes = frames[link.parent]
@@ -72,6 +71,11 @@ class Links:
                 axes = compose(axes, turn)
             frames.append((pos, axes))
         return frames
+
+
+def repeated(qpos: jax.Array, value: np.ndarray) -> jax.Array:
+    """Return a constant with the leading axes and the type of qpos [..., nq]."""
+    return jnp.broadcast_to(jnp.asarray(value, qpos.dtype), (*qpos.shape[:-1], *value.shape))
 
 
 def make_links(model: mujoco.MjModel, bodies: Sequence[int]) -> Links:

@@ -37,7 +37,7 @@ from interactive_nav.robots.spec import RobotCamera
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing import Renderer, build_boxes, make_renderer
 from interactive_nav.sensing.base import draw_look
-from interactive_nav.sensing.boxes import Links, apply_axes, make_links
+from interactive_nav.sensing.boxes import Links, apply_axes, make_links, repeated
 from interactive_nav.sensing.observation import task_observation
 from interactive_nav.sensing.rays import cast_fan
 from interactive_nav.types import NavInfo
@@ -65,12 +65,8 @@ class Mount:
     def pose(self, qpos: jax.Array) -> CameraPose:
         """Return the camera's pose, without roll, for qpos [..., nq]."""
         pos, axes = self.links.frames(qpos)[-1]
-
-        def constant(value: np.ndarray) -> jax.Array:
-            return jnp.broadcast_to(jnp.asarray(value, qpos.dtype), (*qpos.shape[:-1], *value.shape))
-
-        where = pos + apply_axes(axes, constant(self.pos_b))
-        return look_along(where, apply_axes(axes, constant(self.forward_b)))
+        where = pos + apply_axes(axes, repeated(qpos, self.pos_b))
+        return look_along(where, apply_axes(axes, repeated(qpos, self.forward_b)))
 
 
 def make_mount(model: mujoco.MjModel, base_body: str, camera: RobotCamera, yaw_rad: float = 0.0) -> Mount:
@@ -296,12 +292,8 @@ def _noisy(reading: jax.Array, noise: float, dropout: float, lost: float, key: j
 
 def _robot_joints(model: mujoco.MjModel, world: World) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the robot's joints but its free one: addresses in qpos and qvel, and whether they turn without limit."""
-    joints = [
-        j
-        for j in range(model.njnt)
-        if model.jnt_bodyid[j] in world.layout.robot_bodies
-        and int(model.jnt_type[j]) in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-    ]
+    driven = np.isin(model.jnt_type, [mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE])
+    joints = np.flatnonzero(driven & np.isin(model.jnt_bodyid, world.layout.robot_bodies))
     turns = (model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE) & ~model.jnt_limited[joints].astype(bool)
     return model.jnt_qposadr[joints], model.jnt_dofadr[joints], turns
 

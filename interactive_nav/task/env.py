@@ -128,10 +128,8 @@ class InteractiveNav(Env):
 
     def draw_start(self, key: jax.Array, scene: jax.Array | None = None) -> EpisodeStart:
         """Return what an episode starts from, as `reset` draws it: `key` is consumed, `scene` [] i32, drawn if None."""
-        config = self.config
-        distances_m = config.min_goal_distance_m, config.max_goal_distance_m
-        about = self.tables, self._small_radius_m, self.robot.footprint_radius_m, *distances_m, scene
-        return draw_episode(key, *about, config.goal_clear, config.random_object_yaw)
+        radii_m = self._small_radius_m, self.robot.footprint_radius_m
+        return draw_episode(key, self.tables, *radii_m, self.config, scene)
 
     def strew(self, key: jax.Array, start: EpisodeStart) -> EpisodeStart:
         """Return one environment's given episode with its small objects drawn: clear of start, goal and each other."""

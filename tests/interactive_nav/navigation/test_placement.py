@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 import interactive_nav
-from interactive_nav.config import NavConfig
+from interactive_nav.config import NavConfig, TaskRules
 from interactive_nav.navigation.placement import CLEARANCE_M, draw_episode, miss_m
 from interactive_nav.navigation.tables import build_tables
 from interactive_nav.robots import get_robot
@@ -34,7 +34,7 @@ def draws(built):
     radii = jnp.asarray([o.radius_m for o in world.small_objects])
 
     def draw(key):
-        return draw_episode(key, tables, radii, world.robot.footprint_radius_m, 1.0, np.inf)
+        return draw_episode(key, tables, radii, world.robot.footprint_radius_m, TaskRules())
 
     drawn = jax.jit(jax.vmap(draw))(jax.random.split(jax.random.PRNGKey(0), DRAWS))
     return jax.tree.map(np.asarray, drawn)
@@ -163,7 +163,9 @@ def test_a_largest_distance_holds(built):
     world, tables = built
 
     def draw(key):
-        return draw_episode(key, tables, jnp.zeros(0), world.robot.footprint_radius_m, 1.0, 2.0)
+        return draw_episode(
+            key, tables, jnp.zeros(0), world.robot.footprint_radius_m, TaskRules(max_goal_distance_m=2.0)
+        )
 
     drawn = jax.tree.map(np.asarray, jax.jit(jax.vmap(draw))(jax.random.split(jax.random.PRNGKey(1), 200)))
     free = np.asarray(tables.free[0])
@@ -176,8 +178,10 @@ def test_a_largest_distance_holds(built):
 
 
 def draw_pairs(tables, count, least_m, largest_m):
+    rules = TaskRules(min_goal_distance_m=least_m, max_goal_distance_m=largest_m)
+
     def draw(key):
-        start = draw_episode(key, tables, jnp.zeros(0), 0.3, least_m, largest_m)
+        start = draw_episode(key, tables, jnp.zeros(0), 0.3, rules)
         miss = miss_m(tables, start.scene_index, start.start_xy_w, start.goal_xy_w, least_m, largest_m)
         return start.start_xy_w, start.goal_xy_w, miss
 
