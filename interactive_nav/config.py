@@ -304,11 +304,7 @@ class SensorConfig(CameraNoise):
 
     @property
     def views(self) -> tuple[CameraView, ...]:
-        """Return the cameras; where none are listed, the robot's, without a name.
-
-        Raises:
-            ConfigError: `cameras` has an unknown setting or an impossible value.
-        """
+        """Return the cameras; where none are listed, the robot's, without a name."""
         return tuple(overlay(CameraView(), view, "cameras") for view in self.cameras) or (CameraView(),)
 
 
@@ -318,12 +314,8 @@ class NavConfig(SensorConfig, PhysicsConfig, TaskRules):
 
 
 def make_config(variant: str = "paper", **settings: Any) -> NavConfig:
-    """Build a `NavConfig` from settings by name.
-
-    Args:
-        variant: `paper`, the defaults, or `code`: where the original's code differs from its paper, the code.
-        **settings: of `NavConfig`; they take precedence over the variant's.
-    """
+    """Build a `NavConfig` from settings by name, which take precedence over those of the variant: `paper`, the
+    defaults, or `code`: where the original's code differs from its paper, the code."""
     if variant not in VARIANTS:
         raise ConfigError(f"variant is {variant!r}, expected one of {', '.join(VARIANTS)}")
     return NavConfig.of(**{**VARIANTS[variant], **settings})

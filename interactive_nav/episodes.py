@@ -172,11 +172,7 @@ def _check_fits(file: EpisodeFile, env: InteractiveNav, where: str) -> dict[str,
 
 
 def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -> EpisodeStart:
-    """Return the file's episodes for `jax.vmap(env.reset_to)`, leaves [N, ...].
-
-    Args:
-        env: whose scenes must include the file's; their order may differ.
-    """
+    """Return the file's episodes for `jax.vmap(env.reset_to)`, leaves [N, ...]; `env` has the file's scenes."""
     scene_of_digest = _check_fits(file, env, where)
     rows, count = file.episodes, len(file.objects)
     small = [[o or [0.0, 0.0, 0.0] for o in row["objects"]] for row in rows]

@@ -160,16 +160,10 @@ _CELLS_APART = 2**0.5
 
 
 def sees(room: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return which pairs of points see each other over free cells.
+    """Return [P] bool: which pairs of points [P, 2] (column, row) in cells see each other over free cells.
 
-    Args:
-        room: [R, C] `clearance` in cells, 0 where a cell is not free.
-        a: [P, 2] points (column, row) in cells.
-        b: [P, 2] likewise.
-
-    Returns:
-        [P] bool. Halving: the middle first, so that most blocked pairs cost a few samples; a part that lies
-        within what is certainly free around its middle is not halved further.
+    `room` is [R, C] `clearance` in cells, 0 where a cell is not free. Halving: the middle first, so that most blocked
+    pairs cost a few samples; a part within what is certainly free around its middle is not halved further.
     """
     room = np.pad(room, 1)
     columns, clear, step = room.shape[1], room.ravel(), b - a

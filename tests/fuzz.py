@@ -134,7 +134,7 @@ def scenes() -> dict[str, Target]:
     from converters.recipes import load_recipes
     from converters.single_object import ObjectConfig, convert_object
     from interactive_nav.episodes import load_episode_file
-    from interactive_nav.scenes.object_folders import load_object
+    from interactive_nav.scenes.objects import load_object
     from interactive_nav.scenes.scene import load_scene
     from scenes_mjcf.schema import load_manifest, load_maps
     from scenes_mjcf.sets import read_set, scene_digest

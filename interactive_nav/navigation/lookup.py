@@ -53,12 +53,7 @@ def _in_sight(tables: SceneTables, scene: jax.Array, a: jax.Array, b: jax.Array)
 
 
 def goal_field(tables: SceneTables, scene: jax.Array, goal_xy_w: jax.Array) -> GoalField:
-    """Return every corner's distance to a goal, and the next corner on the way: once an episode.
-
-    Args:
-        scene: [] i32.
-        goal_xy_w: (2,) m, anywhere on free ground.
-    """
+    """Return every corner's distance to a goal (2,) on free ground, and the next corner on the way: once an episode."""
     none = tables.corner_xy_w.shape[1] - 1
     near = tables.visible[scene, node_at(tables, scene, goal_xy_w)].astype(jnp.int32)
 
@@ -91,14 +86,9 @@ def _from_node(
 
 
 def geodesic_at(tables: SceneTables, scene: jax.Array, goal: GoalField, xy: jax.Array) -> jax.Array:
-    """Return the geodesic distance to a goal from a world point, continuous.
+    """Return the geodesic distance [] f32, m, to a goal from a world point (2,), continuous.
 
-    Args:
-        scene: [] i32.
-        xy: (2,) m, world.
-
-    Returns:
-        [] f32, m. Within centimetres of structure, where the body cannot be, it is that of the nearest node's view.
+    Within centimetres of structure, where the body cannot be, it is that of the nearest node's view.
     """
     rows, columns = tables.node_of_cell.shape[1:]
     u = (xy - tables.grid_origin_w[scene]) / tables.cell_m - 0.5
@@ -139,15 +129,8 @@ def _hops(tables: SceneTables, ahead_m: float) -> int:
 def waypoints_at(
     tables: SceneTables, scene: jax.Array, goal: GoalField, xy: jax.Array, count: int, spacing_m: float
 ) -> jax.Array:
-    """Return the next waypoints on the shortest path, at equal arc length, the goal repeated at its end.
-
-    Args:
-        scene: [] i32.
-        xy: (2,) m, world.
-
-    Returns:
-        (count, 2) f32, m, world.
-    """
+    """Return the next waypoints (count, 2), m, on the shortest path from a world point (2,), at equal arc length, the
+    goal repeated at its end."""
     points = _path(tables, scene, goal, xy, _hops(tables, count * spacing_m))
     length = jnp.linalg.norm(points[1:] - points[:-1], axis=-1)
     return _along(points, length, spacing_m * jnp.arange(1, count + 1))
@@ -160,8 +143,6 @@ def grid_waypoints_at(
 
     The first is the robot's cell; from there every second node (spacing / cell) of a path that steps to
     one of eight neighbours, so 0.2 m apart along an axis and 0.283 m on diagonals; then the goal, repeated.
-
-    Args and returns: as `waypoints_at`.
     """
     points = _path(tables, scene, goal, cell_centre(tables, scene, xy), _hops(tables, 1.5 * count * spacing_m))
     # A step to one of eight neighbours advances the larger of the two differences by one cell.

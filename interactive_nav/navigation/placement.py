@@ -127,15 +127,8 @@ def draw_episode(
 
     Start and goal are the first of independent uniform pairs that are as far apart as required, so uniform among
     such pairs; in `MAX_ROUNDS` without one, it is one of `tables.fallback_pairs_xy_w`, of the same distances. Each
-    small object lies at the first of `CLUTTER_CANDIDATES` uniform places that is clear of what lies already.
-
-    Args:
-        small_radius_m: [k] radii of the small objects' footprints.
-        scene: [] i32; None: drawn.
-
-    Returns:
-        The episode's start. Nothing touches: small objects keep clear of the robot at the start, at the goal
-        (with `goal_clear`), and of each other.
+    small object, of radii [k], lies at the first of `CLUTTER_CANDIDATES` uniform places that is clear of what lies
+    already, of the robot at the start and, with `goal_clear`, at the goal. A `scene` of None is drawn.
     """
     key_scene, key_start, key_goal, key_yaw, key_place, key_turn = jax.random.split(key, 6)
     if scene is None:

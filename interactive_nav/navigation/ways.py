@@ -149,13 +149,12 @@ class PathGrid:
 
 
 class Ways:
-    """Ways in every scene of an environment.
+    """Plans paths in every scene of an environment.
 
-    Args:
-        weight: 0 takes the shortest way, whatever stands in it; between 0 and 1, a metre through an object of mass m
-            and friction mu costs w / (1 - w) * mu m / m_0 metres of detour, its friction's work over the robot's
-            weight; 1 goes through something only where no way is free. What the robot cannot push (friction above its
-            weight) costs as much as at 1. None: nothing is touched.
+    A weight of 0 takes the shortest path, whatever stands in it; between 0 and 1, a metre through an object of mass m
+    and friction mu costs w / (1 - w) * mu m / m_0 metres of detour, its friction's work over the robot's weight; 1 goes
+    through something only where no path is free. What the robot cannot push (friction above its weight) costs as much
+    as at 1. None: nothing is touched.
     """
 
     def __init__(self, env: Any, weight: float | None):
@@ -164,9 +163,7 @@ class Ways:
 
     def way(self, scene: int, qpos: np.ndarray, start_xy_w: np.ndarray, goal_xy_w: np.ndarray) -> np.ndarray:
         """Return a path [p, 2], m, in the world's frame, for `qpos` [nq] and places (2,), m; [0, 2] where none exists.
-
-        It ends at the goal unless nothing may be touched.
-        """
+        It ends at the goal unless nothing may be touched."""
         grid = self._grids[scene]
         free, cost = self._costs(grid, qpos)
         cells = PathGrid(free, cost).path(grid.cell(start_xy_w), grid.cell(goal_xy_w))

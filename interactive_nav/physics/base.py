@@ -110,16 +110,10 @@ class Physics(abc.ABC):
     def step_batch(
         self, scene: jax.Array, state: PhysicsState, command: jax.Array, time_s: jax.Array
     ) -> tuple[PhysicsState, StepSignals]:
-        """Step a batch by one control period.
+        """Return the states and signals, leaves [N, ...], one control period later.
 
-        Args:
-            scene: [N] i32 index of each environment's scene.
-            state: leaves [N, ...].
-            command: [N, A] f32, held over the period; the robot's control law makes actuator controls of it.
-            time_s: [N] f32 since the start of the episode.
-
-        Returns:
-            The new state and the signals, leaves [N, ...].
+        `scene` is [N] i32; `command` [N, A] f32 is held over the period, and the robot's control law turns it into
+        actuator controls; `time_s` [N] f32 is since the start of the episode.
         """
 
     def step(
@@ -146,9 +140,8 @@ def summarise_forces(
 ) -> dict[str, Any]:
     """Return the fields of `StepSignals` that hold forces, from the contact forces of all substeps.
 
-    Args:
-        force_w: [..., substeps, M + 1, 3] net force on each slot, the structure last, N.
-        contacts: of `from_sensors`, leaves [..., substeps, (3)]; None: no option asks.
+    `force_w` [..., substeps, M + 1, 3], N, is the net force on each slot, the structure last; `contacts` are of
+    `from_sensors`, leaves [..., substeps, (3)], or None where no option needs them.
     """
     each = xp.sqrt((force_w**2).sum(-1)).max(-2)
     vector = force_w.sum(-2) if contacts is None or options.force_part == "full" else contacts[0]

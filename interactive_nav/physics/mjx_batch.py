@@ -71,12 +71,8 @@ class MjxPhysics(Physics):
 
     @abc.abstractmethod
     def _substep_all(self, model: mjx.Model, data: mjx.Data, control: Callable) -> tuple[mjx.Data, Any, jax.Array]:
-        """Run all substeps of a control step of one environment.
-
-        Returns:
-            The last data; the forces [substeps, M + 1, 3] on slots and structure with what `from_sensors` gives of
-            each substep, or None; and the bits of Warp's OverflowType.
-        """
+        """Run all substeps of a control step of one environment; return the last data, the forces [substeps, M + 1, 3]
+        on slots and structure with what `from_sensors` gives of each substep, or None, and Warp's OverflowType bits."""
 
     def _controlled(self, data: mjx.Data, command: jax.Array, time_s: jax.Array) -> mjx.Data:
         robot = self.window.layout.robot_state(data.qpos, data.qvel, time_s)
@@ -256,12 +252,8 @@ def _without_sensors(spec: mujoco.MjSpec) -> mujoco.MjModel:
 def measure_buffers(world: World, window: PhysicsWindow, head_room: float = 1.6) -> tuple[int, int]:
     """Return contact slots and constraint rows per environment that the window needs, measured at rest.
 
-    Everything rests, the small objects laid out on the floor; the window holds the bodies with the most
-    contacts. `head_room` leaves place for a robot that pushes objects into each other. What overflows
-    all the same is counted in the metrics.
-
-    Returns:
-        (contacts, constraint rows) per environment.
+    Everything rests, the small objects laid out on the floor; the window holds the bodies with the most contacts.
+    `head_room` leaves place for a robot that pushes objects into each other. Metrics count what overflows anyway.
     """
     contacts = rows = 0
     for model, qpos in zip(world.models, world.rest_qpos, strict=True):

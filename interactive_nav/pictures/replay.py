@@ -14,8 +14,7 @@ import jax
 import numpy as np
 
 from interactive_nav.pictures.scene_model import world_poses
-from interactive_nav.scenes.object_folders import small_objects
-from interactive_nav.scenes.objects import SmallObject
+from interactive_nav.scenes.objects import SmallObject, small_objects
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav.task.rollout import HostPolicy, Player, PolicyFn, Recorder
 from interactive_nav.types import EpisodeStart

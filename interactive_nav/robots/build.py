@@ -242,13 +242,8 @@ def wheeled_robot(
     rolling: tuple[str, ...] = (),
     **figures: Any,
 ) -> RobotSpec:
-    """Return the spec of a wheeled robot in a control mode.
-
-    Args:
-        base_body: the file's body with the free joint.
-        camera: its body without the robot's name.
-        rolling: bodies of wheels without the robot's name; by default those of the driven wheels.
-    """
+    """Return the spec of a wheeled robot in a control mode; `base_body` is the file's body with the free joint, and
+    bodies of the camera and of wheels (`rolling`; by default the driven ones) are without the robot's name."""
     check_mode(base.name, control_mode, base.modes)
     prefix = f"{base.name}_"
     path, joints = base.path or FOLDER / f"{base.name}.xml", base.joints

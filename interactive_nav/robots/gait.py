@@ -172,12 +172,8 @@ def _add_to(legs: Legged, mode: str, world: mujoco.MjSpec) -> None:
 
 
 def legged_robot(legs: Legged, control_mode: str = "native", **figures: Any) -> RobotSpec:
-    """Return the spec of a legged robot in a control mode.
-
-    Args:
-        control_mode: one of `legs.modes`; `native` is `legs.native` of each joint, `twist` the base's linear and
-            angular velocity through the gait.
-    """
+    """Return the spec of a legged robot in one of `legs.modes`: `native` is `legs.native` of each joint, `twist` the
+    base's linear and angular velocity through the gait."""
     check_mode(legs.name, control_mode, legs.modes)
     joint_mode = legs.native if control_mode == "native" else control_mode
     twist = control_mode == "twist"

@@ -59,11 +59,9 @@ def check_mode(robot: str, mode: str, modes: tuple[str, ...]) -> None:
 def set_servo(
     actuator: mujoco.MjsActuator, gains: tuple[float, float] | None, control_range: tuple[float, float] | None
 ) -> None:
-    """Turn an actuator into a servo of its joint, or a motor.
+    """Turn an actuator into a servo of its joint with stiffness and damping, or, without gains, a motor.
 
-    Args:
-        gains: stiffness and damping; without stiffness the control is a velocity, else a position; None: a force.
-        control_range: least and largest control; None: any.
+    Without stiffness the control is a velocity, else a position; it may be any where `control_range` is None.
     """
     stiffness, damping = gains or (0.0, 0.0)
     actuator.gaintype = mujoco.mjtGain.mjGAIN_FIXED

@@ -85,16 +85,9 @@ def sensor_addresses(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def part_of_contacts(force_c: Any, normal_w: Any, part: str, xp: Any) -> tuple[Any, Any, Any]:
-    """Return sums over contacts.
-
-    Args:
-        force_c: [..., c, 3] in the contacts' frames, normal first, N; 0 where there is no contact.
-        normal_w: [..., c, 3] world frame.
-
-    Returns:
-        The vector sum of the normal forces [..., 3], the sum of the chosen part's norms [...], and the sum of the
-        normal forces' norms [...].
-    """
+    """Return the vector sum of contacts' normal forces [..., 3], and the sums of the chosen part's norms and of the
+    normal forces' norms [...]. `force_c` [..., c, 3], N, is in the contacts' frames, normal first, 0 where there is no
+    contact; `normal_w` is [..., c, 3]."""
     pressure = force_c[..., 0]
     norm = xp.sqrt((force_c**2).sum(-1)) if part == "full" else abs(pressure)
     return (pressure[..., None] * normal_w).sum(-2), norm.sum(-1), abs(pressure).sum(-1)

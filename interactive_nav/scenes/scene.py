@@ -38,14 +38,7 @@ def check_scene(
     movables: Sequence[Any],
     model: mujoco.MjModel,
 ) -> None:
-    """Raise for a scene with absurd poses, masses, walls or maps; warn where most furniture is out of reach.
-
-    Args:
-        walls: [n, 10] world centre, quaternion, half sizes, m.
-
-    Raises:
-        SceneError: the first fault, with its remedy.
-    """
+    """Raise `SceneError` for absurd poses, masses, walls [n, 10] or maps; warn where most furniture is out of reach."""
     faults = [*_wall_faults(maps, walls), *_object_faults(maps, movables, model), *differences(model, manifest.objects)]
     if faults:
         more = f" (and {len(faults) - 1} more faults)" if len(faults) > 1 else ""

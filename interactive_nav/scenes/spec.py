@@ -11,8 +11,7 @@ import numpy as np
 from interactive_nav.config import NavConfig
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.contacts import add_contact_sensors, add_sensor
-from interactive_nav.scenes.object_folders import ConvertedObject
-from interactive_nav.scenes.objects import SmallObject, add_boxes
+from interactive_nav.scenes.objects import ConvertedObject, SmallObject, add_boxes
 from interactive_nav.scenes.scene import Hinge, Movable, Scene
 from interactive_nav.scenes.slots import Layout, Slot, find_layout, parking_spot
 

@@ -13,8 +13,7 @@ import numpy as np
 
 from interactive_nav.config import NavConfig
 from interactive_nav.robots import RobotSpec
-from interactive_nav.scenes.object_folders import small_objects
-from interactive_nav.scenes.objects import SmallObject
+from interactive_nav.scenes.objects import SmallObject, small_objects
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.slots import Layout, SlotTables, build_slot_tables, find_layout, find_slots, parking_spot
 from interactive_nav.scenes.spec import build_spec

@@ -7,12 +7,9 @@ from scenes_mjcf.look import CameraPose, Lens, look_along
 
 
 def make_renderer(tables: BoxTables, lens: Lens, name: str, backend: str, meshes: World | None = None) -> Renderer:
-    """Build a renderer.
+    """Build a renderer: warp (MJX-Warp's), rays (plain JAX), or auto: warp beside physics on warp, rays elsewhere.
 
-    Args:
-        lens: the camera's.
-        name: warp (MJX-Warp's), rays (plain JAX), or auto: warp beside physics on warp, rays elsewhere.
-        meshes: whose visual meshes are drawn, by a Warp kernel whatever the name; None: boxes.
+    With `meshes` its visual meshes are drawn, by a Warp kernel whatever the name; else boxes.
     """
     from interactive_nav.physics import resolve_backend
 

@@ -83,16 +83,8 @@ class Renderer(abc.ABC):
         return other
 
     def render_batch(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
-        """Draw a batch.
-
-        Args:
-            scene: [N] i32 index of each environment's scene.
-            qpos: [N, nq] f32.
-            camera: leaves [N, ...].
-
-        Returns:
-            Depth [N, H, W] f32, the distance along the optical axis, m, 0 where nothing is met; class ids [N, H, W] u8.
-        """
+        """Draw a batch of scenes [N], qpos [N, nq] and cameras, leaves [N, ...]: depth [N, H, W] f32, the distance
+        along the optical axis, m, 0 where nothing is met, and class ids [N, H, W] u8."""
         images = self.images_batch(("depth", "segmentation"), scene, qpos, camera)
         return images["depth"], images["segmentation"]
 
@@ -100,17 +92,10 @@ class Renderer(abc.ABC):
     def images_batch(
         self, names: tuple[str, ...], scene: jax.Array, qpos: jax.Array, camera: CameraPose, look: Look | None = None
     ) -> dict[str, jax.Array]:
-        """Draw a batch in several ways.
+        """Draw a batch as `render_batch`, in several ways; without a `look` objects keep their colours.
 
-        Args:
-            scene: [N] i32.
-            qpos: [N, nq] f32.
-            camera: leaves [N, ...].
-            look: leaves [N, ...]; None: objects keep their colours.
-
-        Returns:
-            depth and segmentation as `render_batch` gives them; rgb [N, H, W, 3] f32 in [0, 1]; normals
-            [N, H, W, 3] f32, unit vectors in the camera's frame (right, up, towards the viewer), 0 where nothing is.
+        Depth and segmentation are as there; rgb is [N, H, W, 3] f32 in [0, 1]; normals [N, H, W, 3] f32 are unit
+        vectors in the camera's frame (right, up, towards the viewer), 0 where nothing is.
         """
 
     def images(
@@ -126,11 +111,8 @@ class BoxRenderer(Renderer):
 
     @abc.abstractmethod
     def trace_batch(self, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> tuple[jax.Array, jax.Array]:
-        """Return which box each pixel shows, from which colours and normals follow.
-
-        Returns:
-            Depth as `render_batch` gives it, and indices [N, H, W] i32 into the tables' boxes, B the floor, -1 nothing.
-        """
+        """Return depth as `render_batch` has it, and the box that each pixel shows: indices [N, H, W] i32 into the
+        tables' boxes, B the floor, -1 nothing."""
 
     def images_batch(self, names, scene, qpos, camera, look=None):
         if not set(names) & {"rgb", "normals"}:

@@ -60,12 +60,8 @@ def _low_bits(number: int) -> int:
 
 
 def camera_boxes(tables: BoxTables, scene: jax.Array, qpos: jax.Array, camera: CameraPose) -> dict[str, jax.Array]:
-    """Return what a slab test needs of each box; leading axes [N].
-
-    Returns:
-        axes [N, B, 3, 3], the camera's forward, right and up (columns) in the box's frame; eye [N, B, 3], its
-        position there, m; half [N, B, 3], m, negative for padding; id [N, B] i32.
-    """
+    """Return what a slab test needs of each box: axes [N, B, 3, 3], the camera's forward, right and up (columns) in the
+    box's frame; eye [N, B, 3], its position there, m; half [N, B, 3], m, negative for padding; id [N, B] i32."""
     centre, axes = box_poses(tables, scene, qpos)
     inverse = jnp.swapaxes(axes, -1, -2)
     return {
@@ -168,11 +164,8 @@ def _in_front(boxes: dict[str, jax.Array]) -> jax.Array:
 
 
 def _lists(shows: jax.Array, env: np.ndarray, n: int) -> tuple[jax.Array, jax.Array]:
-    """Return each tile's list of the boxes that it shows, and how many, from `shows` [T, B] and its environment [T].
-
-    Returns:
-        [T, B + 1] i32 rows of boxes, the free places pointing at the row of padding behind all of them; [T] i32.
-    """
+    """Return each tile's list of the boxes that it shows, and how many, from `shows` [T, B] and its environment [T]:
+    [T, B + 1] i32 rows of boxes, the free places pointing at the row of padding behind all of them; [T] i32."""
     count, num_boxes = shows.shape
     rank = jnp.cumsum(shows, -1, dtype=jnp.int32)
     number = env[:, None] * num_boxes + np.arange(num_boxes, dtype=np.int32)

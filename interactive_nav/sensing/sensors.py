@@ -70,12 +70,7 @@ class Mount:
 
 
 def make_mount(model: mujoco.MjModel, base_body: str, camera: RobotCamera, yaw_rad: float = 0.0) -> Mount:
-    """Find the chain of bodies from a robot's base to its camera.
-
-    Args:
-        camera: its body lies in the base's subtree.
-        yaw_rad: how far it looks to the left of its body's x axis.
-    """
+    """Return a camera's mount in the base's subtree, which looks `yaw_rad` to the left of its body's x axis."""
     base, body = (mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, n) for n in (base_body, camera.body))
     names = [model.body(b).name for b in range(model.nbody) if model.body_rootid[b] == base]
     if body < 0 or model.body_rootid[body] != base:
@@ -130,9 +125,7 @@ class Sensors:
     def __init__(self, world: World, config: NavConfig, backend: str, extra: Mapping[str, int] | None = None):
         """Build tables, and the renderer if images are observed.
 
-        Args:
-            backend: of the physics.
-            extra: parts appended to the vector -> their lengths; `observe` is given their values.
+        `extra` are parts appended to the vector -> their lengths; `observe` is given their values.
         """
         self._layout, self._config = world.layout, config
         model = world.models[0]
@@ -181,11 +174,9 @@ class Sensors:
     def observe(
         self, physics: PhysicsState, nav: NavInfo, rng: jax.Array, remembered: Mapping[str, jax.Array] | None = None
     ) -> jax.Array | dict[str, jax.Array]:
-        """Return the observation of one environment.
+        """Return the observation of one environment; `rng`, the episode's key, is read for noise and not consumed.
 
-        Args:
-            rng: key of the episode, read for noise and not consumed.
-            remembered: part -> its value, of `odometry`, `trail` and the `extra` parts where they are observed.
+        `remembered` has the values of `odometry`, `trail` and the `extra` parts where they are observed.
         """
         vector = self._vector(physics, nav, rng, remembered or {})
         if not self._images:
@@ -299,11 +290,8 @@ def _robot_joints(model: mujoco.MjModel, world: World) -> tuple[np.ndarray, np.n
 
 
 def disturbed(noise: CameraNoise, lens: Lens, images: dict[str, jax.Array], key_of: KeyOf) -> dict[str, jax.Array]:
-    """Return the images of one camera with its errors.
-
-    Args:
-        images: as `Renderer.images` gives them: depth in m, rgb in [0, 1]; normals are needed for `depth_grazing_deg`.
-    """
+    """Return the images of one camera, as `Renderer.images` gives them, with its errors; `depth_grazing_deg` needs
+    normals."""
     out = dict(images)
     if "rgb" in out:
         out["rgb"] = noisy_rgb(noise, out["rgb"], key_of)

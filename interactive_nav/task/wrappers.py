@@ -48,14 +48,10 @@ def reset_all(env: InteractiveNav, keys: jax.Array, slot: jax.Array | None = Non
 
 
 def draw_where(env: InteractiveNav, current: tuple, over: jax.Array) -> tuple:
-    """Draw new episodes where `over`, drawn for a part of the batch at a time: few end in one step.
+    """Return physics, `nav` and `rng` of N environments with new episodes where `over` [N], whose `rng` is consumed.
 
-    Args:
-        current: physics, `nav` and `rng` of N environments; where an episode is over, its `rng` is consumed.
-        over: [N] bool.
-
-    Returns:
-        As `current`; an environment that keeps its scene stays in it.
+    They are drawn for a part of the batch at a time: few end in one step. An environment that keeps its scene stays in
+    it.
     """
     n = over.shape[0]
     share = max(1, n // DRAW_SHARE)

@@ -17,8 +17,7 @@ from converters.single_object import ObjectConfig, convert_object
 from interactive_nav import episodes
 from interactive_nav.config import make_config
 from interactive_nav.pictures.replay import EpisodePlayer, load_replay, save_replay
-from interactive_nav.scenes.object_folders import load_object, small_objects
-from interactive_nav.scenes.objects import Box, pick
+from interactive_nav.scenes.objects import Box, load_object, pick, small_objects
 from interactive_nav.scenes.slots import bodies_by_name
 from interactive_nav_common.errors import UserError
 from scenes_mjcf.schema import SceneError

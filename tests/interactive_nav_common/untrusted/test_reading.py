@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from interactive_nav import episodes
-from interactive_nav.scenes.object_folders import load_object
+from interactive_nav.scenes.objects import load_object
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.config import read_words
 from interactive_nav_common.errors import ConfigError, FileError, UserError, readable
