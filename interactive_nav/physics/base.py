@@ -103,7 +103,7 @@ class Physics(abc.ABC):
 
     name: str
     nv: int
-    tells_convergence = True
+    reports_convergence = True
     """Whether `StepSignals.unconverged` is reported."""
 
     @abc.abstractmethod

@@ -166,7 +166,7 @@ class JaxPhysics(MjxPhysics):
     """MJX-JAX: it has no contact sensors between bodies, so forces are summed from its contacts instead."""
 
     name = "jax"
-    tells_convergence = False
+    reports_convergence = False
 
     def __init__(self, world: World, config: NavConfig, window: PhysicsWindow | None = None):
         super().__init__(world, config, window)
@@ -313,7 +313,7 @@ class TieredPhysics(Physics):
         """Build the engines; `make` takes a world, settings and a window."""
         whole = make(world, config)
         self.name, self.nv, self.window = whole.name, whole.nv, whole.window
-        self.tells_convergence = whole.tells_convergence
+        self.reports_convergence = whole.reports_convergence
         words = config.windows
         proposed = propose_tiers(whole.window.needs_at_rest) if words is None else parse_window_tiers(words)
         self.shares = tuple(tier.share for tier in proposed)

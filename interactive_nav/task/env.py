@@ -238,7 +238,7 @@ class InteractiveNav(Env):
         metrics = {name: done * jnp.asarray(values[name], jnp.float32) for name in self.metric_names}
         rewards = {name: values[name] for name in self.reward_names}
         reward = functools.reduce(operator.add, rewards.values())
-        if not self.physics.tells_convergence:
+        if not self.physics.reports_convergence:
             metrics["unconverged_steps"] = jnp.where(done > 0, jnp.nan, 0.0)
 
         # After its end an episode pays nothing and scores nothing more; that its physics broke is still reported.

@@ -93,8 +93,8 @@ def test_success_is_paid_once_and_the_end_stays(room, batch, auto):
 
 
 def test_what_a_backend_does_not_tell_is_nan_at_the_end(env, batch, monkeypatch):
-    assert not JaxPhysics.tells_convergence
-    monkeypatch.setattr(env.physics, "tells_convergence", False)
+    assert not JaxPhysics.reports_convergence
+    monkeypatch.setattr(env.physics, "reports_convergence", False)
     states = played(_Batch(env), LIMIT, batch)
     assert [np.isnan(s.metrics["unconverged_steps"]).all() for s in states] == [False] * LIMIT + [True]
 
