@@ -67,6 +67,9 @@ class Compositor:
         check_height(height)
         check_replay_scene(replay, scene)
         self.replay, self.height, self.views = replay, height, tuple(views)
+        self._columns, self._strip = height * 4 // 3, height // 6
+        self.size = len(views) * self._columns or self._columns + height // 3, height + self._strip
+        """Columns and rows of a frame."""
         robot = get_robot(replay.robot)
         self._middle_m = 0.6 * robot.height_m
         self._goal_radius_m = replay.success_distance_m or robot.body_width_m
@@ -77,20 +80,6 @@ class Compositor:
         self._cameras = {view: self._positions(view) for view in self.views if view in BEHIND_M}
         # Pillow's font has spaces of 0.2 em, which round to nothing between some letters of small sizes.
         self._font = ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf"), height / 28)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Return the columns and rows of a frame."""
-        columns = len(self.views) * self._columns or self._columns + self.height // 3
-        return columns, self.height + self._strip
-
-    @property
-    def _columns(self) -> int:
-        return self.height * 4 // 3
-
-    @property
-    def _strip(self) -> int:
-        return self.height // 6
 
     def frame(self, step: int) -> np.ndarray:
         """Draw [rows, columns, 3] u8: the state after `step` control steps."""

@@ -67,20 +67,12 @@ def draw_topdown(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "tim
     robot = get_robot(replay.robot)
     for step, style in ((0, "--"), (-1, "-")):
         place, yaw = replay.robot_xy_w[step], yaw_from_quat(replay.body_quat_w[step, 0])
-        axis.add_patch(
-            Circle((float(place[0]), float(place[1])), robot.footprint_radius_m, fill=False, linestyle=style, zorder=6)
-        )
+        x, y = map(float, place)
+        axis.add_patch(Circle((x, y), robot.footprint_radius_m, fill=False, linestyle=style, zorder=6))
         nose = place + robot.footprint_radius_m * np.array([np.cos(yaw), np.sin(yaw)])
         axis.plot(*np.stack([place, nose]).T, color="k", linewidth=1, linestyle=style, zorder=6)
-    goal = Circle(
-        (float(replay.goal_xy_w[0]), float(replay.goal_xy_w[1])),
-        replay.success_distance_m or robot.body_width_m,
-        color="#009e73",
-        alpha=0.35,
-        linewidth=0,
-        zorder=2,
-    )
-    axis.add_patch(goal)
+    (x, y), reach_m = map(float, replay.goal_xy_w), replay.success_distance_m or robot.body_width_m
+    axis.add_patch(Circle((x, y), reach_m, color="#009e73", alpha=0.35, linewidth=0, zorder=2))
     axis.plot(*replay.goal_xy_w, marker="*", color="#009e73", markeredgecolor="k", markersize=11, zorder=7)
     s = replay.metrics
     axis.set_title(
@@ -140,15 +132,12 @@ def _draw_object(axis: Axes, category: str, boxes: np.ndarray, pos: np.ndarray, 
     centre = np.array(before.centroid.coords[0])
     if not (extent[0] <= centre[0] <= extent[1] and extent[2] <= centre[1] <= extent[3]):
         return  # an object without a place waits outside
-    colour = COLOURS[category]
-    axis.add_patch(
-        patch_from_polygon(
-            after, facecolor=(*colour, 0.75), edgecolor=(*(0.6 * np.array(colour)), 1.0), linewidth=0.6, zorder=3
-        )
-    )
+    colour = np.array(COLOURS[category])
+    shades = {"facecolor": (*colour, 0.75), "edgecolor": (*(0.6 * colour), 1.0)}
+    axis.add_patch(patch_from_polygon(after, linewidth=0.6, zorder=3, **shades))
     if before.hausdorff_distance(after) <= MOVED_M:
         return
-    dark = 0.55 * np.array(colour)
+    dark = 0.55 * colour
     axis.add_patch(patch_from_polygon(before, facecolor="none", edgecolor=dark, linewidth=0.9, linestyle=":", zorder=3))
     there = np.array(after.centroid.coords[0])
     if np.linalg.norm(there - centre) > MOVED_M:

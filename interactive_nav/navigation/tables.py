@@ -6,7 +6,6 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -217,12 +216,10 @@ def build_tables(world: World, rules: TaskRules) -> SceneTables:
         places = list(pool.map(lambda i: _scene_places(world, i, rules), range(len(world.scenes))))
     mass = np.concatenate([np.full((len(world.scenes), 1), world.robot_mass_kg), world.slots.mass_kg], 1)
 
-    def f32(value) -> jnp.ndarray:
-        return jax.device_put(np.asarray(value, np.float32))
+    def f32(value: Any, dtype: Any = np.float32) -> jax.Array:
+        return jax.device_put(np.asarray(value, dtype))
 
-    def i32(value) -> jnp.ndarray:
-        return jax.device_put(np.asarray(value, np.int32))
-
+    i32 = functools.partial(f32, dtype=np.int32)
     tables = SceneTables(
         rest_qpos=f32(world.rest_qpos),
         mass_kg=f32(mass),

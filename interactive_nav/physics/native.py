@@ -21,13 +21,9 @@ from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, sum
 from interactive_nav.scenes.contacts import from_sensors, sensor_addresses
 from interactive_nav.scenes.world import World
 
-_ENGINE_FAILURES = (
-    mujoco.mjtWarning.mjWARN_BADQPOS,
-    mujoco.mjtWarning.mjWARN_BADQVEL,
-    mujoco.mjtWarning.mjWARN_BADQACC,
-    mujoco.mjtWarning.mjWARN_INERTIA,
-)
-_OVERFLOWS = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
+_W = mujoco.mjtWarning
+_ENGINE_FAILURES = [w.value for w in (_W.mjWARN_BADQPOS, _W.mjWARN_BADQVEL, _W.mjWARN_BADQACC, _W.mjWARN_INERTIA)]
+_OVERFLOWS = [_W.mjWARN_CONTACTFULL.value, _W.mjWARN_CNSTRFULL.value]
 
 
 def with_feet_apart(spec: mujoco.MjSpec, names: Sequence[str]) -> mujoco.MjModel:
@@ -114,13 +110,12 @@ class NativePhysics(Physics):
         packed = np.asarray(packed)
         qpos, qvel, warm, rest = np.split(packed, np.cumsum([self.nq, self.nv, self.nv]), 1)
         command, time_s, scene = np.nan_to_num(rest[:, :-2]), rest[:, -2], rest[:, -1].astype(np.int64)
-        size, state = len(packed), PhysicsState(qpos, qvel, warm)
         pool = self._take_pool(qpos)
         try:
-            return self._step_pool(pool, size, scene, state, qpos, qvel, command, time_s)
+            return self._step_pool(pool, scene, PhysicsState(qpos, qvel, warm), command, time_s)
         finally:
             with self._lock:
-                self._pools[size].append(pool)
+                self._pools[len(packed)].append(pool)
 
     def _take_pool(self, qpos: np.ndarray) -> _Pool:
         """Return a pool that nobody else is using (each JAX device calls from another thread), if possible the one that
@@ -133,8 +128,8 @@ class NativePhysics(Physics):
                 return free.pop(int(np.argmax(equal)))
         return _Pool(self._models, size, self._config.threads, self._config.sleep)
 
-    def _step_pool(self, pool: _Pool, size: int, scene, state: PhysicsState, qpos, qvel, command, time_s):
-        batch = pool.batch
+    def _step_pool(self, pool: _Pool, scene, state: PhysicsState, command, time_s):
+        batch, qpos, qvel = pool.batch, state.qpos, state.qvel
         if len(self._models) > 1 and not np.array_equal(pool.scene, scene):
             batch.set_models([self._models[s] for s in scene])
             pool.qpos[np.flatnonzero(pool.scene - scene)] = np.nan
@@ -152,7 +147,7 @@ class NativePhysics(Physics):
         raised = batch.warning[:, :, 1] > 0
         new_qpos, new_qvel = pool.state_qpos.astype(np.float32), pool.state_qvel.astype(np.float32)
         finite &= np.isfinite(new_qpos).all(1) & np.isfinite(new_qvel).all(1)
-        nonfinite = ~finite | raised[:, [int(w) for w in _ENGINE_FAILURES]].any(1)
+        nonfinite = ~finite | raised[:, _ENGINE_FAILURES].any(1)
         pool.qpos, pool.qvel = new_qpos, new_qvel
         pool.qpos[nonfinite] = np.nan
         contacts = None
@@ -163,8 +158,8 @@ class NativePhysics(Physics):
             PhysicsState(new_qpos.copy(), new_qvel.copy(), pool.state_warm.astype(np.float32)),
             StepSignals(
                 **forces,
-                overflow=raised[:, [int(w) for w in _OVERFLOWS]].any(1).astype(np.int32),
-                left_out=np.zeros(size, np.int32),
+                overflow=raised[:, _OVERFLOWS].any(1).astype(np.int32),
+                left_out=np.zeros(len(scene), np.int32),
                 unconverged=(iterations >= self._iterations).astype(np.int32),
                 nonfinite=nonfinite.astype(np.int32),
             ),

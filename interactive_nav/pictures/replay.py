@@ -24,10 +24,6 @@ from interactive_nav_common.untrusted.reading import read_npz
 from scenes_mjcf.categories import MaskClasses
 
 FORMAT = 1
-_ARRAYS = (
-    *("start_xy_w", "goal_xy_w", "body_pos_w", "body_quat_w", "action", "reward", "force_n"),
-    *("touches_movable", "touches_structure"),
-)
 
 
 class ReplayError(UserError):
@@ -100,6 +96,9 @@ class Replay:
     def robot_xy_w(self) -> np.ndarray:
         """Return the [T + 1, 2] path of the robot's base, m."""
         return self.body_pos_w[:, 0, :2]
+
+
+_ARRAYS = tuple(field.name for field in dataclasses.fields(Replay) if field.type is np.ndarray)
 
 
 def _read(state: Any, action: jax.Array) -> dict[str, jax.Array]:

@@ -192,11 +192,6 @@ def turn_freely(joint, path: Path, slip_n_m: float) -> None:
         joint.actfrcrange = [-slip_n_m, slip_n_m]
 
 
-def _height_m(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
-    """Return half the height of the geom's box."""
-    return float(np.abs(data.geom_xmat[geom, 6:]) @ half_extents(model, geom))
-
-
 def hold(
     child: mujoco.MjSpec,
     path: Path,
@@ -226,7 +221,8 @@ def hold(
             if parents[other] in below:
                 below.add(other)
         geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in below and model.geom_group[g] == 3]
-        lowest = min((data.geom_xpos[g, 2] - _height_m(model, data, g) for g in geoms), default=np.inf)
+        down_m = [np.abs(data.geom_xmat[g, 6:]) @ half_extents(model, g) for g in geoms]
+        lowest = min((data.geom_xpos[g, 2] - down for g, down in zip(geoms, down_m, strict=True)), default=np.inf)
         on_floor = joint.type == hinge and not model.jnt_limited[model.joint(joint.name).id]
         on_floor = on_floor and lowest < bottom_m + FLOOR_M
         if on_floor or any(model.body(name).id in below for name in casters):

@@ -147,11 +147,8 @@ class WarpColour:
         """Draw geoms' poses [N, ngeom, 3] and [N, ngeom, 3, 3], cameras [N, ...] to [N, H, W, 3] u8."""
         n = geom_xpos.shape[0]
         context, template = self._context.pytree(), mjx.make_data(self._host, impl="warp", naconmax=1, njmax=1)
-        fields = {
-            "geom_xpos": jnp.asarray(geom_xpos, jnp.float32),
-            "geom_xmat": jnp.asarray(geom_xmat, jnp.float32),
-            **_data_of_camera(camera, self._host),
-        }
+        geoms = {"geom_xpos": geom_xpos, "geom_xmat": geom_xmat}
+        fields = {name: jnp.asarray(x, jnp.float32) for name, x in geoms.items()} | _data_of_camera(camera, self._host)
 
         def one(fields):
             data = mjx.refit_bvh(self._model, template.replace(**fields), context)

@@ -101,14 +101,8 @@ def _velocity_law(command, state, xp):
     quat, velocity_w = state.qpos[..., 3:7], state.qvel[..., :3]
     heading = yaw_from_quat(quat)
     cos, sin = xp.cos(heading), xp.sin(heading)
-    wanted_w = xp.stack(
-        [
-            cos * command[..., 0] - sin * command[..., 1],
-            sin * command[..., 0] + cos * command[..., 1],
-            command[..., 2],
-        ],
-        -1,
-    )
+    ahead, left, climb, turn = (command[..., k] for k in range(4))
+    wanted_w = xp.stack([cos * ahead - sin * left, sin * ahead + cos * left, climb], -1)
     lift = _VELOCITY_GAIN * (wanted_w - velocity_w)
     most = GRAVITY * math.tan(MAX_TILT_RAD)
     across = xp.clip(lift[..., :2], -most, most)
@@ -117,7 +111,7 @@ def _velocity_law(command, state, xp):
     size = xp.sqrt((thrust_w**2).sum(-1, keepdims=True))
     # The thrust axis in the body frame is z; turning it onto the wanted direction d takes z x d.
     d = rotate_back(quat, thrust_w / size)
-    yaw_rate_w = xp.stack([0 * heading, 0 * heading, command[..., 3]], -1)
+    yaw_rate_w = xp.stack([0 * heading, 0 * heading, turn], -1)
     rates = rotate_back(quat, yaw_rate_w) + _TILT_GAIN * xp.stack([-d[..., 1], d[..., 0], 0 * heading], -1)
     thrust = MASS_KG * size[..., 0] * xp.maximum(d[..., 2], 0.0)
     return _fly_rates(xp.clip(rates, -MAX_RATE_RAD_S, MAX_RATE_RAD_S), thrust, state, xp)
