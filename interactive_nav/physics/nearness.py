@@ -100,18 +100,13 @@ class Nearness:
         centre = xp.where(hinge[:, None], hung, placed)
         return Boxes(centre[..., :2], axes[..., :2, :], half)
 
-    def walls_m(self, scene: Array, state: PhysicsState) -> Array:
-        """Return [..., W] planar distance from the robot to each wall box; `FAR_M` for empty ones."""
+    def _walls_gap_m(self, scene: Array, state: PhysicsState, reach_m: float, boxes: Boxes, push_m: Array) -> Array:
+        """Return [..., W] m to where walls are met: within `reach_m` of the robot, or `TOUCH_M` of what it may push."""
         xp = namespace(state.qpos)
         xpos, xmat, half, used = (xp.asarray(t)[scene] for t in self._walls)
         offset = xp.einsum("...wi,wij->...wj", state.qpos[..., None, self._robot] - xpos, xmat)
         outside = xp.maximum(xp.abs(offset) - half, 0.0)
-        return xp.where(used > 0, xp.linalg.norm(outside, axis=-1), FAR_M)
-
-    def _walls_gap_m(self, scene: Array, state: PhysicsState, reach_m: float, boxes: Boxes, push_m: Array) -> Array:
-        """Return [..., W] m to where walls are met: within `reach_m` of the robot, or `TOUCH_M` of what it may push."""
-        xp, gap = namespace(state.qpos), self.walls_m(scene, state) - reach_m
-        xpos, xmat, half, used = (xp.asarray(t)[scene] for t in self._walls)
+        gap = xp.where(used > 0, xp.linalg.norm(outside, axis=-1), FAR_M) - reach_m
         walls = Boxes(xpos, xp.pad(xmat, ((0, 0), (0, 0), (0, 1))), xp.pad(half, ((0, 0), (0, 1))))
         nearest = xp.argsort(push_m)
         for k in range(min(_PUSHED, push_m.shape[-1])):
