@@ -49,16 +49,19 @@ def footprint(folder: Path) -> shapely.Geometry:
     return shapely.union_all([shapely.box(*(g.pos - g.size)[:2], *(g.pos + g.size)[:2]) for g in boxes])
 
 
-def seen(folder: Path, name: str) -> np.ndarray:
-    """(n, 3) vertices of a body's picture, in the world."""
+def seen(folder: Path, name: str) -> trimesh.Trimesh:
+    """Return a body's visual mesh, in the world."""
     body = of_scene(folder).body(name)
-    own = np.asarray(trimesh.load_mesh(folder / "assets" / f"{name}_visual.obj", process=False).vertices)
-    return own @ matrix_from_quat(np.array(body.quat)).T + body.pos
+    mesh = trimesh.load_mesh(folder / "assets" / f"{name}_visual.obj", process=False)
+    return trimesh.Trimesh(mesh.vertices @ matrix_from_quat(np.array(body.quat)).T + body.pos, mesh.faces)
 
 
-def apart(first: np.ndarray, second: np.ndarray) -> float:
-    """The Hausdorff distance of two clouds, m."""
-    return max(KDTree(a).query(b)[0].max() for a, b in ((first, second), (second, first)))
+def apart(first: trimesh.Trimesh, second: trimesh.Trimesh) -> float:
+    """Return how far the vertices of one of two surfaces are at most from the other surface, m.
+
+    Not from its vertices: a mesh that comes back may be divided into other triangles.
+    """
+    return max(trimesh.proximity.closest_point(a, b.vertices)[1].max() for a, b in ((first, second), (second, first)))
 
 
 def test_every_piece_stands_where_it_stood(drawing):
@@ -67,7 +70,7 @@ def test_every_piece_stands_where_it_stood(drawing):
     for thing in objects:
         world = seen(HOME, thing.name)
         found = [
-            apart(surface.vertices @ a.pose[:3, :3].T + a.pose[:3, 3], world)
+            apart(trimesh.Trimesh(surface.vertices @ a.pose[:3, :3].T + a.pose[:3, 3], surface.faces), world)
             for a in raw.annotations
             if a.category == thing.category and (surface := raw.cads[a.cad_id].surface) is not None
         ]
