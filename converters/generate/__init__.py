@@ -69,8 +69,7 @@ def render_building(
     progress("scanning", 0.1)
     scan = scan_building(building.plan, list(building.items), config, streams[1])
     progress("painting", 0.6)
-    rooms = [(r.x0, r.y0, r.x1, r.y1) for r in building.plan.rooms]
-    return scan, make_atlas(scan, rooms, building.uses, config.texels_per_m, streams[2])
+    return scan, make_atlas(scan, building.plan.rooms, building.uses, config.texels_per_m, streams[2])
 
 
 def generate_building(

@@ -1,4 +1,4 @@
-"""Numbers in, a checked `BuildingConfig` out: what shapes a generated building besides its seed."""
+"""Define `BuildingConfig`: what shapes a generated building besides its seed."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ NAMES = ("models", "passage_chairs")
 
 
 class GenerationError(UserError):
-    """A building that cannot be generated; the message says what, where, what was expected and what to do."""
+    """Report a building that cannot be generated: what, where, what was expected and what to do."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BuildingConfig:
-    """What to build. Pairs are inclusive ranges from which each seed draws."""
+    """Configure what to build. Pairs are inclusive ranges from which each seed draws."""
 
     floor_area_m2: tuple[float, float] = (31.0, 42.0)
     """Inside area of the building, walls between rooms included."""
@@ -67,7 +67,7 @@ class BuildingConfig:
     """How far before the wall's face the hinges stand: an open leaf that is annotated 1 cm off clears the wall."""
     leaves_at_walls: bool = False
     """Leaves only where a side wall is close behind the hinge, never into a corridor or before another doorway:
-    robots that pass seldom catch them. Needs `corner_doorways` to be found often."""
+    robots that pass seldom catch them. Needs `corner_doorways`."""
     n_bottlenecks: int = 1
     """Chairs put so that they narrow the way through a doorway to `bottleneck_gap_m`."""
     bottleneck_gap_m: tuple[float, float] = (0.42, 0.62)
@@ -87,7 +87,7 @@ class BuildingConfig:
     models: tuple[str, ...] = TRAIN_MODELS
     """Names of the CAD models that may be used (see `converters.generate.models.cad`)."""
     floor_height_m: tuple[float, float] = (0.05, 0.25)
-    """The floor's height in the scan's own frame."""
+    """The floor's height in the scan's frame."""
     voxel_m: float = 0.025
     """Grid of the scanner's volume; thin parts come out about as broken as in a real reconstruction."""
     vertex_noise_m: float = 0.006
@@ -102,7 +102,7 @@ class BuildingConfig:
     """Texture resolution."""
 
     def validate(self) -> BuildingConfig:
-        """Returns itself, or raises."""
+        """Return the configuration, or raise."""
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if isinstance(value, tuple) and field.name not in NAMES and not 0 <= value[0] <= value[1]:

@@ -41,7 +41,7 @@ def door_leaf(
     hinge[axis] = doorway.rect.span(axis)[int(high_side)]
     hinge[along] = doorway.rect.span(along)[int(high_jamb)] + closed[along] * DOOR_GAP_M
     hinge += proud_m * into
-    # Opening turns `closed` towards `into`; the sign says which way round that is, seen from above.
+    # Opening turns `closed` towards `into`; the sign says which way round that is, from above.
     sign = float(np.sign(closed[0] * into[1] - closed[1] * into[0]))
     width, height = doorway.width_m - 2 * DOOR_GAP_M, doorway.height_m - 0.02 - lift_m
     extents = 2 * model.half_extents

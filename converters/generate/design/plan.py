@@ -145,7 +145,7 @@ class Building:
     items: tuple[Instance, ...]
     """What can be moved; of a home the door leaves first."""
     floor_height_m: float
-    """The floor in the scan's own frame."""
+    """The floor in the scan's frame."""
     uses: tuple[str, ...] = ()
     """What each room of a home is used as, keys of `converters.generate.homes.design.USES`; empty: just rooms."""
     measured: dict[str, Any] = dataclasses.field(default_factory=dict)

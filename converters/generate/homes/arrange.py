@@ -1,7 +1,7 @@
 """Choose models for a group of furniture and stand them against each other, by the tables of `groups.yaml`.
 
 Frame of a group: v points away from the wall behind the anchor (or to its front, where it has no wall), u to the right
-of who looks along v; the anchor's middle has u = 0, the wall's face v = 0. A piece's turn is counter-clockwise seen
+of who looks along v; the anchor's middle has u = 0, the wall's face v = 0. A piece's turn is counter-clockwise
 from above, 0 where it faces along v.
 
 Facts of which furniture homes have in which rooms, whether it stands at walls, in corners or in the middle, in which

@@ -1,4 +1,4 @@
-"""Settings in, a checked `HomeConfig` out: what a furnished home is like besides its seed."""
+"""Define `HomeConfig`: what a furnished home is like besides its seed."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ARTEFACTS = ("none", "phone")
 
 @dataclasses.dataclass(frozen=True)
 class HomeConfig:
-    """What kind of home. Pairs are inclusive ranges."""
+    """Configure what kind of home to build. Pairs are inclusive ranges."""
 
     shell: BuildingConfig = SHELL
     """Rooms, walls, doors and the scan of them; its counts of furniture are not looked at."""
@@ -41,7 +41,7 @@ class HomeConfig:
     """Boxes, bags, bins, stools and the like, for each ten square metres of floor, before more is added to meet
     `furniture_share`."""
     must_push_turtlebot: Range | None = (0.0, 0.10)
-    """Share of the pairs of places between which a disc of the TurtleBot's radius finds no way round the movables
+    """Share of the pairs of places between which a disc of the TurtleBot's radius has no path round the movables
     although there is one with them away; None: any."""
     must_push_fetch: Range | None = (0.0, 0.40)
     """The same for Fetch's."""
@@ -51,17 +51,17 @@ class HomeConfig:
 
     @property
     def floor_area_m2(self) -> Range:
-        """Inside area of the home."""
+        """Return the inside area of the home."""
         return self.shell.floor_area_m2
 
     @property
     def must_push(self) -> dict[str, Range]:
-        """Robot -> range asked for, of those that are asked for."""
-        asked = {"turtlebot": self.must_push_turtlebot, "fetch": self.must_push_fetch}
-        return {robot: wanted for robot, wanted in asked.items() if wanted is not None}
+        """Return the wanted range by robot, of those that have one."""
+        wanted = {"turtlebot": self.must_push_turtlebot, "fetch": self.must_push_fetch}
+        return {robot: limits for robot, limits in wanted.items() if limits is not None}
 
     def validate(self) -> HomeConfig:
-        """Returns itself, or raises."""
+        """Return the configuration, or raise."""
         if self.tier not in TIERS:
             raise GenerationError(f"tier is '{self.tier}': expected one of {', '.join(TIERS)}")
         self.shell.validate()
@@ -84,21 +84,21 @@ class HomeConfig:
 MOST_SHARE = 0.42
 """Largest `furniture_share`: of sixteen homes of four and five rooms 13 take 0.37, 7 take 0.40 and 2 take 0.43."""
 TIERS = read_packaged(Path(__file__).with_name("tiers.yaml"), dict[str, dict[str, float | Range]])
-"""Tier -> how it departs from the defaults. Shares that must be pushed: so that planners that never push arrive in the
-other episodes."""
+"""Tier -> how it departs from the defaults. Shares that must be pushed are such that planners that never push succeed in
+the other episodes."""
 
 
 def home_fields() -> dict[str, Any]:
-    """Every setting of a home by name, with its type: its own and those of its shell, but for the CAD models."""
+    """Return the type of every setting of a home by name, its shell's included, but for the CAD models."""
     every = get_type_hints(BuildingConfig) | get_type_hints(HomeConfig)
     return {name: hint for name, hint in every.items() if name not in ("shell", "tier", "models", *COUNTED)}
 
 
 def home_config(tier: str, settings: dict[str, Any], models: tuple[str, ...] = HOME_TRAIN_MODELS) -> HomeConfig:
-    """A tier's home with some settings changed."""
+    """Return a tier's home with some settings changed."""
     if tier not in TIERS:
         raise GenerationError(f"tier is '{tier}': expected one of {', '.join(TIERS)}")
-    own = {f.name for f in dataclasses.fields(HomeConfig)}
-    shell = {name: value for name, value in settings.items() if name not in own}
-    chosen = TIERS[tier] | {name: value for name, value in settings.items() if name in own}
+    direct = {f.name for f in dataclasses.fields(HomeConfig)}
+    shell = {name: value for name, value in settings.items() if name not in direct}
+    chosen = TIERS[tier] | {name: value for name, value in settings.items() if name in direct}
     return HomeConfig(dataclasses.replace(SHELL, models=models, **shell), tier, **chosen).validate()

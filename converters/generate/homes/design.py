@@ -125,7 +125,7 @@ def home_plan(cfg: BuildingConfig, rng: np.random.Generator) -> tuple[Plan, list
 MOST_PLANS = 8
 """Plans furnished before giving up."""
 MOST_FULL, LARGE_M2 = 2, 150.0
-"""Of these, plans into which less fits than asked for: one is enough where it is so large, for each takes its time."""
+"""Of these, plans into which less fits than wanted: one is enough where it is so large, for each takes its time."""
 
 
 def design_home(cfg: HomeConfig, rng: np.random.Generator) -> Building:

@@ -44,7 +44,7 @@ class Standing:
     window: tuple[slice, slice]
     """Rows and columns of the raster around it."""
     shadow: np.ndarray
-    """(rows, columns of `window`) bool: what it covers, seen from above."""
+    """(rows, columns of `window`) bool: what it covers, from above."""
     below: dict[str, np.ndarray]
     """Robot -> what of it is in the robot's way: what lies higher is not."""
 

@@ -42,7 +42,7 @@ MOST_ADDED = 500
 CLUTTER_SHARE = 0.1
 """Of what is added: small things that lie about."""
 WIDE_M = max(disc.radius_m for disc in ROBOTS.values()) + 0.02
-"""Disc that gets past what a room's use asks for; past what is added, the disc of the settings does."""
+"""Disc that gets past what a room's use demands; past what is added, the disc of the settings does."""
 
 
 class Full(GenerationError):

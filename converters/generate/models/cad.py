@@ -1,9 +1,9 @@
-"""Model names in, CAD furniture out: convex parts in metres, and the same as ShapeNet-like normalised models.
+"""Build CAD furniture by name, as ShapeNet-like normalised models of convex parts, and place it on a floor.
 
 Frame of a CAD model: y up, front along +z (or -z where `front` says so), normalised so that the diagonal of
 the bounding box is 1. Each model is a union of overlapping convex parts, so most are not watertight as a
 whole; parts marked `open` lack their underside, as in many models that people draw. Homes take the packaged library's
-models, with a surface of their own, and drawn ones of the kinds that it lacks.
+models, with a textured surface, and drawn ones of the kinds that it lacks.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ from scenes_mjcf.categories import CATEGORIES
 
 @dataclasses.dataclass(frozen=True)
 class Drawing:
-    """How a model is drawn."""
+    """Describe how a model is drawn."""
 
     category: str
     parts: tuple[list[Any], ...] = ()
@@ -44,18 +44,19 @@ class Drawing:
     """Only homes to test in have it."""
 
     def draw(self) -> list[Part]:
-        """Its parts."""
-        drawn = [_shape(row) for row in self.parts]
-        return [part for made in drawn for part in (made if isinstance(made, list) else [made])]
+        """Return its parts."""
+        shapes_of = [_shape(row) for row in self.parts]
+        return [part for shape in shapes_of for part in (shape if isinstance(shape, list) else [shape])]
 
 
 def _shape(row: list[Any]) -> Any:
-    """What a row makes; an argument that is a row is made first, one of points becomes an array."""
+    """Build what a row describes; an argument that is a row is built first, one of points becomes an array."""
     name, *values = row
     named = values.pop() if isinstance(values[-1], dict) else {}
-    points = [np.array(v) if isinstance(v, list) and isinstance(v[0], list) else v for v in values]
-    made = [_shape(v) if isinstance(v, list) and isinstance(v[0], str) else v for v in points]
-    return getattr(shapes, name)(*made, **named)
+    for k, value in enumerate(values):
+        if isinstance(value, list) and isinstance(value[0], (list, str)):
+            values[k] = _shape(value) if isinstance(value[0], str) else np.array(value)
+    return getattr(shapes, name)(*values, **named)
 
 
 _TABLES = read_packaged(Path(__file__).with_name("drawings.yaml"), dict[str, dict[str, Drawing]])
@@ -67,7 +68,7 @@ DRAWN: dict[str, Drawing] = SPARSE | _TABLES["furnished"]
 
 @dataclasses.dataclass(frozen=True)
 class CadModel:
-    """A normalised model."""
+    """Describe a normalised model."""
 
     name: str
     category: str
@@ -84,23 +85,23 @@ class CadModel:
 
     @functools.cached_property
     def bounds(self) -> np.ndarray:
-        """(2, 3) lowest and highest corner, CAD frame."""
+        """Return the (2, 3) lowest and highest corner, CAD frame."""
         points = np.concatenate([p.vertices for p in self.parts])
         return np.stack([points.min(axis=0), points.max(axis=0)])
 
     @property
     def center(self) -> np.ndarray:
-        """(3,) centre of the bounding box, CAD frame."""
+        """Return the (3,) centre of the bounding box, CAD frame."""
         return self.bounds.mean(axis=0)
 
     @property
     def half_extents(self) -> np.ndarray:
-        """(3,) half extents of the bounding box, CAD frame."""
+        """Return the (3,) half extents of the bounding box, CAD frame."""
         return np.diff(self.bounds, axis=0)[0] / 2
 
 
 def _library_parts(name: str) -> list[Part]:
-    """The hulls of a library model, as the converter joins them, in the colour nearest to the model's."""
+    """Return the hulls of a library model, as the converter joins them, in the colour nearest to the model's."""
     shape = read_shape(name)
     colour = shape.visual.image.reshape(-1, 3).mean(axis=0) / 255
     material = min(MATERIALS, key=lambda m: float(np.abs(np.array(MATERIALS[m]) - colour).sum()))
@@ -124,7 +125,7 @@ TRAIN_MODELS = tuple(name for name in SPARSE if name not in TEST_MODELS)
 
 
 def _home_models(test: bool) -> tuple[str, ...]:
-    """The library's models of a split, and drawn ones of the kinds that it lacks there."""
+    """Return the library's models of a split, and drawn ones of the kinds that it lacks there."""
     packaged = {name: d for name, d in _PACKAGED.items() if d.held_out == test}
     have = {d.category for d in packaged.values()}
     return (
@@ -142,13 +143,9 @@ HOME_TRAIN_MODELS = _home_models(test=False)
 
 @functools.cache
 def cad_model(name: str) -> CadModel:
-    """Draws and normalises one model.
+    """Draw and normalise one model: in its CAD frame the bounding box's diagonal is 1, y is up.
 
-    The CAD origin is a little off the box centre, by an amount that depends on the name: ShapeNet's models
-    are so too.
-
-    Returns:
-        The model in its CAD frame: bounding box diagonal 1, y up.
+    The CAD origin is a little off the box centre, by an amount that depends on the name: ShapeNet's models are so too.
     """
     drawing = LIBRARY[name]
     parts = _library_parts(name) if name in _PACKAGED else drawing.draw()
@@ -173,21 +170,21 @@ def cad_model(name: str) -> CadModel:
 
 
 class Models:
-    """The CAD models that a building may use: draws those first that were drawn least. Mutable, private to one."""
+    """Draw CAD models that a building may use, the least drawn first. Mutable, private to one building."""
 
     def __init__(self, names: tuple[str, ...], jitter: float):
-        """Of keys of `LIBRARY`, each scaled per axis by up to a fraction."""
+        """Take keys of `LIBRARY`, each scaled per axis by up to a fraction."""
         self._jitter, self._drawn = jitter, Counter[str]()
         self._by_category: dict[str, list[str]] = {}
         for name in names:
             self._by_category.setdefault(LIBRARY[name].category, []).append(name)
 
     def has(self, category: str) -> bool:
-        """True where there is a model of it."""
+        """Return whether there is a model of it."""
         return category in self._by_category
 
     def draw(self, category: str, rng: np.random.Generator, among: tuple[str, ...] = ()) -> tuple[CadModel, np.ndarray]:
-        """A model of a category, or one of those `among` it, and its scale (CAD units -> metres)."""
+        """Draw a model of a category, or one of those `among` it, and its scale (CAD units -> metres)."""
         names = among or self._by_category[category]
         least = min(self._drawn[name] for name in names)
         names = [name for name in names if self._drawn[name] == least]
@@ -198,7 +195,7 @@ class Models:
 
 @dataclasses.dataclass(frozen=True)
 class LeafHinge:
-    """How a door leaf turns; CAD frame, angle 0 is the pose as placed."""
+    """Describe how a door leaf turns; CAD frame, angle 0 is the pose as placed."""
 
     axis: tuple[float, float, float]
     origin: tuple[float, float, float]
@@ -207,7 +204,7 @@ class LeafHinge:
 
 @dataclasses.dataclass(frozen=True)
 class Instance:
-    """One piece of furniture."""
+    """Place one piece of furniture: scan x, y; heights above the floor; metres."""
 
     model: CadModel
     scale: np.ndarray
@@ -220,28 +217,28 @@ class Instance:
 
     @property
     def matrix(self) -> np.ndarray:
-        """(4, 4) CAD frame (y up) -> scan x, y and height above the floor (z up)."""
+        """Return (4, 4) CAD frame (y up) -> scan x, y and height above the floor (z up)."""
         return transform(yaw_matrix(self.yaw_rad) @ Y_UP_TO_Z_UP @ np.diag(self.scale), self.position)
 
     def to_floor(self, points_cad: np.ndarray) -> np.ndarray:
-        """Moves (n, 3) points of the CAD frame into scan x, y and height above the floor."""
+        """Move (n, 3) points of the CAD frame into scan x, y and height above the floor."""
         return transformed(points_cad, self.matrix)
 
     @property
     def footprint(self) -> shapely.Polygon:
-        """The rectangle it stands on."""
+        """Return the rectangle that it stands on."""
         (x0, _, z0), (x1, _, z1) = self.model.bounds
         return shapely.Polygon(self.to_floor(np.array([[x0, 0, z0], [x1, 0, z0], [x1, 0, z1], [x0, 0, z1]]))[:, :2])
 
     def outlines(self, band_m: tuple[float, float] = (-math.inf, math.inf)) -> list[shapely.Geometry]:
-        """What is seen of each of its convex parts from above, of those that reach into a band of heights."""
+        """Return the outline from above of each of its convex parts that reach into a band of heights."""
         placed = [self.to_floor(part.vertices) for part in self.model.parts]
         inside = [p for p in placed if p[:, 2].min() < band_m[1] and p[:, 2].max() > band_m[0]]
         return [shapely.MultiPoint(p[:, :2]).convex_hull for p in inside]
 
 
 def place(model: CadModel, scale: np.ndarray, xy: np.ndarray, facing_rad: float, lift_m: float = 0.0) -> Instance:
-    """Stands a model on the floor: centre of the footprint at `xy`, front towards `facing_rad` (from +x)."""
+    """Stand a model on the floor: centre of the footprint at `xy`, front towards `facing_rad` (from +x)."""
     yaw = facing_rad + math.pi / 2 + (math.pi if model.front < 0 else 0.0)
     yaw = math.atan2(math.sin(yaw), math.cos(yaw))
     at_origin = Instance(model, scale, yaw, np.zeros(3))

@@ -1,4 +1,4 @@
-"""Sizes in, convex pieces of furniture out: boxes, cushions, bars, plates, shells and leaves, in metres, y up."""
+"""Build convex pieces of furniture: boxes, cushions, bars, plates, shells and leaves, in metres, y up."""
 
 import dataclasses
 from pathlib import Path
@@ -17,7 +17,7 @@ MATERIALS: dict[str, tuple[float, float, float]] = read_packaged(
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """One convex piece."""
+    """Describe one convex piece."""
 
     vertices: np.ndarray
     """(n, 3) float64."""
@@ -29,40 +29,41 @@ class Part:
     """Written without its underside."""
 
 
-def box(center, size, material, tilt_rad=0.0, open=False) -> Part:
-    """A box; `tilt_rad` turns it about x (positive: the top leans back, towards -z)."""
-    mesh = trimesh.creation.box(extents=size)
+def _leaned(part: Part, center, tilt_rad: float) -> Part:
+    """Return a part turned about x (positive: the top leans back, towards -z), then moved to `center`."""
     turn = Rotation.from_euler("x", -tilt_rad).as_matrix()
-    vertices = np.asarray(mesh.vertices) @ turn.T + np.asarray(center, float)
-    return Part(vertices, np.asarray(mesh.faces), material, open)
+    return dataclasses.replace(part, vertices=part.vertices @ turn.T + np.asarray(center, float))
+
+
+def box(center, size, material, tilt_rad=0.0, open=False) -> Part:
+    """Build a box that leans back by `tilt_rad`."""
+    mesh = trimesh.creation.box(extents=size)
+    return _leaned(Part(np.asarray(mesh.vertices), np.asarray(mesh.faces), material, open), center, tilt_rad)
 
 
 def block(base, size, material, open=False) -> Part:
-    """A box whose underside has its middle at `base`."""
+    """Build a box whose underside has its middle at `base`."""
     x, y, z = base
     return box((x, y + size[1] / 2, z), size, material, open=open)
 
 
 def hull(points, material) -> Part:
-    """The convex hull of points."""
+    """Build the convex hull of points."""
     mesh = trimesh.convex.convex_hull(np.asarray(points, float))
     return Part(np.asarray(mesh.vertices), np.asarray(mesh.faces), material)
 
 
 def cushion(center, size, material, chamfer=0.03, tilt_rad=0.0) -> Part:
-    """A box with cut edges."""
+    """Build a box with cut edges."""
     half = np.asarray(size, float) / 2
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     cut = min(chamfer, 0.45 * half.min())
     points = np.concatenate([signs * (half - cut * (1 - np.eye(3)[i])) for i in range(3)])
-    mesh = trimesh.convex.convex_hull(points)
-    turn = Rotation.from_euler("x", -tilt_rad).as_matrix()
-    vertices = np.asarray(mesh.vertices) @ turn.T + np.asarray(center, float)
-    return Part(vertices, np.asarray(mesh.faces), material)
+    return _leaned(hull(points, material), center, tilt_rad)
 
 
 def bar(start, end, radius, material, sides=8) -> Part:
-    """A prism of `sides` sides from `start` to `end`; `radius` is a number, or a pair (at start, at end)."""
+    """Build a prism of `sides` sides from `start` to `end`; `radius` is a number, or a pair (at start, at end)."""
     p0, p1 = np.asarray(start, float), np.asarray(end, float)
     r0, r1 = (radius, radius) if isinstance(radius, int | float) else radius
     axis = (p1 - p0) / np.linalg.norm(p1 - p0)
@@ -83,23 +84,23 @@ def bar(start, end, radius, material, sides=8) -> Part:
 
 
 def rail(reach, y, z, radius, material, sides=8) -> Part:
-    """A level bar from left to right."""
+    """Build a level bar from left to right."""
     return bar((-reach, y, z), (reach, y, z), radius, material, sides)
 
 
 def beam(x, y, reach, radius, material, sides=8) -> Part:
-    """A level bar from the back to the front."""
+    """Build a level bar from the back to the front."""
     return bar((x, y, -reach), (x, y, reach), radius, material, sides)
 
 
 def pillar(base, height, radius, material, sides=12) -> Part:
-    """An upright bar that stands at `base`."""
+    """Build an upright bar that stands at `base`."""
     x, y, z = base
     return bar((x, y, z), (x, y + height, z), radius, material, sides)
 
 
 def turned(base, profile, material, sides=12) -> list[Part]:
-    """What a lathe makes: pieces between the (radius, height) pairs of a profile, from below."""
+    """Build what a lathe turns: pieces between the (radius, height) pairs of a profile, from below."""
     x, y, z = base
     return [
         bar((x, y + y0, z), (x, y + y1, z), (r0, r1), material, sides)
@@ -108,13 +109,13 @@ def turned(base, profile, material, sides=12) -> list[Part]:
 
 
 def oval(x, z, rx, rz, sides=16) -> np.ndarray:
-    """(sides, 2) outline of an ellipse in the plane of the floor."""
+    """Return the (sides, 2) outline of an ellipse in the plane of the floor."""
     angles = 2 * np.pi * (np.arange(sides) + 0.5) / sides
     return np.stack([x + rx * np.cos(angles), z + rz * np.sin(angles)], axis=1)
 
 
 def rectangle(x, z, width, depth, cut=0.0) -> np.ndarray:
-    """(4 or 8, 2) outline of a rectangle in the plane of the floor, its corners cut by `cut`, anticlockwise."""
+    """Return the (4 or 8, 2) outline of a rectangle on the floor, its corners cut by `cut`, anticlockwise."""
     w, d = width / 2, depth / 2
     if not cut:
         return np.array([(w, -d), (w, d), (-w, d), (-w, -d)]) + [x, z]
@@ -128,12 +129,12 @@ def _at(outline, y) -> np.ndarray:
 
 
 def plate(outline, y0, y1, material, top=None) -> Part:
-    """A convex outline drawn up from y0 to y1, where it has the outline `top` if that is given."""
+    """Build a convex outline drawn up from y0 to y1, where it has the outline `top` if that is given."""
     return hull(np.concatenate([_at(outline, y0), _at(outline if top is None else top, y1)]), material)
 
 
 def shell(outline, y0, y1, thick, material, top=None) -> list[Part]:
-    """The wall along an outline, one piece a side; its underside is open, its inside `thick` further in."""
+    """Build the wall along an outline, one piece a side; its underside is open, its inside `thick` further in."""
     above = outline if top is None else top
     pieces = []
     for k in range(len(outline)):
@@ -148,14 +149,14 @@ def shell(outline, y0, y1, thick, material, top=None) -> list[Part]:
 
 
 def ball(center, radii, material, sides=8) -> Part:
-    """An ellipsoid."""
+    """Build an ellipsoid."""
     rings = [(np.cos(a), np.sin(a)) for a in np.pi * np.array([-0.5, -0.3, -0.1, 0.1, 0.3, 0.5])]
     points = [_at(oval(0, 0, max(r, 0.02), max(r, 0.02), sides), y) for r, y in rings]
     return hull(np.concatenate(points) * np.asarray(radii, float) + np.asarray(center, float), material)
 
 
 def leaf(base, tip, width, material, thick=0.008) -> Part:
-    """A pointed leaf from base to tip, broadest past its middle, lying as flat as its direction allows."""
+    """Build a pointed leaf from base to tip, broadest past its middle, lying as flat as its direction allows."""
     p0, p1 = np.asarray(base, float), np.asarray(tip, float)
     along = p1 - p0
     across = np.cross(along, [0.0, 1.0, 0.0])
@@ -167,7 +168,7 @@ def leaf(base, tip, width, material, thick=0.008) -> Part:
 
 
 def four_legs(width, depth, height, thick, material, splay=0.0, square=True) -> list[Part]:
-    """Legs under the corners of a `width` x `depth` top whose underside is at `height`."""
+    """Build legs under the corners of a `width` x `depth` top whose underside is at `height`."""
     legs = []
     for sx in (-1, 1):
         for sz in (-1, 1):
@@ -179,7 +180,7 @@ def four_legs(width, depth, height, thick, material, splay=0.0, square=True) -> 
 
 
 def on_floor(parts) -> list[Part]:
-    """The same, with what leaning bars reach below the floor cut off."""
+    """Return the same parts, with what leaning bars reach below the floor cut off."""
     low = [part.vertices[:, 1].min() for part in parts]
     return [
         dataclasses.replace(hull(np.maximum(part.vertices, [-np.inf, 0.0, -np.inf]), part.material), open=part.open)
@@ -190,11 +191,7 @@ def on_floor(parts) -> list[Part]:
 
 
 def fronts(low, high, z, columns, rows, material, handle="bar", metal="steel") -> list[Part]:
-    """Doors or drawers before a carcass, with handles: a grid of slabs from `low` to `high` (x, y), their backs at z.
-
-    Args:
-        z: of the carcass's face.
-    """
+    """Build doors or drawers with handles before a carcass, their backs at z: a grid from `low` to `high` (x, y)."""
     parts = []
     width, height = (high[0] - low[0]) / columns, (high[1] - low[1]) / rows
     for k in range(columns * rows):

@@ -1,4 +1,4 @@
-"""Flat patches in, one textured mesh out: each patch has its own rectangle of texels on one sheet.
+"""Join flat patches into one textured mesh: each patch has a rectangle of texels on one sheet.
 
 Frame: scan x, y, height above the floor; metres. Faces are one-sided, counter-clockwise from where they are seen.
 """
@@ -28,7 +28,7 @@ Light = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 @dataclasses.dataclass(frozen=True)
 class Chart:
-    """A patch that is flat, or nearly so."""
+    """Describe a patch that is flat, or nearly so."""
 
     vertices: np.ndarray
     """(k, 3)."""
@@ -46,10 +46,10 @@ class Chart:
     uv_faces: np.ndarray | None = None
     """(m, 3) into `uv`; None: as `faces`."""
     lit_as: np.ndarray | None = None
-    """(3,) normal that light falls on as if it were its own: of thin things at a wall, whose edges are not dark."""
+    """(3,) normal that light falls on instead of the patch's: of thin things at a wall, whose edges are not dark."""
 
     def frame(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Its rectangle: corner (3,), unit edges (2, 3) and normal (3,), size (2,) in metres."""
+        """Return its rectangle: corner (3,), unit edges (2, 3) and normal (3,), size (2,) in metres."""
         normal = face_vectors(self.vertices, self.faces).sum(axis=0)
         normal = normal / max(float(np.linalg.norm(normal)), 1e-12)
         edge = np.array([0.0, 0.0, 1.0]) if abs(normal[2]) < 0.7 else np.array([0.0, 1.0, 0.0])
@@ -63,14 +63,14 @@ class Chart:
 
 
 def plain(colour: Sequence[float] | np.ndarray) -> Colouring:
-    """One colour all over."""
+    """Paint one colour all over."""
     value = np.asarray(colour, float)
     return lambda p: np.broadcast_to(value, (len(p), 3))
 
 
 def polygon(points: Iterable[Iterable[float]], towards: Iterable[float], label: int, paint: Colouring,
             texels_per_m: float = 80.0, glows: bool = False, lit_as: np.ndarray | None = None) -> Chart:  # fmt: skip
-    """A flat convex polygon that is seen from where `towards` (3,) points."""
+    """Return a flat convex polygon that is visible from where `towards` (3,) points."""
     corners = np.array([tuple(p) for p in points])
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[1])
     if normal @ np.array(tuple(towards)) < 0:
@@ -80,7 +80,7 @@ def polygon(points: Iterable[Iterable[float]], towards: Iterable[float], label: 
 
 
 def piece_charts(vertices: np.ndarray, faces: np.ndarray, label: int, paint: Colouring) -> list[Chart]:
-    """A mesh as patches of faces that look mostly along one axis."""
+    """Cut a mesh into patches of faces that look mostly along one axis."""
     n, chart = charts_of(faces, face_axes(vertices, faces))
     return [Chart(*compacted(vertices, faces[chart == k]), label, paint, 50.0) for k in range(n)]
 
@@ -94,14 +94,14 @@ class _Laid:
     size_m: np.ndarray
 
     def grid(self, n: np.ndarray, step_m: np.ndarray, first: float) -> np.ndarray:
-        """(n[0] * n[1], 3) places, rows along the second edge, clamped to the patch."""
+        """Return (n[0] * n[1], 3) places, rows along the second edge, clamped to the patch."""
         s, t = (np.clip((np.arange(n[k]) + first) * step_m[k], 0, self.size_m[k]) for k in range(2))
         st = np.stack(np.meshgrid(s, t), axis=-1).reshape(-1, 2)
         return self.corner + st[:, :1] * self.axes[0] + st[:, 1:] * self.axes[1]
 
 
 def _lit(laid: list[_Laid], light: Light) -> list[np.ndarray]:
-    """For each patch (rows, columns, 3) brightness on a coarse grid from corner to corner; all worked out at once."""
+    """Compute for each patch (rows, columns, 3) brightness on a coarse grid from corner to corner, all at once."""
     counts = [np.maximum(np.ceil(q.size_m / LIGHT_M).astype(int), 1) + 1 for q in laid]
     places = [q.grid(n, q.size_m / (n - 1), 0.0) for q, n in zip(laid, counts, strict=True)]
     normals = [q.normal if q.chart.lit_as is None else q.chart.lit_as for q in laid]
@@ -112,7 +112,7 @@ def _lit(laid: list[_Laid], light: Light) -> list[np.ndarray]:
 
 
 def _between(grid: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Bilinear values of a grid; rows and columns in 0..1 from its first to its last."""
+    """Interpolate a grid bilinearly; rows and columns in 0..1 from its first to its last."""
     for axis, at in ((0, rows), (1, columns)):
         place = np.clip(at, 0, 1) * (grid.shape[axis] - 1)
         low = np.minimum(place.astype(int), grid.shape[axis] - 2)
@@ -122,7 +122,7 @@ def _between(grid: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndar
 
 
 def _texels(laid: _Laid, n: np.ndarray, density: np.ndarray, grid: np.ndarray | None) -> np.ndarray:
-    """(rows, columns, 3) colours of one patch with its margin, first row lowest."""
+    """Return (rows, columns, 3) colours of one patch with its margin, first row lowest."""
     chart = laid.chart
     if isinstance(chart.paint, np.ndarray):
         return np.pad(chart.paint[::-1], ((MARGIN, MARGIN), (MARGIN, MARGIN), (0, 0)), mode="edge")
@@ -137,7 +137,7 @@ def _texels(laid: _Laid, n: np.ndarray, density: np.ndarray, grid: np.ndarray | 
 
 
 def _packed(laid: list[_Laid]) -> tuple[int, float, list[np.ndarray], np.ndarray]:
-    """Side of the sheet, factor on the resolution, texels (columns, rows) and corner of each patch."""
+    """Return side of the sheet, factor on the resolution, texels (columns, rows) and corner of each patch."""
     finer = 1.0
     while True:
         sizes = [
@@ -156,15 +156,11 @@ def _packed(laid: list[_Laid]) -> tuple[int, float, list[np.ndarray], np.ndarray
 
 
 def assemble(charts: list[Chart], light: Light) -> tuple[Scan, Atlas]:
-    """Joins patches into one mesh and paints its sheet.
-
-    Returns:
-        The mesh, no vertex in two patches, and its atlas.
-    """
+    """Join patches into one mesh, no vertex in two of them, and paint its sheet."""
     laid = [_Laid(c, *c.frame()) for c in charts]
     first: dict[int, int] = {}
-    own = [first.setdefault(id(c.paint) if c.uv is not None else -1 - k, k) for k, c in enumerate(charts)]
-    drawn = sorted(set(own))
+    sheet_of = [first.setdefault(id(c.paint) if c.uv is not None else -1 - k, k) for k, c in enumerate(charts)]
+    drawn = sorted(set(sheet_of))
     side, finer, sizes, corners = _packed([laid[k] for k in drawn])
     shaded = [k for k in drawn if not charts[k].glows and charts[k].uv is None]
     grids = dict(zip(shaded, _lit([laid[k] for k in shaded], light), strict=True))
@@ -176,7 +172,7 @@ def assemble(charts: list[Chart], light: Light) -> tuple[Scan, Atlas]:
         x, y = corner
         sheet[y : y + n[1] + 2 * MARGIN, x : x + n[0] + 2 * MARGIN] = _texels(laid[k], n, density, grids.get(k))
     uv = []
-    for q, k in zip(laid, own, strict=True):
+    for q, k in zip(laid, sheet_of, strict=True):
         corner, density, n = place[k]
         if q.chart.uv is not None:
             uv.append(corner + q.chart.uv * n)

@@ -1,12 +1,12 @@
-"""A room's use in, the colours of its floor and walls out: boards, tiles, carpet, paint, wallpaper, rugs, pictures."""
+"""Colour floors and walls by a room's use: boards, tiles, carpet, paint, wallpaper, rugs, pictures."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
-Room = tuple[float, float, float, float]
-"""x0, y0, x1, y1."""
+from converters.generate.design.plan import Rect
+
 Colouring = Callable[[np.ndarray], np.ndarray]
 """(n, 3) places in the building -> (n, 3) colours in 0..1."""
 
@@ -33,7 +33,7 @@ WITH_RUG = ("living", "bedroom", "dining")
 
 @dataclasses.dataclass(frozen=True)
 class Finish:
-    """How one room is finished."""
+    """Describe how one room is finished."""
 
     floor_colour: Colouring
     wall_colour: Colouring
@@ -42,7 +42,7 @@ class Finish:
 
 
 def hashed(*keys: np.ndarray) -> np.ndarray:
-    """Integers to repeatable numbers in 0..1."""
+    """Turn integers into repeatable numbers in 0..1."""
     value = np.zeros(keys[0].shape)
     for i, k in enumerate(keys):
         value = value + k * (12.9898 + 65.133 * i)
@@ -50,7 +50,7 @@ def hashed(*keys: np.ndarray) -> np.ndarray:
 
 
 def boards(p: np.ndarray, base: np.ndarray, along: int) -> np.ndarray:
-    """Wooden boards, 0.14 m wide, about 1.1 m long."""
+    """Paint wooden boards, 0.14 m wide, about 1.1 m long."""
     across, length = p[:, 1 - along] / 0.14, p[:, along] / 1.1
     row = np.floor(across)
     board = np.floor(length + hashed(row))
@@ -62,8 +62,7 @@ def boards(p: np.ndarray, base: np.ndarray, along: int) -> np.ndarray:
 
 def tiles(u: np.ndarray, v: np.ndarray, base: np.ndarray, side_m: float, chequered: bool = False,
           blur_m: float = 0.0) -> np.ndarray:  # fmt: skip
-    """Square tiles with grout, over a plane's two coordinates; `blur_m` is the width of a texel that takes its share of
-    a line of grout."""
+    """Paint square tiles with grout, over a plane's two coordinates; a texel `blur_m` wide takes its share of grout."""
     i, j = np.floor(u / side_m), np.floor(v / side_m)
     if blur_m:
         off = np.minimum(*(np.minimum(np.mod(w, side_m), side_m - np.mod(w, side_m)) for w in (u, v)))
@@ -76,11 +75,11 @@ def tiles(u: np.ndarray, v: np.ndarray, base: np.ndarray, side_m: float, chequer
     return base * tone[:, None]
 
 
-def _rug(room: Room, colour: np.ndarray, rng: np.random.Generator) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """A woven rug near the room's middle, laid over what the floor is."""
-    size = np.array([room[2] - room[0], room[3] - room[1]])
+def _rug(room: Rect, colour: np.ndarray, rng: np.random.Generator) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Return what lays a woven rug near the room's middle over the floor."""
+    size = np.array(room.size)
     half = np.minimum(rng.uniform(0.24, 0.36) * size, [1.5, 1.1])
-    middle = np.array([room[0] + room[2], room[1] + room[3]]) / 2 + rng.uniform(-0.1, 0.1, 2) * size
+    middle = np.array(room.centre) + rng.uniform(-0.1, 0.1, 2) * size
     period = rng.uniform(0.18, 0.4)
 
     def lay(p: np.ndarray, under: np.ndarray) -> np.ndarray:
@@ -94,30 +93,10 @@ def _rug(room: Room, colour: np.ndarray, rng: np.random.Generator) -> Callable[[
     return lay
 
 
-def _pictures(
-    room: Room, count: int, rng: np.random.Generator
-) -> list[tuple[int, float, np.ndarray, np.ndarray, np.ndarray]]:
-    """Framed pictures: the wall's axis and place along it, middle and half size on it, and its frame's colour."""
-    hung = []
-    for _ in range(count):
-        axis = int(rng.integers(2))
-        wall = room[axis] if rng.random() < 0.5 else room[axis + 2]
-        low, high = room[1 - axis], room[3 - axis]
-        half = rng.uniform([0.2, 0.16], [0.45, 0.34])
-        if high - low < 2 * half[0] + 0.6:
-            continue
-        middle = np.array([rng.uniform(low + half[0] + 0.3, high - half[0] - 0.3), rng.uniform(1.45, 1.6)])
-        hung.append((axis, wall, middle, half, FRAMES[rng.integers(len(FRAMES))]))
-    return hung
-
-
 def framed(at: np.ndarray, half: np.ndarray, frame: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Colours of a picture behind a mount: two ridges under a sky with a sun.
+    """Paint a picture behind a mount, two ridges under a sky with a sun, at (n, 2) places -1..1, right and up on it.
 
-    Args:
-        at: (n, 2) places, right and up, -1..1 on the picture.
-        half: (2,) half its width and height, m.
-        frame: (3,) colour of its rim.
+    `half` is (2,) half its width and height, m; `frame` (3,) the colour of its rim.
     """
     sky, land = PRINTS[rng.integers(len(PRINTS))] + rng.uniform(-0.05, 0.05, (2, 3))
     sun, horizon = rng.uniform(-0.6, 0.6), rng.uniform(-0.3, 0.2)
@@ -132,17 +111,27 @@ def framed(at: np.ndarray, half: np.ndarray, frame: np.ndarray, rng: np.random.G
     return np.where(from_edge < 0.02, frame, np.where(from_edge < 0.055, [0.95, 0.94, 0.91], inner))
 
 
-def _hang(p: np.ndarray, colour: np.ndarray, room: Room, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Paints pictures over a wall's colours."""
-    for axis, wall, middle, half, frame in _pictures(room, count, rng):
+def _hang(p: np.ndarray, colour: np.ndarray, room: Rect, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Paint framed pictures over a wall's colours."""
+    hung = []
+    for _ in range(count):
+        axis = int(rng.integers(2))
+        wall = room.span(axis)[int(rng.random() >= 0.5)]
+        low, high = room.span(1 - axis)
+        half = rng.uniform([0.2, 0.16], [0.45, 0.34])
+        if high - low < 2 * half[0] + 0.6:
+            continue
+        middle = np.array([rng.uniform(low + half[0] + 0.3, high - half[0] - 0.3), rng.uniform(1.45, 1.6)])
+        hung.append((axis, wall, middle, half, FRAMES[rng.integers(len(FRAMES))]))
+    for axis, wall, middle, half, frame in hung:
         at = (p[:, [1 - axis, 2]] - middle) / half
         on = (np.abs(p[:, axis] - wall) < 0.08) & (np.abs(at) < 1).all(axis=1)
         colour = np.where(on[:, None], framed(at, half, frame, rng), colour)
     return colour
 
 
-def _wall(room: Room, use: str, rng: np.random.Generator, pictured: bool) -> Colouring:
-    """Paint or wallpaper over a skirting board; glazed tiles in wet rooms; pictures in dry ones."""
+def _wall(room: Rect, use: str, rng: np.random.Generator, pictured: bool) -> Colouring:
+    """Choose paint or wallpaper over a skirting board; glazed tiles in wet rooms; pictures in dry ones."""
     base, glaze = PAINTS[rng.integers(len(PAINTS))], GLAZES[rng.integers(len(GLAZES))]
     tiled_to = {"bathroom": rng.choice([1.25, 2.0]), "kitchen": 1.45}.get(use, 0.0)
     tiled_from = 0.85 if use == "kitchen" else 0.0
@@ -154,7 +143,7 @@ def _wall(room: Room, use: str, rng: np.random.Generator, pictured: bool) -> Col
 
     def colour(p: np.ndarray) -> np.ndarray:
         out = np.tile(base, (len(p), 1))
-        off = np.minimum(np.abs(p[:, :2] - room[:2]), np.abs(p[:, :2] - room[2:]))
+        off = np.minimum(np.abs(p[:, :2] - (room.x0, room.y0)), np.abs(p[:, :2] - (room.x1, room.y1)))
         along = np.where(off[:, 0] < off[:, 1], p[:, 1], p[:, 0])
         if papered:
             out[np.mod(along, 2 * stripe) < stripe] = accent
@@ -167,8 +156,8 @@ def _wall(room: Room, use: str, rng: np.random.Generator, pictured: bool) -> Col
     return colour
 
 
-def _floor(room: Room, use: str, wood: np.ndarray, along: int, rng: np.random.Generator) -> Colouring:
-    """Tiles in wet rooms, carpet in some bedrooms, boards elsewhere; a rug in some."""
+def _floor(room: Rect, use: str, wood: np.ndarray, along: int, rng: np.random.Generator) -> Colouring:
+    """Choose tiles in wet rooms, carpet in some bedrooms, boards elsewhere; a rug in some."""
     tile, carpet = TILES[rng.integers(len(TILES))], CARPETS[rng.integers(len(CARPETS))]
     side_m, chequered = rng.choice([0.2, 0.3, 0.45]), bool(rng.random() < 0.3)
     soft = use in SOFT and rng.random() < 0.5
@@ -186,13 +175,9 @@ def _floor(room: Room, use: str, wood: np.ndarray, along: int, rng: np.random.Ge
 
 
 def finishes(
-    rooms: Sequence[Room], uses: Sequence[str], rng: np.random.Generator, pictures: bool = True
+    rooms: Sequence[Rect], uses: Sequence[str], rng: np.random.Generator, pictures: bool = True
 ) -> list[Finish]:
-    """How each room is finished.
-
-    Args:
-        rooms: x0, y0, x1, y1 of each.
-    """
+    """Choose how each room is finished."""
     wood, along = WOODS[rng.integers(len(WOODS))], int(rng.integers(2))
     if uses:
         return [

@@ -27,14 +27,15 @@ AROUND_M = ((0.06, 0.2), (0.13, 0.25), (0.27, 0.25), (0.55, 0.2), (0.9, 0.1))
 """How far from a surface it is looked whether something is near, and the weight of each."""
 AMBIENT, LAMP, DAY = (np.array(c) for c in ([0.65, 0.65, 0.66], [0.32, 0.30, 0.27], [0.50, 0.51, 0.53]))
 """Brightness of each channel: of all around, of a lamp and of a window at one metre."""
-
+REACH_M = 7.0
+"""How far a lamp or window shines."""
 BRIGHT = 0.8
 """From here on more light makes things less and less brighter."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Space:
-    """Distance to the nearest surface, of the structure alone."""
+    """Hold the distance to the nearest surface, of the structure alone."""
 
     distance: np.ndarray
     """(nx, ny, nz) m, negative inside."""
@@ -42,11 +43,11 @@ class Space:
     """(3,) place of [0, 0, 0]."""
 
     def at(self, points: np.ndarray) -> np.ndarray:
-        """(n, 3) -> (n,) between the grid's values."""
+        """Interpolate the distance at points: (n, 3) -> (n,)."""
         return ndimage.map_coordinates(self.distance, ((points - self.low) / VOXEL_M).T, order=1, mode="nearest")
 
-    def seen(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """(n,) 0..1: how freely a small lamp at `end` (n, 3) is seen; softer the nearer the way passes something."""
+    def visible(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Return (n,) 0..1: how much of a small lamp at `end` (n, 3) is visible; softer the nearer an obstacle is."""
         way = end - start
         length = np.linalg.norm(way, axis=1)
         out, index = np.ones(len(start)), np.arange(len(start))
@@ -64,7 +65,7 @@ class Space:
 
 
 def space_of(plan: Plan) -> Space:
-    """The structure's distances, windows open."""
+    """Return the structure's distances, windows open."""
     o, pad = plan.outer, 4 * VOXEL_M
     low = np.array([o.x0, o.y0, 0.0]) - pad
     top = plan.wall_height_m
@@ -85,7 +86,7 @@ def space_of(plan: Plan) -> Space:
 
 @dataclasses.dataclass(frozen=True)
 class Daylight:
-    """Light in a home."""
+    """Compute the light in a home."""
 
     space: Space
     lamps: np.ndarray
@@ -96,30 +97,26 @@ class Daylight:
     """(m, 3) unit, from each into its room."""
 
     def __call__(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """(n, 3) places and normals -> (n, 3) brightness."""
+        """Return the brightness (n, 3) at places and normals (n, 3)."""
         hidden = np.zeros(len(points))
         for d, weight in AROUND_M:
             hidden += weight * np.clip(1 - self.space.at(points + d * normals) / d, 0, 1)
         light = AMBIENT * (1 - 0.5 * hidden)[:, None]
         start = points + 0.05 * normals
-        for source in self.lamps:
-            light += LAMP * self._from(source, None, start, normals, 7.0)[:, None]
-        for source, inward in zip(self.panes, self.inwards, strict=True):
-            light += DAY / 2 * self._from(source, inward, start, normals, 7.0)[:, None]
+        sources = [(LAMP, lamp, None) for lamp in self.lamps]
+        sources += [(DAY / 2, pane, inward) for pane, inward in zip(self.panes, self.inwards, strict=True)]
+        for brightness, source, inward in sources:
+            away = source - start
+            far = np.linalg.norm(away, axis=1)
+            value = np.clip((normals * away).sum(axis=1) / far, 0, 1) / (0.55 + 0.3 * far**2)
+            if inward is not None:
+                value *= np.clip(-(away * inward).sum(axis=1) / far, 0, 1) * 2
+            index = np.flatnonzero((value > 0.004) & (far < REACH_M))
+            share = np.zeros(len(start))
+            ends = np.broadcast_to(source, (len(index), 3))
+            share[index] = value[index] * self.space.visible(start[index], ends)
+            light += brightness * share[:, None]
         return np.where(light > BRIGHT, BRIGHT + 0.3 * (1 - np.exp((BRIGHT - light) / 0.3)), light)
-
-    def _from(self, source: np.ndarray, inward: np.ndarray | None, start: np.ndarray, normals: np.ndarray,
-              reach_m: float) -> np.ndarray:  # fmt: skip
-        """(n,) of one source: a lamp where it has no direction, else a part of a window."""
-        away = source - start
-        far = np.linalg.norm(away, axis=1)
-        value = np.clip((normals * away).sum(axis=1) / far, 0, 1) / (0.55 + 0.3 * far**2)
-        if inward is not None:
-            value *= np.clip(-(away * inward).sum(axis=1) / far, 0, 1) * 2
-        index = np.flatnonzero((value > 0.004) & (far < reach_m))
-        out = np.zeros(len(start))
-        out[index] = value[index] * self.space.seen(start[index], np.broadcast_to(source, (len(index), 3)))
-        return out
 
 
 CEILING_WHITE, LAMP_LABEL = np.array([0.95, 0.95, 0.93]), 35
@@ -136,7 +133,7 @@ def _flat(rect: Rect, z: float, up: int, label: int, paint: Colouring, texels_pe
 
 
 def _shell(plan: Plan, sides: list[list[Side]], finish: list[Finish]) -> list[Chart]:
-    """Floors, ceilings, walls with their boards, doorways; tops and outsides of the walls."""
+    """Return floors, ceilings, walls with their boards, doorways; tops and outsides of the walls."""
     height, charts = plan.wall_height_m, []
     for room, walls, of in zip(plan.rooms, sides, finish, strict=True):
         charts.append(_flat(room, FLOOR_M, 1, FLOOR, of.floor_colour))
@@ -149,18 +146,15 @@ def _shell(plan: Plan, sides: list[list[Side]], finish: list[Finish]) -> list[Ch
     for doorway in plan.doorways:
         charts += at_walls.lining(doorway, finish[doorway.rooms[0]].floor_colour)
     charts += [_flat(w.rect, w.high[2], 1, WALL, plain([0.62, 0.61, 0.59]), 2.0, True) for w in plan.walls]
-    o = plan.outer
-    for axis, way, face, low, high in (
-        (0, -1, o.x0, o.y0, o.y1), (0, 1, o.x1, o.y0, o.y1), (1, -1, o.y0, o.x0, o.x1), (1, 1, o.y1, o.x0, o.x1)
-    ):  # fmt: skip
-        near = [w for w in plan.windows if abs((w.low if way < 0 else w.high)[axis] - face) < 0.005]
-        outside = Side(axis, way, face, low, high, (), tuple(near))
+    for axis, way, face, start, end in plan.outer.sides():
+        near = [w for w in plan.windows if abs((w.low if way > 0 else w.high)[axis] - face) < 0.005]
+        outside = Side(axis, -way, face, start, end, (), tuple(near))
         charts += at_walls.wall_face(outside, height, plain([0.80, 0.78, 0.73]), 8.0)
     return charts
 
 
 def _lamp(at: np.ndarray, radius: float) -> list[Chart]:
-    """A round shade under the ceiling; `at` is the middle of its top."""
+    """Return a round shade under the ceiling; `at` is the middle of its top."""
     turn = 2 * math.pi * np.arange(14) / 14
     ring = np.round(at + radius * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn]), 4)
     low = ring - [0, 0, 0.11]
@@ -173,7 +167,7 @@ def _lamp(at: np.ndarray, radius: float) -> list[Chart]:
 
 
 def _standing(items: Sequence[Instance], above_m: float) -> shapely.Geometry:
-    """Footprints of what is higher than that."""
+    """Return the footprints of what is higher than that."""
     return shapely.union_all([
         i.footprint for i in items if i.position[2] + i.scale[1] * i.model.bounds[1, 1] > above_m
     ])  # fmt: skip
@@ -181,7 +175,7 @@ def _standing(items: Sequence[Instance], above_m: float) -> shapely.Geometry:
 
 def _windows(plan: Plan, uses: Sequence[str], sides: list[list[Side]], items: Sequence[Instance],
              rng: np.random.Generator) -> list[Chart]:  # fmt: skip
-    """Windows, and curtains where nothing is in their way."""
+    """Return windows, and curtains where nothing is in their way."""
     charts, sky = [], np.array([0.52, 0.70, 0.92]) + rng.uniform(-0.06, 0.06, 3)
     low, tall = _standing(items, 0.1), _standing(items, 0.84)
     for walls, use in zip(sides, uses, strict=True):
@@ -199,7 +193,7 @@ def _windows(plan: Plan, uses: Sequence[str], sides: list[list[Side]], items: Se
 
 
 def _pictures(side: Side, count: int, tall: shapely.Geometry, rng: np.random.Generator) -> list[Chart]:
-    """Framed pictures on one wall, clear of its openings and of what stands high before it."""
+    """Return framed pictures on one wall, clear of its openings and of what stands high before it."""
     charts, taken = [], [(h.start - 0.4, h.end + 0.4) for h in side.holes()]
     for _ in range(3 * count):
         half = rng.uniform([0.18, 0.15], [0.42, 0.32]).round(2)
@@ -229,18 +223,18 @@ def _pictures(side: Side, count: int, tall: shapely.Geometry, rng: np.random.Gen
 
 def _fittings(plan: Plan, uses: Sequence[str], sides: list[list[Side]], items: Sequence[Instance],
               rng: np.random.Generator) -> list[Chart]:  # fmt: skip
-    """Front door, pictures, switches and sockets."""
-    charts, o = [], plan.outer
+    """Return front door, pictures, switches and sockets."""
+    charts: list[Chart] = []
     standing, tall = _standing(items, 0.05), _standing(items, 1.1)
     order = sorted(range(len(uses)), key=lambda k: ({"hall": 0, "living": 1}.get(uses[k], 2), k))
     walls = [s for k in order if k == plan.corridor or uses[k] in ("hall", "living", "dining") for s in sides[k]]
-    reach = {(0, 1): o.x0, (0, -1): o.x1, (1, 1): o.y0, (1, -1): o.y1}
-    found = at_walls.entrance_place(walls, [abs(reach[s.axis, s.way] - s.face) < 0.5 for s in walls], standing)
+    reach = {(axis, way): face for axis, way, face, *_ in plan.outer.sides()}
+    entrance = at_walls.entrance_place(walls, [abs(reach[s.axis, s.way] - s.face) < 0.5 for s in walls], standing)
     colour = ENTRANCES[rng.integers(len(ENTRANCES))]
-    if found is not None:
-        charts += at_walls.entrance(*found, colour)
-        middle = found[1]
-        tall = shapely.union(tall, found[0].strip(middle - 0.6, middle + 0.6, 0.2))
+    if entrance is not None:
+        side, middle = entrance
+        charts += at_walls.entrance(side, middle, colour)
+        tall = shapely.union(tall, side.strip(middle - 0.6, middle + 0.6, 0.2))
     for k, use in enumerate(uses):
         left = PICTURES.get(use, 0)
         for index in rng.permutation(4):
@@ -258,7 +252,7 @@ def _fittings(plan: Plan, uses: Sequence[str], sides: list[list[Side]], items: S
 
 
 def _built_in(items: Sequence[Instance]) -> list[Chart]:
-    """Built-in furniture: drawn parts in the colour of their material, a library's model with its image."""
+    """Return built-in furniture: drawn parts in the colour of their material, a library's model with its image."""
     charts = []
     images: dict[str, np.ndarray] = {}
     for item in items:
@@ -280,13 +274,8 @@ def _built_in(items: Sequence[Instance]) -> list[Chart]:
 
 def model_building(plan: Plan, items: Sequence[Instance], uses: Sequence[str],
                    rng: np.random.Generator) -> tuple[Scan, Atlas]:  # fmt: skip
-    """Models and paints the structure.
-
-    Returns:
-        The mesh, no vertex in faces of two labels, and its atlas.
-    """
-    rooms = [(r.x0, r.y0, r.x1, r.y1) for r in plan.rooms]
-    finish = finishes(rooms, uses, rng, pictures=False)
+    """Model and paint the structure; no vertex of the mesh is in faces of two labels."""
+    finish = finishes(plan.rooms, uses, rng, pictures=False)
     sides = [at_walls.sides_of(room, plan.doorways, plan.windows) for room in plan.rooms]
     everything = [*plan.built_in, *items]
     lamps = np.array([[*np.round(r.centre, 3), plan.wall_height_m] for r in plan.rooms])

@@ -1,6 +1,6 @@
-"""Plan and furniture in, a scan-like labelled mesh out: what a depth camera would leave.
+"""Scan plan and furniture into a labelled mesh, as a depth camera would.
 
-Solids are fused on a voxel grid and contoured; what no camera position saw is dropped (behind sofas, under
+Solids are fused on a voxel grid and contoured; what no camera position sees is dropped (behind sofas, under
 desks, outside faces, the tops of walls), as is glass; the rest is thinned to the wanted number of faces, gets
 noise along the normals, and labels that are sometimes wrong near a border. There is no ceiling: nothing in
 this project looks at it. Frame: scan x, y, height above the floor; metres.
@@ -24,7 +24,7 @@ from scenes_mjcf.categories import TABLE
 
 @dataclasses.dataclass(frozen=True)
 class Solid:
-    """A convex solid, as half-spaces `normals @ x <= offsets`."""
+    """Describe a convex solid as half-spaces `normals @ x <= offsets`."""
 
     normals: np.ndarray
     """(k, 3) unit outward normals."""
@@ -44,7 +44,7 @@ class Solid:
     """What stands there, of which it is a part; None: floor or wall."""
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """(n, 3) -> (n,) signed distance, exact inside and beside faces, a lower bound off edges."""
+        """Return the signed distance, (n, 3) -> (n,): exact inside and beside faces, a lower bound off edges."""
         out = points @ self.normals[0] - self.offsets[0]
         for normal, offset in zip(self.normals[1:], self.offsets[1:], strict=True):
             np.maximum(out, points @ normal - offset, out=out)
@@ -52,7 +52,7 @@ class Solid:
 
 
 def solid_from_mesh(vertices: np.ndarray, faces: np.ndarray, label: int, material: str, owner: int) -> Solid:
-    """A convex mesh as half-spaces, equal planes merged."""
+    """Return a convex mesh as half-spaces, equal planes merged."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     area = np.linalg.norm(normals, axis=1)
@@ -64,14 +64,14 @@ def solid_from_mesh(vertices: np.ndarray, faces: np.ndarray, label: int, materia
 
 
 def solid_from_box(low, high, label: int, material: str) -> Solid:
-    """An axis-aligned box of the static structure."""
+    """Return an axis-aligned box of the static structure."""
     low, high = np.asarray(low, float), np.asarray(high, float)
     return Solid(np.concatenate([np.eye(3), -np.eye(3)]), np.concatenate([high, -low]), low, high, label, material, -1)
 
 
 @dataclasses.dataclass(frozen=True)
 class Volume:
-    """Truncated signed distances."""
+    """Hold truncated signed distances."""
 
     sdf: np.ndarray
     """(nx, ny, nz) float32, metres, negative inside; at `origin + voxel_m * index`."""
@@ -80,14 +80,14 @@ class Volume:
     voxel_m: float
 
     def sample(self, points: np.ndarray) -> np.ndarray:
-        """(n, 3) -> (n,) value at the nearest voxel; outside the grid: that of its border."""
+        """Return the value at the nearest voxel, (n, 3) -> (n,); outside the grid that of its border."""
         index = (points - self.origin) / self.voxel_m + 0.5
         i, j, k = (np.clip(index[:, d].astype(np.int32), 0, size - 1) for d, size in enumerate(self.sdf.shape))
         return self.sdf.ravel().take((i * self.sdf.shape[1] + j) * self.sdf.shape[2] + k)
 
 
 def fuse(solids: list[Solid], low: np.ndarray, high: np.ndarray, voxel_m: float) -> Volume:
-    """Writes the union of the solids into a grid that spans `low`..`high`, truncated at three voxels."""
+    """Write the union of the solids into a grid that spans `low`..`high`, truncated at three voxels."""
     shape = np.ceil((high - low) / voxel_m).astype(int) + 1
     trunc = 3 * voxel_m
     sdf = np.full(tuple(shape), trunc, np.float32)
@@ -109,10 +109,10 @@ def fuse(solids: list[Solid], low: np.ndarray, high: np.ndarray, voxel_m: float)
 
 
 def surface_nets(volume: Volume) -> tuple[np.ndarray, np.ndarray]:
-    """Extracts the zero surface.
+    """Extract the zero surface: vertices (n, 3) in the volume's frame, faces (m, 3) counter-clockwise from outside.
 
-    Returns:
-        vertices (n, 3) float64 in the volume's frame; faces (m, 3) int64, counter-clockwise from outside.
+    Surface nets (one vertex per cell that the surface crosses, at the mean of its edge crossings) give the evenly
+    sized triangles and rounded edges that fused depth images give.
     """
     sdf = volume.sdf
     shape = np.array(sdf.shape)
@@ -158,7 +158,7 @@ GRAZING = 0.12
 
 @dataclasses.dataclass(frozen=True)
 class Scan:
-    """A reconstruction."""
+    """Hold a reconstruction."""
 
     vertices: np.ndarray
     """(n, 3) float64."""
@@ -173,12 +173,12 @@ class Scan:
 
     @property
     def owner(self) -> np.ndarray:
-        """(n,) index of the piece of furniture that each vertex shows, -1 where it shows none."""
+        """Return (n,) the index of the piece of furniture that each vertex shows, -1 where it shows none."""
         return np.array([s.owner for s in self.solids])[self.solid] if self.solids else np.full(len(self.labels), -1)
 
 
 def building_solids(plan: Plan, items: list[Instance]) -> list[Solid]:
-    """Everything that a camera can hit, with labels and materials."""
+    """Return everything that a camera can hit, with labels and materials."""
     o = plan.outer
     solids = [solid_from_box((o.x0, o.y0, -0.3), (o.x1, o.y1, 0.0), NYU40["floor"], "floor")]
     solids += [solid_from_box(w.low, w.high, NYU40["wall"], "paint") for w in plan.walls]
@@ -192,7 +192,7 @@ def building_solids(plan: Plan, items: list[Instance]) -> list[Solid]:
 
 
 def camera_positions(plan: Plan, items: list[Instance], rng: np.random.Generator) -> np.ndarray:
-    """(n, 3) places where the camera stood: two to four a room, at eye height, and one in each doorway."""
+    """Draw (n, 3) places of the camera: two to four a room, at eye height, and one in each doorway."""
     free = clearance(free_grid(plan, items), GRID_M)
     centres = cell_centres(free)
     out = []
@@ -211,9 +211,9 @@ def camera_positions(plan: Plan, items: list[Instance], rng: np.random.Generator
     return np.array(out)
 
 
-def seen_from(points: np.ndarray, normals: np.ndarray, cameras: np.ndarray, volume: Volume) -> np.ndarray:
-    """(n,) bool: some camera sees the point, within reach, not grazing, nothing between."""
-    seen = np.zeros(len(points), bool)
+def visible_from(points: np.ndarray, normals: np.ndarray, cameras: np.ndarray, volume: Volume) -> np.ndarray:
+    """Return (n,) bool: some camera sees the point, within reach, not grazing, nothing between."""
+    visible = np.zeros(len(points), bool)
     start = points + normals * 1.6 * volume.voxel_m
     step = 1.5 * volume.voxel_m
     free = dataclasses.replace(volume, sdf=volume.sdf > 0)
@@ -221,20 +221,20 @@ def seen_from(points: np.ndarray, normals: np.ndarray, cameras: np.ndarray, volu
         ray = camera - start
         length = np.linalg.norm(ray, axis=1)
         facing = np.einsum("ij,ij->i", ray, normals) > GRAZING * length
-        index = np.flatnonzero(~seen & facing & (length < RANGE_M))
+        index = np.flatnonzero(~visible & facing & (length < RANGE_M))
         at, left = start[index], length[index]
         stride = ray[index] / left[:, None] * step
         while len(index):
             keep = free.sample(at)
-            seen[index[keep & (left <= 0)]] = True
+            visible[index[keep & (left <= 0)]] = True
             on = np.flatnonzero(keep & (left > 0))
             index, left, stride = index[on], left[on] - step, stride.take(on, axis=0)
             at = at.take(on, axis=0) + stride
-    return seen
+    return visible
 
 
 def smooth_noise(points: np.ndarray, wave_m: float, rng: np.random.Generator) -> np.ndarray:
-    """(n, 3) -> (n,) spatially correlated noise of about unit deviation and correlation length `wave_m`."""
+    """Draw spatially correlated noise, (n, 3) -> (n,), of about unit deviation and correlation length `wave_m`."""
     low = points.min(axis=0) - wave_m
     shape = np.ceil((points.max(axis=0) - low) / wave_m).astype(int) + 2
     grid = rng.standard_normal(tuple(shape))
@@ -242,7 +242,7 @@ def smooth_noise(points: np.ndarray, wave_m: float, rng: np.random.Generator) ->
 
 
 def compact(vertices: np.ndarray, faces: np.ndarray, min_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Drops connected pieces of fewer than `min_faces` faces, degenerate faces, and unused vertices."""
+    """Drop connected pieces of fewer than `min_faces` faces, degenerate faces, and unused vertices."""
     degenerate = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
     faces = faces[~degenerate]
     part = loose_parts(vertices, faces)
@@ -250,11 +250,9 @@ def compact(vertices: np.ndarray, faces: np.ndarray, min_faces: int) -> tuple[np
 
 
 def nearest_solids(points: np.ndarray, solids: list[Solid], reach_m: float = 0.12) -> tuple[np.ndarray, np.ndarray]:
-    """For each of (n, 3) points the solid whose surface is nearest, and the label of the nearest one of another class.
+    """Return for each of (n, 3) points the index of the solid whose surface is nearest, and the label of another class.
 
-    Returns:
-        index (n,) int64 of the nearest solid; other (n,) int64 label of the nearest other class
-            within 0.05 m, or 0.
+    That is the nearest other class within 0.05 m, or 0.
     """
     best = np.full(len(points), np.inf)
     index = np.zeros(len(points), np.int64)
@@ -273,14 +271,14 @@ def nearest_solids(points: np.ndarray, solids: list[Solid], reach_m: float = 0.1
         better = distance < best[near]
         best[near[better]] = distance[better]
         index[near[better]] = k
-    own = np.array([s.label for s in solids])[index]
+    nearest = np.array([s.label for s in solids])[index]
     labels = np.array(sorted(by_label))
-    table = np.stack([np.where(own == lab, np.inf, by_label[int(lab)]) for lab in labels], axis=1)
+    table = np.stack([np.where(nearest == lab, np.inf, by_label[int(lab)]) for lab in labels], axis=1)
     return index, np.where(table.min(axis=1) < 0.05, labels[table.argmin(axis=1)], 0)
 
 
 def scan_building(plan: Plan, items: list[Instance], cfg: BuildingConfig, rng: np.random.Generator) -> Scan:
-    """Reconstructs the building: a mesh with a label for each vertex."""
+    """Reconstruct the building: a mesh with a label for each vertex."""
     solids = building_solids(plan, items)
     o = plan.outer
     pad = 4 * cfg.voxel_m
@@ -289,15 +287,15 @@ def scan_building(plan: Plan, items: list[Instance], cfg: BuildingConfig, rng: n
     volume = fuse(solids, low, np.array([o.x1, o.y1, plan.wall_height_m]) + pad, cfg.voxel_m)
     vertices, faces = surface_nets(volume)
     normals = vertex_normals(vertices, faces)
-    seen = seen_from(vertices, normals, camera_positions(plan, items, rng), volume)
+    visible = visible_from(vertices, normals, camera_positions(plan, items, rng), volume)
     for w in plan.windows:
         inside = (vertices > np.array(w.low) - 0.06) & (vertices < np.array(w.high) + 0.06)
-        seen &= ~inside.all(axis=1)
+        visible &= ~inside.all(axis=1)
     # Glossy spots return no depth either.
     spots = vertices[rng.integers(len(vertices), size=max(3, int(0.15 * o.area_m2)))]
     for spot in spots:
-        seen &= ((vertices - spot) ** 2).sum(axis=1) > rng.uniform(0.04, 0.11) ** 2
-    vertices, faces = compact(vertices, faces[seen[faces].all(axis=1)], 60)
+        visible &= ((vertices - spot) ** 2).sum(axis=1) > rng.uniform(0.04, 0.11) ** 2
+    vertices, faces = compact(vertices, faces[visible[faces].all(axis=1)], 60)
     index, _ = nearest_solids(vertices, solids)
     movable = np.array([s.owner for s in solids])[index] >= 0
     # Flat walls and floors thin out more readily than furniture if they are smoother before thinning.

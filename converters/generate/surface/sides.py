@@ -1,4 +1,4 @@
-"""A room's four walls in, what is on them out: wall faces with holes, boards, casings, panes, curtains, a front door.
+"""Model what is on a room's walls: faces with holes, boards, casings, panes, curtains, a front door.
 
 A place at a wall is (along, out, z): metres along the wall, out of its face into the room, above the floor.
 """
@@ -31,7 +31,7 @@ ENTRANCES = np.array([[0.36, 0.22, 0.15], [0.88, 0.88, 0.86], [0.24, 0.33, 0.36]
 
 @dataclasses.dataclass(frozen=True)
 class Hole:
-    """An opening in a wall's face."""
+    """Describe an opening in a wall's face."""
 
     start: float
     end: float
@@ -41,7 +41,7 @@ class Hole:
 
 @dataclasses.dataclass(frozen=True)
 class Side:
-    """One wall of a room."""
+    """Describe one wall of a room."""
 
     axis: int
     """The wall faces along it."""
@@ -55,38 +55,45 @@ class Side:
 
     @property
     def inward(self) -> np.ndarray:
-        """(3,) unit."""
+        """Return the (3,) unit vector into the room."""
         return self.at(0, 1, 0) - self.at(0, 0, 0)
 
     def at(self, along: float, out: float, z: float) -> np.ndarray:
-        """(3,) of the scan frame."""
+        """Return a place at the wall, (3,) of the scan frame."""
         across = self.face + self.way * out
         return np.array([across, along, z] if self.axis == 0 else [along, across, z])
 
     def along(self, rect: Rect) -> tuple[float, float]:
-        """Where a rectangle lies along the wall."""
-        return (rect.y0, rect.y1) if self.axis == 0 else (rect.x0, rect.x1)
+        """Return where a rectangle lies along the wall."""
+        return rect.span(1 - self.axis)
+
+    def corners(self, hole: Hole, out: float = 0.0) -> list[np.ndarray]:
+        """Return the corners of an opening, or of any upright rectangle, at a distance out of the wall."""
+        low, high = hole.low, hole.high
+        return [
+            self.at(a, out, z) for a, z in ((hole.start, low), (hole.end, low), (hole.end, high), (hole.start, high))
+        ]
 
     def holes(self) -> list[Hole]:
-        """Doorways and windows in it, in order."""
+        """Return the doorways and windows in it, in order."""
         holes = [Hole(*self.along(d.rect), 0.0, d.height_m) for d in self.doorways]
         holes += [Hole(*self.along(w.rect), w.low[2], w.high[2]) for w in self.windows]
         return sorted(holes, key=lambda h: h.start)
 
     def strip(self, start: float, end: float, depth_m: float) -> shapely.Polygon:
-        """Floor before a stretch of the wall."""
-        (x0, y0), (x1, y1) = (self.at(a, out, 0)[:2] for a, out in ((start, 0.0), (end, depth_m)))
-        return shapely.box(min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1))
+        """Return the floor before a stretch of the wall."""
+        low, high = sorted((self.face, self.face + self.way * depth_m))
+        return Rect.across(self.axis, low, high, start, end).polygon
 
     def slab(self, along: Span, out: Span, z: Span, label: int, paint: Colouring, texels_per_m: float = 40.0,
              skip: str = "b", thin: bool = True) -> list[Chart]:  # fmt: skip
-        """A box at the wall: its faces but those in `skip` (f front, b back, l, r along, t top, u under).
+        """Return a box at the wall: its faces but those in `skip` (f front, b back, l, r along, t top, u under).
 
         The edges of what is `thin` are as bright as its front.
         """
         ranges = (along, out, z)
         faces = {"l": (0, 0), "r": (0, 1), "b": (1, 0), "f": (1, 1), "u": (2, 0), "t": (2, 1)}
-        made = []
+        charts = []
         for name, (k, end) in faces.items():
             if name in skip:
                 continue
@@ -98,52 +105,45 @@ class Side:
                 corners.append(self.at(*place))
             middle = self.at(*(sum(r) / 2 for r in ranges))
             towards = np.mean(corners, axis=0) - middle
-            made.append(polygon(corners, towards, label, paint, texels_per_m, lit_as=self.inward if thin else None))
-        return made
+            charts.append(polygon(corners, towards, label, paint, texels_per_m, lit_as=self.inward if thin else None))
+        return charts
 
 
 def sides_of(room: Rect, doorways: Iterable[Doorway], windows: Iterable[PlanBox]) -> list[Side]:
-    """The four walls of a room, each with what opens in it."""
+    """Return the four walls of a room, each with what opens in it."""
     out = []
-    for axis, way, face, start, end in (
-        (0, 1, room.x0, room.y0, room.y1), (0, -1, room.x1, room.y0, room.y1),
-        (1, 1, room.y0, room.x0, room.x1), (1, -1, room.y1, room.x0, room.x1),
-    ):  # fmt: skip
-        side = Side(axis, way, face, start, end, (), ())
+    for wall in room.sides():
+        side = Side(*wall, (), ())
 
         def here(rect: Rect, side: Side = side) -> bool:
-            faces = ((rect.x1, rect.x0) if side.axis == 0 else (rect.y1, rect.y0))[int(side.way < 0)]
             low, high = side.along(rect)
-            return abs(faces - side.face) < 0.005 and low > side.start - 0.005 and high < side.end + 0.005
+            return (
+                abs(rect.span(side.axis)[int(side.way > 0)] - side.face) < 0.005
+                and low > side.start - 0.005
+                and high < side.end + 0.005
+            )
 
-        mine = tuple(d for d in doorways if d.axis == axis and here(d.rect))
-        out.append(dataclasses.replace(side, doorways=mine, windows=tuple(w for w in windows if here(w.rect))))
+        through = tuple(d for d in doorways if d.axis == side.axis and here(d.rect))
+        out.append(dataclasses.replace(side, doorways=through, windows=tuple(w for w in windows if here(w.rect))))
     return out
 
 
-def pierced(start: float, end: float, height: float, holes: Iterable[Hole]) -> Iterator[Hole]:
-    """The rectangles that are left of a wall's face."""
-    at = start
-    for h in holes:
-        yield Hole(at, h.start, 0.0, height)
-        yield Hole(h.start, h.end, 0.0, h.low)
-        yield Hole(h.start, h.end, h.high, height)
-        at = h.end
-    yield Hole(at, end, 0.0, height)
-
-
 def wall_face(side: Side, height: float, paint: Colouring, texels_per_m: float = 80.0) -> list[Chart]:
-    """The wall around its holes."""
-    pieces = [
-        p for p in pierced(side.start, side.end, height, side.holes())
-        if p.end - p.start > 1e-6 and p.high - p.low > 1e-6
-    ]  # fmt: skip
-    corners = [((p.start, p.low), (p.end, p.low), (p.end, p.high), (p.start, p.high)) for p in pieces]
-    return [polygon([side.at(a, 0, z) for a, z in c], side.inward, WALL, paint, texels_per_m) for c in corners]
+    """Return the wall around its holes."""
+    pieces, at = [], side.start
+    for h in side.holes():
+        pieces += [
+            Hole(at, h.start, 0.0, height),
+            Hole(h.start, h.end, 0.0, h.low),
+            Hole(h.start, h.end, h.high, height),
+        ]
+        at = h.end
+    pieces = [p for p in (*pieces, Hole(at, side.end, 0.0, height)) if min(p.end - p.start, p.high - p.low) > 1e-6]
+    return [polygon(side.corners(p), side.inward, WALL, paint, texels_per_m) for p in pieces]
 
 
 def skirting(side: Side) -> list[Chart]:
-    """A board along its foot, between the casings."""
+    """Return a board along its foot, between the casings."""
     charts, at = [], side.start
     for h in [h for h in side.holes() if h.low < 0.01] + [Hole(side.end + CASING_M, side.end, 0.0, 0.0)]:
         if h.start - CASING_M - at > 0.02:
@@ -154,7 +154,7 @@ def skirting(side: Side) -> list[Chart]:
 
 
 def casing(side: Side, hole: Hole) -> list[Chart]:
-    """Boards around a doorway on one side of its wall."""
+    """Return boards around a doorway on one side of its wall."""
     low = max(hole.start - CASING_M, side.start), hole.start
     high = hole.end, min(hole.end + CASING_M, side.end)
     top = (hole.high, hole.high + CASING_M)
@@ -164,24 +164,33 @@ def casing(side: Side, hole: Hole) -> list[Chart]:
     return charts + side.slab((hole.start, hole.end), (0.0, PROUD_M), top, WALL, plain(WHITE), skip="blr")
 
 
+def _reveals(side: Side, hole: Hole, deep: float, sill_m: float) -> Iterator[tuple[list[np.ndarray], np.ndarray]]:
+    """Yield the faces inside of an opening, with where each looks: at its low and its high end, below and above."""
+    along, up = side.at(1, 0, 0) - side.at(0, 0, 0), np.array([0, 0, 1])
+    for a, towards in ((hole.start, along), (hole.end, -along)):
+        yield (
+            [side.at(a, o, z) for o, z in ((0, hole.low), (deep, hole.low), (deep, hole.high), (0, hole.high))],
+            towards,
+        )
+    for z, towards in ((sill_m, up), (hole.high, -up)):
+        yield (
+            [side.at(a, o, z) for a, o in ((hole.start, 0), (hole.end, 0), (hole.end, deep), (hole.start, deep))],
+            towards,
+        )
+
+
 def lining(doorway: Doorway, floor: Colouring) -> list[Chart]:
-    """The floor, the sides and the upper side of a doorway."""
-    r, height = doorway.rect, doorway.height_m
-    side = Side(0, 1, r.x0, r.y0, r.y1, (), ()) if doorway.axis == 0 else Side(1, 1, r.y0, r.x0, r.x1, (), ())
-    deep = r.size[doorway.axis]
-    run = (side.start, side.end)
-    inner = []
-    for a, towards in ((run[0], 1), (run[1], -1)):
-        corners = [side.at(a, o, z) for o, z in ((0, 0), (deep, 0), (deep, height), (0, height))]
-        inner.append(polygon(corners, towards * (side.at(1, 0, 0) - side.at(0, 0, 0)), WALL, plain(WHITE)))
-    for z, towards, label, paint in ((FLOOR_M, 1, FLOOR, floor), (height, -1, WALL, plain(WHITE))):
-        corners = [side.at(a, o, z) for a, o in ((run[0], 0), (run[1], 0), (run[1], deep), (run[0], deep))]
-        inner.append(polygon(corners, (0, 0, towards), label, paint))
-    return inner
+    """Return the sides, the floor and the upper side of a doorway."""
+    axis, white = doorway.axis, plain(WHITE)
+    side = Side(axis, 1, doorway.rect.span(axis)[0], *doorway.rect.span(1 - axis), (), ())
+    hole = Hole(side.start, side.end, 0.0, doorway.height_m)
+    faces = _reveals(side, hole, doorway.rect.size[axis], FLOOR_M)
+    paints = ((WALL, white), (WALL, white), (FLOOR, floor), (WALL, white))
+    return [polygon(*face, *paint) for face, paint in zip(faces, paints, strict=True)]
 
 
 def outlook(side: Side, sky: np.ndarray, phase: float) -> Colouring:
-    """What one sees through a pane: sky over a line of trees and a lawn."""
+    """Paint the view through a pane: sky over a line of trees and a lawn."""
 
     def colour(p: np.ndarray) -> np.ndarray:
         along, z = p[:, 1 - side.axis] + phase, p[:, 2]
@@ -201,24 +210,17 @@ def outlook(side: Side, sky: np.ndarray, phase: float) -> Colouring:
 
 
 def window(side: Side, box: PlanBox, pane: Colouring) -> list[Chart]:
-    """Reveals, frame with a mullion, pane and sill of one window; also what one sees of it from outside."""
+    """Return reveals, frame with a mullion, pane and sill of one window, and its pane from outside."""
     a0, a1 = side.along(box.rect)
     z0, z1, deep = box.low[2], box.high[2], box.rect.size[side.axis]
-    glass, white = -0.6 * deep, plain(WHITE)
-    charts = []
-    for corners, towards in (
-        ([(a0, 0, z0), (a0, -deep, z0), (a0, -deep, z1), (a0, 0, z1)], side.at(1, 0, 0) - side.at(0, 0, 0)),
-        ([(a1, 0, z0), (a1, -deep, z0), (a1, -deep, z1), (a1, 0, z1)], side.at(0, 0, 0) - side.at(1, 0, 0)),
-        ([(a0, 0, z0), (a1, 0, z0), (a1, -deep, z0), (a0, -deep, z0)], (0, 0, 1)),
-        ([(a0, 0, z1), (a1, 0, z1), (a1, -deep, z1), (a0, -deep, z1)], (0, 0, -1)),
-    ):
-        charts.append(polygon([side.at(*c) for c in corners], towards, WALL, plain(0.86 * WHITE), 10.0, glows=True))
-    corners = [side.at(a, glass, z) for a, z in ((a0, z0), (a1, z0), (a1, z1), (a0, z1))]
+    glass, white, hole = -0.6 * deep, plain(WHITE), Hole(a0, a1, z0, z1)
+    charts = [polygon(*f, WALL, plain(0.86 * WHITE), 10.0, glows=True) for f in _reveals(side, hole, -deep, z0)]
+    corners = side.corners(hole, glass)
     charts.append(polygon(corners, side.inward, WINDOW, pane, 60.0, glows=True))
     charts.append(polygon(corners, -side.inward, WINDOW, plain([0.35, 0.42, 0.47]), 4.0))
     bar, out = 0.055, (glass, glass + 0.045)
-    mullions = [(a0 + a1) / 2] if a1 - a0 > 0.95 else []
-    for m in mullions:
+    if a1 - a0 > 0.95:
+        m = (a0 + a1) / 2
         charts += side.slab((m - 0.03, m + 0.03), out, (z0 + bar, z1 - bar), WINDOW, white, skip="but")
     charts += side.slab((a0, a1), out, (z0, z0 + bar), WINDOW, white, skip="bulr")
     charts += side.slab((a0, a1), out, (z1 - bar, z1), WINDOW, white, skip="btlr")
@@ -228,7 +230,7 @@ def window(side: Side, box: PlanBox, pane: Colouring) -> list[Chart]:
 
 
 def curtains(side: Side, box: PlanBox, foot: float, colour: np.ndarray) -> list[Chart]:
-    """A rod and two gathered curtains down to the height `foot`, at most 0.06 m from the wall."""
+    """Return a rod and two gathered curtains down to the height `foot`, at most 0.06 m from the wall."""
     a0, a1 = side.along(box.rect)
     a0, a1 = max(a0 - 0.16, side.start + 0.02), min(a1 + 0.16, side.end - 0.02)
     top = box.high[2] + 0.1
@@ -239,17 +241,13 @@ def curtains(side: Side, box: PlanBox, foot: float, colour: np.ndarray) -> list[
         outs = [0.0, *(0.028 + 0.03 * (k % 2) for k in range(folds + 1)), 0.0]
         alongs = [start, *(start + k * step for k in range(folds + 1)), start + folds * step]
         for k in range(len(outs) - 1):
-            ends = (alongs[k], outs[k]), (alongs[k + 1], outs[k + 1])
-            corners = [
-                side.at(a, o, z) for (a, o), z in ((ends[0], foot), (ends[1], foot), (ends[1], top), (ends[0], top))
-            ]
-            run = (alongs[k + 1] - alongs[k]) * np.sign(step)
-            # Out of the wall, or to the curtain's own end where it returns to it.
-            away = (
-                side.inward
-                if run > 0
-                else (side.at(alongs[k] - sum(alongs[1:-1]) / (folds + 1), 0, 0) - side.at(0, 0, 0))
-            )
+            a, b = alongs[k : k + 2]
+            places = ((a, outs[k], foot), (b, outs[k + 1], foot), (b, outs[k + 1], top), (a, outs[k], top))
+            corners = [side.at(*place) for place in places]
+            # Out of the wall, or to the curtain's end where it returns to it.
+            away = side.inward
+            if (b - a) * np.sign(step) <= 0:
+                away = side.at(a - sum(alongs[1:-1]) / (folds + 1), 0, 0) - side.at(0, 0, 0)
             shade = 0.86 if k % 2 else 1.04
             paint = plain(np.minimum(colour * shade, 1))
             charts.append(polygon(corners, away, CURTAIN, paint, 25.0, lit_as=side.inward))
@@ -257,7 +255,7 @@ def curtains(side: Side, box: PlanBox, foot: float, colour: np.ndarray) -> list[
 
 
 def _leaf(side: Side, middle: float, colour: np.ndarray) -> Colouring:
-    """A front door's leaf: four panels with bevelled rims."""
+    """Paint a front door's leaf: four panels with bevelled rims."""
 
     def paint(p: np.ndarray) -> np.ndarray:
         x, z = np.abs(p[:, 1 - side.axis] - middle), p[:, 2]
@@ -273,7 +271,7 @@ def _leaf(side: Side, middle: float, colour: np.ndarray) -> Colouring:
 def entrance_place(
     sides: Iterable[Side], outer: Iterable[bool], standing: shapely.Geometry
 ) -> tuple[Side, float] | None:
-    """A wall and the middle of a front door on it, with floor before it; None: no outer wall has room for one."""
+    """Return a wall and the middle of a front door on it, with floor before it; None where no outer wall has room."""
     half = ENTRANCE_M[0] / 2 + CASING_M + 0.03
     for depth_m in (0.95, 0.5, 0.15):
         for side, is_outer in zip(sides, outer, strict=True):
@@ -287,7 +285,7 @@ def entrance_place(
 
 
 def entrance(side: Side, middle: float, colour: np.ndarray) -> list[Chart]:
-    """A closed front door with casing and handle."""
+    """Return a closed front door with casing and handle."""
     low, high = middle - ENTRANCE_M[0] / 2, middle + ENTRANCE_M[0] / 2
     hole = Hole(low, high, 0.0, ENTRANCE_M[1])
     leaf = side.slab((low, high), (0.0, 0.006), (0.0, ENTRANCE_M[1]), OTHER, _leaf(side, middle, colour), 80.0, "bulrt")
@@ -298,7 +296,7 @@ def entrance(side: Side, middle: float, colour: np.ndarray) -> list[Chart]:
 
 
 def switch(side: Side, along: float, z: float) -> list[Chart]:
-    """A plate of a light switch or socket."""
+    """Return a plate of a light switch or socket."""
     run, heights = (along - 0.04, along + 0.04), (z - 0.04, z + 0.04)
     plate = side.slab(run, (0.0, 0.008), heights, WALL, plain([0.97, 0.97, 0.96]))
     inner = (along - 0.022, along + 0.022), (0.008, 0.011), (z - 0.026, z + 0.026)
@@ -306,7 +304,7 @@ def switch(side: Side, along: float, z: float) -> list[Chart]:
 
 
 def cupboard(box: PlanBox, colour: np.ndarray) -> list[Chart]:
-    """A fixture: a box with fronts and a dark worktop where it is low."""
+    """Return a fixture: a box with fronts and a dark worktop where it is low."""
     low, high = np.array(box.low), np.array(box.high)
 
     def paint(p: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A scan mesh in, a texture atlas out: charts by dominant direction, packed into rows, painted procedurally.
+"""Unwrap a scan into a texture atlas: charts by dominant direction, packed into rows, painted procedurally.
 
 Each chart is a connected patch of faces that look mostly along the same axis, projected along that axis; so a
 texel knows its place in the building, and a floor board runs on across chart borders.
@@ -13,9 +13,10 @@ from PIL import Image, ImageDraw
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from converters.generate.design.plan import Rect
 from converters.generate.models.cad import cad_model
 from converters.generate.models.parts import MATERIALS
-from converters.generate.surface.finishes import Room, finishes
+from converters.generate.surface.finishes import finishes
 from converters.generate.surface.scan import Scan, smooth_noise
 from converters.geometry.faces import face_vectors, unit_normals
 from converters.records.visual import TexturedMesh
@@ -30,7 +31,7 @@ MODEL_SPACING_M = 0.01
 
 @dataclasses.dataclass(frozen=True)
 class Atlas:
-    """UVs and the image they look up."""
+    """Hold UVs and the image they look up."""
 
     uv: np.ndarray
     """(k, 2) float64 in 0..1, origin at the lower left (OBJ's convention)."""
@@ -41,17 +42,14 @@ class Atlas:
 
 
 def face_axes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(m,) 0..5: +x, -x, +y, -y, +z, -z, the axis that each face's normal is closest to."""
+    """Return (m,) 0..5: +x, -x, +y, -y, +z, -z, the axis that each face's normal is closest to."""
     normals = face_vectors(vertices, faces)
     axis = np.abs(normals).argmax(axis=1)
     return 2 * axis + (normals[np.arange(len(faces)), axis] < 0)
 
 
 def charts_of(faces: np.ndarray, axes: np.ndarray) -> tuple[int, np.ndarray]:
-    """Connected patches of faces with the same axis.
-
-    Returns number of charts, and (m,) the chart of each face.
-    """
+    """Return the number of connected patches of faces with the same axis, and (m,) the patch of each face."""
     m = len(faces)
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     owner = np.tile(np.arange(m), 3)
@@ -65,10 +63,9 @@ def charts_of(faces: np.ndarray, axes: np.ndarray) -> tuple[int, np.ndarray]:
 
 
 def pack_rows(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
-    """Packs rectangles into rows, tallest first.
+    """Pack rectangles of (n, 2) width and height, texels, into rows, tallest first.
 
-    `sizes`: (n, 2) int width and height, texels.
-    Returns (n, 2) lower corner of each, and the height used.
+    Return the (n, 2) lower corner of each, and the height used.
     """
     corner = np.zeros_like(sizes)
     x = y = row = 0
@@ -82,10 +79,9 @@ def pack_rows(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
 
 
 def unwrap(vertices: np.ndarray, faces: np.ndarray, texels_per_m: float) -> tuple[np.ndarray, np.ndarray, int]:
-    """Lays the faces out on a square sheet.
+    """Lay the faces out on a square sheet.
 
-    Returns uv (k, 2) in texels, face_uv (m, 3), and the sheet's side (a power of two, so resolution may come out
-    lower).
+    Return uv (k, 2) in texels, face_uv (m, 3), and the sheet's side (a power of two, so resolution may come out lower).
     """
     axes = face_axes(vertices, faces)
     n, chart = charts_of(faces, axes)
@@ -116,7 +112,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, texels_per_m: float) -> tupl
 
 
 def face_image(uv: np.ndarray, face_uv: np.ndarray, side: int) -> np.ndarray:
-    """(side, side) int32: the face that each texel shows (row 0 at v = 0), nearest face where none does."""
+    """Return (side, side) int32: the face that each texel shows (row 0 at v = 0), nearest face where none does."""
     image = Image.new("I", (side, side), 0)
     draw = ImageDraw.Draw(image)
     corners = (uv[face_uv] - 0.5).reshape(-1, 6)
@@ -127,7 +123,7 @@ def face_image(uv: np.ndarray, face_uv: np.ndarray, side: int) -> np.ndarray:
 
 
 def texel_positions(uv: np.ndarray, face_uv: np.ndarray, scan: Scan, ids: np.ndarray, texels: np.ndarray) -> np.ndarray:
-    """(n, 3) place in the building of each texel, from its barycentric coordinates (clamped to the face)."""
+    """Return the (n, 3) place in the building of each texel, by barycentric coordinates clamped to the face."""
     a, b, c = (uv[face_uv[ids, i]] for i in range(3))
     d = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     d = np.where(np.abs(d) < 1e-9, 1e-9, d)
@@ -140,7 +136,7 @@ def texel_positions(uv: np.ndarray, face_uv: np.ndarray, scan: Scan, ids: np.nda
 
 
 def _light(points: np.ndarray, normals: np.ndarray, lamp: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(n,) brightness: a lamp per room that falls off, shade by direction, darker in corners near the floor."""
+    """Return (n,) brightness: a lamp per room that falls off, shade by direction, darker in corners near the floor."""
     away = lamp - points
     far = np.linalg.norm(away, axis=1)
     lambert = np.clip(np.einsum("ij,ij->i", normals, away) / far, 0, 1)
@@ -151,7 +147,7 @@ def _light(points: np.ndarray, normals: np.ndarray, lamp: np.ndarray, rng: np.ra
 
 @functools.cache
 def _coloured(name: str) -> tuple[cKDTree, np.ndarray]:
-    """Points of a library model's surface, CAD frame, and the colour (n, 3) of each in 0..1."""
+    """Return points of a library model's surface, CAD frame, and the colour (n, 3) of each in 0..1."""
     model = cad_model(name)
     surface = model.surface
     assert surface is not None
@@ -161,7 +157,7 @@ def _coloured(name: str) -> tuple[cKDTree, np.ndarray]:
 
 
 def _paint_models(scan: Scan, solid: np.ndarray, points: np.ndarray, colour: np.ndarray) -> None:
-    """Gives points whose solid is of a library model the colour of the model's nearest point, in place."""
+    """Give points whose solid is of a library model the colour of the model's nearest point, in place."""
     items = {id(s.item): s.item for s in scan.solids if s.item is not None and s.item.model.surface is not None}
     of = np.array([id(s.item) for s in scan.solids])[solid]
     order = np.argsort(of, kind="stable")
@@ -172,16 +168,11 @@ def _paint_models(scan: Scan, solid: np.ndarray, points: np.ndarray, colour: np.
         colour[here] = colours[tree.query(in_cad)[1]]
 
 
-def paint(scan: Scan, rooms: list[Room], uses: Sequence[str], points: np.ndarray, ids: np.ndarray,
+def paint(scan: Scan, rooms: Sequence[Rect], uses: Sequence[str], points: np.ndarray, ids: np.ndarray,
           normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:  # fmt: skip
-    """Colours of points on the scan.
+    """Return colours (n, 3) in 0..1 of points (n, 3) on faces `ids` (n,) of the scan, by the nearest solid's material.
 
-    `scan`: the mesh; the nearest solid's material decides.
-    `rooms`: x0, y0, x1, y1 of each; each has its own walls and floor.
-    `points`: (n, 3).
-    `ids`: (n,) face of each point.
-    `normals`: (m, 3) of faces.
-    Returns (n, 3) float in 0..1.
+    Each of the rooms has its own walls and floor; `normals` (m, 3) are those of faces.
     """
     corner = scan.solid[scan.faces[ids]]
     # Two of three corners decide, so that a border follows edges rather than zigzags.
@@ -189,8 +180,8 @@ def paint(scan: Scan, rooms: list[Room], uses: Sequence[str], points: np.ndarray
     names = sorted({s.material for s in scan.solids})
     material = np.array([names.index(s.material) for s in scan.solids])[solid]
     colour = np.zeros((len(points), 3))
-    centres = np.array([[(r[0] + r[2]) / 2, (r[1] + r[3]) / 2] for r in rooms])
-    half = np.array([[(r[2] - r[0]) / 2, (r[3] - r[1]) / 2] for r in rooms])
+    centres = np.array([r.centre for r in rooms])
+    half = np.array([r.size for r in rooms]) / 2
     outside = np.stack([(np.abs(points[:, :2] - c) - h).max(axis=1) for c, h in zip(centres, half, strict=True)], 1)
     room = outside.argmin(axis=1)
     finish = finishes(rooms, uses, rng)
@@ -201,8 +192,8 @@ def paint(scan: Scan, rooms: list[Room], uses: Sequence[str], points: np.ndarray
         if name in ("floor", "paint"):
             value = np.zeros((len(p), 3))
             for k, of in enumerate(finish):
-                own = room[here] == k
-                value[own] = of.floor_colour(p[own]) if name == "floor" else of.wall_colour(p[own])
+                inside = room[here] == k
+                value[inside] = of.floor_colour(p[inside]) if name == "floor" else of.wall_colour(p[inside])
         elif name == "cabinet":
             seam = (np.mod(p[:, 0] + 0.003, 0.45) < 0.012) | (np.mod(p[:, 1] + 0.003, 0.45) < 0.012)
             value = cabinet * np.where(seam, 0.7, 1.0)[:, None]
@@ -217,12 +208,9 @@ def paint(scan: Scan, rooms: list[Room], uses: Sequence[str], points: np.ndarray
     return np.clip(colour * light[:, None], 0, 1)
 
 
-def make_atlas(scan: Scan, rooms: list[Room], uses: Sequence[str], texels_per_m: float,
+def make_atlas(scan: Scan, rooms: Sequence[Rect], uses: Sequence[str], texels_per_m: float,
                rng: np.random.Generator) -> Atlas:  # fmt: skip
-    """Unwraps and paints a scan; rooms are x0, y0, x1, y1 (m), their `uses` as `finishes` takes them.
-
-    Returns the atlas.
-    """
+    """Unwrap and paint a scan; the rooms' `uses` are as `finishes` takes them."""
     uv, face_uv, side = unwrap(scan.vertices, scan.faces, texels_per_m)
     faces_at = face_image(uv, face_uv, side).ravel()
     normals = unit_normals(scan.vertices, scan.faces)

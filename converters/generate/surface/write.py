@@ -1,9 +1,11 @@
-"""Meshes, images and annotations in, files out: the raw Gibson layout. Same input, same bytes."""
+"""Write meshes, images and annotations in the raw Gibson layout. Same input, same bytes.
+
+Frames: the scan is z up; the annotations' world is y up (`trs` of the scan turns -90 degrees about x and centres it).
+"""
 
 import io
 import json
 import zipfile
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,6 @@ from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.scan import Scan
 from converters.generate.surface.texture import Atlas
 from converters.geometry.faces import face_vectors
-from converters.records.visual import VisualMesh
 
 LICENCE = """CC0 1.0 Universal
 
@@ -28,23 +29,17 @@ https://creativecommons.org/publicdomain/zero/1.0/
 """
 
 
-def _lines(path: Path, chunks: Iterable[str]) -> None:
-    with path.open("w", encoding="ascii", newline="\n") as f:
-        for chunk in chunks:
-            f.write(chunk)
-
-
 def _rows(pattern: str, table: np.ndarray) -> str:
     return "".join(pattern % tuple(row) for row in table.tolist())
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Writes an 8-bit grey or RGB image."""
+    """Write an 8-bit grey or RGB image."""
     Image.fromarray(pixels).save(path, optimize=True)
 
 
 def write_npz(path: Path, **arrays: np.ndarray) -> None:
-    """Writes arrays as `np.savez_compressed` does, with a fixed time stamp inside."""
+    """Write arrays as `np.savez_compressed` does, with a fixed time stamp inside."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, array in arrays.items():
             buffer = io.BytesIO()
@@ -52,79 +47,67 @@ def write_npz(path: Path, **arrays: np.ndarray) -> None:
             archive.writestr(zipfile.ZipInfo(f"{name}.npy"), buffer.getvalue(), zipfile.ZIP_DEFLATED)
 
 
+def _write_textured(path: Path, before: str, vertices: str, uv: np.ndarray, between: str, corners: np.ndarray,
+                    material: str) -> None:  # fmt: skip
+    """Write an OBJ file, with lines before its vertices and its faces, and its MTL beside it."""
+    faces = _rows("f %d/%d %d/%d %d/%d\n", (corners + 1).reshape(-1, 6))
+    head = f"mtllib {path.stem}.mtl\n{before}"
+    path.write_text(head + vertices + _rows("vt %.5f %.5f\n", uv) + between + faces, "ascii")
+    path.with_suffix(".mtl").write_text(material, "ascii")
+
+
 def write_scan(folder: Path, scan: Scan, atlas: Atlas, floor_height_m: float) -> None:
-    """Writes `mesh_z_up.obj`, its MTL, texture and labels; raises the mesh to the scan's own floor height."""
-    vertices = scan.vertices + [0.0, 0.0, floor_height_m]
-    corners = np.stack([scan.faces + 1, atlas.face_uv + 1], axis=2).reshape(-1, 6)
-    _lines(folder / "mesh_z_up.obj", [
-        "mtllib mesh_z_up.mtl\n",
-        _rows("v %.4f %.4f %.4f\n", vertices),
-        _rows("vt %.5f %.5f\n", atlas.uv),
-        "usemtl scan\n",
-        _rows("f %d/%d %d/%d %d/%d\n", corners),
-    ])  # fmt: skip
-    _lines(
-        folder / "mesh_z_up.mtl",
-        ["newmtl scan\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd mesh_z_up_texture.png\n"],
-    )
+    """Write `mesh_z_up.obj`, its MTL, texture and labels; raise the mesh to the scan's floor height."""
+    vertices = _rows("v %.4f %.4f %.4f\n", scan.vertices + [0.0, 0.0, floor_height_m])
+    corners = np.stack([scan.faces, atlas.face_uv], axis=2)
+    material = "newmtl scan\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd mesh_z_up_texture.png\n"
+    _write_textured(folder / "mesh_z_up.obj", "", vertices, atlas.uv, "usemtl scan\n", corners, material)
     write_png(folder / "mesh_z_up_texture.png", atlas.image)
     bare = {} if scan.solids else {"furnished": np.array(False)}
     write_npz(folder / "mesh_z_up.labels.npz", label=scan.labels, **bare)
 
 
 def write_cad(library: Path, model: CadModel, pieces: bool = False) -> None:
-    """Writes `<library>/<catid>/<id>/models/model_normalized.obj` and its MTL, with `pieces` its convex parts too."""
+    """Write `<library>/<catid>/<id>/models/model_normalized.obj` and its MTL, with `pieces` its convex parts too."""
     folder = library / model.catid / model.id_cad / "models"
     folder.mkdir(parents=True, exist_ok=True)
-    if model.surface is not None:
-        _write_surface(folder, model.surface)
+    path, surface = folder / "model_normalized.obj", model.surface
+    if surface is not None:
+        vertices, corners = (
+            _rows("v %.6f %.6f %.6f\n", surface.vertices),
+            np.stack([surface.faces, surface.uv_faces], 2),
+        )
+        material = "newmtl surface\nKd 1 1 1\nd 1\nillum 1\nmap_Kd texture.png\n"
+        _write_textured(path, "usemtl surface\n", vertices, surface.uv, "", corners, material)
+        write_png(folder / "texture.png", surface.image)
     else:
-        _write_parts(folder, model)
+        path.write_text("mtllib model_normalized.mtl\n" + _part_lines(model, drawn=True), "ascii")
+        colours = [
+            f"newmtl {name}\nKd {r:.4f} {g:.4f} {b:.4f}\nKs 0 0 0\nd 1\nillum 1\n"
+            for name, (r, g, b) in MATERIALS.items()
+            if any(p.material == name for p in model.parts)
+        ]
+        path.with_suffix(".mtl").write_text("".join(colours), "ascii")
     if pieces:
-        first, solid = 1, []
-        for k, part in enumerate(model.parts):
-            solid += [
-                f"o part_{k}\n",
-                _rows("v %.6f %.6f %.6f\n", part.vertices),
-                _rows("f %d %d %d\n", part.faces + first),
-            ]
-            first += len(part.vertices)
-        _lines(folder / "collision.obj", solid)
+        (folder / "collision.obj").write_text(_part_lines(model, drawn=False), "ascii")
 
 
-def _write_surface(folder: Path, surface: VisualMesh) -> None:
-    corners = np.stack([surface.faces + 1, surface.uv_faces + 1], axis=2).reshape(-1, 6)
-    _lines(folder / "model_normalized.obj", [
-        "mtllib model_normalized.mtl\nusemtl surface\n",
-        _rows("v %.6f %.6f %.6f\n", surface.vertices),
-        _rows("vt %.5f %.5f\n", surface.uv),
-        _rows("f %d/%d %d/%d %d/%d\n", corners),
-    ])  # fmt: skip
-    _lines(folder / "model_normalized.mtl", ["newmtl surface\nKd 1 1 1\nd 1\nillum 1\nmap_Kd texture.png\n"])
-    write_png(folder / "texture.png", surface.image)
-
-
-def _write_parts(folder: Path, model: CadModel) -> None:
-    chunks, base = ["mtllib model_normalized.mtl\n"], 1
+def _part_lines(model: CadModel, drawn: bool) -> str:
+    """Return the OBJ lines of a model's parts: as they are drawn, in their materials, or closed."""
+    lines, base = "", 1
     for k, part in enumerate(model.parts):
         faces = part.faces
-        if part.open:
+        if drawn and part.open:
             normal = face_vectors(part.vertices, faces)
             faces = faces[normal[:, 1] > -0.99 * np.linalg.norm(normal, axis=1)]
-        chunks += [f"o part_{k}\nusemtl {part.material}\n", _rows("v %.6f %.6f %.6f\n", part.vertices)]
-        chunks.append(_rows("f %d %d %d\n", faces + base))
+        lines += f"o part_{k}\n" + (f"usemtl {part.material}\n" if drawn else "")
+        lines += _rows("v %.6f %.6f %.6f\n", part.vertices) + _rows("f %d %d %d\n", faces + base)
         base += len(part.vertices)
-    _lines(folder / "model_normalized.obj", chunks)
-    colours = [
-        f"newmtl {name}\nKd {r:.4f} {g:.4f} {b:.4f}\nKs 0 0 0\nd 1\nillum 1\n"
-        for name, (r, g, b) in MATERIALS.items()
-        if any(p.material == name for p in model.parts)
-    ]
-    _lines(folder / "model_normalized.mtl", colours)
+    return lines
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Writes JSON, floats in full."""
+    """Write JSON, floats in full."""
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
@@ -132,40 +115,28 @@ SCAN_TO_WORLD = Rotation.from_euler("x", -90, degrees=True)
 """z up -> y up: (x, y, z) -> (x, z, -y)."""
 
 
-def quat_wxyz(rotation: Rotation) -> list[float]:
-    """Quaternion, scalar first and not negative."""
-    x, y, z, w = rotation.as_quat(canonical=True)
-    return [float(w), float(x), float(y), float(z)]
-
-
 def _trs(translation: np.ndarray, rotation: Rotation, scale: np.ndarray) -> dict[str, list[float]]:
-    return {
-        "translation": [float(v) for v in translation],
-        "rotation": quat_wxyz(rotation),
-        "scale": [float(v) for v in scale],
-    }
+    """Return a pose as Scan2CAD has it; the quaternion's scalar is first and not negative."""
+    quat_wxyz = np.roll(rotation.as_quat(canonical=True), 1)
+    return {"translation": translation.tolist(), "rotation": quat_wxyz.tolist(), "scale": scale.tolist()}
 
 
 def pose_in_world(item: Instance, scan_to_world_m: np.ndarray, floor_height_m: float) -> tuple[np.ndarray, Rotation]:
-    """The exact pose of a piece of furniture.
-
-    Returns:
-        (3,) translation and rotation of T * R * S, CAD frame -> world (y up).
-    """
+    """Return the exact (3,) translation and rotation of T * R * S, CAD frame -> world (y up), of a piece."""
     position_scan = item.position + np.array([0.0, 0.0, floor_height_m])
     return SCAN_TO_WORLD.apply(position_scan) + scan_to_world_m, Rotation.from_euler("y", item.yaw_rad)
 
 
-def pick_keypoints(item: Instance, scan_owned: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Chooses (n, 3) points of the CAD, CAD frame: corners that the scan shows, far from one another.
+def pick_keypoints(item: Instance, scanned: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Choose (n, 3) points of the CAD, CAD frame: corners that the scan shows, far from one another.
 
-    A candidate is a vertex of a part; those near a scanned point of the object come first. Spread is by
-    farthest points, so that all three scales can be told.
+    A candidate is a vertex of a part; those near a scanned point of the object come first. Spread is by farthest
+    points, so that all three scales can be determined.
     """
     candidates = np.unique(np.round(np.concatenate([p.vertices for p in item.model.parts]), 5), axis=0)
     placed = item.to_floor(candidates)
-    if len(scan_owned):
-        distance, _ = KDTree(scan_owned).query(placed)
+    if len(scanned):
+        distance, _ = KDTree(scanned).query(placed)
         visible = distance < 0.04
         if visible.sum() >= 3 * n:
             candidates, placed = candidates[visible], placed[visible]
@@ -181,10 +152,11 @@ def pick_keypoints(item: Instance, scan_owned: np.ndarray, n: int, rng: np.rando
 
 def annotate_items(items: list[Instance], scan: Scan, floor_height_m: float, cfg: BuildingConfig, seed: int,
              rng: np.random.Generator) -> list[dict[str, Any]]:  # fmt: skip
-    """Writes down what an annotator would.
+    """Return the content of `alignments.json`, a list of one scan: noisy poses and keypoint pairs, as people give.
 
-    Returns:
-        The content of `alignments.json`: a list of one scan.
+    A pose composes as in Scan2CAD: world = T * R * S * cad. `bbox` holds half extents and `center` the centre of the
+    CAD's bounding box, both in the CAD frame. Keypoints of both kinds are in world coordinates, those of the CAD
+    through the annotated pose.
     """
     lift = np.array([0.0, 0.0, floor_height_m])
     centre = (scan.vertices.min(axis=0) + scan.vertices.max(axis=0)) / 2 + lift
@@ -203,13 +175,13 @@ def annotate_items(items: list[Instance], scan: Scan, floor_height_m: float, cfg
         on_scan = true_r.apply(points * item.scale) + true_t + rng.normal(0, noise, points.shape)
         entry: dict[str, Any] = {
             "trs": _trs(t, r, scale),
-            "bbox": [float(v) for v in item.model.half_extents],
-            "center": [float(v) for v in item.model.center],
+            "bbox": item.model.half_extents.tolist(),
+            "center": item.model.center.tolist(),
             "sym": item.model.sym,
             "id_cad": item.model.id_cad,
             "catid_cad": item.model.catid,
-            "keypoints_cad": {"n_keypoints": len(points), "position": [float(v) for v in on_cad.ravel()]},
-            "keypoints_scan": {"n_keypoints": len(points), "position": [float(v) for v in on_scan.ravel()]},
+            "keypoints_cad": {"n_keypoints": len(points), "position": on_cad.ravel().tolist()},
+            "keypoints_scan": {"n_keypoints": len(points), "position": on_scan.ravel().tolist()},
         }
         if item.hinge is not None:
             entry["articulation"] = {

@@ -186,7 +186,7 @@ def test_corners_are_darker_than_the_middle_and_walls_cast_shadows():
     space = space_of(_boxed(plan))
     at = np.array([[2.0, 1.5, 1.2], [2.0, 0.5, 1.2], [2.0, 1.5, 0.3]])
     assert space.at(at) == pytest.approx([1.2, 0.5, 0.3], abs=0.03)
-    seen = space.seen(np.array([[0.2, 0.2, 1.0]] * 2), np.array([[3.8, 2.8, 1.0], [6.0, 2.8, 1.0]]))
+    seen = space.visible(np.array([[0.2, 0.2, 1.0]] * 2), np.array([[3.8, 2.8, 1.0], [6.0, 2.8, 1.0]]))
     assert seen[0] == 1 and seen[1] == 0
 
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import converters.generate as generate
 from converters.generate import BuildingConfig, GenerationError, design_building, generate_building
-from converters.generate.surface.scan import NYU40, building_solids, fuse, nearest_solids, seen_from, solid_from_box
+from converters.generate.surface.scan import NYU40, building_solids, fuse, nearest_solids, solid_from_box, visible_from
 from converters.generate.surface.write import SCAN_TO_WORLD, pose_in_world
 from interactive_nav_common.errors import FileError
 
@@ -307,7 +307,7 @@ def test_a_wall_hides_what_is_behind_it():
     volume = fuse([wall, floor], np.array([-1.1, -1.1, -0.4]), np.array([3.1, 1.1, 2.1]), 0.025)
     points = np.array([[0.5, 0.0, 0.0], [2.0, 0.0, 0.0], [1.0, 0.0, 1.0], [1.1, 0.0, 1.0], [-0.9, 0.0, 0.0]])
     normals = np.array([[0, 0, 1.0], [0, 0, 1.0], [-1.0, 0, 0], [1.0, 0, 0], [0, 0, 1.0]])
-    seen = seen_from(points, normals, np.array([[0.0, 0.0, 1.5]]), volume)
+    seen = visible_from(points, normals, np.array([[0.0, 0.0, 1.5]]), volume)
     # floor before the wall, floor behind it, its near face, its far face, floor on the other side
     assert seen.tolist() == [True, False, True, False, True]
 
