@@ -10,19 +10,22 @@ import argparse
 import contextlib
 import dataclasses
 import glob
+import math
 import os
 import signal
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from converters.generating import GENERATING
 from converters.records.errors import StageFailed
 from converters.segmenting import SEGMENTING, label_unlabelled, next_step, propose_unproposed
-from converters.tables import alignment_table, bounds, gate_table, proposal_tables
 from interactive_nav_common.config import read_words, refuse_unused
 from interactive_nav_common.errors import UserError, printable, reports_errors
 from interactive_nav_common.jobs.progress import SafeConsole, stage_progress, warn_once
@@ -39,6 +42,76 @@ FORMATS = (
 
 if TYPE_CHECKING:
     from converters.pipeline import ConvertConfig
+    from converters.propose.report import Proposed
+    from converters.records.limits import Gate
+
+
+def bounds(gate: Gate) -> str:
+    """Return a gate's limits in words."""
+    pairs = ((">=", gate.limit.least), ("<=", gate.limit.most))
+    return " ".join(f"{word} {value:g}" for word, value in pairs if value is not None)
+
+
+def gate_table(gates: tuple[Gate, ...]) -> Table:
+    """Return a table of one row a gate."""
+    table = Table("gate", "value", "limit", "", title="Gates")
+    for gate in gates:
+        verdict = Text("PASS", "green") if gate.passed else Text("FAIL", "red")
+        table.add_row(gate.name, f"{gate.value:.5g} {gate.limit.unit}", bounds(gate), verdict)
+    return table
+
+
+def alignment_table(rows: tuple[dict[str, Any], ...]) -> Table:
+    """Return a table of alignments; `settled` is how far the simulation moved the object from its annotation."""
+    heads = ("object", "pairs", "rms cm", "shift cm", "yaw °", "scale x y z", "tilt °", "settled cm")
+    table = Table(*heads, title="Pose re-solved from keypoints, against the annotated pose")
+    for row in rows:
+        if row["solved"]:
+            solved = (
+                f"{100 * row['rms_m']:.1f}",
+                f"{100 * row['translation_difference_m']:.1f}",
+                f"{row['yaw_difference_deg']:.1f}",
+                " ".join(f"{v:.2f}" for v in row["scale_ratio"]),
+            )
+        else:
+            solved = ("-", "-", "-", row["reason"])
+        moved = f"{row['tilt_removed_deg']:.1f}", f"{100 * row['settle_shift_m']:.1f}"
+        table.add_row(row["name"], str(row["n_keypoints"]), *solved, *moved)
+    return table
+
+
+def proposal_tables(proposed: Proposed) -> Iterator[Table]:
+    """Yield a table of the proposals; and with a library and annotations, how well."""
+    table = Table("class", "confidence", "x y z, m", "size, m", "model", "sure", title="Proposals")
+    for k, proposal in enumerate(proposed.proposals):
+        model = proposed.retrieved.get(k)
+        table.add_row(
+            proposal.category,
+            f"{proposal.confidence:.2f}",
+            " ".join(f"{v:.2f}" for v in proposal.centre),
+            " ".join(f"{v:.2f}" for v in proposal.extent_m),
+            model.cad.cad_id[:8] if model else "-",
+            f"{model.confidence:.2f}" if model else "-",
+        )
+    yield table
+    if not proposed.comparisons:
+        return
+    heads = ("class", "annotated", "chosen", "rank", "cm", "yaw °", "scale x y z", "IoU", "sure")
+    caption = "cm, yaw and scale: the annotated model's best fit against its annotated pose"
+    table = Table(*heads, title="Retrieved models against the annotation", caption=caption)
+    for row in proposed.comparisons:
+        table.add_row(
+            row.category,
+            row.true_cad[:6],
+            row.chosen_cad[:6],
+            f"{row.rank}/{row.n_tried}",
+            f"{100 * row.difference.translation_m:.1f}",
+            f"{math.degrees(row.difference.yaw_rad):.1f}",
+            " ".join(f"{v:.2f}" for v in row.difference.scale_ratio),
+            f"{row.iou:.2f}",
+            f"{row.confidence:.2f}",
+        )
+    yield table
 
 
 def _words_of(config: type[Any], arguments: argparse.Namespace) -> dict[str, Any]:
@@ -258,7 +331,7 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
 
 
 def _standing(arguments: argparse.Namespace) -> dict[str, int]:
-    """What stands where the command writes: path -> inode, another one once something was put in its place."""
+    """Return the inode by path where the command writes: it changes once something else is put there."""
     target = glob.escape(str(getattr(arguments, "out", None) or getattr(arguments, "output", "")))
     inodes = {}
     for path in (p for pattern in arguments.writes for p in glob.glob(pattern.format(target))):

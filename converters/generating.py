@@ -32,7 +32,7 @@ def _generate_scenes(arguments: argparse.Namespace, console: Console) -> int:
     from converters.sets import SEEDS, Wanted, generate_scenes
 
     if arguments.tier:
-        refuse_unused(arguments, "--recipes", "with --tier, which writes its own")
+        refuse_unused(arguments, "--recipes", "with --tier, which writes them")
         arguments.count, arguments.seed = arguments.count or 10, SEEDS if arguments.seed is None else arguments.seed
     else:
         refuse_unused(arguments, "--count --seed", "without --tier")

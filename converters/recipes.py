@@ -15,25 +15,20 @@ from converters.clock import Report
 from converters.generate import generate_building
 from converters.generate.design.config import BuildingConfig, GenerationError
 from converters.generate.homes.config import SHARE_TOLERANCE, TIERS, HomeConfig, home_config, home_fields
-from converters.generate.models.cad import HOME_TEST_MODELS, HOME_TRAIN_MODELS, TEST_MODELS, TRAIN_MODELS
+from converters.generate.models.cad import MODELS
 from converters.pipeline import ConvertConfig, Converted, convert
 from interactive_nav_common.config import Natural, nearest
 from interactive_nav_common.files import check_name, part_folder, publish
 from interactive_nav_common.records import Reader
 from interactive_nav_common.untrusted.reading import read_bytes
 
-MODELS = {"train": TRAIN_MODELS, "test": TEST_MODELS}
-"""Split -> CAD models of sparse buildings: held-out models are held out here."""
-HOME_MODELS = {"train": HOME_TRAIN_MODELS, "test": HOME_TEST_MODELS}
-"""Split -> CAD models of homes."""
 _CONVERSION = ("structure_faces", "object_faces", "structure_texture", "object_texture", "seed")
-_FIXED = ("models",)
 MOST_SEEDS, NEXT_SEED = 5, 1_000_000
 """Seeds that a home's recipe stands for, and between them: of six one gives no plan that meets its shares."""
 SPARSE = "sparse"
 """Tier of buildings that `BuildingConfig` describes: a recipe's, where it names none."""
-GENERATE, CONVERT, DRAW = 0.55, 0.35, 0.10
-"""Shares of one scene's time, hulls cached: weights of the progress bar."""
+GENERATE, CONVERT = 0.55, 0.35
+"""Shares of one scene's time, hulls cached, the rest is drawing: weights of the progress bar."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,14 +98,14 @@ def building_of(tier: str, settings: dict[str, Any], split: str, where: str) -> 
     """
     if tier not in (SPARSE, *TIERS):
         raise GenerationError(f"{where}: tier is {tier!r}, expected one of {', '.join((SPARSE, *TIERS))}")
-    sparse = {name: hint for name, hint in get_type_hints(BuildingConfig).items() if name not in _FIXED}
+    sparse = {name: hint for name, hint in get_type_hints(BuildingConfig).items() if name != "models"}
     fields = sparse if tier == SPARSE else home_fields()
     _refuse_unknown(settings, fields, where)
     values = {key: _value(value, fields[key], f"{where}: {key}") for key, value in settings.items()}
     try:
         if tier == SPARSE:
-            return BuildingConfig(**values, models=MODELS[split]).validate()
-        return home_config(tier, values, HOME_MODELS[split])
+            return BuildingConfig(**values, models=MODELS[split][0]).validate()
+        return home_config(tier, values, MODELS[split][1])
     except GenerationError as error:
         raise GenerationError(f"{where}: {error}") from error
 

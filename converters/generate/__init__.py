@@ -1,11 +1,11 @@
 """Generate a raw building folder from a seed: a synthetic apartment in the raw Gibson layout."""
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from converters.clock import Report
 from converters.generate.design.config import BuildingConfig, GenerationError
 from converters.generate.design.furnish import Effort, furnish_plan, no_place
 from converters.generate.design.plan import Building, make_plan
@@ -24,9 +24,6 @@ __all__ = ["Building", "BuildingConfig", "GenerationError", "HomeConfig", "desig
 
 GENERATOR_VERSION = 3
 """Raised whenever the same seed would give other bytes."""
-
-Progress = Callable[[str, float], None]
-"""Called with what is being done and the share (0..1) that is done."""
 
 
 def _streams(seed: int) -> list[np.random.Generator]:
@@ -58,7 +55,7 @@ def design_building(seed: int, config: BuildingConfig | HomeConfig | None = None
 
 
 def render_building(
-    building: Building, seed: int, config: BuildingConfig | HomeConfig, progress: Progress
+    building: Building, seed: int, config: BuildingConfig | HomeConfig, progress: Report
 ) -> tuple[Scan, Atlas]:
     """Scan and paint a building; of a home without artefacts its exact structure."""
     streams = _streams(seed)
@@ -73,7 +70,7 @@ def render_building(
 
 
 def generate_building(
-    out_dir: Path, seed: int, progress: Progress | None = None, config: BuildingConfig | HomeConfig | None = None
+    out_dir: Path, seed: int, progress: Report | None = None, config: BuildingConfig | HomeConfig | None = None
 ) -> None:
     """Write a raw building folder, whole or not at all; the same seed and configuration give the same bytes.
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from converters.generate import BuildingConfig, GenerationError, HomeConfig, design_building, render_building
 from converters.generate.homes.config import home_config
-from converters.generate.models.cad import HOME_TEST_MODELS, HOME_TRAIN_MODELS, TEST_MODELS, TRAIN_MODELS, Instance
+from converters.generate.models.cad import MODELS, Instance
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.scan import NYU40 as LABELS
 from converters.generate.surface.scan import smooth_noise
@@ -54,7 +54,7 @@ def _of_item(item: Instance) -> list[Surface]:
 def building_surface(seed: int, tier: str, split: str) -> tuple[Surface, np.ndarray]:
     """Return the surface of a generated building's structure and furniture, with the class of each point."""
     # Not `recipes.building_of`, whose imports a machine for training alone lacks.
-    sparse, homes = (TRAIN_MODELS, HOME_TRAIN_MODELS) if split == "train" else (TEST_MODELS, HOME_TEST_MODELS)
+    sparse, homes = MODELS[split]
     config = BuildingConfig(models=sparse) if tier == "sparse" else home_config(tier, {}, homes)
     building = design_building(seed, config)
     scan, atlas = render_building(building, seed, config, lambda stage, share: None)

@@ -66,7 +66,7 @@ def test_a_tiers_recipes_name_seeds_and_splits(tmp_path: Path) -> None:
         ([], "recipes.yaml: no such file"),
         (["--seed", "0"], "--seed has no effect without --tier; leave it out"),
         (["--count", "3"], "--count has no effect without --tier; leave it out"),
-        (["--tier", "furnished", "--recipes", "r.yaml"], "--recipes has no effect with --tier, which writes its own"),
+        (["--tier", "furnished", "--recipes", "r.yaml"], "--recipes has no effect with --tier, which writes them"),
         (["--ray-address", "here:1"], "--ray-address has no effect without --launcher ray; leave it out"),
     ],
 )

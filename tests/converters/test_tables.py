@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import io
 
+from converters.__main__ import gate_table
 from converters.check.gates import judge
-from converters.tables import gate_table
 from interactive_nav_common.jobs.progress import SafeConsole
 
 

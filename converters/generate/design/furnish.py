@@ -14,7 +14,7 @@ import shapely
 from converters.generate.design.config import BuildingConfig, GenerationError
 from converters.generate.design.plan import Doorway, Plan, doorway_zone
 from converters.generate.design.space import GRID_M, free_grid, passes, room_mask, rooms_joined, without
-from converters.generate.models.cad import CadModel, Instance, LeafHinge, Models, place
+from converters.generate.models.cad import CadModel, Instance, LeafHinge, Models, place, stand_at
 from interactive_nav_common.grids import clearance
 
 DOOR_GAP_M = 0.02
@@ -55,14 +55,10 @@ def door_leaf(
     slab = model.parts[0].vertices[:, 2]
     face_z = float(float(slab.mean()) - sign * float(np.ptp(slab) / 2))
     origin = (float(model.bounds[0, 0]), float(model.bounds[0, 1]), face_z)
-    yaw = math.atan2(closed[1], closed[0]) + sign * open_rad
-    yaw = math.atan2(math.sin(yaw), math.cos(yaw))
     swing = (-open_rad, most - open_rad) if sign > 0 else (-(most - open_rad), open_rad)
-    at_origin = Instance(model, scale, yaw, np.zeros(3))
-    offset = at_origin.to_floor(np.array([origin]))[0]
-    position = np.array([hinge[0] - offset[0], hinge[1] - offset[1], lift_m - scale[1] * model.bounds[0, 1]])
-    leaf = Instance(model, scale, yaw, position, LeafHinge((0.0, 1.0, 0.0), origin, swing))
-    angles = math.atan2(closed[1], closed[0]) + sign * np.linspace(0.0, most, 24)
+    closed_rad, joint = math.atan2(closed[1], closed[0]), LeafHinge((0.0, 1.0, 0.0), origin, swing)
+    leaf = stand_at(model, scale, closed_rad + sign * open_rad, np.array(origin), hinge, lift_m, joint)
+    angles = closed_rad + sign * np.linspace(0.0, most, 24)
     fan = hinge + (width + 0.04) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return leaf, shapely.Polygon([hinge, *fan]).buffer(0.03)
 

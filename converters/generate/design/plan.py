@@ -132,7 +132,6 @@ class Plan:
     corridor: int | None
     """Index of the corridor in `rooms`."""
     wall_height_m: float
-    door_height_m: float
     built_in: tuple[Instance, ...] = dataclasses.field(default=(), compare=False)
     """Furniture that stays: part of the static structure as the fixtures are."""
 
@@ -382,7 +381,7 @@ def make_plan(
         windows = _windows(inside, plain, fixtures, thick, cfg, rng)
         return Plan(
             tuple(rooms), outer, tuple(boxes), tuple(doorways), tuple(windows), tuple(fixtures), corridor,
-            height, door_height,
+            height,
         )  # fmt: skip
     raise GenerationError(
         f"no plan in {max_tries} tries for {cfg.n_rooms} rooms on {cfg.floor_area_m2} m2: "

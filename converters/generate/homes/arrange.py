@@ -19,11 +19,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import shapely
 
 from converters.generate.models.cad import CadModel, Instance, Models, place
 from interactive_nav_common.records import read_packaged
-from scenes_mjcf.categories import CATEGORIES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,11 +137,6 @@ class Piece:
         (hu, hv), u, v = self.half_m, self.u, self.v
         return u - hu, v - hv, u + hu, v + hv
 
-    @property
-    def built_in(self) -> bool:
-        """Return whether it is part of the building."""
-        return not CATEGORIES[self.model.category].is_object
-
 
 @dataclasses.dataclass(frozen=True)
 class Arrangement:
@@ -195,14 +188,8 @@ def apart(a: Instance, b: Instance, gap_m: float = TOUCH_M) -> bool:
         return True
     return not any(
         p[1] < q[2] + gap_m and q[1] < p[2] + gap_m and p[0].distance(q[0]) < gap_m
-        for p, q in itertools.product(_slabs(a), _slabs(b))
+        for p, q in itertools.product(a.slabs, b.slabs)
     )
-
-
-def _slabs(item: Instance) -> list[tuple[shapely.Geometry, float, float]]:
-    """Return outline, lowest and highest point of each part."""
-    placed = [item.to_floor(part.vertices) for part in item.model.parts]
-    return [(shapely.MultiPoint(p[:, :2]).convex_hull, p[:, 2].min(), p[:, 2].max()) for p in placed]
 
 
 def _at(host: Piece, piece: Piece, right_m: float, ahead_m: float, turn_rad: float) -> Piece:
@@ -298,8 +285,8 @@ def arrange(name: str, models: Models, rng: np.random.Generator, fewer: int = 0)
         return None
     draw = draw_set(models, rng)
     anchor = draw(group.anchor)
-    gap = 0.005 if anchor.built_in else float(rng.uniform(*WALL_GAP_M))
-    turn = 0.0 if anchor.built_in else float(rng.normal(0, 0.012))
+    gap = 0.005 if anchor.model.built_in else float(rng.uniform(*WALL_GAP_M))
+    turn = 0.0 if anchor.model.built_in else float(rng.normal(0, 0.012))
     turn = float(rng.uniform(-math.pi, math.pi)) if group.at == "anywhere" else turn
     anchor = dataclasses.replace(anchor, turn_rad=turn)
     if group.at in ("wall", "corner", "window"):

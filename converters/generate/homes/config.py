@@ -84,8 +84,7 @@ class HomeConfig:
 MOST_SHARE = 0.42
 """Largest `furniture_share`: of sixteen homes of four and five rooms 13 take 0.37, 7 take 0.40 and 2 take 0.43."""
 TIERS = read_packaged(Path(__file__).with_name("tiers.yaml"), dict[str, dict[str, float | Range]])
-"""Tier -> how it departs from the defaults. Shares that must be pushed are such that planners that never push succeed in
-the other episodes."""
+"""Tier -> how it departs from the defaults; shares that must be pushed leave some to planners that never push."""
 
 
 def home_fields() -> dict[str, Any]:

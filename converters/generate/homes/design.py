@@ -144,12 +144,12 @@ def design_home(cfg: HomeConfig, rng: np.random.Generator) -> Building:
             if full == (1 if sum(r.area_m2 for r in plan.rooms) > LARGE_M2 else MOST_FULL):
                 break
             continue
-        standing = home.floor.standing
-        plan = dataclasses.replace(plan, built_in=tuple(s.item for s in standing if s.built_in))
+        items = [s.item for s in home.floor.standing]
+        plan = dataclasses.replace(plan, built_in=tuple(item for item in items if item.model.built_in))
         if not rooms_joined(static_grid(plan), plan, WIDE_M - 0.02):
             refused = GenerationError("built-in furniture bars a room: ask for more area or fewer rooms")
             continue
-        movable = tuple(s.item for s in standing if not s.built_in)
+        movable = tuple(item for item in items if not item.model.built_in)
         must_push = {robot: round(share, 4) for robot, share in shares.items()}
         measured = {"furniture_share": round(home.floor.share, 4), "must_push_share": must_push}
         return Building(plan, movable, floor_height_m, tuple(uses), measured)

@@ -16,7 +16,6 @@ from converters.generate.homes.arrange import LOW_M, Arrangement
 from converters.generate.models.cad import Instance
 from converters.geometry.density import ROBOTS
 from interactive_nav_common.grids import clearance, label
-from scenes_mjcf.categories import CATEGORIES
 
 CELL_M = 0.025
 DOORWAY_ZONE_M = 0.75
@@ -47,11 +46,6 @@ class Standing:
     """(rows, columns of `window`) bool: what it covers, from above."""
     below: dict[str, np.ndarray]
     """Robot -> what of it is in the robot's way: what lies higher is not."""
-
-    @property
-    def built_in(self) -> bool:
-        """Return whether it is part of the building."""
-        return not CATEGORIES[self.item.model.category].is_object
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,12 +139,12 @@ class Floor:
         self.covered[piece.window] += np.where(piece.shadow, np.uint8(by % 256), np.uint8(0))
         for robot, below in piece.below.items():
             self.below[robot][piece.window] += np.where(below, np.uint8(by % 256), np.uint8(0))
-        if piece.built_in:
+        if piece.item.model.built_in:
             self.fixed[piece.window] |= piece.shadow
 
     def remove(self, piece: Standing) -> None:
         """Take away a piece that is not built in."""
-        assert not piece.built_in
+        assert not piece.item.model.built_in
         self.standing = [s for s in self.standing if s is not piece]
         self.cover(piece, -1)
 
@@ -230,9 +224,9 @@ class Floor:
         for k, piece in enumerate(arrangement.pieces):
             box = np.array(piece.corners_m)
             # A scan's annotations are a centimetre off: what stood in an alcove without play would be wedged there.
-            beside = 0.0 if piece.built_in else GAP_M
+            beside = 0.0 if piece.model.built_in else GAP_M
             high = piece.size_m[1] > LOW_M and piece.model.category != "sink"  # a tap may stand before a window
-            high &= piece.size_m[0] > 0.4 or piece.built_in
+            high &= piece.size_m[0] > 0.4 or piece.model.built_in
             fits[:, k] = clear(box + [-beside, 0, beside, 0], ["wall"]) & clear(box, ["taken"], GAP_M)
             fits[:, k] &= clear(box, ["swept", *(("kept", "front") if strict else ()), *(("glass",) if high else ())])
         if arrangement.front is not None and strict:

@@ -99,7 +99,7 @@ def _preference(
         return liking - 6.0 * np.minimum(places.ends.min(axis=1) - half, 0.5)
     if at == "window":
         before = floor.before_window(arrangement, places, room) > 0.7
-        return np.where(before, liking + 2.0, -np.inf if arrangement.pieces[0].built_in else liking)
+        return np.where(before, liking + 2.0, -np.inf if arrangement.pieces[0].model.built_in else liking)
     if at == "free":
         return liking + 0.8 * np.minimum(places.ends.min(axis=1), 1.5)
     if at == "anywhere":  # most things lie near walls, some in the way

@@ -95,6 +95,11 @@ class CadModel:
         return self.bounds.mean(axis=0)
 
     @property
+    def built_in(self) -> bool:
+        """Return whether it is part of the building."""
+        return not CATEGORIES[self.category].is_object
+
+    @property
     def half_extents(self) -> np.ndarray:
         """Return the (3,) half extents of the bounding box, CAD frame."""
         return np.diff(self.bounds, axis=0)[0] / 2
@@ -134,11 +139,10 @@ def _home_models(test: bool) -> tuple[str, ...]:
     )
 
 
-HOME_TEST_MODELS = _home_models(test=True)
-"""Held out: no furnished training home uses them."""
-
-HOME_TRAIN_MODELS = _home_models(test=False)
-"""All others."""
+HOME_TEST_MODELS, HOME_TRAIN_MODELS = _home_models(test=True), _home_models(test=False)
+"""Those of homes; no furnished training home uses the former."""
+MODELS = {"train": (TRAIN_MODELS, HOME_TRAIN_MODELS), "test": (TEST_MODELS, HOME_TEST_MODELS)}
+"""Split -> models of sparse buildings and of homes: held-out models are held out here."""
 
 
 @functools.cache
@@ -230,18 +234,28 @@ class Instance:
         (x0, _, z0), (x1, _, z1) = self.model.bounds
         return shapely.Polygon(self.to_floor(np.array([[x0, 0, z0], [x1, 0, z0], [x1, 0, z1], [x0, 0, z1]]))[:, :2])
 
-    def outlines(self, band_m: tuple[float, float] = (-math.inf, math.inf)) -> list[shapely.Geometry]:
-        """Return the outline from above of each of its convex parts that reach into a band of heights."""
+    @functools.cached_property
+    def slabs(self) -> list[tuple[shapely.Geometry, float, float]]:
+        """Return the outline from above, the lowest and the highest point of each of its convex parts."""
         placed = [self.to_floor(part.vertices) for part in self.model.parts]
-        inside = [p for p in placed if p[:, 2].min() < band_m[1] and p[:, 2].max() > band_m[0]]
-        return [shapely.MultiPoint(p[:, :2]).convex_hull for p in inside]
+        return [(shapely.MultiPoint(p[:, :2]).convex_hull, p[:, 2].min(), p[:, 2].max()) for p in placed]
+
+    def outlines(self, band_m: tuple[float, float] = (-math.inf, math.inf)) -> list[shapely.Geometry]:
+        """Return the outlines of the parts that reach into a band of heights."""
+        return [outline for outline, low, high in self.slabs if low < band_m[1] and high > band_m[0]]
+
+
+def stand_at(
+    model: CadModel, scale: np.ndarray, yaw_rad: float, point_cad: np.ndarray, xy: np.ndarray, lift_m: float,
+    hinge: LeafHinge | None = None,
+) -> Instance:  # fmt: skip
+    """Stand a model so that a point of its CAD frame is above `xy`, and its lowest point `lift_m` above the floor."""
+    yaw = math.atan2(math.sin(yaw_rad), math.cos(yaw_rad))
+    x, y, _ = Instance(model, scale, yaw, np.zeros(3)).to_floor(point_cad[None])[0]
+    return Instance(model, scale, yaw, np.array([xy[0] - x, xy[1] - y, lift_m - scale[1] * model.bounds[0, 1]]), hinge)
 
 
 def place(model: CadModel, scale: np.ndarray, xy: np.ndarray, facing_rad: float, lift_m: float = 0.0) -> Instance:
     """Stand a model on the floor: centre of the footprint at `xy`, front towards `facing_rad` (from +x)."""
     yaw = facing_rad + math.pi / 2 + (math.pi if model.front < 0 else 0.0)
-    yaw = math.atan2(math.sin(yaw), math.cos(yaw))
-    at_origin = Instance(model, scale, yaw, np.zeros(3))
-    centre = at_origin.to_floor(model.center[None])[0]
-    lift = lift_m - scale[1] * model.bounds[0, 1]
-    return Instance(model, scale, yaw, np.array([xy[0] - centre[0], xy[1] - centre[1], lift]))
+    return stand_at(model, scale, yaw, model.center, xy, lift_m)

@@ -73,7 +73,7 @@ def test_rooms_and_walls_tile_the_building(seed):
     for a, b in itertools.combinations(pieces, 2):
         assert a.intersection(b).area < 1e-9
     assert len(lintels) == len(holes)
-    assert all(w.low[2] == plan.door_height_m and w.high[2] == plan.wall_height_m for w in lintels)
+    assert all(w.low[2] == plan.doorways[0].height_m and w.high[2] == plan.wall_height_m for w in lintels)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
