@@ -1,1 +1,1 @@
-"""A seed in; a floor plan and its furniture out."""
+"""Design floor plans and furnish them sparsely."""

@@ -74,7 +74,7 @@ SIDE_WALL_M = 0.35
 
 
 class Effort:
-    """Work left, counted in places tried: the same on every machine, where seconds are not."""
+    """Count the work left in places tried: the same on every machine, where seconds are not."""
 
     def __init__(self, places: int = 30_000):
         self.places = places

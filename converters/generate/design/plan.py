@@ -25,7 +25,7 @@ DOORWAY_MARGIN_M = 0.12
 
 @dataclasses.dataclass(frozen=True)
 class Rect:
-    """An axis-aligned rectangle on the floor."""
+    """Describe an axis-aligned rectangle on the floor."""
 
     x0: float
     y0: float
@@ -80,7 +80,7 @@ class Rect:
 
 @dataclasses.dataclass(frozen=True)
 class PlanBox:
-    """An axis-aligned box."""
+    """Describe an axis-aligned box."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
@@ -98,7 +98,7 @@ class PlanBox:
 
 @dataclasses.dataclass(frozen=True)
 class Doorway:
-    """An opening in the wall between two rooms."""
+    """Describe an opening in the wall between two rooms."""
 
     rooms: tuple[int, int]
     """Indices of the rooms on its low and its high side along `axis`."""
@@ -116,7 +116,7 @@ class Doorway:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """A floor plan."""
+    """Hold a floor plan."""
 
     rooms: tuple[Rect, ...]
     """Clear inside of each room."""

@@ -1,1 +1,1 @@
-"""What kind of home in; its rooms, their furniture as people arrange it, and how much of it must be pushed, out."""
+"""Design furnished homes: rooms, furniture as people arrange it, and how much of it must be pushed."""

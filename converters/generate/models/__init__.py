@@ -1,1 +1,1 @@
-"""CAD furniture of convex parts."""
+"""Build CAD furniture of convex parts."""

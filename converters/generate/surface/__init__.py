@@ -1,1 +1,1 @@
-"""A plan and furniture in; the scan of it, its colours and annotations out."""
+"""Turn a plan and furniture into a scan, its colours and annotations."""

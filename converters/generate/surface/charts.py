@@ -1,6 +1,6 @@
 """Join flat patches into one textured mesh: each patch has a rectangle of texels on one sheet.
 
-Frame: scan x, y, height above the floor; metres. Faces are one-sided, counter-clockwise from where they are seen.
+Frame: scan x, y, height above the floor; metres. Faces are one-sided, counter-clockwise from their visible side.
 """
 
 import dataclasses

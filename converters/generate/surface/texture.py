@@ -172,7 +172,7 @@ def paint(scan: Scan, rooms: Sequence[Rect], uses: Sequence[str], points: np.nda
           normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:  # fmt: skip
     """Return colours (n, 3) in 0..1 of points (n, 3) on faces `ids` (n,) of the scan, by the nearest solid's material.
 
-    Each of the rooms has its own walls and floor; `normals` (m, 3) are those of faces.
+    Walls and floors differ by room; `normals` (m, 3) are those of faces.
     """
     corner = scan.solid[scan.faces[ids]]
     # Two of three corners decide, so that a border follows edges rather than zigzags.
