@@ -129,8 +129,8 @@ def _score(arguments: argparse.Namespace, console: Console) -> None:
             score = score_source(read_source(source), scores, report)
             _table(console, str(source), score["iou"])
             console.print(
-                f"{source}: of {score['objects']} annotated objects {score['found']} found, "
-                f"{score['found_true']} with its own labels",
+                f"{source}: {score['matched']} of {score['objects']} annotated objects are recognised, "
+                f"{score['matched_true']} with the scan's labels",
                 soft_wrap=True,
             )
         if arguments.homes:

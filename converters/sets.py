@@ -198,8 +198,8 @@ def make_packaged(names: Sequence[str], jobs: int, report: Report, log: Callable
             log(f"{scene}: in the cache is not the scene that the set {name} lists; made again")
         if not todo:
             continue
-        asks = Wanted(out, folder / RECIPES, None, None, None, todo, bool(others), jobs, "local", None)
-        failed += generate_scenes(asks, report, log)
+        rest = Wanted(out, folder / RECIPES, None, None, None, todo, bool(others), jobs, "local", None)
+        failed += generate_scenes(rest, report, log)
         for scene in (n for n in todo if n not in failed and not is_listed(out / n, wanted[n])):
             command = f"python -m converters generate-scenes FOLDER --recipes {folder / RECIPES} --only {scene}"
             log(f"{scene}: not the scene that the set {name} lists; as a scene of your own: {command}")

@@ -60,7 +60,7 @@ def label_scan(raw: RawScene, scores: Scores, report: Report = lambda stage, sha
     return np.where(scored.any(axis=1), NYU40[scored.argmax(axis=1)], UNLABELLED)
 
 
-def objects_found(raw: RawScene, scan: ScanMesh) -> int:
+def objects_matched(raw: RawScene, scan: ScanMesh) -> int:
     """Return how many of a source's annotated objects `propose` finds by a scan's labels: category, `MATCH_IOU`."""
     proposals = propose_instances(scan)
     boxes = [(a.category, bounds(annotated_vertices(a, raw.cads))) for a in raw.annotations]
@@ -74,8 +74,8 @@ def score_source(raw: RawScene, scores: Scores, report: Report) -> dict[str, Any
     """Return IoU by class at the vertices of a labelled source, and how many annotated objects `propose` finds."""
     labels = label_scan(raw, scores, report)
     iou = intersection_over_union(classes_of(raw.scan.labels), classes_of(labels))
-    count = objects_found(raw, dataclasses.replace(raw.scan, labels=labels))
-    return {"iou": iou, "objects": len(raw.annotations), "found": count, "found_true": objects_found(raw, raw.scan)}
+    by_labels, by_truth = (objects_matched(raw, s) for s in (dataclasses.replace(raw.scan, labels=labels), raw.scan))
+    return {"iou": iou, "objects": len(raw.annotations), "matched": by_labels, "matched_true": by_truth}
 
 
 def score_homes(seed: int, count: int, scores: Scores, report: Report) -> dict[str, float]:
