@@ -8,11 +8,11 @@ from interactive_nav_common.errors import UserError
 
 
 class SpaceError(UserError):
-    """A scene without the free space that was asked for."""
+    """A scene without the free space that is needed."""
 
 
 class DatasetError(UserError):
-    """A dataset that is missing, incomplete, or made with other settings."""
+    """A dataset that is missing, incomplete, or of other settings."""
 
 
 class RunError(UserError):
@@ -24,18 +24,18 @@ class MapError(UserError):
 
 
 class Stopped(Exception):
-    """A signal asked to stop; carries its number. What was done is kept, and the same command goes on."""
+    """A signal to stop; carries its number. What was done is kept, and the same command goes on."""
 
 
 Progress = Callable[[str, int, int], None]
-"""Told what is done, how much of it, and of how much; may raise to stop."""
+"""Called with what is done, how much of it, and of how much; may raise to stop."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Host:
     """Whoever started long work: shows its lines, and stops it between two steps."""
 
-    tell: Callable[[str], None] = lambda _: None
+    show: Callable[[str], None] = lambda _: None
     signal: Callable[[], int] = lambda: 0
     """Return the number of the signal that wants the work to stop; 0: go on."""
 

@@ -29,7 +29,7 @@ from topological_nav.evaluate.contest import Contest, ContestScene, local_policy
 from topological_nav.evaluate.evaluation import NavigatorPlayer, Played
 from topological_nav.learn.training import load_networks
 from topological_nav.navigate.navigator import Navigator
-from topological_nav.weights.packaged import packaged_weights
+from topological_nav.weights.export import packaged_weights
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
 """JAX's event of a program that XLA has compiled; tracing and lowering have others, of which one may hold another."""

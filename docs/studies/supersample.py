@@ -21,11 +21,11 @@ from benchmarks.steps_per_second import timed
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.rows import markdown
-from topological_nav.learn.training import Trained, camera_of, load_trained
+from topological_nav.learn.training import Networks, Trained, load_networks
 from topological_nav.maps.build import renderer_of
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.space import free_space
-from topological_nav.weights.packaged import packaged_weights
+from topological_nav.weights.export import packaged_weights
 
 CLEARANCE_M = 0.35
 """Least distance of places from obstacles."""
@@ -61,11 +61,8 @@ def compare(
 
     Returns:
         A row each, the largest first; and the mean distance of the embeddings of different places.
-
-    Raises:
-        MapError: the networks learned from different cameras, or the second judges no passages.
     """
-    data = camera_of(localiser, detector)
+    data = Networks(localiser, detector).camera
     robot = get_robot(data.robot)
     rng = np.random.default_rng(seed)
     xy = free_space(scene, robot.height_m).sample(rng, places, CLEARANCE_M)
@@ -95,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     made.add_argument("--detector", type=Path, default=packaged_weights() / "passages", metavar="RUN")
     made.add_argument("--places", type=int, default=36)
     arguments = made.parse_args(argv)
-    networks = load_trained(arguments.localiser), load_trained(arguments.detector)
+    networks = load_networks(arguments.localiser, arguments.detector)
     rows, typical = compare(load_scene(arguments.scene), *networks, arguments.places)
     header = ("supersample", "images/s", "embeddings apart", "p: mean difference", "largest", "other side of 0.5")
     lines = [(r.supersample, f"{r.images_per_s:.1f}", *(f"{value:.3f}" for value in r[2:])) for r in rows]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from topological_nav.weights.packaged import packaged_weights
+from topological_nav.weights.export import packaged_weights
 
 ROOT = Path(__file__).parents[2]
 HINT = "pip install -e '.[warp]'"

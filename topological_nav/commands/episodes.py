@@ -20,13 +20,11 @@ from topological_nav.config import PASSAGE_POLICY, RUNS, EvaluationConfig, Expor
 from topological_nav.errors import Host, Progress, Stopped, say
 from topological_nav.evaluate.contest import Contest, contest_scenes, play_contest, tracks_of
 from topological_nav.evaluate.scores import console_table, differences, markdown, summary
-from topological_nav.figures.journey import drive_episode, film
 from topological_nav.figures.learning import export_figure
-from topological_nav.figures.maps import journeys_figure, map_figure, save
+from topological_nav.figures.maps import drive_episode, film, journeys_figure, map_figure, save
 from topological_nav.maps.build import Built, build_map, forget
 from topological_nav.maps.graph import save_map
-from topological_nav.weights.export import export, size_lines
-from topological_nav.weights.packaged import choose, fitting_map
+from topological_nav.weights.export import choose, export, fitting_map, size_lines
 
 
 @contextmanager
@@ -80,8 +78,7 @@ def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: S
     if arguments.truth or not {"dense", "sparse"} & set(contenders):
         return contest
     chosen = choose(arguments.localiser, arguments.detector, arguments.policy)
-    if chosen.told:
-        say(chosen.told)
+    chosen.report()
     maps, files = arguments.maps or chosen.maps[0], {}
     for folder in contest.scenes if arguments.maps is None else ():
         scene = load_scene(folder)
@@ -167,8 +164,7 @@ def make_map(arguments: argparse.Namespace) -> None:
     """Build a map and draw it."""
     config = overridden(MapConfig(), arguments.settings)
     chosen = choose(arguments.localiser, arguments.detector, PASSAGE_POLICY)
-    if chosen.said:
-        say(chosen.said)
+    chosen.report(policy=False)
     out = arguments.out or chosen.maps[0] / f"{Path(arguments.scene).resolve().name}.npz"
     build(Path(arguments.scene), chosen.localiser, chosen.detector, config, out, arguments.route)
 

@@ -8,9 +8,14 @@ from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.records import read_metrics
 from interactive_nav_common.signals import stop_signals
 from scenes_mjcf.sets import scene_folders
-from topological_nav.adapt.adaptation import adapt_features, target_rooms
+from topological_nav.adapt.adaptation import (
+    CONFIGURATIONS,
+    adapt_features,
+    collected_map,
+    passage_configurations,
+    target_rooms,
+)
 from topological_nav.adapt.config import AdaptConfig
-from topological_nav.adapt.transfer import CONFIGURATIONS, collected_map, passage_configurations
 from topological_nav.commands.episodes import bar, keep_map, terminal
 from topological_nav.config import (
     ADAPTED,
@@ -30,7 +35,7 @@ from topological_nav.data.folders import folder_bytes
 from topological_nav.drives.dataset import draw_drives, simulate_drives, summary
 from topological_nav.drives.driving import embed_drives
 from topological_nav.drives.imitation import grid_table, train_grid, train_policy
-from topological_nav.errors import Host, say
+from topological_nav.errors import Host
 from topological_nav.figures.learning import (
     curves_figure,
     drives_figure,
@@ -41,7 +46,7 @@ from topological_nav.figures.learning import (
 from topological_nav.figures.maps import dataset_figure, save
 from topological_nav.learn.networks import in_words
 from topological_nav.learn.training import train as train_network
-from topological_nav.weights.packaged import choose
+from topological_nav.weights.export import choose
 
 
 def data(arguments: argparse.Namespace) -> None:
@@ -149,8 +154,7 @@ def adapt(arguments: argparse.Namespace) -> None:
     needs = _NEEDS[arguments.what]
     chosen = choose(arguments.localiser, arguments.detector, needs=needs)
     arguments.localiser, arguments.detector = chosen.localiser, chosen.detector
-    if chosen.said:
-        say(chosen.said)
+    chosen.report(policy=False)
     with terminal() as host:
         ADAPTATIONS[arguments.what](arguments, config, host)
 

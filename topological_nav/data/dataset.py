@@ -1,4 +1,4 @@
-"""Scene folders in, a dataset folder out, and back: room images around positions, and passage images.
+"""Make dataset folders of scenes, and read them: room images around positions, and labelled passage images.
 
     DATASET/dataset.json           settings, scenes with digests and counts, versions
             <scene>/plan.npz       rooms, positions and passages with labels: all that is decided before drawing
@@ -21,10 +21,9 @@ from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scenes.scene import Scene
 from interactive_nav_common.errors import readable
 from interactive_nav_common.files import write_arrays
+from interactive_nav_common.rows import Rows
 from topological_nav.config import DataConfig
-from topological_nav.data.folders import Folder, draw_missing, load_scenes
-from topological_nav.data.passages import Passages, draw_passages, held_out
-from topological_nav.data.shards import numbered, read_arrays, read_shards
+from topological_nav.data.folders import Folder, draw_missing, load_scenes, numbered, read_arrays, read_shards
 from topological_nav.errors import DatasetError, Progress, SpaceError
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.rooms import Rooms, agreement, recorded_rooms, scene_rooms
@@ -41,8 +40,26 @@ read_header = DATASET.read
 
 
 @dataclasses.dataclass(frozen=True)
+class Passages(Rows):
+    """Hold n looks along straight ways, grouped by source."""
+
+    xy_w: np.ndarray
+    """[n, 2] m, sources."""
+    heading_rad: np.ndarray
+    """[n] towards the targets."""
+    free: np.ndarray
+    """[n, L] bool labels for `DataConfig.passage_lengths_m`; never true after false."""
+    source: np.ndarray
+    """[n] i32 index of the source."""
+    room: np.ndarray
+    """[n] i32 room of the source."""
+    test: np.ndarray
+    """[n] bool."""
+
+
+@dataclasses.dataclass(frozen=True)
 class ScenePlan:
-    """Where a scene's images are taken, with labels."""
+    """Say where a scene's images are taken, with labels."""
 
     rooms: Rooms
     xy_w: np.ndarray
@@ -56,7 +73,7 @@ class ScenePlan:
 
 @dataclasses.dataclass(frozen=True)
 class RoomImages:
-    """Room images of a dataset: P positions, three pitches, K headings."""
+    """Hold the room images of a dataset: P positions, three pitches, K headings."""
 
     images: np.ndarray
     """[P, 3, K, H, W, 3] u8."""
@@ -74,7 +91,7 @@ class RoomImages:
 
 @dataclasses.dataclass(frozen=True)
 class PassageImages:
-    """Passage images of a dataset."""
+    """Hold the passage images of a dataset."""
 
     images: np.ndarray
     """[N, H, W, 3] u8."""
@@ -91,12 +108,12 @@ class PassageImages:
 
 
 def headings(config: DataConfig) -> np.ndarray:
-    """[K] rad: evenly about a position, from the world's x axis on."""
+    """Return K headings (rad), evenly about a position, from the world's x axis on."""
     return 2 * np.pi * np.arange(config.headings) / config.headings
 
 
 def plan_scene(scene: Scene, space: FreeSpace, config: DataConfig) -> ScenePlan:
-    """Decides where a scene's images are taken.
+    """Decide where a scene's images are taken.
 
     Positions are drawn uniformly; of a room that has more than its share, those farthest from each other stay.
     """
@@ -139,7 +156,7 @@ def make_dataset(
 
 
 def _shards(folder: Path, plan: ScenePlan, robot: RobotSpec, config: DataConfig):
-    """Yields each file of a scene and the camera poses of its sheets."""
+    """Yield each file of a scene and the camera poses of its sheets."""
     pitch, heading = (a.ravel() for a in np.meshgrid(config.pitches_rad, headings(config), indexing="ij"))
     passages, each, level = plan.passages, len(pitch), np.zeros(len(pitch))
     rows = [np.arange(first, min(first + each, len(passages))) for first in range(0, len(passages), each)]
@@ -152,7 +169,7 @@ def _shards(folder: Path, plan: ScenePlan, robot: RobotSpec, config: DataConfig)
 
 
 def load_rooms(folder: Path) -> RoomImages:
-    """The room images of a dataset."""
+    """Read the room images of a dataset."""
     header, config = read_header(folder)
     parts, first = [], 0
     for index, scene in enumerate(header["scenes"]):
@@ -167,7 +184,7 @@ def load_rooms(folder: Path) -> RoomImages:
 
 
 def load_passages(folder: Path) -> PassageImages:
-    """The passage images of a dataset."""
+    """Read the passage images of a dataset."""
     header, config = read_header(folder)
     parts = []
     for index, scene in enumerate(header["scenes"]):
@@ -179,7 +196,7 @@ def load_passages(folder: Path) -> PassageImages:
 
 
 def load_plan(folder: Path, scene: str) -> ScenePlan:
-    """Where a scene's images were taken."""
+    """Read where a scene's images were taken."""
     path = Path(folder) / scene / "plan.npz"
     arrays = read_arrays(path)
     with readable(path, DatasetError, "run 'data' again"):
@@ -202,14 +219,14 @@ def _plan_arrays(plan: ScenePlan) -> dict[str, np.ndarray]:
 
 
 def _about(scene: Scene, plan: ScenePlan) -> dict[str, Any]:
-    known = recorded_rooms(scene.digest)
+    recorded = recorded_rooms(scene.digest)
     return {
         "name": scene.name,
         "digest": scene.digest,
         "split": scene.split,
         "rooms": plan.rooms.count,
         "rooms_chosen_by": plan.rooms.chosen_by,
-        "rooms_agreement": None if known is None else round(agreement(plan.rooms, known), 4),
+        "rooms_agreement": None if recorded is None else round(agreement(plan.rooms, recorded), 4),
         "positions": len(plan.xy_w),
         "test_positions": int(plan.test.sum()),
         "passages": len(plan.passages),
@@ -227,3 +244,83 @@ def _read_all(folder: Path, kind: str, count: int, config: DataConfig) -> np.nda
             f"{folder}: {kind} are {joined.shape}, expected {(count, *shape)}; delete them and make again"
         )
     return joined
+
+
+def draw_passages(space: FreeSpace, rooms: Rooms, config: DataConfig, rng: np.random.Generator) -> Passages:
+    """Draw sources of every room, targets on a circle about each, and labels from the map.
+
+    As many are free as blocked for `passage_length_m`. A room with fewer eligible places than sources gives them all.
+    Surplus passages of the commoner label are left out at random, apart for training and testing, so that guessing
+    scores one half in both.
+    """
+    places = space.centres(config.passage_clearance_m)
+    labels = rooms.of(places)
+    xy, room, test = [], [], []
+    for k in range(rooms.count):
+        mine = np.flatnonzero(labels == k)
+        picked = rng.choice(mine, min(config.passage_sources, len(mine)), replace=False)
+        xy.append(places[picked])
+        room.append(np.full(len(picked), k, np.int32))
+        test.append(held_out(len(picked), config.test_share, rng))
+    sources, room, test = np.concatenate(xy), np.concatenate(room), np.concatenate(test)
+    n, each = len(sources), config.passage_targets
+    phase = rng.uniform(0, 2 * np.pi, n)
+    heading = (phase[:, None] + 2 * np.pi * np.arange(each) / each).ravel() % (2 * np.pi)
+    start = np.repeat(sources, each, 0)
+    free = free_lengths(space, start, heading, config)
+    every = Passages(
+        start,
+        heading,
+        free,
+        np.repeat(np.arange(n, dtype=np.int32), each),
+        np.repeat(room, each),
+        np.repeat(test, each),
+    )
+    scored = free[:, config.passage_column]
+    kept = [balanced(np.flatnonzero(every.test == held), scored, rng) for held in (False, True)]
+    return every.take(np.sort(np.concatenate(kept)))
+
+
+def free_lengths(space: FreeSpace, xy_w: np.ndarray, heading_rad: np.ndarray, config: DataConfig) -> np.ndarray:
+    """Return whether the ways from places [n, 2] along headings [n] are free for `passage_lengths_m`: [n, L] bool.
+
+    Each length is looked up at points of another spacing, and one may hit a corner that the others miss. So
+    `passage_length_m` decides: what is free for it is free for less, what is not is not for more, and so on outwards.
+    """
+    step = np.stack([np.cos(heading_rad), np.sin(heading_rad)], -1)
+    points, margin_m, scored = config.passage_points, config.passage_margin_m, config.passage_column
+    ways = [space.segment_free(xy_w, xy_w + length * step, points, margin_m) for length in config.passage_lengths_m]
+    free = np.stack(ways, -1)
+    free[:, : scored + 1] = np.logical_or.accumulate(free[:, scored::-1], 1)[:, ::-1]
+    free[:, scored:] = np.logical_and.accumulate(free[:, scored:], 1)
+    return free
+
+
+def logits_at(logits: np.ndarray, lengths_m: Sequence[float], ahead_m: np.ndarray | float) -> np.ndarray:
+    """Interpolate a detector's logits [n, L] of ascending lengths [L] at others: [n], [n, M], or a number for all.
+
+    Return [n] or [n, M]. Beyond the detector's lengths the nearest counts.
+    """
+    given = np.asarray(lengths_m, float)
+    ahead = np.asarray(ahead_m, float)
+    ahead = np.broadcast_to(ahead, (len(logits), *ahead.shape[1:]))
+    if len(given) == 1:
+        return np.broadcast_to(logits.reshape(-1, *[1] * (ahead.ndim - 1)), ahead.shape).astype(float)
+    x = np.clip(ahead, given[0], given[-1])
+    right = np.clip(np.searchsorted(given, x), 1, len(given) - 1)
+    share = (x - given[right - 1]) / (given[right] - given[right - 1])
+    rows = np.arange(len(logits)).reshape(-1, *[1] * (ahead.ndim - 1))
+    return (1.0 - share) * logits[rows, right - 1] + share * logits[rows, right]
+
+
+def balanced(rows: np.ndarray, labels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return as many of the rows with a true label as with a false one, the surplus left out at random."""
+    yes, no = rows[labels[rows]], rows[~labels[rows]]
+    count = min(len(yes), len(no))
+    return np.sort(np.concatenate([rng.permutation(part)[:count] for part in (yes, no)]))
+
+
+def held_out(count: int, share: float, rng: np.random.Generator) -> np.ndarray:
+    """Draw which are for testing, [count] bool: the share rounded, of two or more at least one and never all."""
+    tests = 0 if count < 2 else int(np.clip(round(count * share), 1, count - 1))
+    return np.isin(np.arange(count), rng.permutation(count)[:tests])

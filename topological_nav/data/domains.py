@@ -1,8 +1,8 @@
-"""Rendered images in, images as another camera would have taken them out: what stands for the real world.
+"""Turn rendered images into those that another camera would have taken: a stand-in for the real world.
 
 In the order of a real camera: lens (narrower, distorted, darker corners), motion blur, exposure and white balance in
 linear light, sensor noise, the camera's own tone curve. Pure functions of images and a seed; where images come from
-(rendered anew through another lens or engine, or a scanned room) is a dataset's business, see `config.DataConfig`.
+(rendered again through another lens or engine, or a scanned room) is a dataset's business, see `config.DataConfig`.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ _CHUNK = 256
 
 @dataclasses.dataclass(frozen=True)
 class DomainConfig(Settings):
-    """A camera that is not the renderer's; the defaults change nothing."""
+    """Describe a camera that is not the renderer's; the defaults change nothing."""
 
     seed: Seed = 0
     """Of noise and of what differs from image to image."""
@@ -56,20 +56,16 @@ PRESETS = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, DomainCon
 
 
 def preset(name: str) -> DomainConfig:
-    """A named camera."""
+    """Return a named camera."""
     if name not in PRESETS:
         raise ConfigError(f"domain is '{name}', expected one of {', '.join(PRESETS)}")
     return PRESETS[name]
 
 
 def as_seen(images: np.ndarray, config: DomainConfig, stream: int = 0) -> np.ndarray:
-    """Images as the camera would have taken them.
+    """Return images [..., H, W, 3] u8 as the camera would have taken them.
 
-    Args:
-        images: [..., H, W, 3] u8.
-
-    Returns:
-        The same shape, u8. An image depends on the seed, the stream, its place in the set and itself alone.
+    An image depends on the seed, the stream, its place in the set and itself alone.
     """
     if _changes_nothing(config):
         return images
@@ -83,15 +79,9 @@ def as_seen(images: np.ndarray, config: DomainConfig, stream: int = 0) -> np.nda
 
 
 def as_seen_from(images: np.ndarray, config: DomainConfig, xy_w: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
-    """Images as the camera would have taken them, whatever set they are taken in.
+    """Return images [N, H, W, 3] u8 as the camera would have taken them, whatever set they are in.
 
-    Args:
-        images: [N, H, W, 3] u8.
-        xy_w: [N, 2] m, where they were taken.
-        heading_rad: [N].
-
-    Returns:
-        [N, H, W, 3] u8. The chance in an image depends on the seed, and on place and heading to 1 mm and 1 mrad.
+    Chance depends on the seed, and on the place [N, 2] (m) and heading [N] of an image to 1 mm and 1 mrad.
     """
     if _changes_nothing(config) or not len(images):
         return images
@@ -111,7 +101,7 @@ def _changes_nothing(config: DomainConfig) -> bool:
 def _chance(
     rng: np.random.Generator, config: DomainConfig, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What is drawn for images of a shape: ways [N] (px), exposures [N] and noise, standard normal."""
+    """Draw for images of a shape: ways [N] (px), exposures [N] and noise, standard normal."""
     ways, stops = rng.uniform(0.0, config.blur_px, shape[0]), rng.standard_normal(shape[0])
     noisy = config.shot_noise or config.read_noise
     return ways, stops, rng.standard_normal(shape) if noisy else np.zeros((shape[0], 1, 1, 1))
@@ -139,9 +129,9 @@ def _taken(
 
 
 def smeared(light: np.ndarray, way_px: float) -> np.ndarray:
-    """An image [H, W, 3] whose points moved evenly by this many pixels along the rows while it was taken.
+    """Blur an image [H, W, 3] as if its points moved evenly by so many pixels along the rows during the exposure.
 
-    The mean over a window of 1 + `way_px` pixels, the outermost ones counted in part; borders are repeated.
+    Take the mean over a window of 1 + `way_px` pixels, the outermost ones counted in part; borders are repeated.
     """
     half = way_px / 2
     whole = math.floor(half)
@@ -155,17 +145,17 @@ def smeared(light: np.ndarray, way_px: float) -> np.ndarray:
 
 
 def _through_lens(light: np.ndarray, zoom: float, barrel: float) -> np.ndarray:
-    """Images [N, H, W, 3] resampled, bilinearly, so that nothing outside them is asked for."""
+    """Resample images [N, H, W, 3] bilinearly, so that nothing outside of them is needed."""
     height, width = light.shape[1:3]
     factor = (1.0 + barrel * _radius(height, width) ** 2) / (1.0 + barrel) / zoom
     y, x = np.meshgrid(np.arange(height) - (height - 1) / 2, np.arange(width) - (width - 1) / 2, indexing="ij")
     at = np.stack([y * factor + (height - 1) / 2, x * factor + (width - 1) / 2])
     channels = np.moveaxis(light, -1, 1).reshape(-1, height, width)
-    seen = np.stack([map_coordinates(one, at, order=1, mode="nearest") for one in channels])
-    return np.moveaxis(seen.reshape(-1, 3, height, width), 1, -1)
+    taken = np.stack([map_coordinates(one, at, order=1, mode="nearest") for one in channels])
+    return np.moveaxis(taken.reshape(-1, 3, height, width), 1, -1)
 
 
 def _radius(height: int, width: int) -> np.ndarray:
-    """[H, W] distance from the middle; 1 in the corners' pixels."""
+    """Return distances from the middle [H, W]; 1 in the corners' pixels."""
     y, x = np.meshgrid(np.arange(height) - (height - 1) / 2, np.arange(width) - (width - 1) / 2, indexing="ij")
     return np.hypot(x, y) / max(np.hypot((height - 1) / 2, (width - 1) / 2), 1e-9)

@@ -1,24 +1,30 @@
-"""A folder of images of scenes: its description, who may work in it, and how its files of images are drawn."""
+"""Describe folders of images of scenes, claim and fill them; store images as sheets of WebP, some sheets a file."""
 
 import contextlib
 import dataclasses
 import functools
+import io
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import math
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import numpy as np
+from PIL import Image
 
 from interactive_nav.robots import RobotSpec, get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import readable
-from interactive_nav_common.files import write_text
+from interactive_nav_common.files import whole_file, write_text
 from interactive_nav_common.locks import alone_in
+from interactive_nav_common.untrusted.reading import read_npz
+from interactive_nav_common.versions import usable_cores
 from scenes_mjcf.look import CameraPose, Lens
 from topological_nav.config import CameraConfig
-from topological_nav.data.shards import THREADS, in_order, write_shard
 from topological_nav.errors import DatasetError, Progress
 from topological_nav.scenes.rendering import SceneRenderer, need_engine
 
@@ -27,7 +33,7 @@ Config = TypeVar("Config", bound=CameraConfig)
 
 @dataclasses.dataclass(frozen=True)
 class Folder(Generic[Config]):
-    """A kind of folder."""
+    """Describe a kind of folder."""
 
     file: str
     """Of its description."""
@@ -41,20 +47,20 @@ class Folder(Generic[Config]):
     """What to do about one that cannot be used."""
 
     def read(self, folder: Path) -> tuple[dict[str, Any], Config]:
-        """The description of a folder, and the settings in it."""
+        """Return the description of a folder, and the settings in it."""
         path = Path(folder) / self.file
         if not path.is_file():
             raise DatasetError(f"{folder}: {self.none}")
         with readable(path, DatasetError, f"delete the folder and {self.again}"):
             header = json.loads(path.read_text(encoding="utf-8"))
-            found = header["format"]
-            settings = header["settings"] if found == self.version else {}
-        if found != self.version:
-            raise DatasetError(f"{path}: format {found}, expected {self.version}; {self.again}")
+            version = header["format"]
+            settings = header["settings"] if version == self.version else {}
+        if version != self.version:
+            raise DatasetError(f"{path}: format {version}, expected {self.version}; {self.again}")
         return header, overlay(self.base, settings, str(path))
 
     def describe(self, config: Config, scenes: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        """The description of a folder with these settings and of these scenes."""
+        """Return the description of a folder with these settings and of these scenes."""
         robot = get_robot(config.robot)
         return {
             "format": self.version,
@@ -66,7 +72,7 @@ class Folder(Generic[Config]):
 
     @contextlib.contextmanager
     def claimed(self, out: Path, header: dict[str, Any]) -> Iterator[None]:
-        """Describes a new folder, or checks that the one there is the same; nobody else works there for the block."""
+        """Describe a new folder, or check that the one there is the same; nobody else works there for the block."""
         with alone_in(out):
             path = out / self.file
             if path.is_file():
@@ -88,7 +94,7 @@ class Folder(Generic[Config]):
 
 
 def load_scenes(folders: Sequence[Path], engine: str) -> list[Scene]:
-    """The scenes to draw."""
+    """Load the scenes to draw."""
     scenes = [load_scene(folder) for folder in folders]
     need_engine(engine)
     names = [scene.name for scene in scenes]
@@ -98,7 +104,7 @@ def load_scenes(folders: Sequence[Path], engine: str) -> list[Scene]:
 
 
 def lens_of(config: CameraConfig, robot: RobotSpec) -> Lens:
-    """The lens of stored images."""
+    """Return the lens of stored images."""
     return Lens(config.width, config.height, config.fov_deg or robot.camera.fov_deg)
 
 
@@ -108,19 +114,15 @@ def draw_missing(
     config: CameraConfig,
     progress: Progress,
 ) -> None:
-    """Draws the files of images that are not there yet."""
+    """Draw the files of images that are not there yet."""
     lens = lens_of(config, get_robot(config.robot))
 
     def missing() -> Iterator[Callable[[], tuple[str, int]]]:
         for name, load, files in scenes:
-            renderer: SceneRenderer | None = None
+            renderer = functools.cache(lambda load=load: SceneRenderer(load(), lens, config.supersample, config.engine))
             for path, poses in files:
-                sheets = []
-                if not path.is_file():
-                    renderer = renderer or SceneRenderer(load(), lens, config.supersample, config.engine)
-                    sheets = _draw_sheets(renderer, poses)
-                told = name, sum(len(pose.pos_w) for pose in poses)
-                yield functools.partial(_written, path, sheets, config.quality, told)
+                sheets = [] if path.is_file() else _draw_sheets(renderer(), poses)
+                yield functools.partial(_write, path, sheets, config.quality, name, sum(len(p.pos_w) for p in poses))
 
     done = 0
     with contextlib.closing(in_order(missing(), 2 * THREADS)) as written:
@@ -129,19 +131,116 @@ def draw_missing(
             progress(name, done, total)
 
 
-def _written(path: Path, sheets: list[np.ndarray], quality: int, told: tuple[str, int]) -> tuple[str, int]:
+def _write(path: Path, sheets: list[np.ndarray], quality: int, name: str, count: int) -> tuple[str, int]:
     if sheets:
         write_shard(path, sheets, quality)
-    return told
+    return name, count
 
 
 def _draw_sheets(renderer: SceneRenderer, poses: Sequence[CameraPose]) -> list[np.ndarray]:
-    """Images [n_i, H, W, 3] of groups of cameras, drawn together: full batches."""
+    """Draw images [n_i, H, W, 3] of groups of cameras together, in full batches."""
     together = CameraPose(*(np.concatenate([getattr(pose, name) for pose in poses]) for name in ("pos_w", "axes_w")))
     images = renderer.draw(together)
     return np.split(images, np.cumsum([len(pose.pos_w) for pose in poses])[:-1])
 
 
 def folder_bytes(folder: Path) -> int:
-    """Bytes of a folder's arrays and images."""
+    """Return the bytes of a folder's arrays and images."""
     return sum(path.stat().st_size for path in Path(folder).rglob("*.npz"))
+
+
+COLUMNS = 18
+"""Images a row of a sheet."""
+Result = TypeVar("Result")
+THREADS = min(usable_cores(), 16)
+"""That encode and decode: WebP's library runs outside of Python's lock."""
+
+
+def encode(images: np.ndarray, quality: int) -> bytes:
+    """Encode images [N, H, W, 3] u8 as one WebP picture, row by row; quality 100 is without loss."""
+    n, height, width, _ = images.shape
+    columns = min(COLUMNS, n)
+    rows = math.ceil(n / columns)
+    padded = np.concatenate([images, np.zeros((rows * columns - n, height, width, 3), np.uint8)])
+    sheet = padded.reshape(rows, columns, height, width, 3).swapaxes(1, 2).reshape(rows * height, columns * width, 3)
+    out = io.BytesIO()
+    Image.fromarray(sheet).save(out, "WEBP", quality=quality, lossless=quality == 100, method=4)
+    return out.getvalue()
+
+
+def decode(data: bytes, count: int, height: int, width: int) -> np.ndarray:
+    """Decode the `count` images [N, H, W, 3] u8 of a picture by `encode`."""
+    sheet = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+    rows, columns = sheet.shape[0] // height, sheet.shape[1] // width
+    tiles = sheet.reshape(rows, height, columns, width, 3).swapaxes(1, 2)
+    return tiles.reshape(-1, height, width, 3)[:count]
+
+
+def write_shard(path: Path, sheets: list[np.ndarray], quality: int) -> int:
+    """Write groups of images [n_i, H, W, 3] as sheets into one npz file, whole or not at all; return its bytes."""
+    coded = [np.frombuffer(encode(images, quality), np.uint8) for images in sheets]
+    arrays = {
+        "data": np.concatenate(coded),
+        "ends": np.cumsum([len(c) for c in coded]),
+        "counts": np.asarray([len(images) for images in sheets]),
+        "size": np.asarray(sheets[0].shape[1:3]),
+    }
+    with whole_file(path) as partial, open(partial, "wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+    return path.stat().st_size
+
+
+def read_arrays(path: Path, command: str = "data") -> dict[str, np.ndarray]:
+    """Read the arrays of an npz file that a command wrote."""
+    need_files([path], command)
+    remedy = f"delete it and run '{command}' again"
+    with read_npz(path, DatasetError, remedy) as arrays:
+        return dict(arrays)
+
+
+def need_files(paths: Iterable[Path], command: str = "data") -> None:
+    """Raise DatasetError where one is missing."""
+    missing = next((path for path in paths if not path.is_file()), None)
+    if missing:
+        raise DatasetError(f"{missing} is missing; the same '{command}' command goes on where it stopped")
+
+
+def read_shard(path: Path) -> np.ndarray:
+    """Read all images [N, H, W, 3] u8 of a file, in the order they were written."""
+    stored = read_arrays(path)
+    with readable(path, DatasetError, "delete it and run 'data' again"):
+        height, width = (int(v) for v in stored["size"])
+        sheets = np.split(stored["data"], stored["ends"][:-1])
+        pairs = zip(sheets, stored["counts"], strict=True)
+        return np.concatenate([decode(sheet.tobytes(), int(count), height, width) for sheet, count in pairs])
+
+
+def in_order(tasks: Iterable[Callable[[], Result]], ahead: int) -> Generator[Result, None, None]:
+    """Yield the results of tasks that threads run, in the tasks' order.
+
+    Tasks are taken one by one, in the caller's thread. Where one or the caller raises, those that have started are
+    finished and the others left out.
+    """
+    waiting: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(THREADS) as pool:
+        try:
+            for task in tasks:
+                waiting.append(pool.submit(task))
+                while waiting and (len(waiting) > ahead or waiting[0].done()):
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def read_shards(paths: Sequence[Path], command: str = "data") -> Iterator[np.ndarray]:
+    """Return `read_shard` of each file that a command wrote, in order, some files ahead in threads."""
+    need_files(paths, command)
+    return in_order((functools.partial(read_shard, path) for path in paths), THREADS)
+
+
+def numbered(folder: Path, kind: str, items: Sequence[Any] | np.ndarray, each: int) -> list[tuple[Path, Any]]:
+    """Return the files that hold so many items each, and the items of each file."""
+    firsts = range(0, len(items), each)
+    return [(folder / f"{kind}-{i:03d}.npz", items[first : first + each]) for i, first in enumerate(firsts)]

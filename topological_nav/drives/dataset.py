@@ -1,4 +1,4 @@
-"""Scene folders in, a folder of the expert's drives out, and back: poses, commands, contacts, and what the robot saw.
+"""Simulate the expert's drives into a folder, and read them: poses, commands, contacts, and what the robot saw.
 
     DRIVES/drives.json             settings, scenes with digests, counts, versions of the format
            plan.npz                all drives that were decided on: routes, starts, split
@@ -24,14 +24,13 @@ from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav.task.rollout import Player
 from interactive_nav_common.files import write_arrays
 from interactive_nav_common.locks import alone_in
+from interactive_nav_common.rotations import wrap_angle
 from scenes_mjcf.look import CameraPose
 from topological_nav.config import DataConfig, DriveConfig, MapConfig
-from topological_nav.data.folders import Folder, draw_missing, load_scenes
-from topological_nav.data.shards import numbered, read_arrays, read_shards
+from topological_nav.data.folders import Folder, draw_missing, load_scenes, numbered, read_arrays, read_shards
 from topological_nav.drives.expert import CONTROL_S, RECORDERS, Tasks, Terrain, drive, drive_env, way_field
 from topological_nav.errors import DatasetError, Progress, SpaceError
-from topological_nav.maps.graph import angles, near_pairs
-from topological_nav.maps.nodes import place_nodes
+from topological_nav.maps.graph import angles, near_pairs, place_nodes
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.rooms import scene_rooms
 from topological_nav.scenes.space import FreeSpace, free_space
@@ -53,7 +52,7 @@ CANDIDATES = 32
 
 @dataclasses.dataclass(frozen=True)
 class Drives:
-    """What the expert did: n drives, F control steps in all, drive after drive."""
+    """Hold what the expert did: n drives, F control steps in all, drive after drive."""
 
     scene: np.ndarray
     """[n] i32."""
@@ -80,29 +79,29 @@ class Drives:
         return len(self.scene)
 
     def rows(self, which: np.ndarray | int) -> np.ndarray:
-        """[f] indices of the control steps of a drive, or of several, drive after drive."""
+        """Return the indices [f] of the control steps of a drive, or of several, drive after drive."""
         return np.concatenate([np.arange(int(self.first[k]), int(self.first[k + 1])) for k in np.atleast_1d(which)])
 
     @property
     def steps(self) -> np.ndarray:
-        """[n] control steps."""
+        """Return the control steps of each drive [n]."""
         return np.diff(self.first)
 
     @property
     def touched(self) -> np.ndarray:
-        """[n] bool: anything was touched on the way."""
+        """Return whether anything was touched on the way, [n] bool."""
         sums = np.concatenate([[0], np.cumsum(self.touching.any(1))])
         return sums[self.first[1:]] > sums[self.first[:-1]]
 
     @property
     def kept(self) -> np.ndarray:
-        """[n] bool: reached its last node, touched nothing: drawn and learned from."""
+        """Return which reached their last node and touched nothing, [n] bool: they are drawn and learned from."""
         return self.reached & ~self.broken & ~self.touched
 
 
 @dataclasses.dataclass(frozen=True)
 class Routes:
-    """Drives of one scene; n of them."""
+    """Hold n drives of one scene."""
 
     nodes: np.ndarray
     """[n, legs + 1] i32 nodes one after the other; the last repeated where a drive is shorter."""
@@ -117,11 +116,9 @@ class Routes:
 
 
 def drivable(space: FreeSpace, nodes_w: np.ndarray, to_go_m: np.ndarray, config: DriveConfig) -> np.ndarray:
-    """[E, 2] i32: the ordered pairs of nodes nearer than `edge_m` whose planned way is no long detour.
+    """Return the ordered pairs [E, 2] of nodes [N, 2] nearer than `edge_m` whose planned way is no long detour.
 
-    Args:
-        nodes_w: [N, 2] m.
-        to_go_m: [N, rows, columns] of `expert.way_field`, one to each node.
+    `to_go_m` [N, rows, columns] is of `expert.way_field`, a field for each node.
     """
     edges = near_pairs(nodes_w, config.edge_m)
     column, row = space.inner_cells(nodes_w).T
@@ -133,15 +130,11 @@ def drivable(space: FreeSpace, nodes_w: np.ndarray, to_go_m: np.ndarray, config:
 def draw_routes(
     space: FreeSpace, nodes_w: np.ndarray, edges: np.ndarray, config: DriveConfig, rng: np.random.Generator
 ) -> Routes:
-    """Draws the drives of a scene.
+    """Draw the drives of a scene along edges [E, 2] of `drivable` between nodes [N, 2].
 
     The first edge is uniform over all that are long enough; from its end a drive goes on by an edge that turns less
     than `turn_deg`, if there is one, uniform over those. A share of the nodes is held out: drives that begin there are
     for testing.
-
-    Args:
-        nodes_w: [N, 2] m.
-        edges: [E, 2] of `drivable`.
     """
     if not len(edges):
         raise SpaceError(f"no two of {len(nodes_w)} nodes are joined by a way to drive; use a larger edge_m or detour")
@@ -158,7 +151,7 @@ def draw_routes(
         way = [int(rng.choice(begins))]
         while len(way) < config.legs:
             onward = out_of[edges[way[-1], 1]]
-            turn = np.abs((heading[onward] - heading[way[-1]] + np.pi) % (2 * np.pi) - np.pi)
+            turn = np.abs(wrap_angle(heading[onward] - heading[way[-1]]))
             passed = {int(edges[way[0], 0]), *(int(edges[w, 1]) for w in way)}
             fresh = np.array([int(edges[e, 1]) not in passed for e in onward], bool)
             onward = onward[(turn < np.radians(config.turn_deg)) & fresh]
@@ -172,11 +165,11 @@ def draw_routes(
         off = np.radians(config.start_turn_deg) * rng.uniform(-1.0, 1.0)
         towards = nodes_w[visited[1]] - start[i]
         yaw[i] = np.arctan2(towards[1], towards[0]) + off
-    return Routes(nodes, legs, start, (yaw + np.pi) % (2 * np.pi) - np.pi, np.isin(nodes[:, 0], tests))
+    return Routes(nodes, legs, start, wrap_angle(yaw), np.isin(nodes[:, 0], tests))
 
 
 def _start(space: FreeSpace, node_w: np.ndarray, config: DriveConfig, rng: np.random.Generator) -> np.ndarray:
-    """[2] a place near a node: the first of some that is clear, else the clearest."""
+    """Draw a place [2] near a node: the first of some that is clear, else the clearest."""
     angle, share = rng.uniform(0, 2 * np.pi, CANDIDATES), np.sqrt(rng.uniform(0, 1, CANDIDATES))
     offset = config.start_off_m * share[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
     tried = np.concatenate([node_w + offset, node_w[None]])
@@ -186,11 +179,7 @@ def _start(space: FreeSpace, node_w: np.ndarray, config: DriveConfig, rng: np.ra
 
 
 def plan_drives(scenes: Sequence[Scene], config: DriveConfig) -> tuple[Tasks, np.ndarray, Terrain]:
-    """Decides on all drives.
-
-    Returns:
-        The n drives, scene by scene, [n] bool which of them are for testing, and what the expert knows of the scenes.
-    """
+    """Return n drives, scene by scene, which of them are for testing [n], and what the expert has of the scenes."""
     robot = get_robot(config.robot)
     spaces, fields, parts, tests = [], [], [], []
     for index, scene in enumerate(scenes):
@@ -232,7 +221,7 @@ def _terrain(spaces: Sequence[FreeSpace], fields: Sequence[np.ndarray]) -> Terra
 def simulate_drives(
     scene_folders: Sequence[Path], out: Path, config: DriveConfig, progress: Progress = lambda *_: None
 ) -> Drives:
-    """Drives all drives, or those that are missing."""
+    """Simulate all drives, or those that are missing."""
     scenes = load_scenes(scene_folders, config.engine)
     header = DRIVES.describe(config, [{"name": s.name, "digest": s.digest, "split": s.split} for s in scenes])
     with DRIVES.claimed(out, header):
@@ -259,7 +248,7 @@ def simulate_drives(
 
 
 def draw_drives(scene_folders: Sequence[Path], out: Path, progress: Progress = lambda *_: None) -> None:
-    """Draws what the robot saw on the kept drives, or what is missing of it."""
+    """Draw what the robot saw on the kept drives, or what is missing of it."""
     with alone_in(out):
         header, config = read_drives_header(out)
         drives, robot = load_drives(out), get_robot(config.robot)
@@ -305,7 +294,7 @@ def drive_images(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 
 def load_drives(folder: Path) -> Drives:
-    """All drives of a folder, kept or not."""
+    """Read all drives of a folder, kept or not."""
     folder = Path(folder)
     header, config = read_drives_header(folder)
     batches = numbered(folder, "batch", range(len(header["scenes"]) * config.drives), config.batch)
@@ -317,19 +306,17 @@ def load_drives(folder: Path) -> Drives:
 
 
 def _write_batch(path: Path, driven: dict[str, np.ndarray], count: int) -> None:
-    """Writes the first drives of a batch, without what came after their ends."""
+    """Write the first drives of a batch, without what came after their ends."""
     on = np.arange(driven["pose_w"].shape[1]) < driven["steps"][:count, None]
     rows = {name: values[:count] for name, values in driven.items()}
     write_arrays(path, **{name: row[on] if row.shape[:2] == on.shape else row for name, row in rows.items()})
 
 
 def summary(drives: Drives) -> dict[str, float]:
-    """Counts, success and contacts.
+    """Return counts, success and contacts.
 
-    Returns:
-        `drives`; `reached`, `touched` and `kept` as shares of them; `contact_s`: seconds in contact a drive;
-        `seconds`: mean duration of those that reached; `m_s`: mean speed; `turning`: share of their steps that turn by
-        an eighth of a radian a second or more.
+    `reached`, `touched` and `kept` are shares of the `drives`; `contact_s`: seconds in contact a drive; `seconds`: mean
+    duration of those that reached; `m_s`: mean speed; `turning`: share of steps that turn by 0.125 rad/s or more.
     """
     going = np.repeat(drives.kept, drives.steps)
     return {

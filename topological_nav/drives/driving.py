@@ -17,7 +17,7 @@ from topological_nav.drives.dataset import Drives, drive_images, load_drives, re
 from topological_nav.errors import ALONE, Host, RunError, Stopped
 from topological_nav.learn.learning import in_batches, initial
 from topological_nav.learn.runs import read_description, read_weights
-from topological_nav.learn.training import SAME, Trained, load_pair, need_task, seen_by
+from topological_nav.learn.training import SAME, Networks, Trained, camera_settings, load_networks, need_task
 from topological_nav.maps.sight import PassagePolicy, Sight
 
 Memory = tuple[jax.Array, jax.Array]
@@ -35,7 +35,7 @@ class SummedCell(nn.Module):
 
     @nn.compact
     def __call__(self, hidden: jax.Array, total: jax.Array, x: jax.Array) -> jax.Array:
-        """[B, H] memory, [B, H] sum and [B, D] input to the new memory [B, H]."""
+        """Map a memory [B, H], a sum [B, H] and an input [B, D] to the new memory [B, H]."""
         from_x = jnp.split(nn.Dense(3 * self.hidden, name="inputs")(x), 3, -1)
         from_total = jnp.split(nn.Dense(3 * self.hidden, name="memory")(total), 3, -1)
         reset, keep = (nn.sigmoid(a + b) for a, b in zip(from_x[:2], from_total[:2], strict=True))
@@ -44,7 +44,7 @@ class SummedCell(nn.Module):
 
 
 class Policy(nn.Module):
-    """One cell for each velocity; both read the sum of both memories."""
+    """Choose velocities by one cell for each; both read the sum of both memories."""
 
     hidden: int = 500
     projection: int = 0
@@ -52,20 +52,13 @@ class Policy(nn.Module):
     angular_classes: int = 5
 
     def setup(self) -> None:
-        """Makes the parts; flax calls it."""
+        """Build the parts; flax calls it."""
         self.project = nn.Dense(self.projection) if self.projection else None
         self.cells = [SummedCell(self.hidden), SummedCell(self.hidden)]
         self.heads = [nn.Dense(self.linear_classes), nn.Dense(self.angular_classes)]
 
     def __call__(self, memory: Memory, x: jax.Array) -> tuple[Memory, tuple[jax.Array, jax.Array]]:
-        """One control step.
-
-        Args:
-            x: [B, D] standardised embeddings.
-
-        Returns:
-            The memory after it, and logits of the linear [B, L] and the angular classes [B, A].
-        """
+        """Map standardised embeddings [B, D] to the next memory and logits of linear and angular classes."""
         if self.project is not None:
             x = nn.relu(self.project(x))
         total = memory[0] + memory[1]
@@ -73,24 +66,20 @@ class Policy(nn.Module):
         return new, tuple(head(h) for head, h in zip(self.heads, new, strict=True))  # type: ignore[return-value]
 
     def fresh(self, batch: int) -> Memory:
-        """The memory at the beginning of a run."""
+        """Return the memory at the start of a run."""
         return jnp.zeros((batch, self.hidden)), jnp.zeros((batch, self.hidden))
 
 
 class Forward(nn.Module):
-    """What the next embedding will be after an action: two layers that say how it changes."""
+    """Predict the next embedding after an action: two layers that say how it changes."""
 
     hidden: int = 512
 
     @nn.compact
     def __call__(self, u: jax.Array, x: jax.Array, action: jax.Array, deviation: jax.Array) -> jax.Array:
-        """[..., D].
+        """Map embeddings u [..., D], the same standardised as x, and actions [..., L + A] to the next embeddings.
 
-        Args:
-            u: [..., D] embeddings.
-            x: [..., D] the same, standardised.
-            action: [..., L + A] one-hot classes, or probabilities of them, linear then angular.
-            deviation: [D] unit of changes.
+        Actions are one-hot classes, or probabilities of them, linear then angular; `deviation` [D] is a change's unit.
         """
         y = jnp.concatenate([x, action], -1)
         for _ in range(2):
@@ -99,13 +88,13 @@ class Forward(nn.Module):
 
 
 def standardised(u: jax.Array, scale: dict[str, jax.Array]) -> jax.Array:
-    """Embeddings [..., D] about their `mean` [D], in units of their `deviation` [D]."""
+    """Return embeddings [..., D] about their `mean` [D], in units of their `deviation` [D]."""
     mean, deviation = (jnp.broadcast_to(scale[name], u.shape) for name in ("mean", "deviation"))
     return (u - mean) / deviation
 
 
 def unrolled(policy: Policy, params: Any, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Logits [B, T, L] and [B, T, A] of runs of standardised embeddings [B, T, D], each begun with a fresh memory."""
+    """Return logits [B, T, L] and [B, T, A] of runs of standardised embeddings [B, T, D], each from a fresh memory."""
 
     def step(memory, now):
         return policy.apply({"params": params}, memory, now)
@@ -115,7 +104,7 @@ def unrolled(policy: Policy, params: Any, x: jax.Array) -> tuple[jax.Array, jax.
 
 
 def mean_over(values: jax.Array, mask: jax.Array) -> jax.Array:
-    """[] mean of values where the mask is true, 0 where it nowhere is."""
+    """Return the mean of values where the mask is true, 0 where it nowhere is."""
     return jnp.where(mask, values, 0.0).sum() / jnp.maximum(mask.sum(), 1)
 
 
@@ -128,17 +117,11 @@ def policy_loss(
     lam: jax.Array | float,
     jointly: jax.Array | float = 1.0,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """alpha (CE_angular + CE_linear) + |u - f(u, a)|^2 + lambda |u - f(u, a_hat)|^2, means over steps.
+    """Return alpha (CE_angular + CE_linear) + |u - f(u, a)|^2 + lambda |u - f(u, a_hat)|^2 and its parts, means.
 
-    Args:
-        logits: [B, T, L] and [B, T, A] of the policy.
-        truth: `linear`, `angular` (the expert's classes), `valid` and `followed` of `imitation.Sequences`.
-        guesses: [B, T, D] each: f(u, a), from the expert's action a, and f(u, a_hat), from the policy's.
-        following: [B, T, D] u, the embedding of the next step.
-        jointly: 0 leaves the forward model's error alone.
-
-    Returns:
-        The loss, and its parts by name: ce_linear, ce_angular, forward, consistency.
+    The policy's logits are [B, T, L] and [B, T, A], `truth` fields of `imitation.Sequences`, `guesses` [B, T, D]
+    f(u, a) by the expert's action a and f(u, a_hat) by the policy's, `following` [B, T, D] u, the embedding of the next
+    step; `jointly` 0 leaves the forward model's error alone.
     """
     cross = [
         mean_over(optax.softmax_cross_entropy_with_integer_labels(one, truth[name]), truth["valid"])
@@ -150,7 +133,7 @@ def policy_loss(
 
 
 def fresh_params(policy: Policy, forward: Forward, width: int, seed: int) -> dict[str, Any]:
-    """First weights of policy and forward model for embeddings of `width` numbers; the latter predicts no change."""
+    """Return first weights of policy and forward model for embeddings of a `width`; the latter predicts no change."""
     key, u = jax.random.PRNGKey(0), jax.ShapeDtypeStruct((1, width), jnp.float32)
     action = jax.ShapeDtypeStruct((1, policy.linear_classes + policy.angular_classes), jnp.float32)
     shapes = {
@@ -169,28 +152,26 @@ _REPORT_EVERY = 10
 
 @dataclasses.dataclass(frozen=True)
 class Frames:
-    """Drives of a folder and the embeddings of their images."""
+    """Hold the drives of a folder and the embeddings of their images."""
 
     drives: Drives
     config: DriveConfig
     header: dict[str, Any]
     features: np.ndarray
     """[F or 2 F, D] f16 of all control steps, 0 where nothing was drawn; then the same of mirrored images."""
-    networks: tuple[Trained, Trained]
-    """Of rooms and of passages."""
-    runs: tuple[Path, Path]
+    networks: Networks
 
     @property
     def mirrored(self) -> bool:
-        """Whether there are mirrored ones."""
+        """Return whether there are mirrored ones."""
         return len(self.features) > len(self.drives.command)
 
 
 def embed_drives(folder: Path, localiser_run: Path, detector_run: Path, mirror: bool, host: Host = ALONE) -> Frames:
     """Embed the images of all kept drives."""
     header, config = read_drives_header(folder)
-    drives, networks = load_drives(folder), load_pair(localiser_run, detector_run)
-    mine, theirs = {**header["settings"], "fov_deg": header["fov_deg"]}, seen_by(networks[0])
+    drives, networks = load_drives(folder), load_networks(localiser_run, detector_run, classifies=True, same=SAME)
+    mine, theirs = {**header["settings"], "fov_deg": header["fov_deg"]}, camera_settings(networks.localiser)
     for name in SAME:
         if mine[name] != theirs[name]:
             raise RunError(
@@ -208,22 +189,22 @@ def embed_drives(folder: Path, localiser_run: Path, detector_run: Path, mirror: 
             features[at + side * count] = part[:, side]
         done += len(images)
         if i % _REPORT_EVERY == 0 or done == total:
-            host.tell(f"embedded {done:,} of {total:,} images")
+            host.show(f"embedded {done:,} of {total:,} images")
         if stop := host.signal():
             raise Stopped(stop)
     if features is None:
         raise RunError(f"{folder}: none of {len(drives)} drives was kept; drive more, or in other scenes")
-    return Frames(drives, config, header, features, networks, (Path(localiser_run), Path(detector_run)))
+    return Frames(drives, config, header, features, networks)
 
 
 def embedded(networks: Sequence[Trained], weights: Any, images: jax.Array) -> jax.Array:
-    """[N, D] embeddings of images [N, H, W, 3] by all networks, one network after the other."""
+    """Embed images [N, H, W, 3] by all networks, one after the other: [N, D]."""
     pairs = zip(networks, weights, strict=True)
     return jnp.concatenate([network.network.apply(w, images, method="embed") for network, w in pairs], -1)  # type: ignore[arg-type]
 
 
 def _embedder(networks: Sequence[Trained], mirror: bool) -> Callable[[jax.Array], jax.Array]:
-    """Compiled: images [N, H, W, 3] to [N, 1 or 2, D] f16, all networks' embeddings, then those of the mirrored."""
+    """Compile images [N, H, W, 3] to [N, 1 or 2, D] f16: all networks' embeddings, then those of the mirrored."""
 
     @jax.jit
     def sides(weights: Any, images: jax.Array) -> jax.Array:
@@ -234,27 +215,27 @@ def _embedder(networks: Sequence[Trained], mirror: bool) -> Callable[[jax.Array]
 
 
 class LocalPolicy(Protocol):
-    """Drives by images alone; what it remembers travels in a state that belongs to the caller."""
+    """Drive by images alone; what is remembered travels in a state that belongs to the caller."""
 
     def start(self, batch: int) -> Any:
-        """Hidden state of `batch` fresh runs."""
+        """Return the hidden state of `batch` fresh runs."""
         ...
 
     def act(self, state: Any, images: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
-        """images (B, H, W, 3) uint8 level, straight ahead -> new state, linear (B,) m/s, angular (B,) rad/s."""
+        """Map level images [B, H, W, 3] u8 straight ahead to the new state, linear [B] m/s and angular [B] rad/s."""
         ...
 
 
 class TrainedPolicy:
-    """A `LocalPolicy` that was learned: at each step the likeliest class of either velocity."""
+    """Drive by a `LocalPolicy` that was learned: at each step the likeliest class of either velocity."""
 
     def __init__(self, policy: Policy, variables: dict[str, Any], about: dict[str, Any], networks: Any):
-        """Takes what `load_policy` read; compiles at the first step of each batch size."""
+        """Take what `load_policy` read; compile at the first step of each batch size."""
         self.about: dict[str, Any] = about
         """Content of network.json."""
-        self._networks: tuple[Trained, Trained] = networks
+        self._networks: Networks = networks
         self._policy = policy
-        data = self._networks[0].about["data"]
+        data = self._networks.localiser.about["data"]
         self._shape = (data["height"], data["width"], 3)
         weights = {"policy": variables, "embedders": [n.variables for n in self._networks]}
         self._weights = jax.tree.map(jnp.asarray, weights)
@@ -291,10 +272,10 @@ def load_policy(
     need_task(about, "policy", f"{run}:")
     recorded = [run / network["run"] for network in about["networks"]]
     paths = [Path(given or there) for given, there in zip((localiser, detector), recorded, strict=True)]
-    networks = load_pair(paths[0], paths[1])
-    for path, network, learned in zip(paths, networks, about["networks"], strict=True):
+    networks = load_networks(*paths, classifies=True, same=SAME)
+    for network, learned in zip(networks, about["networks"], strict=True):
         if learned["digest"] not in (network.about["digest"], network.about.get("adapted_from")):
-            raise RunError(f"{path}: is not the network that {run} learned with; train the policy again")
+            raise RunError(f"{network.run}: is not the network that {run} learned with; train the policy again")
     policy = Policy(about["hidden"], about["projection"], len(about["linear_m_s"]), len(about["angular_rad_s"]))
     width = about["width"]
     template = {
@@ -304,13 +285,8 @@ def load_policy(
     return TrainedPolicy(policy, read_weights(run, template, about), about, networks)
 
 
-def local_policy(name: str, sight: Sight, config: NavigatorConfig, *seeing: tuple[Path, Trained]) -> LocalPolicy:
-    """What drives along edges.
-
-    Args:
-        seeing: the navigator's localiser and detector with their run folders; a trained policy sees through those of
-            them that are adapted.
-    """
+def local_policy(name: str, sight: Sight, config: NavigatorConfig, networks: Sequence[Trained] = ()) -> LocalPolicy:
+    """Return what drives along edges; a trained policy sees through those of the networks that are adapted."""
     if name == PASSAGE_POLICY:
         return PassagePolicy(sight, config.passable, config.clear_m)
-    return load_policy(name, *(run if "adapted_from" in network.about else None for run, network in seeing))
+    return load_policy(name, *(n.run if "adapted_from" in n.about else None for n in networks))

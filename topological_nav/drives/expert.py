@@ -1,4 +1,4 @@
-"""Maps, a scan and where to go in, velocities out: the expert that the local policy learns from.
+"""Command velocities by maps, a scan and where to go: the expert that the local policy learns from.
 
 Pure functions of one robot, for `jax.vmap`. A global path and a local planner in one, after the global dynamic window
 approach (Brock and Khatib 1999): each node of the graph has a field of the way that is left to it round walls and
@@ -45,7 +45,7 @@ _SLOW = 0.02
 
 @flax.struct.dataclass
 class Terrain:
-    """What the expert knows of S scenes and G nodes, padded alike."""
+    """Hold what the expert has of S scenes and G nodes, padded alike."""
 
     clearance_m: jax.Array
     """[S, rows, columns] f32 distance to the nearest obstacle; 0 where blocked."""
@@ -58,16 +58,12 @@ class Terrain:
 
 
 def way_field(space: FreeSpace, goals_w: np.ndarray, config: ExpertConfig, limit_m: float) -> np.ndarray:
-    """The way left to goals from everywhere, by Dijkstra's algorithm over the 32 moves of the environment's geodesic.
+    """Return the way left (m) to goals [G, 2] from everywhere, [G, rows, columns] f32, finite everywhere.
 
-    A metre along obstacles counts for up to 1 + `near_cost`. Cells that the robot's middle cannot be in take the value
-    of the nearest cell that it can be in and four times the distance there; so does what is farther than the limit.
-
-    Args:
-        goals_w: [G, 2] m; the nearest cell with room stands for each.
-
-    Returns:
-        [G, rows, columns] f32, m. Infinite nowhere: a goal without any room around it has a field of distances to it.
+    It is by Dijkstra's algorithm over the 32 moves of the environment's geodesic, from the cell with room that is
+    nearest to a goal; one without any room around it has a field of distances to it. A metre along obstacles counts for
+    up to 1 + `near_cost`. Cells that the robot's middle cannot be in take the value of the nearest cell that it can be
+    in and four times the distance there; so does what is farther than the limit.
     """
     room = np.maximum(space.clearance_m - config.radius_m, 0.0)
     free = space.clearance_m >= config.radius_m
@@ -90,7 +86,7 @@ def way_field(space: FreeSpace, goals_w: np.ndarray, config: ExpertConfig, limit
 
 
 def sample(grid: jax.Array, origin_w: jax.Array, resolution_m: jax.Array, xy_w: jax.Array) -> jax.Array:
-    """[...] bilinear values of a grid [rows, columns] of cell centres at points [..., 2]; outside, of its rim."""
+    """Interpolate [...] a grid [rows, columns] of cell centres at points [..., 2], outside of its rim."""
     rows, columns = grid.shape
     origin, last = (jnp.broadcast_to(x, xy_w.shape) for x in (origin_w, jnp.asarray([columns - 1.001, rows - 1.001])))
     u = jnp.clip((xy_w - origin) / resolution_m - 0.5, 0.0, last)
@@ -107,21 +103,17 @@ def window(velocity: jax.Array, config: ExpertConfig) -> tuple[jax.Array, jax.Ar
     Velocities of the lattice that are out of reach are clipped to the nearest that is in reach. `velocity` [2] is the
     last command (m/s, rad/s).
     """
-
-    def around(now, change, lattice):
-        return jnp.clip(lattice, now - change, now + change)
-
     most = config.angular_rad_s
     v = jnp.linspace(0.0, config.linear_m_s, config.linear_samples)
     w = jnp.linspace(-most, most, config.angular_samples)
-    v = around(velocity[0], config.acceleration_m_s2 * CONTROL_S, v)
-    w = around(velocity[1], config.angular_acceleration_rad_s2 * CONTROL_S, w)
+    changes = config.acceleration_m_s2 * CONTROL_S, config.angular_acceleration_rad_s2 * CONTROL_S
+    v, w = (jnp.clip(x, now - by, now + by) for x, now, by in zip((v, w), velocity, changes, strict=True))
     pairs = jnp.stack(jnp.meshgrid(v, w, indexing="ij"), -1).reshape(-1, 2)
     return pairs[:, 0], pairs[:, 1]
 
 
 def arcs(linear: jax.Array, angular: jax.Array, times_s: jax.Array) -> jax.Array:
-    """[C, K, 3] poses x, y (m) and yaw in the frame where constant velocities [C] begin, after times [K]."""
+    """Return poses [C, K, 3] in the frame where constant velocities [C] start, after times [K]."""
     turn = angular[:, None] * times_s[None]
     length = linear[:, None] * times_s[None]
     small = jnp.abs(turn) < 1e-4
@@ -132,7 +124,7 @@ def arcs(linear: jax.Array, angular: jax.Array, times_s: jax.Array) -> jax.Array
 
 
 def scan_gap(poses_b: jax.Array, points_b: jax.Array, half_m: jax.Array) -> jax.Array:
-    """[...] m from a rectangle at poses [..., 3] to the nearest of points [R, 2]; 0 inside, infinite without points."""
+    """Return gaps [...] (m) from a rectangle at poses [..., 3] to points [R, 2]; 0 inside, infinite without points."""
     cos, sin = jnp.cos(poses_b[..., 2])[..., None], jnp.sin(poses_b[..., 2])[..., None]
     points_b = jnp.expand_dims(points_b, range(poses_b.ndim - 1))
     met = jnp.isfinite(points_b).all(-1)
@@ -144,16 +136,17 @@ def scan_gap(poses_b: jax.Array, points_b: jax.Array, half_m: jax.Array) -> jax.
 
 
 def outline(half_m: jax.Array) -> jax.Array:
-    """[8, 2] corners and middles of the sides of a rectangle about the origin."""
+    """Return the corners and the middles of the sides [8, 2] of a rectangle about the origin."""
     signs = jnp.asarray([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y], jnp.float32)
     return signs * half_m[None]
 
 
 def moved(pose: jax.Array, by: jax.Array) -> jax.Array:
-    """[..., 3] poses given in the frame of a pose [3], in that pose's own frame of reference."""
-    cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
+    """Move poses [..., 3], or points [..., 2], from the frame of a pose [..., 3] to the frame of the pose."""
+    cos, sin = jnp.cos(pose[..., 2]), jnp.sin(pose[..., 2])
     x, y = by[..., 0], by[..., 1]
-    return jnp.stack([pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y, pose[2] + by[..., 2]], -1)
+    xy = [pose[..., 0] + cos * x - sin * y, pose[..., 1] + sin * x + cos * y]
+    return jnp.stack([*xy, pose[..., 2] + by[..., 2]] if by.shape[-1] == 3 else xy, -1)
 
 
 def command(
@@ -166,18 +159,10 @@ def command(
     half_m: jax.Array,
     config: ExpertConfig,
 ) -> tuple[jax.Array, jax.Array]:
-    """The velocities to command now.
+    """Return the velocities [2] (m/s, rad/s) to command now, and the gap [] (m) that they keep until the horizon.
 
-    Args:
-        scene: [] i32.
-        goal: [] i32 node to drive to.
-        pose_w: [3] x, y (m), yaw.
-        velocity: [2] commanded last, m/s and rad/s.
-        points_b: [R, 2] where the beams end, robot frame; infinite where nothing is met.
-        half_m: [2] half the footprint's length and width.
-
-    Returns:
-        [2] linear (m/s) and angular (rad/s), and the gap [] (m) that they keep until the horizon.
+    `velocity` [2] was commanded last; beams end at `points_b` [R, 2], infinite where they meet nothing; `half_m` [2] is
+    half the footprint's length and width.
     """
     linear, angular = window(velocity, config)
     times = config.horizon_s * (jnp.arange(config.horizon_steps) + 1.0) / config.horizon_steps
@@ -186,11 +171,8 @@ def command(
     plan = {"origin_w": terrain.origin_w[scene], "resolution_m": terrain.resolution_m[scene]}
     to_go = functools.partial(sample, terrain.to_go_m[goal], **plan)
     scanned = scan_gap(ways_b, points_b, half_m)
-    rim = outline(half_m)[None, None]
-    cos, sin = jnp.cos(ways_w[..., 2])[..., None], jnp.sin(ways_w[..., 2])[..., None]
-    x = ways_w[..., :1] + cos * rim[..., 0] - sin * rim[..., 1]
-    y = ways_w[..., 1:2] + sin * rim[..., 0] + cos * rim[..., 1]
-    mapped = sample(terrain.clearance_m[scene], xy_w=jnp.stack([x, y], -1), **plan).min(-1)
+    rim = moved(ways_w[..., None, :], outline(half_m)[None, None])
+    mapped = sample(terrain.clearance_m[scene], xy_w=rim, **plan).min(-1)
     gap = jnp.minimum(scanned, mapped).min(-1)
     left, end = _left(to_go, ways_w, linear, config)
     heading = _fall(to_go, end[:, :2])
@@ -230,11 +212,9 @@ def _fall(to_go: Callable[..., jax.Array], xy_w: jax.Array) -> jax.Array:
 
 
 def scan_points(ranges_m: jax.Array, config: ExpertConfig, lidar_xy_b: tuple[float, float]) -> jax.Array:
-    """[R, 2] ends of beams in the robot's frame, infinite for those that reach `lidar_range_m`.
+    """Return the ends [R, 2] of beams in the robot's frame, infinite for those that reach `lidar_range_m`.
 
-    Args:
-        ranges_m: [R], from the right to the left as `interactive_nav.sensing.sensors` orders them.
-        lidar_xy_b: where the scanner sits, m.
+    Ranges [R] go from the right to the left, from a scanner at `lidar_xy_b` (m).
     """
     step = config.lidar_fov_deg / config.lidar_rays
     angle = jnp.radians(-0.5 * config.lidar_fov_deg + jnp.arange(config.lidar_rays) * step)
@@ -244,7 +224,7 @@ def scan_points(ranges_m: jax.Array, config: ExpertConfig, lidar_xy_b: tuple[flo
 
 @flax.struct.dataclass
 class Tasks(Rows):
-    """Drives of one batch over several scenes; B of them."""
+    """Hold a batch of B drives over several scenes."""
 
     scene: np.ndarray
     """[B] i32."""
@@ -310,12 +290,8 @@ class Expert:
         return action, {**memory, "command": velocity, "pose_w": pose}, over
 
 
-def _remembered(name: str, at: Any) -> Recorder:
-    return Recorder(lambda state, action: state.info["policy"][name], at)
-
-
-RECORDERS = {name: _remembered(name, "step") for name in ("pose_w", "command", "gap_m")}
-RECORDERS |= {name: _remembered(name, "end") for name in ("reached", "broken")}
+_REMEMBERED: Any = {"pose_w": "step", "command": "step", "gap_m": "step", "reached": "end", "broken": "end"}
+RECORDERS = {n: Recorder(lambda state, _, n=n: state.info["policy"][n], at) for n, at in _REMEMBERED.items()}
 RECORDERS |= {"touching": Recorder(lambda state, action: state.info["nav"].memory["touching"], "step")}
 
 

@@ -1,4 +1,4 @@
-"""Drives and two trained networks in, a run folder with a local policy out; or one for every alpha and lambda.
+"""Train a local policy on drives seen by two networks, into a run folder; or one for every alpha and lambda.
 
 RUN/config.yaml      settings; a run that is started again with the same ones goes on
     versions.json, metrics.jsonl, checkpoint.msgpack, results.json, curves.png   as in `training`
@@ -40,7 +40,7 @@ LEAST_SPREAD = 0.3
 
 @dataclasses.dataclass(frozen=True)
 class Sequences(Rows):
-    """W windows of T control steps."""
+    """Hold W windows of T control steps."""
 
     rows: np.ndarray
     """[W, T + 1] i32 indices of the steps' frames; behind a drive's end its last one."""
@@ -55,7 +55,7 @@ class Sequences(Rows):
 
 
 def class_values(config: PolicyConfig, linear_m_s: float, angular_rad_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """The velocity that each class stands for: linear [L] m/s and angular [A] rad/s, in rising order."""
+    """Return the velocity that each class stands for: linear [L] m/s and angular [A] rad/s, in rising order."""
     return (
         np.linspace(0.0, linear_m_s, config.linear_classes),
         np.linspace(-angular_rad_s, angular_rad_s, config.angular_classes),
@@ -63,12 +63,12 @@ def class_values(config: PolicyConfig, linear_m_s: float, angular_rad_s: float) 
 
 
 def classes(values: np.ndarray, of: np.ndarray) -> np.ndarray:
-    """i32 index of the nearest of rising values [C]; half way between two, the lower."""
+    """Return the index (i32) of the nearest of rising values [C]; half way between two, the lower."""
     return np.searchsorted((of[1:] + of[:-1]) / 2, values - 1e-6).astype(np.int32)
 
 
 def window_starts(steps: int, window: int, overlap: int) -> np.ndarray:
-    """Where windows begin in a drive: from its first step on, each sharing at most `overlap` steps with the next.
+    """Return where windows start in a drive: from its first step, each sharing at most `overlap` steps with the next.
 
     A drive that is shorter than a window has one, which its end cuts short; at the end of a longer one, what is left
     over is left out.
@@ -80,11 +80,7 @@ def window_starts(steps: int, window: int, overlap: int) -> np.ndarray:
 def make_sequences(
     drives: Drives, which: np.ndarray, config: PolicyConfig, values: tuple[np.ndarray, np.ndarray], overlap_s: float
 ) -> Sequences:
-    """All windows of some drives.
-
-    Args:
-        which: [k] indices of drives.
-    """
+    """Return all windows of some drives, by their indices [k]."""
     window, overlap = config.steps, int(np.floor(overlap_s / CONTROL_S + 1e-9))
     rows, ends = [], []
     for k in which:
@@ -105,20 +101,20 @@ def make_sequences(
 
 
 def turning_share(sequences: Sequences, config: PolicyConfig) -> np.ndarray:
-    """[W] share of a window's steps whose angular class is not straight ahead."""
+    """Return the share [W] of a window's steps whose angular class is not straight ahead."""
     turns = (sequences.angular != config.angular_classes // 2) & sequences.valid
     return turns.sum(1) / np.maximum(sequences.valid.sum(1), 1)
 
 
 def thinned(sequences: Sequences, config: PolicyConfig) -> Sequences:
-    """The windows without some of the nearly straight ones, which stay with probability `straight_kept`."""
+    """Return the windows without some of the nearly straight ones, which stay with probability `straight_kept`."""
     straight = turning_share(sequences, config) < config.straight_share
     rng = np.random.default_rng([config.seed, 7])
     return sequences.take(np.flatnonzero(~straight | (rng.random(len(sequences)) < config.straight_kept)))
 
 
 def mirrored(sequences: Sequences, frames: int, config: PolicyConfig) -> Sequences:
-    """The same windows in a mirror: its frames follow `frames` others, and left is right."""
+    """Return the same windows in a mirror: its frames follow `frames` others, and left is right."""
     return dataclasses.replace(
         sequences, rows=sequences.rows + frames, angular=config.angular_classes - 1 - sequences.angular
     )
@@ -129,18 +125,18 @@ def train_policy(frames: Frames, out: Path, config: PolicyConfig, host: Host = A
     if config.mirror and not frames.mirrored:
         raise RunError("mirror is set, but mirrored images were not embedded; embed them too or set mirror=false")
     values = class_values(config, frames.config.linear_m_s, frames.config.angular_rad_s)
-    split = _split(frames.drives, config, values)
+    every, learned, held_out = _split(frames.drives, config, values)
     digests = [network.about["digest"] for network in frames.networks]
     with claimed(out, {"task": "policy", "dataset": frames.header, "networks": digests, **to_dict(config)}):
         policy = Policy(config.hidden, config.projection, config.linear_classes, config.angular_classes)
         forward = Forward(config.forward_hidden)
         params = fresh_params(policy, forward, frames.features.shape[1], config.seed)
-        scale = _scale(frames.features[np.unique(split.learned.rows)])
+        scale = _scale(frames.features[np.unique(learned.rows)])
         learner = Learner(params, scale, optax.adam(config.learning_rate).init(params))
         alone = math.ceil(config.alone * config.epochs - 1e-9)
         weights = {"alpha": jnp.float32(config.alpha), "lam": jnp.float32(config.lam)}
-        shown, truth = jnp.asarray(frames.features), jax.tree.map(jnp.asarray, dataclasses.asdict(split.learned))
-        epoch = policy_epoch(policy, forward, config.learning_rate, config.batch, len(split.learned))  # type: ignore[arg-type]
+        shown, truth = jnp.asarray(frames.features), jax.tree.map(jnp.asarray, dataclasses.asdict(learned))
+        epoch = policy_epoch(policy, forward, config.learning_rate, config.batch, len(learned))  # type: ignore[arg-type]
 
         def one(learner: Learner, number: int, key: jax.Array):
             return epoch(learner, shown, {**truth, **weights, "jointly": jnp.float32(number >= alone)}, key)
@@ -154,27 +150,17 @@ def train_policy(frames: Frames, out: Path, config: PolicyConfig, host: Host = A
             "alpha": config.alpha,
             "lambda": config.lam,
             "parameters": about["parameters"],
-            "sequences": len(split.learned),
-            "nearly_straight": float((turning_share(split.every, config) < config.straight_share).mean()),
+            "sequences": len(learned),
+            "nearly_straight": float((turning_share(every, config) < config.straight_share).mean()),
             "classes": {"linear": about["linear_m_s"], "angular": about["angular_rad_s"]},
         }
-        if len(split.held_out):
-            results["test"] = _scores(frames.features, learner, policy, forward, split.held_out, config)
+        if len(held_out):
+            results["test"] = _scores(frames.features, learner, policy, forward, held_out, config)
         return write_results(out, results)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Split:
-    """Sequences of drives."""
-
-    every: Sequences
-    """Of those to learn from."""
-    learned: Sequences
-    """Of them those that are learned from: thinned, and mirrored where set."""
-    held_out: Sequences
-
-
-def _split(drives: Drives, config: PolicyConfig, values: tuple[np.ndarray, np.ndarray]) -> _Split:
+def _split(drives: Drives, config: PolicyConfig, values: tuple[np.ndarray, np.ndarray]):
+    """Return the sequences of drives to learn from, the same thinned and mirrored where set, and held-out ones."""
     every = make_sequences(drives, np.flatnonzero(drives.kept & ~drives.test), config, values, config.overlap_s)
     held_out = make_sequences(drives, np.flatnonzero(drives.kept & drives.test), config, values, 0.0)
     learned = thinned(every, config)
@@ -182,11 +168,11 @@ def _split(drives: Drives, config: PolicyConfig, values: tuple[np.ndarray, np.nd
         raise RunError(f"no sequence to learn from in {len(drives)} drives; drive more or set straight_kept=1")
     if config.mirror:
         learned = Sequences.joined([learned, mirrored(learned, len(drives.command), config)])
-    return _Split(every, learned, held_out)
+    return every, learned, held_out
 
 
 def _scale(features: np.ndarray) -> dict[str, jax.Array]:
-    """How features [F, D] are scaled: those that hardly vary here must not become large where they do."""
+    """Return how features [F, D] are scaled: those that hardly vary here must not become large where they do."""
     used = features.astype(np.float32)
     spread = used.std(0)
     deviation = np.maximum(spread, LEAST_SPREAD * spread.mean() + 1e-6)
@@ -194,7 +180,7 @@ def _scale(features: np.ndarray) -> dict[str, jax.Array]:
 
 
 def _applied(policy: Policy, forward: Forward, params: Any, scale: Any, u: jax.Array):
-    """Logits of runs of embeddings [B, T + 1, D], and what makes of actions [B, T, classes] the next embeddings."""
+    """Return logits of runs of embeddings [B, T + 1, D], and a function of actions [B, T, classes] to the next ones."""
     x = standardised(u, scale)
 
     def next_after(action: list[jax.Array]) -> Any:
@@ -210,7 +196,7 @@ def _one_hot(policy: Policy, linear: jax.Array, angular: jax.Array) -> list[jax.
 
 @functools.cache
 def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: int, count: int) -> Epoch:
-    """An epoch over `count` sequences; the last, incomplete batch is left out. See `learning.compiled_epoch`.
+    """Build an epoch over `count` sequences; the last, incomplete batch is left out. See `learning.compiled_epoch`.
 
     Labels: the fields of `Sequences`, and numbers `alpha`, `lam` and `jointly` as `policy_loss` has them: one program
     serves a whole grid.
@@ -250,8 +236,8 @@ def _about(
         "linear_m_s": values[0].tolist(),
         "angular_rad_s": values[1].tolist(),
         "networks": [
-            {"run": os.path.relpath(run.resolve(), out.resolve()), "digest": network.about["digest"]}
-            for run, network in zip(frames.runs, frames.networks, strict=True)
+            {"run": os.path.relpath(network.run.resolve(), out.resolve()), "digest": network.about["digest"]}
+            for network in frames.networks
         ],
         "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params["policy"]))),
     }
@@ -269,7 +255,7 @@ def _judged(policy: Policy, forward: Forward, params: Any, scale: Any, u: jax.Ar
 def _scores(
     features: np.ndarray, learner: Learner, policy: Policy, forward: Forward, held_out: Sequences, config: PolicyConfig
 ) -> dict[str, Any]:
-    """How the policy's commands on held-out drives compare with the expert's, and the forward model with no change."""
+    """Compare the policy's commands on held-out drives with the expert's, and the forward model with no change."""
     columns = []
     for first in range(0, len(held_out), config.batch):
         rows = np.minimum(np.arange(first, first + config.batch), len(held_out) - 1)
@@ -302,7 +288,7 @@ def train_grid(frames: Frames, out: Path, config: PolicyConfig, host: Host = ALO
     rows = []
     for alpha, lam in GRID:
         one = dataclasses.replace(config, alpha=alpha, lam=lam)
-        host.tell(f"alpha {alpha:g}, lambda {lam:g}: {len(rows) + 1} of {len(GRID)}")
+        host.show(f"alpha {alpha:g}, lambda {lam:g}: {len(rows) + 1} of {len(GRID)}")
         rows.append(train_policy(frames, out / f"alpha-{alpha:g}-lambda-{lam:g}", one, host))
     write_text(out / "grid.json", json.dumps(rows, indent=1) + "\n")
     write_text(out / "grid.md", grid_table(rows))
@@ -310,7 +296,7 @@ def train_grid(frames: Frames, out: Path, config: PolicyConfig, host: Host = ALO
 
 
 def grid_table(rows: list[dict[str, Any]]) -> str:
-    """Markdown: a row for every alpha and lambda."""
+    """Return a Markdown table with a row for every alpha and lambda."""
     lines = []
     for row in rows:
         cells = [f"{row['alpha']:g}", f"{row['lambda']:g}"]

@@ -174,7 +174,7 @@ class ContestScene:
         """Return networks, or the truth."""
         if self.networks is None:
             return TrueSight(graph, self.space)
-        return NetworkSight(graph, self.networks.localiser, self.networks.detector, self.contest.config.match)
+        return NetworkSight(graph, self.networks, self.contest.config.match)
 
     def navigator(self, contender: str) -> Navigator:
         """Return the navigator of the dense or the sparse map."""
@@ -227,8 +227,7 @@ def local_policy(contest: Contest, sight: Sight, networks: Networks | None) -> L
     """Return what drives along edges; a trained policy sees through adapted networks where the navigator does."""
     if contest.truth and contest.policy != PASSAGE_POLICY:
         raise ConfigError(f"--policy {contest.policy} looks at images, --truth has none; leave one of them out")
-    seeing = [(contest.localiser, networks.localiser), (contest.detector, networks.detector)] if networks else []
-    return driving.local_policy(contest.policy, sight, contest.config, *seeing)
+    return driving.local_policy(contest.policy, sight, contest.config, networks or ())
 
 
 def _digest_of(policy: str) -> str:

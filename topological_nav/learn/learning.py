@@ -17,6 +17,7 @@ import optax
 
 from topological_nav.errors import RunError
 from topological_nav.learn.networks import Contrast, Network, augmented, vicreg_loss
+from topological_nav.scenes.rendering import batched
 
 EVALUATED, DEVICE_EVALUATED = (8, 64), (16, 64, 256)
 """Images a call where nothing is learned, on a CPU and on an accelerator: each call takes the least that serves."""
@@ -157,6 +158,11 @@ def over(epoch: Epoch, images: Any, labels: Any) -> Callable[[Learner, int, jax.
     return lambda learner, _, key: epoch(learner, x, y, key)
 
 
+def phase_key(seed: int, phase: int) -> jax.Array:
+    """Return the key of all epochs of a phase of a run."""
+    return jax.random.fold_in(jax.random.PRNGKey(seed), phase)
+
+
 def keyed_batches(batch: int) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
     """Return the steps of an epoch over images in random order: rows of a batch, and a key."""
 
@@ -207,19 +213,11 @@ def compiled_epoch(steps: Callable[..., Any], update: Callable[..., Any]) -> Epo
 
 
 def in_batches(function: Callable[[jax.Array], jax.Array], images: np.ndarray) -> np.ndarray:
-    """Return a compiled function's rows of images [N, H, W, 3], a fixed number at a time; fewer are padded."""
+    """Return a compiled function's rows of images [N, H, W, 3]; see `rendering.batched`."""
     sizes = EVALUATED if jax.default_backend() == "cpu" else DEVICE_EVALUATED
-    rows, waiting, first = [], None, 0
-    while first < len(images) or waiting is None:
-        size = next((n for n in sizes if n >= len(images) - first), sizes[-1])
-        part = images[first : first + size]
-        padded = np.concatenate([part, np.zeros((size - len(part), *part.shape[1:]), part.dtype)])
-        call = function(jnp.asarray(padded)), len(part)
-        if waiting is not None:  # copied while an accelerator works on the next
-            rows.append(np.asarray(waiting[0]))
-        waiting, first = call, first + size
-    rows.append(np.asarray(waiting[0])[: waiting[1]])  # cut here: on a device each length would be compiled
-    return np.concatenate(rows)
+    if not len(images):  # the shape of a row takes a call
+        return np.asarray(function(jnp.zeros((sizes[0], *images.shape[1:]), images.dtype)))[:0]
+    return batched(lambda part: function(jnp.asarray(part)), (images,), sizes)
 
 
 def padded_size(count: int) -> int:

@@ -82,7 +82,7 @@ def run_epochs(
         append_text(out / METRICS, json.dumps({**line, "seconds": round(now - started, 3)}) + "\n")
         left = (now - began) / (number + 1 - first) * (epochs - number - 1)
         scores = "  ".join(f"{k} {line[k]:.3f}" for k in means)
-        host.tell(f"{phase}: epoch {number + 1} of {epochs}  {scores}  {now - started:.1f} s  {left:.0f} s left")
+        host.show(f"{phase}: epoch {number + 1} of {epochs}  {scores}  {now - started:.1f} s  {left:.0f} s left")
         stop = host.signal()
         if number + 1 == epochs or stop or now - saved_at > SAVE_EVERY_S:
             state = {"phase": phase, "epoch": number + 1, "learner": flax.serialization.to_state_dict(learner)}

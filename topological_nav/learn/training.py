@@ -13,7 +13,7 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -23,8 +23,7 @@ from sklearn.metrics import confusion_matrix, f1_score
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import readable
 from topological_nav.config import PITCHES, DataConfig, NetworkTrainConfig
-from topological_nav.data.dataset import RoomImages, load_passages, load_rooms, read_header
-from topological_nav.data.passages import logits_at
+from topological_nav.data.dataset import RoomImages, load_passages, load_rooms, logits_at, read_header
 from topological_nav.errors import ALONE, Host, RunError
 from topological_nav.learn.learning import (
     Learner,
@@ -33,6 +32,7 @@ from topological_nav.learn.learning import (
     make_learner,
     over,
     paired_epoch,
+    phase_key,
     variable_shapes,
     with_backbone,
 )
@@ -61,6 +61,8 @@ class Trained:
     variables: dict[str, Any]
     about: dict[str, Any]
     """Content of network.json."""
+    run: Path = Path()
+    """Where it was read."""
 
     @property
     def stored(self) -> str:
@@ -132,7 +134,7 @@ def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host:
             learner = _started_from(learner, Path(config.init))
         epoch = labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment, work.scored)
         one = over(epoch, work.images, work.labels)
-        learner = run_epochs(out, "labels", learner, one, config.epochs, _key(config, 2), host)
+        learner = run_epochs(out, "labels", learner, one, config.epochs, phase_key(config.seed, 2), host)
         about = {
             "task": task,
             "backbone": config.network,
@@ -148,10 +150,6 @@ def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host:
         return write_results(out, _scores(save_trained(out, Trained(network, learner.variables, about)), work))
 
 
-def _key(config: NetworkTrainConfig, phase: int) -> jax.Array:
-    return jax.random.fold_in(jax.random.PRNGKey(config.seed), phase)
-
-
 def _learned_without_labels(
     learner: Learner, rooms: RoomImages, out: Path, config: NetworkTrainConfig, host: Host
 ) -> Learner:
@@ -163,7 +161,7 @@ def _learned_without_labels(
     contrast, tx = Contrast(config.network, config.width), optax.adam(config.selfsup_learning_rate)
     epoch = over(paired_epoch(contrast, tx, config.selfsup_batch), places, np.zeros(0, np.int32))
     paired = make_learner(contrast, places.shape[2:4], tx, config.seed)
-    paired = run_epochs(out, "pairs", paired, epoch, config.selfsup_epochs, _key(config, 1), host)
+    paired = run_epochs(out, "pairs", paired, epoch, config.selfsup_epochs, phase_key(config.seed, 1), host)
     return with_backbone(learner, paired.variables)
 
 
@@ -186,7 +184,7 @@ def load_trained(run: Path) -> Trained:
     with readable(run / DESCRIPTION, RunError, "train again"):
         network = Network(about["task"], about["backbone"], about["width"], about["hidden"], about["outputs"])
         template = variable_shapes(network, (about["data"]["height"], about["data"]["width"]))
-    return Trained(network, read_weights(run, template, about), about)
+    return Trained(network, read_weights(run, template, about), about, run)
 
 
 def _work(task: str, dataset: Path, config: NetworkTrainConfig) -> _Work:
@@ -290,7 +288,7 @@ def _started_from(learner: Learner, run: Path) -> Learner:
         ) from None
 
 
-def seen_by(network: Trained) -> dict[str, Any]:
+def camera_settings(network: Trained) -> dict[str, Any]:
     """Return the settings of the images that a network learned from, the lens as it was."""
     return {**network.about["data"], "fov_deg": network.about["fov_deg"]}
 
@@ -301,47 +299,39 @@ def need_task(about: dict[str, Any], task: str, who: str) -> None:
         raise RunError(f"{who} was trained for '{about['task']}', expected a run of 'train {task}'")
 
 
-def load_pair(localiser_run: Path, detector_run: Path, same: Sequence[str] = SAME) -> tuple[Trained, Trained]:
-    """Load a room classifier and a passage detector of finished runs."""
-    networks = load_trained(localiser_run), load_trained(detector_run)
-    for run, network, task in zip((localiser_run, detector_run), networks, ("rooms", "passages"), strict=True):
-        need_task(network.about, task, f"{run}:")
-    _need_one_camera(*networks, same)
-    return networks
-
-
-@dataclasses.dataclass(frozen=True)
-class Networks:
+class Networks(NamedTuple):
     """Group what a navigator sees by."""
 
     localiser: Trained
     detector: Trained
-    camera: DataConfig
+
+    @property
+    def camera(self) -> DataConfig:
+        """Return the settings of the camera that both networks learned from."""
+        return overlay(DataConfig(), camera_settings(self.localiser), "network.json")
 
     @property
     def digests(self) -> dict[str, str]:
         """Return the digests of the weights, as a map names those that it was built with."""
-        return {"localiser": self.localiser.about["digest"], "detector": self.detector.about["digest"]}
+        return {name: network.about["digest"] for name, network in zip(self._fields, self, strict=True)}
 
 
-def load_networks(localiser: Path, detector: Path) -> Networks:
-    """Load the networks of two finished runs; the first may be of either task, as any embedding localises."""
-    pair = load_trained(localiser), load_trained(detector)
-    return Networks(*pair, camera_of(*pair))
+def load_networks(
+    localiser: Path, detector: Path, classifies: bool = False, same: Sequence[str] = (*SAME, "headings")
+) -> Networks:
+    """Load the networks of two finished runs that learned from one camera, by the settings that must be the `same`.
 
-
-def camera_of(localiser: Trained, detector: Trained) -> DataConfig:
-    """Return the settings of the camera that both networks learned from."""
-    need_task(detector.about, "passages", "the detector")
-    _need_one_camera(localiser, detector, (*SAME, "headings"))
-    return overlay(DataConfig(), seen_by(localiser), "network.json")
-
-
-def _need_one_camera(localiser: Trained, detector: Trained, same: Sequence[str]) -> None:
-    first, second = seen_by(localiser), seen_by(detector)
+    Any embedding localises; where the localiser `classifies` rooms, it must have been trained for that.
+    """
+    networks = Networks(load_trained(localiser), load_trained(detector))
+    if classifies:
+        need_task(networks.localiser.about, "rooms", f"{localiser}:")
+    need_task(networks.detector.about, "passages", f"{detector}:" if classifies else "the detector")
+    first, second = map(camera_settings, networks)
     for name in same:
         if first[name] != second[name]:
             raise RunError(
                 f"the localiser learned from images with {name} = {first[name]!r}, the detector {second[name]!r}; "
                 "train both on one dataset"
             )
+    return networks

@@ -1,4 +1,4 @@
-"""A scene and two trained networks in, its topological map out: nodes placed, images drawn, edges judged."""
+"""Build a scene's topological map by two trained networks: place nodes, draw images, judge edges."""
 
 import contextlib
 import dataclasses
@@ -24,8 +24,7 @@ from topological_nav.errors import Progress, SpaceError
 from topological_nav.learn.networks import nearest_turn
 from topological_nav.learn.runs import DESCRIPTION
 from topological_nav.learn.training import Networks, Trained, load_networks
-from topological_nav.maps.graph import TopologicalMap, assemble, lengths
-from topological_nav.maps.nodes import place_nodes
+from topological_nav.maps.graph import TopologicalMap, assemble, lengths, place_nodes
 from topological_nav.maps.sight import NetworkSight, Sight, place_distances
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
 from topological_nav.scenes.rooms import Rooms, scene_rooms
@@ -57,7 +56,7 @@ def build_map(
     progress: Progress = lambda *_: None,
     parts: Path | None = None,
 ) -> Built:
-    """Builds a scene's map.
+    """Build a scene's map.
 
     Args:
         scene_folder: the scene.
@@ -68,7 +67,6 @@ def build_map(
         parts: folder that drawn images are kept in, so that a map that was stopped goes on; None: they are not.
     """
     networks = load_networks(localiser_run, detector_run)
-    localiser = networks.localiser
     data = drawn_for(networks.camera, config.supersample)
     scene, robot = load_scene(scene_folder), get_robot(data.robot)
     space = free_space(scene, robot.height_m)
@@ -94,7 +92,7 @@ def build_map(
         places = space.sample(np.random.default_rng([data.seed, 13]), config.check, config.clearance_m)
         looked = pictures.draw_around(places, around, "check")
         for match in ("aligned", "nearest"):
-            sight = NetworkSight(graph, localiser, networks.detector, match)
+            sight = NetworkSight(graph, networks, match)
             scores |= localisation_check(sight, graph, looked, around, places)
     return dataclasses.replace(built, scores=scores)
 
@@ -137,7 +135,7 @@ def judged_map(
 def localisation_check(
     sight: Sight, graph: TopologicalMap, images: np.ndarray, heading_rad: np.ndarray, xy_w: np.ndarray
 ) -> dict[str, str]:
-    """How well a map localises, in words, by all images of a place and by its first alone."""
+    """Say how well a map localises, by all images of a place and by its first alone."""
     each, summed = place_distances(sight, images, heading_rad)
     away, said = np.linalg.norm(xy_w[:, None] - graph.xy_w, axis=-1), {}
     for what, evidence in ((f"{len(heading_rad)} images", summed), ("1 image", each[:, 0])):
@@ -151,7 +149,7 @@ def localisation_check(
 
 
 def true_map(scene: Scene, space: FreeSpace, rooms: Rooms, config: MapConfig, data: DataConfig) -> TopologicalMap:
-    """The map that perfect networks would make: ways that are free on the plan have p = 1, others 0.
+    """Build the map that perfect networks would: ways that are free on the plan have p = 1, others 0.
 
     It has no embeddings: only `sight.TrueSight` can localise on it.
     """
@@ -179,15 +177,15 @@ def drawn_for(data: DataConfig, supersample: int | None) -> DataConfig:
 
 
 def renderer_of(scene: Scene, data: DataConfig, small: Sequence[SmallObject] = ()) -> SceneRenderer:
-    """What draws a scene, and small objects in it, as a dataset's images were drawn."""
+    """Return what draws a scene, and small objects in it, as a dataset's images were drawn."""
     return SceneRenderer(scene, lens_of(data, get_robot(data.robot)), data.supersample, data.engine, small)
 
 
 class Pictures:
-    """Level images of a scene, a chunk at a time, each kept in a file until they are not needed any more."""
+    """Draw level images of a scene, a chunk at a time, each kept in a file until they are not needed any more."""
 
     def __init__(self, scene: Scene, data: DataConfig, robot: RobotSpec, progress: Progress, parts: Path | None = None):
-        """Draws nothing yet."""
+        """Draw nothing yet."""
         self._scene, self._data, self._robot, self._progress, self._parts = scene, data, robot, progress, parts
         self._done, self.total = 0, 0
         self._of = json.dumps([scene.digest, to_dict(data)], sort_keys=True).encode()
@@ -197,13 +195,13 @@ class Pictures:
         return renderer_of(self._scene, self._data)
 
     def draw_around(self, xy: np.ndarray, around: np.ndarray, what: str) -> np.ndarray:
-        """[N, K, H, W, 3] u8: images from places [N, 2], which count to those to draw, along each of K headings."""
+        """Draw images [N, K, H, W, 3] from places [N, 2], which count to those to draw, along each of K headings."""
         self.total += len(xy) * len(around)
         images = self.draw(np.repeat(xy, len(around), 0), np.tile(around, len(xy)), what)
         return images.reshape(len(xy), len(around), *images.shape[1:])
 
     def draw(self, xy: np.ndarray, heading: np.ndarray, what: str) -> np.ndarray:
-        """[N, H, W, 3] u8: images from places [N, 2] along headings [N]."""
+        """Draw images [N, H, W, 3] u8 from places [N, 2] along headings [N]."""
         drawn = []
         for first in range(0, len(xy), CHUNK):
             rows = slice(first, first + CHUNK)
@@ -228,7 +226,7 @@ class Pictures:
 
 
 def forget(parts: Path) -> None:
-    """Removes the images that `build_map` kept, once the map is written."""
+    """Remove the images that `build_map` kept, once the map is written."""
     for path in parts.glob("*.npy"):
         path.unlink(missing_ok=True)  # by another process that built the same map
     with contextlib.suppress(OSError):
@@ -236,7 +234,7 @@ def forget(parts: Path) -> None:
 
 
 def edge_scores(graph: TopologicalMap, free: np.ndarray, passable: float) -> dict[str, Any]:
-    """How a map's edges compare with the plan, and what open ones join, in words; see `Built`."""
+    """Say how a map's edges compare with the plan, and what open ones join; see `Built`."""
     open_, parts = graph.p >= passable, graph.open_parts(passable)
     return {
         "edges judged open": f"{int(open_.sum())} of {len(open_)}; free on the plan: {int(free.sum())}",

@@ -1,4 +1,4 @@
-"""Nodes, passage probabilities and angles in, a topological map out: planned on, localised in, one file.
+"""Place the nodes of a topological map, join them by edges, plan on it, write and read it.
 
 A node is a position with the embeddings of the images around it. An edge leads from a node to each one nearer than
 `edge_m`; its weight is -log p, p the probability that the way is free, so that the shortest way is the one most likely
@@ -19,11 +19,15 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial.distance import cdist
 
 from interactive_nav_common.files import write_arrays
-from interactive_nav_common.grids import follow
+from interactive_nav_common.grids import MOVES_4, cell_centres, follow, grid_graph
 from interactive_nav_common.untrusted.reading import read_npz
+from topological_nav.config import MapConfig
 from topological_nav.errors import MapError
+from topological_nav.scenes.rooms import Rooms
+from topological_nav.scenes.space import FreeSpace
 
 FORMAT = 1
 """Of map files; raised whenever older ones would be read wrongly."""
@@ -33,7 +37,7 @@ LEAST_P = 1e-6
 
 @dataclasses.dataclass(frozen=True)
 class Route:
-    """A way through a map."""
+    """Describe a way through a map."""
 
     nodes: tuple[int, ...]
     cost: float
@@ -42,7 +46,7 @@ class Route:
 
 @dataclasses.dataclass(frozen=True)
 class TopologicalMap:
-    """N nodes, K images each, E directed edges."""
+    """Hold N nodes, K images each, and E directed edges."""
 
     scene: str
     digest: str
@@ -66,11 +70,11 @@ class TopologicalMap:
 
     @functools.cached_property
     def length_m(self) -> np.ndarray:
-        """[E] of the edges."""
+        """Return the lengths of the edges, [E] m."""
         return lengths(self.xy_w, self.edges)
 
     def plan(self, start: int, goal: int) -> Route:
-        """The cheapest way between two nodes, by Dijkstra's algorithm."""
+        """Return the cheapest way between two nodes, by Dijkstra's algorithm."""
         for node in (start, goal):
             if not 0 <= node < len(self.xy_w):
                 raise MapError(f"node {node} is not in the map of '{self.scene}', expected 0 to {len(self.xy_w) - 1}")
@@ -81,11 +85,11 @@ class TopologicalMap:
 
     @functools.cached_property
     def weight(self) -> np.ndarray:
-        """[E] -log p of the edges, and `metre_cost` for each metre."""
+        """Return the edges' -log p [E], and `metre_cost` for each metre."""
         return np.array([edge_weight(p) for p in self.p.tolist()]) + self.metre_cost * self.length_m
 
     def next_edge(self, start: int, goal: int, penalty: np.ndarray | None = None) -> int:
-        """The first edge of the cheapest way between two different nodes; -1 where there is none.
+        """Return the first edge of the cheapest way between two different nodes; -1 where there is none.
 
         Args:
             start: node.
@@ -103,22 +107,22 @@ class TopologicalMap:
 
     @functools.cached_property
     def left(self) -> np.ndarray:
-        """[N, N] cost of the cheapest way to each goal (first axis) from each node; infinite where there is none."""
+        """Return the cost [N, N] of the cheapest way to each goal (first axis) from each node; infinite without any."""
         return self._left_to(self.weight, np.arange(len(self.xy_w)))
 
     def _left_to(self, weight: np.ndarray, goals: np.ndarray | int) -> np.ndarray:
         return np.asarray(dijkstra(self._matrix(weight).T, indices=goals))
 
     def _matrix(self, weight: np.ndarray) -> csr_array:
-        """[N, N] weights of the edges from each node (row) to others."""
+        """Return the weights [N, N] of the edges from each node (row) to others."""
         return csr_array((weight, tuple(self.edges.T)), shape=(len(self.xy_w),) * 2)
 
     def open_parts(self, passable: float) -> list[list[int]]:
-        """Nodes that reach each other, both ways, along edges with at least this probability; largest part first."""
+        """Return nodes that reach each other along edges of at least this probability; the largest part first."""
         return parts_of(self.edges[self.p >= passable], len(self.xy_w), both_ways=True)
 
     def thinned(self, share: float, seed: int) -> TopologicalMap:
-        """The map with fewer nodes: a sparse one that may fall apart.
+        """Return the map with fewer nodes: a sparse one that may fall apart.
 
         Args:
             share: of each room's nodes that stay, drawn at random; at least one a room.
@@ -150,24 +154,24 @@ def parts_of(edges: np.ndarray, count: int, both_ways: bool = False) -> list[lis
 
 
 def edge_weight(p: float) -> float:
-    """-log p, with p kept `LEAST_P` from 0 and 1."""
+    """Return -log p, with p kept `LEAST_P` from 0 and 1."""
     return -math.log(min(max(p, LEAST_P), 1.0 - LEAST_P))
 
 
 def near_pairs(xy_w: np.ndarray, edge_m: float) -> np.ndarray:
-    """[E, 2] i32: every ordered pair of different points [N, 2] nearer than `edge_m`, sorted."""
+    """Return every ordered pair [E, 2] of different points [N, 2] nearer than `edge_m`, sorted."""
     away = np.linalg.norm(xy_w[:, None] - xy_w[None], axis=-1)
     return np.argwhere((away < edge_m) & ~np.eye(len(xy_w), dtype=bool)).astype(np.int32)
 
 
 def angles(xy_w: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """[E] rad in (-pi, pi]: headings of edges [E, 2] between points [N, 2]."""
+    """Return the headings [E] in (-pi, pi] of edges [E, 2] between points [N, 2]."""
     step = xy_w[edges[:, 1]] - xy_w[edges[:, 0]]
     return np.arctan2(step[:, 1], step[:, 0])
 
 
 def lengths(xy_w: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """[E] m: lengths of edges [E, 2] between points [N, 2]."""
+    """Return the lengths [E] (m) of edges [E, 2] between points [N, 2]."""
     return np.linalg.norm(xy_w[edges[:, 1]] - xy_w[edges[:, 0]], axis=-1).astype(float)
 
 
@@ -199,14 +203,14 @@ _ARRAYS = {"xy_w": _F32, "room": _I32, "embeddings": _F32, "edges": _I32, "p": _
 
 
 def save_map(nav_map: TopologicalMap, path: Path) -> None:
-    """Writes a map as one npz file, whole or not at all."""
+    """Write a map as one npz file, whole or not at all."""
     header = {"format": FORMAT, "scene": nav_map.scene, "digest": nav_map.digest, "about": nav_map.about}
     arrays = {name: getattr(nav_map, name) for name in _ARRAYS}
     write_arrays(path, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
 
 
 def load_map(path: Path, digest: str | None = None) -> TopologicalMap:
-    """Reads a map.
+    """Read a map.
 
     Args:
         path: of the file.
@@ -225,3 +229,119 @@ def load_map(path: Path, digest: str | None = None) -> TopologicalMap:
             "build the map of this scene"
         )
     return TopologicalMap(scene, built_in, **arrays, about=about)
+
+
+ROOMY_M = 0.5
+"""Nodes added to join parts of a map keep to the middle of what is narrower than twice this."""
+TIGHT_COST = 4.0
+"""A metre of the way between parts costs up to so many metres more, the nearer to obstacles."""
+
+
+def place_nodes(
+    space: FreeSpace, rooms: Rooms, config: MapConfig, margin_m: float, points: int
+) -> tuple[np.ndarray, list[str]]:
+    """Return where a map's nodes stand, [N, 2] m, and what could not be had, in words.
+
+    In every room one place after the other becomes a node, each time the one that has most places within `spacing_m`
+    that no node has yet. A room that needs fewer than `min_per_room` is covered again with less spacing.
+    Then, where `connect` is set, nodes are added along the free way between parts of the map that no free edge joins
+    which is shortest where room to the sides counts as well.
+    """
+    places = space.centres(config.clearance_m)
+    label = rooms.of(places)
+    nodes, lacking = [], []
+    for room in range(rooms.count):
+        mine = places[label == room]
+        if len(mine) < config.min_per_room:
+            lacking.append(f"room {room} has place for {len(mine)} nodes only, expected {config.min_per_room}")
+            nodes.append(mine)
+            continue
+        radius = config.spacing_m
+        chosen = _covering(mine, radius, space.resolution_m)
+        while len(chosen) < config.min_per_room:
+            radius *= 0.8
+            chosen = _covering(mine, radius, space.resolution_m)
+        nodes.append(chosen)
+    xy = np.concatenate(nodes) if nodes else np.zeros((0, 2))
+    if not config.connect:
+        return xy, lacking
+    joined, apart = _joined(space, xy, config.edge_m, margin_m, points)
+    if apart > 1:
+        lacking.append(f"{apart} parts of the scene are not joined by any way with {margin_m} m clearance")
+    return joined, lacking
+
+
+def free_edges(space: FreeSpace, xy_w: np.ndarray, edge_m: float, margin_m: float, points: int) -> np.ndarray:
+    """Return the pairs [E, 2] of `near_pairs` whose way is free."""
+    edges = near_pairs(xy_w, edge_m)
+    return edges[space.segment_free(xy_w[edges[:, 0]], xy_w[edges[:, 1]], points, margin_m)]
+
+
+def _covering(places: np.ndarray, radius_m: float, step_m: float) -> np.ndarray:
+    """Choose from places [n, 2], at least one within the radius of each: greedily those with most of the rest near."""
+    # One place in each square of two cells is enough to choose from.
+    _, first = np.unique(np.floor(places / (2 * step_m)), axis=0, return_index=True)
+    some = places[np.sort(first)]
+    near = cdist(some, some) <= radius_m
+    chosen, bare = [], np.ones(len(some), bool)
+    while bare.any():
+        chosen.append(int((near & bare).sum(1).argmax()))
+        bare &= ~near[chosen[-1]]
+    nodes = some[chosen]
+    away = cdist(places, nodes).min(1)
+    while away.max() > radius_m:  # the other places of the squares
+        nodes = np.concatenate([nodes, places[[away.argmax()]]])
+        away = np.minimum(away, np.linalg.norm(places - nodes[-1], axis=1))
+    return nodes
+
+
+def _joined(space: FreeSpace, xy: np.ndarray, edge_m: float, margin_m: float, points: int) -> tuple[np.ndarray, int]:
+    """Add nodes until free edges join all that a free way joins; return them all, and the number of parts left."""
+    free = space.free(margin_m)
+    # Cells that share a side: the straight way between their centres is as free as they are.
+    cost = 1.0 + TIGHT_COST * np.clip(1.0 - space.clearance_m / ROOMY_M, 0.0, 1.0)
+    lattice, centres = (
+        grid_graph(free, cost, space.resolution_m, MOVES_4),
+        cell_centres(np.ones_like(free), space.resolution_m, space.origin_w),
+    )
+    while True:
+        parts = parts_of(free_edges(space, xy, edge_m, margin_m, points), len(xy))
+        column, row = space.inner_cells(xy).T
+        at = np.where(free[row, column], np.ravel_multi_index((row, column), free.shape), -1)
+        for part in parts[1:]:
+            mine = np.array(part)
+            others = np.setdiff1d(np.arange(len(xy)), mine)
+            mine, others = mine[at[mine] >= 0], others[at[others] >= 0]
+            if not len(mine) or not len(others):
+                continue
+            how = {"directed": False, "min_only": True, "return_predecessors": True}
+            far, before, _ = dijkstra(lattice, indices=at[mine], **how)
+            end = int(others[far[at[others]].argmin()])
+            if not np.isfinite(far[at[end]]):
+                continue
+            added = _stations(space, centres[follow(before, at[end])], edge_m, margin_m, points)
+            if len(added):
+                xy = np.concatenate([xy, added])
+                break
+        else:
+            return xy, len(parts)
+
+
+def _stations(space: FreeSpace, way: np.ndarray, edge_m: float, margin_m: float, points: int) -> np.ndarray:
+    """Choose places on a way [n, 2], ends left out, each in free reach of the one before.
+
+    Of those in reach, the one with the most room in the farther half; the end as soon as it is in reach.
+    """
+    chosen, at, room_m = [], 0, np.minimum(space.at(way), ROOMY_M)
+    while at < len(way) - 1:
+        ahead = way[at + 1 :]
+        reach = np.linalg.norm(ahead - way[at], axis=1) < edge_m
+        reachable = reach & space.segment_free(np.broadcast_to(way[at], ahead.shape), ahead, points, margin_m)
+        last = at + 1 + int(np.flatnonzero(reachable)[-1])
+        if last < len(way) - 1:
+            steps = at + 1 + np.flatnonzero(reachable)
+            steps = steps[steps - at > (last - at) // 2][::-1]  # of equals the farthest
+            last = int(steps[room_m[steps].argmax()])
+        at = last
+        chosen.append(way[at])
+    return np.array(chosen[:-1]).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""What a navigator makes of images: how far each node of its map is from where they were taken, and what lies ahead.
+"""Judge images for a navigator: how far each node of its map is from where they were taken, and what lies ahead.
 
 The navigator itself never looks into an image. `NetworkSight` asks trained networks; `TrueSight` stands in for perfect
 ones in tests and measurements: its "images" are poses.
@@ -10,7 +10,7 @@ import numpy as np
 
 from topological_nav.errors import MapError
 from topological_nav.learn.networks import nearest_turn, squares_between
-from topological_nav.learn.training import Trained
+from topological_nav.learn.training import Networks
 from topological_nav.maps.graph import TopologicalMap
 from topological_nav.scenes.space import FreeSpace
 
@@ -21,17 +21,17 @@ LINE_POINTS = 50
 
 
 class Sight(Protocol):
-    """Judges images, in batches; an image is one row of an array, of any shape that the judge understands."""
+    """Judge images, in batches; an image is one row of an array, of any shape that the judge understands."""
 
     summed: bool
     """Whether distances of several images are summed; else the least counts."""
 
     def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
-        """Images [n, ...] taken along headings [n] to [n, N]: how far each node is."""
+        """Return how far each node is, [n, N], by images [n, ...] taken along headings [n]."""
         ...
 
     def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
-        """Probability that the way ahead is navigable for lengths [n], or for M lengths of each [n, M]; as they are.
+        """Return the probability that the way ahead is free for lengths [n], or for M lengths of each [n, M].
 
         A number is a length for all images, and gives [n].
         """
@@ -47,12 +47,12 @@ def place_distances(sight: Sight, images: np.ndarray, heading_rad: np.ndarray) -
 
 
 class NetworkSight:
-    """A map, the network that embeds and the one that judges passages."""
+    """Judge by a map, a network that embeds and one that judges passages."""
 
-    def __init__(self, graph: TopologicalMap, localiser: Trained, detector: Trained, match: str = "aligned"):
-        """Checks that the map is of these networks."""
-        for name, network in (("localiser", localiser), ("detector", detector)):
-            used, digest = graph.about.get(name, ""), network.about["digest"]
+    def __init__(self, graph: TopologicalMap, networks: Networks, match: str = "aligned"):
+        """Check that the map is of these networks."""
+        for name, digest in networks.digests.items():
+            used = graph.about.get(name, "")
             if used != digest:
                 raise MapError(
                     f"the map of '{graph.scene}' was built with {name} {used[:12] or 'unknown'}, "
@@ -60,11 +60,11 @@ class NetworkSight:
                     "build the map again with it, or name the runs it was built with"
                 )
         self._nodes = graph.embeddings.astype(float)
-        self._localiser, self._detector, self.summed = localiser, detector, match == "aligned"
+        self._networks, self.summed = networks, match == "aligned"
 
     def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
-        """[n, N] Euclidean distances of embeddings: to the node's image of that heading, or to its nearest."""
-        queries = self._localiser.embed(images).astype(float)
+        """Return Euclidean distances [n, N] of embeddings: to the node's image of that heading, or to its nearest."""
+        queries = self._networks.localiser.embed(images).astype(float)
         nodes, around = self._nodes, self._nodes.shape[1]
         if self.summed:
             turn = nearest_turn(np.asarray(heading_rad), around)
@@ -76,28 +76,28 @@ class NetworkSight:
         return _apart(queries, nodes.reshape(-1, nodes.shape[-1])).reshape(len(queries), -1, around).min(-1)
 
     def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
-        """The detector's probability; see `Sight.passage`."""
-        return self._detector.passage(images, ahead_m)
+        """Return the detector's probability; see `Sight.passage`."""
+        return self._networks.detector.passage(images, ahead_m)
 
 
 class TrueSight:
-    """The truth in the place of networks: images are poses [n, 3], x and y (m) and yaw (rad), world frame."""
+    """Judge by the truth in the place of networks: images are poses [n, 3], x and y (m) and yaw (rad), world frame."""
 
     summed = True
 
     def __init__(self, graph: TopologicalMap, space: FreeSpace, margin_m: float = 0.225):
-        """Takes the plan."""
+        """Take the plan."""
         self._xy, self._space, self._margin_m = graph.xy_w.astype(float), space, margin_m
 
     def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
-        """[n, N] m to nodes in sight; `OUT_OF_SIGHT_M` more to those that are not."""
+        """Return the distances [n, N] (m) to nodes in sight; `OUT_OF_SIGHT_M` more to those that are not."""
         del heading_rad
         here = np.broadcast_to(images[:, None, :2], (len(images), len(self._xy), 2))
         visible = self._space.segment_free(here, np.broadcast_to(self._xy, here.shape), LINE_POINTS, 0.0)
         return np.linalg.norm(here - self._xy, axis=-1) + OUT_OF_SIGHT_M * ~visible
 
     def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
-        """1 where the way ahead is free, else 0; see `Sight.passage`.
+        """Return 1 where the way ahead is free, else 0; see `Sight.passage`.
 
         Who stands nearer to an obstacle than the margin may leave it: the way may begin as near, but come no nearer.
         """
@@ -118,7 +118,7 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 class PassagePolicy:
-    """The baseline that drives by the passage detector alone: straight on while it agrees, else it swings about.
+    """Drive by the passage detector alone, as a baseline: straight on while it agrees, else it swings about.
 
     It turns left by `SWEEP_RAD`, then right by twice as much, and so on wider, until the detector agrees.
     """
@@ -131,11 +131,11 @@ class PassagePolicy:
     """Looks (of 0.15 rad) that the first turn to the left lasts."""
 
     def __init__(self, sight: Sight, passable: float = 0.5, ahead_m: float = 1.0):
-        """Takes whose judgement it trusts."""
+        """Take whose judgement to trust."""
         self._sight, self._passable, self._ahead_m = sight, passable, ahead_m
 
     def start(self, batch: int) -> Any:
-        """[batch] i32 looks since the way was last free."""
+        """Return the looks since the way was last free, [batch] i32."""
         return np.zeros(batch, np.int32)
 
     def act(self, state: Any, images: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Images, heading and time in, velocity commands out: the navigator, a state machine over a batch of episodes.
+"""Command velocities by images, heading and time: the navigator, a state machine over a batch of episodes.
 
     LOCALISE  turn about, looking along `images` headings; the nearest node is where the robot is
        |      there: ARRIVED; else Dijkstra gives the next edge
@@ -8,7 +8,7 @@
        |      none agrees: the edge costs more from now on; another one: FACE, else all round; still none:
     LEAN      turn to the most open of the headings tried, and drive all the same
     DRIVE     the local policy, in runs of 5 s, or until the edge's head is passed; after twelve: LOCALISE. After each
-              a glance tells by the image ahead whether the robot is still at its node or at a neighbour of it. An
+              a glance at the image ahead decides whether the robot is still at its node or at a neighbour of it. An
               edge that was driven in vain costs more from now on. Plan anew from there: FACE
 
 `Navigator.step` is a pure function of arrays, a phase for each episode, so that thousands run in one batch. It never
@@ -52,10 +52,10 @@ SLACK_S = 1e-3
 
 
 class Navigator:
-    """A map, eyes and a local policy."""
+    """Navigate by a map, eyes and a local policy."""
 
     def __init__(self, nav_map: TopologicalMap, sight: Sight, policy: LocalPolicy, config: NavigatorConfig):
-        """Takes what it needs.
+        """Take what is needed.
 
         Args:
             nav_map: the map; positions of its nodes are not used.
@@ -76,15 +76,11 @@ class Navigator:
         self._ask_m = _judged_m(nav_map.length_m, config)
 
     def goal_nodes(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
-        """[B] i32: the nodes nearest to goals, by the images [B, K, ...] taken there along headings [K]."""
+        """Return the nodes [B] nearest to goals, by images [B, K, ...] taken there along headings [K]."""
         return place_distances(self.sight, images, heading_rad)[1].argmin(-1).astype(np.int32)
 
     def start(self, goal: np.ndarray) -> State:
-        """B fresh episodes.
-
-        Args:
-            goal: [B] nodes, of `goal_nodes`.
-        """
+        """Start B episodes with these goals [B], of `goal_nodes`."""
         batch = len(goal)
         return State(
             **fresh(State, batch),
@@ -95,12 +91,12 @@ class Navigator:
         )
 
     def stop(self, state: State, rows: np.ndarray) -> State:
-        """The state with some episodes [B] bool ended from outside."""
+        """Return the state with some episodes [B] bool ended from outside."""
         phase = np.where(rows & ~state.over, STOPPED, state.phase).astype(np.int8)
         return dataclasses.replace(state, phase=phase, linear=state.linear * ~rows, angular=state.angular * ~rows)
 
     def looks(self, state: State, heading_rad: np.ndarray, time_s: np.ndarray | float) -> np.ndarray:
-        """[B] bool: whose image `step` will look at, given these; the others' need not be taken."""
+        """Return whose image `step` will look at, given these, [B] bool; the others' need not be taken."""
         heading = np.asarray(heading_rad, float)
         turning = _any_of(state.phase, TURNING)
         # A first target is the heading itself, or near it.
@@ -113,7 +109,7 @@ class Navigator:
     def step(
         self, state: State, images: np.ndarray, heading_rad: np.ndarray, time_s: np.ndarray | float
     ) -> tuple[State, np.ndarray, np.ndarray, Events]:
-        """One control step.
+        """Take one control step.
 
         Args:
             state: of `start` or `step`.
@@ -147,7 +143,7 @@ class Navigator:
         return new, new.linear.copy(), new.angular.copy(), events
 
     def _first_heading(self, heading: np.ndarray) -> np.ndarray:
-        """The nearest heading along which nodes have images."""
+        """Return the nearest heading along which nodes have images."""
         step = 2 * np.pi / self.map.embeddings.shape[1]
         return wrap_angle(np.rint(heading / step) * step)
 
@@ -155,13 +151,13 @@ class Navigator:
         return np.full((batch, len(self.map.xy_w)), 0.0 if self.sight.summed else np.inf)
 
     def _reached(self, s: Work, heading: np.ndarray, *phases: int) -> np.ndarray:
-        """Rows in one of the phases whose heading is reached."""
+        """Return the rows in one of the phases whose heading is reached."""
         return np.flatnonzero(
             _any_of(s.phase, phases) & (np.abs(wrap_angle(s.target_rad - heading)) <= self._tolerance)
         )
 
     def _watches(self, s: State | Work, time: np.ndarray) -> np.ndarray:
-        """[B] bool: who looks now, within a run, whether the edge's head is passed."""
+        """Return who looks now, within a run, whether the edge's head is passed, [B] bool."""
         if not self.config.glance or not self.config.watch_s:
             return np.zeros(len(s.phase), bool)
         return (s.phase == DRIVE) & (s.edge >= 0) & (time >= s.watch_s - SLACK_S)
@@ -183,7 +179,7 @@ class Navigator:
         self._plan(s, done[s.node[done] != s.goal[done]], heading)
 
     def _located(self, s: Work, rows: np.ndarray, node: np.ndarray) -> None:
-        """Where the robots are; an edge that was driven and did not lead nearer to its head costs more."""
+        """Note where the robots are; an edge that was driven and did not lead nearer to its head costs more."""
         s.node[rows] = node
         edge = s.driven[rows]
         tail, head = self.map.edges[edge].T if len(self.map.edges) else (node, node)
@@ -283,7 +279,7 @@ class Navigator:
         s.acts[s.phase == DRIVE] += 1
 
     def _passed(self, s: Work, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """[B] bool: of all nodes in question the edge's head is nearest, and it is getting farther."""
+        """Return where of all nodes in question the edge's head is nearest, and getting farther, [B] bool."""
         passed = np.zeros(len(s.phase), bool)
         rows = np.flatnonzero(self._watches(s, time))
         if len(rows):
@@ -304,7 +300,7 @@ class Navigator:
         s.restart_pid(rows)
 
     def _turn(self, s: Work, heading: np.ndarray, time: np.ndarray) -> None:
-        """PID to the target heading, as `simple_pid.PID` computes it."""
+        """Turn by PID to the target heading, as `simple_pid.PID` computes it."""
         rows = np.flatnonzero(_any_of(s.phase, TURNING) & ~np.isnan(s.target_rad))
         config, most = self.config, self.config.max_turn_rad_s
         error = wrap_angle(s.target_rad[rows] - heading[rows])
@@ -318,11 +314,11 @@ class Navigator:
 
 
 def _judged_m(length_m: np.ndarray, config: NavigatorConfig) -> np.ndarray:
-    """[E + 1] m: how far the way must be free to drive along each edge of lengths [E], and, last, along none."""
+    """Return how far (m) the way must be free to drive along edges of lengths [E], and, last, along none: [E + 1]."""
     ahead = np.minimum(length_m - np.minimum(config.slack_m, 0.5 * length_m), config.ahead_m)
     return np.append(ahead, config.clear_m)
 
 
 def _any_of(phase: np.ndarray, phases: tuple[int, ...]) -> np.ndarray:
-    """[B] bool; many times as fast as `np.isin` for few rows."""
+    """Return what `np.isin` does, [B] bool, many times as fast for few rows."""
     return np.logical_or.reduce([phase == one for one in phases])

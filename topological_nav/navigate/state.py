@@ -1,4 +1,4 @@
-"""What a batch of navigators remembers, what happened to it in a step, and a copy of it that a step writes into."""
+"""Define what a batch of navigators remembers, what happens to it in a step, and a copy that a step writes into."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TURNING, OVER = (LOCALISE, FACE, SWING, LEAN), (ARRIVED, STOPPED, TIMED_OUT)
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class State:
-    """What a batch of B navigators remembers; N nodes, E edges. Every leaf has B rows."""
+    """Hold what a batch of B navigators remembers; N nodes, E edges. Every leaf has B rows."""
 
     phase: np.ndarray = column(LOCALISE, np.int8)
     """i8, one of `PHASES`."""
@@ -61,7 +61,7 @@ class State:
     watch_s: np.ndarray = column(0.0)
     """Next time to look, within a run, whether the edge's head is passed."""
     least: np.ndarray = column(np.inf)
-    """Least distance to the head in this run, as `Sight.distances` tells it."""
+    """Least distance to the head in this run, by `Sight.distances`."""
     acts: np.ndarray = column(0, np.int32)
     """i32 control steps of this run."""
     linear: np.ndarray = column(0.0)
@@ -72,12 +72,12 @@ class State:
     """The local policy's."""
 
     def take(self, rows: np.ndarray) -> State:
-        """Those rows of the batch."""
+        """Return those rows of the batch."""
         return jax.tree.map(lambda x: np.asarray(x)[rows], self)
 
     @property
     def over(self) -> np.ndarray:
-        """[B] bool: arrived, stopped or out of time."""
+        """Return which have arrived, stopped or run out of time, [B] bool."""
         return self.phase >= ARRIVED
 
 
@@ -86,7 +86,7 @@ jax.tree_util.register_dataclass(State, [f.name for f in dataclasses.fields(Stat
 
 @dataclasses.dataclass(frozen=True)
 class Events:
-    """What happened in a step, [B] bool each; a caller may stop an episode whose run ended."""
+    """Hold what happened in a step, [B] bool each; a caller may stop an episode whose run ended."""
 
     localised: np.ndarray
     """Turned about, and `State.node` is new."""

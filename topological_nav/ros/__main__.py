@@ -95,13 +95,12 @@ def need_ros() -> Any:
 
 
 def _networks(arguments: argparse.Namespace) -> Any:
-    from topological_nav.weights.packaged import choose
+    from topological_nav.weights.export import choose
 
     if arguments.map is None:
         raise UserError("--driver topological needs a map: --map PATH")
     chosen = choose(arguments.localiser, arguments.detector, arguments.policy)
-    if chosen.told:
-        say(chosen.told)
+    chosen.report()
     return chosen
 
 

@@ -22,7 +22,7 @@ from topological_nav.navigate.navigator import Navigator
 from topological_nav.navigate.state import State
 from topological_nav.ros.config import HeadingConfig
 from topological_nav.ros.messages import seen_through
-from topological_nav.weights.packaged import Choice
+from topological_nav.weights.export import Choice
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,8 +87,8 @@ class PilotDriver:
 
     def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> Command:
         """See `Driver.step`."""
-        seen = image[None], np.array([heading_rad]), np.array([time_s])
-        self._state, linear, angular, events = self._navigator.step(self._state, *seen)
+        now = image[None], np.array([heading_rad]), np.array([time_s])
+        self._state, linear, angular, events = self._navigator.step(self._state, *now)
         done = bool(events.arrived[0]) or bool(events.timed_out[0])
         return Command(0.0, 0.0, done=True) if done else Command(float(linear[0]), float(angular[0]))
 
@@ -99,9 +99,8 @@ def topological_driver(
     """Return the navigator with its goal; the first picture of it looks along `goal_heading_rad` in the map's frame."""
     networks, built = load_networks(choice.localiser, choice.detector), load_map(map_file)
     lens = lens_of(networks.camera, get_robot(networks.camera.robot))
-    sight = NetworkSight(built, networks.localiser, networks.detector, config.match)
-    runs = (choice.localiser, networks.localiser), (choice.detector, networks.detector)
-    policy = local_policy(choice.policy, sight, config, *runs)
+    sight = NetworkSight(built, networks, config.match)
+    policy = local_policy(choice.policy, sight, config, networks)
     if not goals:
         raise ConfigError("the navigator has no goal; name a picture taken there: --goal PICTURE")
     pictures = np.stack([seen_through(_picture(path), lens.fov_deg, lens) for path in goals])

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import interactive_nav
 from interactive_nav.pictures.camera import PictureCamera
 from interactive_nav.sensing.sensors import LIDAR_NEAR_M
 from interactive_nav_common.errors import UserError
@@ -21,11 +20,11 @@ from scenes_mjcf.look import Lens
 from topological_nav.drives.expert import LIDAR_B
 from topological_nav.ros.config import SimulatorConfig
 from topological_nav.scenes.rendering import need_engine, shrink
+from topological_nav.scenes.simulation import make_env
 from topological_nav.scenes.space import free_space
 
 ROBOT = "ttbot"
 LIDAR_POS_M = LIDAR_B[ROBOT]
-_FOREVER = 10**9
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,22 +102,10 @@ class RosSimulator:
         """Build the world, place the robot and compile."""
         need_engine(config.engine)
         self.config = config
-        self._env = interactive_nav.make(
-            ROBOT,
-            [scene],
-            backend="native",
-            control_mode="twist",
-            num_objects=config.objects,
-            observations=("velocity", "localisation", "odometry", "lidar"),
-            episode_steps=_FOREVER,
-            lidar_pos_m=LIDAR_POS_M,
-            lidar_rays=config.lidar_rays,
-            lidar_fov_deg=config.lidar_fov_deg,
-            lidar_range_m=config.lidar_range_m,
-            lidar_noise=config.lidar_noise,
-            odometry_noise=config.odometry_noise,
-            num_waypoints=1,
-        )
+        names = ("lidar_rays", "lidar_fov_deg", "lidar_range_m", "lidar_noise", "odometry_noise")
+        sensors = {name: getattr(config, name) for name in names}
+        sensors |= {"observations": ("velocity", "localisation", "odometry", "lidar"), "lidar_pos_m": LIDAR_POS_M}
+        self._env = make_env([scene], ROBOT, "native", num_objects=config.objects, **sensors)
         twist = self._env.robot.twist
         assert twist is not None
         self.max_linear_mps, self.max_angular_radps = twist.max_linear_m_s, twist.max_angular_rad_s

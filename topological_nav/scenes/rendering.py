@@ -34,12 +34,9 @@ Bodies = tuple[Sequence[str], np.ndarray, np.ndarray]
 
 
 def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pitch_rad: np.ndarray) -> CameraPose:
-    """Return the pose of the camera of a robot that stands on the floor.
+    """Return the pose of the camera of a robot with its base at [..., 2] m on the floor, turned to headings [...].
 
-    Args:
-        xy_w: [..., 2] m, of the base.
-        heading_rad: [...], yaw of the base.
-        pitch_rad: [...], how far up the camera looks beside its mount's pitch.
+    The camera looks by `pitch_rad` [...] further up than its mount's pitch.
     """
     camera = robot.camera
     if camera.body != robot.base_body:
@@ -88,24 +85,10 @@ class SceneRenderer:
     def draw(self, pose: CameraPose, bodies: Bodies | None = None) -> np.ndarray:
         """Draw [N, H, W, 3] u8 images of cameras with leaves [N, ...]."""
         pos, axes = np.asarray(pose.pos_w, np.float32), np.asarray(pose.axes_w, np.float32)
-        count, first = len(pos), 0
-        geoms = self._geoms(count, bodies)
-        out = np.empty((count, self._lens.height, self._lens.width, 3), np.uint8)
-        drawn: list[tuple[int, Any]] = []
-
-        def fetch(waiting: int) -> None:
-            while len(drawn) > waiting:
-                at, images = drawn.pop(0)
-                out[at : at + len(images)] = np.asarray(images)[: count - at]
-
-        for size in calls(count, self._sizes):
-            # Padded by the last camera: Warp draws batches of fixed sizes only.
-            rows = np.minimum(np.arange(first, first + size), count - 1)
-            drawn.append((first, self._painter(size)(pos[rows], axes[rows], *(of[rows] for of in geoms))))
-            first += size
-            fetch(1)  # the accelerator draws the next batch while this one is copied
-        fetch(0)
-        return out
+        if not len(pos):
+            return np.empty((0, self._lens.height, self._lens.width, 3), np.uint8)
+        cameras = pos, axes, *self._geoms(len(pos), bodies)
+        return batched(lambda *of: self._painter(len(of[0]))(*of), cameras, self._sizes)
 
     def _geoms(self, count: int, bodies: Bodies | None) -> tuple[np.ndarray, np.ndarray]:
         """Return positions [count, ngeom, 3] and axes [count, ngeom, 3, 3]."""
@@ -159,6 +142,21 @@ def calls(count: int, sizes: tuple[int, ...]) -> list[int]:
             out.append(next((n for n in sizes if n >= count), sizes[-1]))
         count -= out[-1]
     return out
+
+
+def batched(function: Callable[..., Any], arrays: Sequence[np.ndarray], sizes: tuple[int, ...]) -> np.ndarray:
+    """Return a function's rows of arrays [N, ...], in calls of these sizes only, each of which is compiled.
+
+    The last call is padded by the last row.
+    """
+    count, first, waiting, out = len(arrays[0]), 0, None, []
+    for size in calls(count, sizes):
+        rows = np.minimum(np.arange(first, first + size), count - 1)
+        call, first = function(*(array[rows] for array in arrays)), first + size
+        if waiting is not None:  # copied while an accelerator works on the next
+            out.append(np.asarray(waiting))
+        waiting = call
+    return np.concatenate([*out, np.asarray(waiting)])[:count]
 
 
 def shrink(images: Any, by: int) -> Any:

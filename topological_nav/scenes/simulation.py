@@ -29,12 +29,7 @@ CONTROL = "twist"
 
 
 def make_env(scenes: Sequence[Path], robot: str | RobotSpec, backend: str, **settings: Any) -> InteractiveNav:
-    """Build an environment that steps on past what it itself would call the end of an episode.
-
-    Args:
-        robot: a name, or the spec of one in control mode `CONTROL`.
-        settings: of `interactive_nav.make`.
-    """
+    """Build an environment of velocity commands to a robot, by `interactive_nav.make`; its episodes have no end."""
     need_engine(backend)
     fixed = {"control_mode": CONTROL, "episode_steps": 10**8, "num_waypoints": 1}
     return interactive_nav.make(robot, scenes, backend=backend, **fixed, **settings)

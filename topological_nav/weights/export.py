@@ -1,4 +1,4 @@
-"""Export finished runs as a small folder: weights in half precision, where they come from, maps.
+"""Export finished runs as a small folder, and choose networks, policy and maps where none are named.
 
 OUT/rooms/ passages/ policy/   weights.safetensors.xz, network.json, config.yaml, versions.json, results.json
     maps/SCENE.npz             embeddings in half precision
@@ -7,14 +7,17 @@ OUT/rooms/ passages/ policy/   weights.safetensors.xz, network.json, config.yaml
 Everything that reads a run folder reads these. Kernels and matrices are fp16; biases, scales and statistics, one number
 in a hundred, stay f32: a variance may exceed what fp16 holds. `digest` in network.json stays that of the run, so that
 maps and policies of either belong to both: an export whose predictions differ is refused. `export.weights_digest` is
-that of the tensors in `weights.safetensors.xz`.
+that of the tensors in `weights.safetensors.xz`. The package carries such a folder in `weights/exported`, whose policy
+and maps may be absent: a scene's map is then built when it is first needed.
 """
 
 import dataclasses
+import importlib.resources
 import json
 import os
 import shutil
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -28,12 +31,13 @@ from interactive_nav_common.files import whole_folder, write_text
 from interactive_nav_common.records import Reader
 from interactive_nav_common.runs.weights import half, read_weights
 from interactive_nav_common.versions import versions
-from topological_nav.config import PITCHES, ExportConfig
+from topological_nav.config import PASSAGE_POLICY, PITCHES, RUNS, ExportConfig
 from topological_nav.data.dataset import headings, load_rooms
 from topological_nav.drives.driving import TrainedPolicy, load_policy
-from topological_nav.errors import MapError, Progress, RunError
+from topological_nav.errors import MapError, Progress, RunError, say
 from topological_nav.learn.runs import (
     CONFIG,
+    DESCRIPTION,
     PACKED_WEIGHTS,
     RESULTS,
     VERSIONS,
@@ -41,13 +45,12 @@ from topological_nav.learn.runs import (
     weights_file,
     write_network,
 )
-from topological_nav.learn.training import SAME, Trained, camera_of, load_pair, load_trained
+from topological_nav.learn.training import Networks, load_networks, load_trained
 from topological_nav.maps.build import Pictures
 from topological_nav.maps.graph import load_map, save_map
 from topological_nav.scenes.space import free_space
-from topological_nav.weights.packaged import ABOUT
 
-FORMAT, PRECISION = 1, "fp16"
+FORMAT, PRECISION, ABOUT = 1, "fp16", "export.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +87,7 @@ def export(
     files = sorted(maps.glob("*.npz")) if maps else []
     if maps and not files:
         raise MapError(f"{maps}: holds no map; make some: python -m topological_nav map SCENE -o {maps}/SCENE.npz")
-    networks = load_pair(runs["rooms"], runs["passages"], (*SAME, "headings"))
+    networks = load_networks(runs["rooms"], runs["passages"], classifies=True)
     driver = load_policy(policy, localiser, detector) if policy else None
     pictures = level_images(images, networks, config.places, progress)
     total = len(runs) + len(files) + 1
@@ -97,7 +100,7 @@ def export(
             progress(path.stem, done, total)
             about["maps"][path.stem] = _export_map(path, part / "maps" / path.name, networks)
         progress("comparing", total - 1, total)
-        exported = load_trained(part / "rooms"), load_trained(part / "passages")
+        exported = Networks(load_trained(part / "rooms"), load_trained(part / "passages"))
         compared = compare(networks, exported, driver, load_policy(part / "policy") if driver else None, pictures)
         for name in ("largest_embedding_distance", "largest_probability_difference"):
             if not compared.scores[name] <= config.tolerance:
@@ -133,8 +136,8 @@ def size_lines(sizes: dict[str, int], limit_mib: float) -> str:
 
 
 def compare(
-    networks: tuple[Trained, Trained],
-    exported: tuple[Trained, Trained],
+    networks: Networks,
+    exported: Networks,
     driver: TrainedPolicy | None,
     exported_driver: TrainedPolicy | None,
     images: np.ndarray,
@@ -144,9 +147,9 @@ def compare(
     flat = images.reshape(-1, *images.shape[2:])
     before, after = ([net.embed(flat) for net in pair] for pair in (networks, exported))
     embedding = np.stack([np.linalg.norm(a - b, axis=-1) for a, b in zip(before, after, strict=True)])
-    logits = [pair[1].logits(flat).astype(float) for pair in (networks, exported)]
+    logits = [pair.detector.logits(flat).astype(float) for pair in (networks, exported)]
     probability = 1.0 / (1.0 + np.exp(-np.stack(logits)))
-    rooms = [pair[0].logits(flat).argmax(-1) for pair in (networks, exported)]
+    rooms = [pair.localiser.logits(flat).argmax(-1) for pair in (networks, exported)]
     scores = {
         "images": len(flat),
         "largest_embedding_distance": float(embedding.max()),
@@ -169,9 +172,7 @@ def compare(
     return Compared(embedding, apart, probability, scores)
 
 
-def level_images(
-    source: Path, networks: tuple[Trained, Trained], places: int, progress: Progress = lambda *_: None
-) -> np.ndarray:
+def level_images(source: Path, networks: Networks, places: int, progress: Progress = lambda *_: None) -> np.ndarray:
     """Return level images [P, K, H, W, 3] u8 around places of a dataset, or of a scene, which is drawn."""
     if (source / "dataset.json").is_file():
         images = load_rooms(source).images[:, PITCHES.index("level")]
@@ -180,7 +181,7 @@ def level_images(
         raise ConfigError(
             f"{source}: is neither a dataset nor a scene; name one whose images to compare by: --images PATH"
         )
-    data, scene = camera_of(*networks), load_scene(source)
+    data, scene = networks.camera, load_scene(source)
     robot = get_robot(data.robot)
     xy = free_space(scene, robot.height_m).sample(np.random.default_rng([0, 19]), places, data.clearance_m)
     return Pictures(scene, data, robot, progress).draw_around(xy, headings(data), scene.name)
@@ -220,11 +221,11 @@ def _export_run(task: str, run: Path, out: Path, config: ExportConfig) -> dict[s
     return {**kept, "device": device, "command": origin["argv"]}
 
 
-def _export_map(path: Path, out: Path, networks: tuple[Trained, Trained]) -> dict[str, Any]:
+def _export_map(path: Path, out: Path, networks: Networks) -> dict[str, Any]:
     """Write a map with embeddings in half precision and return its facts."""
     built = load_map(path)
-    for name, network in zip(("localiser", "detector"), networks, strict=True):
-        if built.about.get(name) != network.about["digest"]:
+    for name, digest in networks.digests.items():
+        if built.about.get(name) != digest:
             raise MapError(f"{path}: was built with another {name}; build the map again with the exported one")
     save_map(dataclasses.replace(built, embeddings=built.embeddings.astype(np.float16)), out)
     return {"scene_digest": built.digest, "nodes": len(built.xy_w), "edges": len(built.edges)}
@@ -234,3 +235,91 @@ def _without_folder(word: str) -> str:
     """Return a word of a command line, an absolute path without the folders that it has on one machine alone."""
     key, sign, value = word.rpartition("=")
     return f"{key}{sign}{PurePath(value).name}" if PurePath(value).is_absolute() else word
+
+
+def packaged_weights() -> Path:
+    """Return where the weights of the package are, if it has any."""
+    return Path(str(importlib.resources.files("topological_nav"))) / "weights" / "exported"
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """Name the runs and maps that are used."""
+
+    localiser: Path
+    detector: Path
+    policy: str
+    """A run folder, or `PASSAGE_POLICY`."""
+    maps: tuple[Path, ...]
+    """Folders that may have the scene's map; the first is where a new one is kept."""
+    renewed: bool
+    """Whether a map there that does not fit may be built again: nobody but this program wrote it."""
+    source: str
+    """Where the networks come from; empty: they were named."""
+
+    def report(self, policy: bool = True) -> None:
+        """Print where the networks come from, and the local policy, unless the networks were named."""
+        if self.source:
+            say(f"{self.source}; local policy: {self.policy}" if policy else self.source)
+
+
+def choose(
+    localiser: Path | None,
+    detector: Path | None,
+    policy: str | None = None,
+    needs: Sequence[str] = ("rooms", "passages"),
+) -> Choice:
+    """Choose the run folders that are not given.
+
+    Networks that are not given come from one place: `RUNS`, where those needed are finished, else the package. The
+    policy of that place is used if neither network is given, else it is `PASSAGE_POLICY`.
+    """
+    given = {"rooms": localiser, "passages": detector}
+    missing = [task for task in needs if given[task] is None]
+    if not missing:
+        runs = localiser or RUNS / "rooms", detector or RUNS / "passages"
+        return Choice(*runs, policy or PASSAGE_POLICY, (RUNS / "maps",), False, "")
+    packaged = packaged_weights()
+    place = next((p for p in (RUNS, packaged) if all((p / task / DESCRIPTION).is_file() for task in missing)), None)
+    if place is None:
+        what = " and ".join(missing)
+        options = " or ".join({"rooms": "--localiser RUN", "passages": "--detector RUN"}[task] for task in missing)
+        raise RunError(
+            f"no trained networks of {what}: neither {RUNS} nor the installed package has them; train them (python -m "
+            f"topological_nav train {missing[0]}) or name a run folder: {options}"
+        )
+    chosen = {task: run or place / task for task, run in given.items()}
+    if policy is None:
+        policy = PASSAGE_POLICY
+        if not any(given.values()) and (place / "policy" / DESCRIPTION).is_file():
+            policy = str(place / "policy")
+    if place == RUNS:
+        source = f"networks: {' and '.join(str(chosen[task]) for task in missing)}"
+        maps, renewed = (RUNS / "maps",), False
+    else:
+        source = f"networks: {' and '.join(missing)} of the package, {packaged}{_origin(packaged)}"
+        maps, renewed = (RUNS / "maps-packaged", packaged / "maps"), True
+    return Choice(chosen["rooms"], chosen["passages"], policy, maps, renewed, source)
+
+
+def fitting_map(choice: Choice, scene: str, digest: str) -> Path | None:
+    """Return the first map of a scene that these networks can use, or None where there is none."""
+    networks = [read_description(run, "network", "TASK")["digest"] for run in (choice.localiser, choice.detector)]
+    for folder in choice.maps:
+        path = folder / f"{scene}.npz"
+        if path.is_file():
+            try:
+                about = load_map(path, digest).about
+            except MapError:
+                continue
+            if [about.get(name) for name in ("localiser", "detector")] == networks:
+                return path
+    return None
+
+
+def _origin(folder: Path) -> str:
+    try:
+        about = json.loads((folder / ABOUT).read_text())["networks"]["rooms"]
+        return f" (commit {about['commit'][:12]}, {about['device']})"
+    except (OSError, ValueError, KeyError):
+        return ""

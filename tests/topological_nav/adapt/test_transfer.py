@@ -14,7 +14,7 @@ from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.records import read_metrics
 from topological_nav.__main__ import main
-from topological_nav.adapt import adaptation, transfer
+from topological_nav.adapt import adaptation
 from topological_nav.adapt.config import AdaptConfig
 from topological_nav.data.dataset import load_passages, load_rooms
 from topological_nav.errors import DatasetError, Host, RunError, Stopped
@@ -166,7 +166,7 @@ def test_epochs_go_on_where_they_stopped_and_lines_that_were_lost_are_written_ag
 @pytest.fixture(scope="module")
 def configurations(made, tmp_path_factory):
     out = tmp_path_factory.mktemp("transfer") / "passages"
-    results = transfer.passage_configurations(made.passages, made.data, out, SHORT)
+    results = adaptation.passage_configurations(made.passages, made.data, out, SHORT)
     assert results is not None
     return out, results
 
@@ -190,7 +190,7 @@ def test_the_four_configurations_differ_in_what_they_learned_from(made, configur
 def test_what_learned_from_the_source_scores_there_as_before(made, tmp_path):
     """Configuration C in the source's own domain, on all its test images, is the run's own score."""
     config = AdaptConfig(domain="clean", fine_tune=2, test=10**6, fine_tune_epochs=1)
-    results = transfer.passage_configurations(made.passages, made.data, tmp_path / "clean", config)
+    results = adaptation.passage_configurations(made.passages, made.data, tmp_path / "clean", config)
     assert results is not None
     own = json.loads((made.passages / "results.json").read_text())
     assert results["tested_on"] == load_passages(made.data).test.sum()
@@ -204,11 +204,11 @@ def test_a_stopped_fine_tuning_goes_on_to_the_same_weights(made, configurations,
     places = made.passages, made.data, out, SHORT
     asked = []
     with pytest.raises(Stopped):
-        transfer.passage_configurations(*places, Host(signal=lambda: asked.append(1) is None))
+        adaptation.passage_configurations(*places, Host(signal=lambda: asked.append(1) is None))
     seen = iter([0, 0, 15])
     with pytest.raises(Stopped):
-        transfer.passage_configurations(*places, Host(signal=lambda: next(seen)))
-    results = transfer.passage_configurations(*places)
+        adaptation.passage_configurations(*places, Host(signal=lambda: next(seen)))
+    results = adaptation.passage_configurations(*places)
     assert results == configurations[1]
     assert same(weights(out), weights(configurations[0]))
 
@@ -270,12 +270,12 @@ def test_an_exported_detector_is_fine_tuned_and_makes_maps_like_the_runs(made, e
     """Weights in half precision, no optimiser state."""
     out, rooms, passages = tmp_path / "passages", exported / "rooms", exported / "passages"
     config = AdaptConfig(domain="clean", fine_tune=40, test=10**6, fine_tune_epochs=1)
-    results = transfer.passage_configurations(passages, made.data, out, config)
+    results = adaptation.passage_configurations(passages, made.data, out, config)
     assert results is not None and adapted_from(out, made.passages)
     own = json.loads((made.passages / "results.json").read_text())
     assert results["C"]["macro_f1"] == pytest.approx(own["groups"]["all"]["macro_f1"], abs=0.02)
     of = [
-        transfer.collected_map(made.scene, made.data, *networks, config).map
+        adaptation.collected_map(made.scene, made.data, *networks, config).map
         for networks in ((rooms, passages), (made.rooms, made.passages), (rooms, out))
     ]
     assert of[0].p == pytest.approx(of[1].p, abs=0.02)
@@ -296,21 +296,21 @@ def test_what_does_not_fit_is_refused(made, adapted, painted, tmp_path, capsys):
     with pytest.raises(ConfigError, match="domain is 'fog', expected one of clean"):
         AdaptConfig(domain="fog")
     with pytest.raises(RunError, match="was trained for 'rooms', expected a run of 'train passages'"):
-        transfer.passage_configurations(made.rooms, made.data, tmp_path / "x", SHORT)
+        adaptation.passage_configurations(made.rooms, made.data, tmp_path / "x", SHORT)
     other = tmp_path / "other"
     shutil.copytree(made.data, other)
     header = json.loads((other / "dataset.json").read_text())
     header["settings"]["passage_lengths_m"] = [1.2, 1.8, 2.5]
     (other / "dataset.json").write_text(json.dumps(header))
     with pytest.raises(DatasetError, match=r"detector judges \[0.6, 1.2, 1.8\]; make it again with passage_lengths_m="):
-        transfer.passage_configurations(made.passages, other, tmp_path / "y", SHORT)
+        adaptation.passage_configurations(made.passages, other, tmp_path / "y", SHORT)
     with pytest.raises(RunError, match="was trained for 'rooms'"):
-        transfer.collected_map(made.scene, made.data, made.rooms, made.rooms, SHORT)
+        adaptation.collected_map(made.scene, made.data, made.rooms, made.rooms, SHORT)
     changed = tmp_path / "painted"
     shutil.copytree(painted, changed)
     (changed / "scene.xml").write_text((changed / "scene.xml").read_text() + "\n")
     with pytest.raises(DatasetError, match="holds images of painted as they were, not of 'painted' as it is"):
-        transfer.collected_map(changed, made.data, made.rooms, made.passages, SHORT)
+        adaptation.collected_map(changed, made.data, made.rooms, made.passages, SHORT)
     there = adapted[0]
     with pytest.raises(RunError, match="the run there has domain = 'light', this one 'blur'"):
         adaptation.adapt_features(made.rooms, made.data, made.data, there, AdaptConfig(domain="blur"))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from interactive_nav_common.errors import UserError
-from topological_nav.data import shards
+from topological_nav.data import folders as shards
 from topological_nav.errors import DatasetError
 
 

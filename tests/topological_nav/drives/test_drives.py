@@ -16,8 +16,7 @@ from interactive_nav_common.errors import UserError
 from tests.topological_nav.conftest import DRIVEN
 from topological_nav.__main__ import main
 from topological_nav.config import DriveConfig
-from topological_nav.data.folders import lens_of
-from topological_nav.data.shards import read_shard
+from topological_nav.data.folders import lens_of, read_shard
 from topological_nav.drives import dataset as driving
 from topological_nav.drives.expert import drive_env
 from topological_nav.errors import DatasetError

@@ -30,7 +30,7 @@ from topological_nav.evaluate.evaluation import Contender, DrivenEpisodes, count
 from topological_nav.navigate.state import Events
 from topological_nav.scenes.rooms import RECORDED, find_rooms
 from topological_nav.scenes.simulation import Snapshot, episode_starts
-from topological_nav.weights import packaged
+from topological_nav.weights import export as packaged
 from train.config import EnvConfig, TrainConfig
 from train.config_io import to_yaml
 from train.runs.run_folder import RunFolder

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import dijkstra
 from interactive_nav.scenes.scene import load_scene
 from topological_nav.config import MapConfig
 from topological_nav.errors import MapError
-from topological_nav.maps import graph, nodes
+from topological_nav.maps import graph
 from topological_nav.scenes.rooms import find_rooms
 from topological_nav.scenes.space import free_space, spread
 
@@ -139,7 +139,7 @@ def parts(space, xy) -> int:
     """Parts that free edges join."""
     import networkx as nx
 
-    made = nx.Graph(nodes.free_edges(space, xy, 2.5, 0.225, 50).tolist())
+    made = nx.Graph(graph.free_edges(space, xy, 2.5, 0.225, 50).tolist())
     made.add_nodes_from(range(len(xy)))
     return nx.number_connected_components(made)
 
@@ -147,7 +147,7 @@ def parts(space, xy) -> int:
 def test_rooms_have_their_nodes_and_no_place_is_far_from_one(plan):
     space, rooms = plan
     config = MapConfig(min_per_room=5, spacing_m=1.2, connect=False)
-    xy, lacking = nodes.place_nodes(space, rooms, config, 0.225, 50)
+    xy, lacking = graph.place_nodes(space, rooms, config, 0.225, 50)
     assert (np.bincount(rooms.of(xy)) >= 5).all() and lacking == []
     assert (space.at(xy) >= config.clearance_m).all()
     places = space.centres(config.clearance_m)
@@ -160,9 +160,9 @@ def test_rooms_have_their_nodes_and_no_place_is_far_from_one(plan):
 def test_parts_that_a_way_joins_are_joined(plan):
     space, rooms = plan
     sparse = MapConfig(min_per_room=1, spacing_m=100.0, connect=False)
-    xy, _ = nodes.place_nodes(space, rooms, sparse, 0.225, 50)
+    xy, _ = graph.place_nodes(space, rooms, sparse, 0.225, 50)
     assert len(xy) == 2 and parts(space, xy) == 2  # one node a room: the partition stands between them
-    xy, lacking = nodes.place_nodes(space, rooms, MapConfig(min_per_room=1, spacing_m=100.0), 0.225, 50)
+    xy, lacking = graph.place_nodes(space, rooms, MapConfig(min_per_room=1, spacing_m=100.0), 0.225, 50)
     assert parts(space, xy) == 1 and lacking == [] and len(xy) > 2
     # Where there is room, they keep off the walls: the gap is 1 m wide, and a shortest way would graze its edge.
     assert (space.at(xy[2:]) >= 0.4).all()
@@ -171,7 +171,7 @@ def test_parts_that_a_way_joins_are_joined(plan):
 def test_rooms_that_no_way_joins_are_told(plan):
     space, rooms = plan
     config = MapConfig(min_per_room=1, spacing_m=100.0)
-    _, lacking = nodes.place_nodes(space, rooms, config, 0.6, 50)
+    _, lacking = graph.place_nodes(space, rooms, config, 0.6, 50)
     assert len(lacking) == 1 and "parts of the scene are not joined by any way with 0.6 m clearance" in lacking[0]
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from tests.topological_nav.maps.test_graph import hand_map
 from topological_nav.errors import MapError
-from topological_nav.learn.training import Trained
+from topological_nav.learn.training import Networks, Trained
 from topological_nav.maps.build import localisation_check
 from topological_nav.maps.sight import OUT_OF_SIGHT_M, NetworkSight, PassagePolicy, TrueSight
 from topological_nav.scenes.space import FreeSpace
@@ -46,7 +46,7 @@ def made():
 def test_aligned_images_are_compared_with_those_of_their_heading(made):
     rng = np.random.default_rng(1)
     images = rng.normal(size=(4, 5))
-    sight = NetworkSight(made, Fake("one"), Fake("two"), "aligned")  # type: ignore[arg-type]
+    sight = NetworkSight(made, Networks(Fake("one"), Fake("two")), "aligned")  # type: ignore[arg-type]
     # Headings of a node's images: 0, 60, 120, ... degrees; the nearest of these counts, around the circle.
     found = sight.distances(images, np.deg2rad([89.0, -29.0, 331.0, 360.0 + 120.0]))
     for row, k in enumerate((1, 0, 0, 2)):
@@ -57,7 +57,7 @@ def test_aligned_images_are_compared_with_those_of_their_heading(made):
 
 def test_nearest_images_are_compared_with_all(made):
     images = np.random.default_rng(2).normal(size=(3, 5))
-    sight = NetworkSight(made, Fake("one"), Fake("two"), "nearest")  # type: ignore[arg-type]
+    sight = NetworkSight(made, Networks(Fake("one"), Fake("two")), "nearest")  # type: ignore[arg-type]
     expected = [[min(np.linalg.norm(i - e) for e in made.embeddings[n]) for n in range(4)] for i in images]
     assert sight.distances(images, np.zeros(3)) == pytest.approx(np.array(expected), rel=1e-5)
     assert not sight.summed
@@ -71,9 +71,9 @@ def test_nearest_images_are_compared_with_all(made):
 
 def test_a_map_of_other_networks_is_refused(made):
     with pytest.raises(MapError, match="built with localiser one, this one is three"):
-        NetworkSight(made, Fake("three"), Fake("two"))  # type: ignore[arg-type]
+        NetworkSight(made, Networks(Fake("three"), Fake("two")))  # type: ignore[arg-type]
     with pytest.raises(MapError, match="built with detector two, this one is three"):
-        NetworkSight(made, Fake("one"), Fake("three"))  # type: ignore[arg-type]
+        NetworkSight(made, Networks(Fake("one"), Fake("three")))  # type: ignore[arg-type]
 
 
 def test_how_well_a_map_localises_by_hand():

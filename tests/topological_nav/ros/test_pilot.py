@@ -13,7 +13,7 @@ from topological_nav.learn.training import load_trained
 from topological_nav.maps.graph import load_map
 from topological_nav.ros.__main__ import _networks, main, parser
 from topological_nav.ros.drivers import topological_driver
-from topological_nav.weights.packaged import choose
+from topological_nav.weights.export import choose
 
 
 def seeing(made):

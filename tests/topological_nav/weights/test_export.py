@@ -16,7 +16,7 @@ from topological_nav.data.dataset import load_passages, load_rooms
 from topological_nav.drives.driving import load_policy
 from topological_nav.errors import RunError
 from topological_nav.learn.runs import weights_file
-from topological_nav.learn.training import load_trained, save_trained
+from topological_nav.learn.training import load_networks, load_trained, save_trained
 from topological_nav.maps.graph import load_map, save_map
 from topological_nav.maps.sight import NetworkSight
 from topological_nav.weights.export import level_images, size_lines, sizes_of
@@ -77,7 +77,7 @@ def test_maps_and_networks_fit_across_precisions(made, exported):
     images = load_rooms(made.data).images[::7, 1, ::5].reshape(-1, 32, 32, 3)
     heading = np.tile(np.arange(0, 18, 5) * np.deg2rad(20), len(images) // 4)
     found = [
-        NetworkSight(one, load_trained(home / "rooms"), load_trained(home / "passages")).distances(images, heading)
+        NetworkSight(one, load_networks(home / "rooms", home / "passages")).distances(images, heading)
         for one in maps
         for home in (made.rooms.parent, exported)
     ]
@@ -197,7 +197,7 @@ def test_a_network_trained_on_from_an_export_is_a_run_of_its_own(exported, tmp_p
 
 
 def test_images_of_a_scene_are_drawn_around_free_places(made):
-    networks = load_trained(made.rooms), load_trained(made.passages)
+    networks = load_networks(made.rooms, made.passages)
     images = level_images(made.scene, networks, 2)
     assert images.shape == (2, 18, 32, 32, 3) and images.dtype == np.uint8
     assert images.std((1, 2, 3)).min() > 3

@@ -15,10 +15,10 @@ from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.config import overlay
 from topological_nav.__main__ import main
 from topological_nav.config import RUNS, DataConfig
-from topological_nav.data.passages import draw_passages
+from topological_nav.data.dataset import draw_passages
 from topological_nav.drives.driving import load_policy
 from topological_nav.errors import RunError
-from topological_nav.learn.training import camera_of, load_trained
+from topological_nav.learn.training import load_networks
 from topological_nav.maps.build import renderer_of
 from topological_nav.maps.graph import load_map, save_map
 from topological_nav.ros.__main__ import _networks
@@ -26,9 +26,8 @@ from topological_nav.ros.__main__ import parser as ros_parser
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.rooms import find_rooms, recorded_rooms
 from topological_nav.scenes.space import free_space
-from topological_nav.weights import packaged
-from topological_nav.weights.export import sizes_of
-from topological_nav.weights.packaged import choose, fitting_map, packaged_weights
+from topological_nav.weights import export as packaged
+from topological_nav.weights.export import choose, fitting_map, packaged_weights, sizes_of
 
 ROOT = Path(__file__).parents[3]
 
@@ -50,17 +49,19 @@ def finish(*runs):
 def test_what_is_named_is_used(here):
     finish(here / "rooms", here / "passages", here / "policy")
     chosen = choose(Path("a"), Path("b"))
-    assert (chosen.localiser, chosen.detector, chosen.policy, chosen.said) == (Path("a"), Path("b"), "passage", "")
+    assert (chosen.localiser, chosen.detector, chosen.policy, chosen.source) == (Path("a"), Path("b"), "passage", "")
     assert chosen.maps == (RUNS / "maps",) and not chosen.renewed
     assert choose(Path("a"), Path("b"), "c").policy == "c"
 
 
-def test_own_runs_come_before_the_package(here):
+def test_own_runs_come_before_the_package(here, capsys):
     finish(here / "rooms", here / "passages", here / "policy", RUNS / "rooms", RUNS / "passages")
     chosen = choose(None, None)
     assert (chosen.localiser, chosen.detector) == (RUNS / "rooms", RUNS / "passages")
     assert chosen.policy == "passage" and chosen.maps == (RUNS / "maps",) and not chosen.renewed
-    assert chosen.told == f"networks: {RUNS}/rooms and {RUNS}/passages; local policy: passage"
+    chosen.report()
+    line = f"networks: {RUNS}/rooms and {RUNS}/passages"
+    assert capsys.readouterr().err == f"{line}; local policy: passage\n" and chosen.source == line
     finish(RUNS / "policy")
     assert choose(None, None).policy == str(RUNS / "policy")
     assert choose(None, None, "passage").policy == "passage"
@@ -75,7 +76,7 @@ def test_the_package_is_used_where_a_run_is_missing_or_not_finished(here):
     assert (chosen.localiser, chosen.detector) == (here / "rooms", here / "passages")
     assert chosen.policy == str(here / "policy") and chosen.renewed
     assert chosen.maps == (RUNS / "maps-packaged", here / "maps")
-    assert chosen.said.startswith(f"networks: rooms and passages of the package, {here} (commit 0123456789ab, NVIDIA")
+    assert chosen.source.startswith(f"networks: rooms and passages of the package, {here} (commit 0123456789ab, NVIDIA")
     # One that is named, or not needed, does not have to be there; its policy would be another's.
     some = choose(None, Path("mine"))
     assert (some.localiser, some.detector, some.policy) == (RUNS / "rooms", Path("mine"), "passage")
@@ -215,8 +216,8 @@ def test_the_packaged_weights_are_small_and_say_where_they_come_from():
 def test_the_packaged_networks_tell_free_ways_from_blocked_ones():
     """In a committed scene, ways and labels drawn as a dataset draws them, with a seed of their own."""
     folder = packaged_weights()
-    networks = load_trained(folder / "rooms"), load_trained(folder / "passages")
-    data = camera_of(*networks)
+    networks = load_networks(folder / "rooms", folder / "passages")
+    data = networks.camera
     scene, robot = load_scene(ROOT / "scenes_mjcf" / "cedar"), get_robot(data.robot)
     space, known = free_space(scene, robot.height_m), recorded_rooms(scene.digest)
     rooms = find_rooms(space, data.room_method, data.num_rooms, known, data.seed, data.clearance_m)
