@@ -1,6 +1,6 @@
-"""`python -m topological_nav data|train|map|navigate|evaluate|adapt|export`: words in, files and pictures out.
+"""Run `python -m topological_nav data|train|map|navigate|evaluate|adapt|export`: words in, files and pictures out.
 
-Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when asked to stop: the same command goes on.
+Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when stopped: the same command goes on.
 """
 
 import argparse
@@ -15,30 +15,19 @@ from typing import Any
 from interactive_nav_common.config import settings_help
 from interactive_nav_common.errors import reports_errors
 from interactive_nav_common.words import Parser, add_words, read_commands
-from topological_nav.adapt.config import AdaptConfig
-from topological_nav.config import (
-    ADAPTED,
-    DATASET,
-    DRIVES,
-    RUNS,
-    TASKS,
-    DataConfig,
-    DriveConfig,
-    EvaluationConfig,
-    ExportConfig,
-    MapConfig,
-    PolicyConfig,
-)
+from topological_nav import config as configs
+from topological_nav.config import ADAPTED, DATASET, DRIVES, RUNS
+from topological_nav.data.domains import AdaptConfig
 from topological_nav.errors import Stopped
 
 SETTINGS: dict[str, dict[str, Any]] = {
-    "data": {"": DataConfig(), " of drives": DriveConfig()},
-    "train": {"": TASKS["rooms"], " of policy": PolicyConfig()},
-    "map": {"": MapConfig()},
-    "navigate": {"": EvaluationConfig()},
-    "evaluate": {"": EvaluationConfig()},
+    "data": {"": configs.DataConfig(), " of drives": configs.DriveConfig()},
+    "train": {"": configs.TASKS["rooms"], " of policy": configs.PolicyConfig()},
+    "map": {"": configs.MapConfig()},
+    "navigate": {"": configs.EvaluationConfig()},
+    "evaluate": {"": configs.EvaluationConfig()},
     "adapt": {"": AdaptConfig()},
-    "export": {"": ExportConfig()},
+    "export": {"": configs.ExportConfig()},
 }
 """Command -> its settings, and of what else it does."""
 
@@ -65,13 +54,6 @@ def parser() -> argparse.ArgumentParser:
     return root
 
 
-COMMANDS = {
-    **{"data": "learning.data", "train": "learning.train", "map": "episodes.make_map", "navigate": "episodes.navigate"},
-    **{"evaluate": "episodes.evaluate", "adapt": "learning.adapt", "export": "episodes.export_runs"},
-}
-"""Command -> what runs it, in a module that is imported once the command is known: it is heavy."""
-
-
 @reports_errors("topological_nav")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command."""
@@ -80,8 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser().parse_args([word for word in words if word not in settings])
     arguments.settings = settings
     try:
-        module, _, name = COMMANDS[arguments.command].partition(".")
-        getattr(importlib.import_module(f"topological_nav.commands.{module}"), name)(arguments)
+        # Imported once the command is clear: it is heavy.
+        getattr(importlib.import_module("topological_nav.commands"), f"run_{arguments.command}")(arguments)
     except (Stopped, KeyboardInterrupt) as stopped:  # the latter: before the work began, or at a second Ctrl-C
         print("topological_nav: stopped; the same command goes on", file=sys.stderr)
         return 128 + (stopped.args[0] if isinstance(stopped, Stopped) else signal.SIGINT)

@@ -1,4 +1,4 @@
-"""Every setting of datasets, training and maps: frozen dataclasses checked on construction; docstrings are the help."""
+"""Define all settings of datasets, training and maps, checked on construction; docstrings are the help."""
 
 import dataclasses
 import math
@@ -11,22 +11,22 @@ from interactive_nav_common.errors import ConfigError
 PITCHES = ("up", "level", "down")
 """Order of a position's images by pitch."""
 RUNS = Path("runs/topological")
-"""Where commands write and read when they are told no other place."""
+"""Where commands write and read by default."""
 DATASET, DRIVES, ADAPTED = RUNS / "data", RUNS / "drives", RUNS / "adapted"
 PASSAGE_POLICY = "passage"
-"""The local policy without weights of its own: straight on while the passage detector agrees, else turn."""
+"""The local policy without weights: straight on while the passage detector agrees, else turn."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CameraConfig(Settings):
-    """Whose eyes draw, and how their images are stored."""
+    """Set whose eyes draw, and how their images are stored."""
 
     seed: Seed = 0
     """Of everything that is drawn by chance: positions, splits, passages, drives."""
     robot: str = "ttbot"
     """Whose camera draws."""
     engine: Literal["warp", "gl"] = "warp"
-    """Who draws: MJX-Warp's ray tracer (CPU or GPU), or MuJoCo's own renderer (needs EGL or OSMesa)."""
+    """Who draws: MJX-Warp's ray tracer (CPU or GPU), or MuJoCo's renderer (needs EGL or OSMesa)."""
     width: Annotated[int, (16, 2048)] = 128
     """Of a stored image, pixels."""
     height: Annotated[int, (16, 2048)] = 96
@@ -41,7 +41,7 @@ class CameraConfig(Settings):
 
 @dataclasses.dataclass(frozen=True)
 class DataConfig(CameraConfig):
-    """What is drawn of each scene. Defaults: the report's, at a stored size of 128 x 96."""
+    """Set what is drawn of each scene. Defaults: the report's, at a stored size of 128 x 96."""
 
     room_method: Literal["kmeans", "gmm", "spectral"] = "gmm"
     """How free positions are clustered into rooms."""
@@ -91,19 +91,19 @@ class DataConfig(CameraConfig):
 
     @property
     def passage_column(self) -> int:
-        """Which of `passage_lengths_m` is `passage_length_m`."""
+        """Return which of `passage_lengths_m` is `passage_length_m`."""
         return self.passage_lengths_m.index(self.passage_length_m)
 
     @property
     def pitches_rad(self) -> tuple[float, float, float]:
-        """Upward angles in the order of `PITCHES`."""
+        """Return upward angles in the order of `PITCHES`."""
         up = math.radians(self.pitch_deg)
         return up, 0.0, -up
 
 
 @dataclasses.dataclass(frozen=True)
 class NetworkTrainConfig(Settings):
-    """A network and how it learns. Defaults: the report's room classifier, from scratch."""
+    """Set a network and how it learns. Defaults: the report's room classifier, from scratch."""
 
     seed: Seed = 0
     """The one seed of weights, order and augmentation."""
@@ -141,7 +141,7 @@ TASKS = {"rooms": NetworkTrainConfig(), "passages": NetworkTrainConfig(batch=32,
 
 @dataclasses.dataclass(frozen=True)
 class MapConfig(Settings):
-    """Where nodes stand, and which edges join them."""
+    """Set where nodes stand, and which edges join them."""
 
     clearance_m: Annotated[float, (0.0, 10.0)] = 0.4
     """Least distance of nodes from obstacles: robots turn about there; TTbot's corners reach 0.33 m."""
@@ -152,11 +152,11 @@ class MapConfig(Settings):
     edge_m: Annotated[float, (0.1, 100.0)] = 2.5
     """Nodes nearer than this are joined, both ways."""
     edge_image: Literal["exact", "nearest"] = "exact"
-    """The image that an edge is judged by: drawn along it, or the nearest of the node's own."""
+    """The image that an edge is judged by: drawn along it, or the nearest of the node's images."""
     connect: bool = True
     """Add nodes until every free place that one can drive to is joined by free edges."""
     passable: Share = 0.5
-    """Edges with at least this probability count as open where connectedness is told."""
+    """Edges with at least this probability count as open where connectedness is reported."""
     supersample: Annotated[int | None, (1, 16)] = None
     """Images are drawn this many times larger along each side and averaged; auto: as the networks' were, on a CPU at
     most 2 (docs/topological.md says what that changes)."""
@@ -166,12 +166,12 @@ class MapConfig(Settings):
 
 @dataclasses.dataclass(frozen=True)
 class NavigatorConfig(Settings):
-    """How the navigator localises, turns and drives. Defaults: the report's where it gives a value."""
+    """Set how the navigator localises, turns and drives. Defaults: the report's where it gives a value."""
 
     images: Annotated[int, (1, 1000)] = 18
     """Images that one localisation looks at, evenly about; a divisor of the map's images a node."""
     match: Literal["aligned", "nearest"] = "aligned"
-    """An image is compared with the nodes' images of its own heading, and all are summed (aligned); or with all of
+    """An image is compared with the nodes' images of the same heading, and all are summed (aligned); or with all of
     them, and the nearest of all decides (nearest)."""
     passable: Share = 0.5
     """The passage detector agrees from this probability on."""
@@ -194,8 +194,8 @@ class NavigatorConfig(Settings):
     run_s: Annotated[float, (0.1, 1e6)] = 5.0
     """Length of a run."""
     glance: bool = True
-    """After every run, tell by the image ahead whether the robot is still at its node or at one joined to it, and plan
-    anew from there."""
+    """After every run, judge by the image ahead whether the robot is still at its node or at one joined to it, and plan
+    again from there."""
     watch_s: Annotated[float, (0.0, 1e6)] = 0.5
     """How often to look, within a run, whether the edge's head is passed (nearest of all, and getting farther), which
     ends the run; 0: never. Needs `glance`."""
@@ -203,7 +203,7 @@ class NavigatorConfig(Settings):
     """Added to the cost of an edge, -log p, for each of its metres: of ways that are all but surely free the shorter is
     taken; 0: the report's."""
     retry_cost: Annotated[float, (0.0, 1e6)] = 1.0
-    """Added to the cost of an edge each time that it was driven and the robot was then not found nearer to its head."""
+    """Added to the cost of an edge each time that it was driven and the robot was then not nearer to its head."""
     limit_s: Annotated[float, (0.1, 1e6)] = 1800.0
     """Time after which an episode has failed."""
     kp: Annotated[float, (0.0, 100.0)] = 2.0
@@ -218,7 +218,7 @@ class NavigatorConfig(Settings):
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationConfig(NavigatorConfig):
-    """The navigator, its episodes, and how they are scored."""
+    """Set the navigator, its episodes, and how they are scored."""
 
     seed: Seed = 0
     """Of the episodes."""
@@ -245,7 +245,7 @@ class EvaluationConfig(NavigatorConfig):
 
 @dataclasses.dataclass(frozen=True)
 class ExpertConfig(Settings):
-    """The expert: what it may command, how far it looks ahead, and what it weighs."""
+    """Set the expert: what it may command, how far it looks ahead, and what it weighs."""
 
     linear_m_s: Annotated[float, (0.01, 100.0)] = 0.5
     """Fastest forward; it never reverses."""
@@ -278,7 +278,7 @@ class ExpertConfig(Settings):
     lidar_fov_deg: Annotated[float, (1.0, 360.0)] = 270.0
     """Angle that they cover."""
     lidar_range_m: Annotated[float, (0.1, 100.0)] = 4.0
-    """What is farther is not seen."""
+    """What is farther is not measured."""
     radius_m: Annotated[float, (0.001, 10.0)] = 0.27
     """The planned way keeps its middle this far from obstacles."""
     near_m: Annotated[float, (0.001, 10.0)] = 0.3
@@ -291,7 +291,7 @@ class ExpertConfig(Settings):
 
 @dataclasses.dataclass(frozen=True)
 class DriveConfig(ExpertConfig, CameraConfig):
-    """Drives of the expert along edges of each scene's graph, seen from the robot."""
+    """Set the expert's drives along edges of each scene's graph, drawn from the robot."""
 
     backend: Literal["auto", "warp", "jax", "native"] = "auto"
     """Physics: as in `interactive_nav`."""
@@ -302,7 +302,7 @@ class DriveConfig(ExpertConfig, CameraConfig):
     legs: Count = 3
     """Edges a drive, at most: on from each node by a random edge that turns less than `turn_deg`."""
     turn_deg: Annotated[float, (0.0, 180.0)] = 30.0
-    """Sharpest turn from one edge to the next: nothing but the images tells the policy where to go."""
+    """Sharpest turn from one edge to the next: nothing but the images shows the policy where to go."""
     edge_m: Annotated[float, (0.1, 1000.0)] = 2.5
     """Longest edge, as in maps."""
     least_edge_m: Annotated[float, (0.0, 100.0)] = 1.0
@@ -325,7 +325,7 @@ class DriveConfig(ExpertConfig, CameraConfig):
 
 @dataclasses.dataclass(frozen=True)
 class PolicyConfig(Settings):
-    """The local policy and how it learns. Defaults: the report's, but 50 of its 1,000 epochs."""
+    """Set the local policy and how it learns. Defaults: the report's, but 50 of its 1,000 epochs."""
 
     seed: Seed = 0
     """The one seed of weights, order and thinning."""
@@ -365,7 +365,7 @@ class PolicyConfig(Settings):
 
 @dataclasses.dataclass(frozen=True)
 class ExportConfig(Settings):
-    """What an export must keep to."""
+    """Set what an export must keep to."""
 
     limit_mib: Annotated[float, (0.001, 1e6)] = 8.0
     """The whole folder is no larger."""

@@ -1,4 +1,4 @@
-"""What can go wrong for a user of `topological_nav`: each error is one clear line (what, got, expected, remedy)."""
+"""Define the errors of users of `topological_nav`, each one clear line, and who is informed of long work."""
 
 import dataclasses
 import sys
@@ -8,23 +8,23 @@ from interactive_nav_common.errors import UserError
 
 
 class SpaceError(UserError):
-    """A scene without the free space that is needed."""
+    """Report a scene without the free space that is needed."""
 
 
 class DatasetError(UserError):
-    """A dataset that is missing, incomplete, or of other settings."""
+    """Report a dataset that is missing, incomplete, or of other settings."""
 
 
 class RunError(UserError):
-    """A run folder that is missing, damaged, or trained with other settings."""
+    """Report a run folder that is missing, damaged, or trained with other settings."""
 
 
 class MapError(UserError):
-    """A topological map that is damaged, of another version, or of another scene."""
+    """Report a topological map that is damaged, of another version, or of another scene."""
 
 
 class Stopped(Exception):
-    """A signal to stop; carries its number. What was done is kept, and the same command goes on."""
+    """Stop at a signal, whose number it carries. What was done is kept, and the same command goes on."""
 
 
 Progress = Callable[[str, int, int], None]
@@ -33,7 +33,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclasses.dataclass(frozen=True)
 class Host:
-    """Whoever started long work: shows its lines, and stops it between two steps."""
+    """Show the lines of long work, and stop it between two steps."""
 
     show: Callable[[str], None] = lambda _: None
     signal: Callable[[], int] = lambda: 0

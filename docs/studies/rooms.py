@@ -17,8 +17,7 @@ from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.errors import reports_errors
 from topological_nav.config import DataConfig
 from topological_nav.figures.maps import floor_plan, plt, room_points, save
-from topological_nav.scenes.rooms import METHODS, agreement, find_rooms, recorded_rooms
-from topological_nav.scenes.space import free_space
+from topological_nav.scenes.space import METHODS, agreement, find_rooms, free_space, recorded_rooms
 
 
 def compare(scene_folders: Sequence[Path], seed: int = 0, clearance_m: float = 0.2) -> list[dict[str, Any]]:

@@ -12,7 +12,6 @@ import pytest
 
 from interactive_nav_common.config import overridden
 from topological_nav.__main__ import parser
-from topological_nav.adapt.config import AdaptConfig
 from topological_nav.config import (
     TASKS,
     DataConfig,
@@ -22,6 +21,7 @@ from topological_nav.config import (
     MapConfig,
     PolicyConfig,
 )
+from topological_nav.data.domains import AdaptConfig
 from train.config_io import load_config
 
 ROOT = Path(__file__).parents[2]

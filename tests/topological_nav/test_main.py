@@ -8,13 +8,13 @@ from PIL import Image
 
 from docs.studies import rooms as rooms_study
 from interactive_nav.scenes.scene import load_scene
+from topological_nav import commands
 from topological_nav.__main__ import main
-from topological_nav.commands import episodes
 from topological_nav.learn.networks import nearest_node
 from topological_nav.maps import build
 from topological_nav.maps.graph import load_map
 from topological_nav.ros.__main__ import main as nodes
-from topological_nav.scenes import rooms
+from topological_nav.scenes import space as rooms
 from topological_nav.scenes.rendering import SceneRenderer
 
 
@@ -155,7 +155,7 @@ def test_a_stop_before_the_work_begins_is_one_line(monkeypatch, capsys):
     def stopped(arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("topological_nav.commands.learning.data", stopped)
+    monkeypatch.setattr("topological_nav.commands.run_data", stopped)
     assert main(["data", "nowhere"]) == 128 + signal.SIGINT
     assert capsys.readouterr().err == "topological_nav: stopped; the same command goes on\n"
 
@@ -177,8 +177,8 @@ def test_rooms_of_a_scene_are_compared_in_a_figure(made, tmp_path, capsys, monke
 
 def test_time_left_is_told_by_what_this_run_has_done_so_far(monkeypatch, capsys):
     clock = iter((400.0, 420.0, 500.0))  # after five minutes of compiling
-    monkeypatch.setattr(episodes.time, "perf_counter", lambda: next(clock))
-    with episodes.bar() as tell:
+    monkeypatch.setattr(commands.time, "perf_counter", lambda: next(clock))
+    with commands.bar() as tell:
         for done in (20, 25, 30, 31, 100):
             tell("cedar", done, 100)
     # 20 were there before; then 10 in 20 s, so 140 s for the other 70.

@@ -1,1 +1,1 @@
-"""Rooms and passages as datasets of images."""
+"""Make datasets of images of rooms and passages."""

@@ -26,8 +26,7 @@ from topological_nav.config import DataConfig
 from topological_nav.data.folders import Folder, draw_missing, load_scenes, numbered, read_arrays, read_shards
 from topological_nav.errors import DatasetError, Progress, SpaceError
 from topological_nav.scenes.rendering import camera_pose
-from topological_nav.scenes.rooms import Rooms, agreement, recorded_rooms, scene_rooms
-from topological_nav.scenes.space import FreeSpace, free_space, spread
+from topological_nav.scenes.space import FreeSpace, Rooms, agreement, free_space, recorded_rooms, scene_rooms, spread
 
 DATASET = Folder(
     file="dataset.json",

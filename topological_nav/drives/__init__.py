@@ -1,1 +1,1 @@
-"""The expert's drives, and the local policy that learns from them."""
+"""Simulate the expert's drives, and train the local policy on them."""

@@ -32,8 +32,7 @@ from topological_nav.drives.expert import CONTROL_S, RECORDERS, Tasks, Terrain, 
 from topological_nav.errors import DatasetError, Progress, SpaceError
 from topological_nav.maps.graph import angles, near_pairs, place_nodes
 from topological_nav.scenes.rendering import camera_pose
-from topological_nav.scenes.rooms import scene_rooms
-from topological_nav.scenes.space import FreeSpace, free_space
+from topological_nav.scenes.space import FreeSpace, free_space, scene_rooms
 
 DRIVES = Folder(
     file="drives.json",

@@ -25,7 +25,7 @@ Memory = tuple[jax.Array, jax.Array]
 
 
 class SummedCell(nn.Module):
-    """A GRU cell (Cho et al. 2014, with the reset gate after the product) whose gates read a sum of memories.
+    """Define a GRU cell (Cho et al. 2014, reset gate after the product) whose gates read a sum of memories.
 
     With the input x, the sum s and its memory h: r, z = sigmoid(W x + U s + b) and n = tanh(V x + c + r (Q s + d))
     make the new memory (1 - z) n + z h. It keeps only its memory, which stays within (-1, 1).

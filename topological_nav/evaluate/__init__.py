@@ -1,1 +1,1 @@
-"""Navigators in, rows of episodes out."""
+"""Play episodes with navigators, and score their rows."""

@@ -53,9 +53,8 @@ from topological_nav.maps.build import drawn_for, renderer_of, true_map
 from topological_nav.maps.graph import TopologicalMap, load_map
 from topological_nav.maps.sight import NetworkSight, Sight, TrueSight
 from topological_nav.navigate.navigator import Navigator
-from topological_nav.scenes.rooms import scene_rooms
 from topological_nav.scenes.simulation import CONTROL, Camera, make_env, pose_camera, scene_camera
-from topological_nav.scenes.space import FreeSpace, free_space
+from topological_nav.scenes.space import FreeSpace, free_space, scene_rooms
 from train.runs import checkpoint
 from train.runs.run_folder import RunFolder
 
@@ -67,7 +66,7 @@ UNDECIDING = ("batch", "episodes", "supersample")
 
 @dataclasses.dataclass(frozen=True)
 class Contest:
-    """Who plays what."""
+    """Set who plays what."""
 
     scenes: tuple[Path, ...]
     contenders: tuple[str, ...]
@@ -105,7 +104,7 @@ class Contest:
 
 
 class ContestScene:
-    """One scene of a contest; what is costly is built when it is first needed."""
+    """Hold one scene of a contest; what is costly is built when it is first needed."""
 
     def __init__(self, folder: Path, contest: Contest, networks: Networks | None):
         self.contest, self.networks = contest, networks

@@ -24,9 +24,8 @@ from topological_nav.config import EvaluationConfig
 from topological_nav.errors import SpaceError
 from topological_nav.navigate.navigator import Navigator
 from topological_nav.navigate.state import Events, State
-from topological_nav.scenes.rooms import Rooms
 from topological_nav.scenes.simulation import Camera, Snapshot, episode_starts
-from topological_nav.scenes.space import FreeSpace
+from topological_nav.scenes.space import FreeSpace, Rooms
 from train.scoring.policies import Planner
 
 CONNECTED_M = 0.25
@@ -37,10 +36,10 @@ LEAST, MOST, PER_M2 = 25, 60, 0.5
 
 @dataclasses.dataclass(frozen=True)
 class DrivenEpisodes(Rows):
-    """Fixed episodes of one scene."""
+    """Hold fixed episodes of one scene."""
 
     number: np.ndarray
-    """[n] i32, theirs in the scene."""
+    """[n] i32, in the scene."""
     start_xy_w: np.ndarray
     """[n, 2] m."""
     yaw_rad: np.ndarray
@@ -107,7 +106,7 @@ EXPERT_WEIGHT = 1.0
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Played:
-    """The outcome of n episodes."""
+    """Hold the outcome of n episodes."""
 
     success: np.ndarray
     """[n] bool."""
@@ -138,7 +137,7 @@ class Played:
 
 
 class Contender(HostPolicy):
-    """Plays a batch of episodes, by the rule for all, and keeps what their scores need of every step."""
+    """Play a batch of episodes, by the rule for all, and keep what their scores need of every step."""
 
     observes = False
 
@@ -237,7 +236,7 @@ def _outcome(moments: dict[str, np.ndarray], dt_s: float) -> dict[str, Any]:
 
 
 class NavigatorPlayer(Contender):
-    """The navigator, seeing through a camera."""
+    """Play with the navigator, which looks through a camera."""
 
     def __init__(
         self,
@@ -285,7 +284,7 @@ Act = Callable[[Any, np.ndarray, np.ndarray, int], Any]
 
 
 class ActionPlayer(Contender):
-    """A policy that acts on the environment's state: its runs follow each other without a break."""
+    """Play with a policy that acts on the environment's state: its runs follow each other without a break."""
 
     def __init__(self, player: Player, config: EvaluationConfig, make_act: Callable[[], Act], observes: bool = False):
         super().__init__(player, config)

@@ -48,7 +48,7 @@ def by_scene(rows: pa.Table, name: str) -> list[float]:
 
 @dataclasses.dataclass(frozen=True)
 class Line:
-    """A line of the summary."""
+    """Hold a line of the summary."""
 
     contender: str
     group: str
@@ -75,7 +75,7 @@ def summary(rows: pa.Table) -> list[Line]:
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """Two means compared."""
+    """Compare two means."""
 
     compared: str
     score: str

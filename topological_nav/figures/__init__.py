@@ -1,1 +1,1 @@
-"""Rows, maps and paths in, pictures out."""
+"""Draw rows, maps and paths."""

@@ -204,7 +204,7 @@ PATH_RGB, GOAL_RGB, ROBOT_RGB = (31, 119, 180), (44, 160, 44), (214, 39, 40)
 
 @dataclasses.dataclass(frozen=True)
 class Driven:
-    """An episode."""
+    """Hold an episode."""
 
     venue: ContestScene
     map: TopologicalMap

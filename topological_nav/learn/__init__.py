@@ -1,1 +1,1 @@
-"""Images and labels in, trained networks out."""
+"""Train networks on images and labels."""

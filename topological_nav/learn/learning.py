@@ -1,4 +1,4 @@
-"""Images and labels in, trained variables out: on an accelerator a whole epoch is one compiled program.
+"""Train variables on images and labels: on an accelerator a whole epoch is one compiled program.
 
 The images stay on the device as u8. An epoch's order and augmentation follow from the seed and its number alone, so a
 run that goes on from a checkpoint ends where an uninterrupted one does.
@@ -27,7 +27,7 @@ VIEW_STEPS = 2
 
 @flax.struct.dataclass
 class Learner:
-    """What an epoch changes."""
+    """Hold what an epoch changes."""
 
     params: Any
     batch_stats: Any

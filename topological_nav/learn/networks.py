@@ -12,12 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-TASKS = ("rooms", "passages")
 _EPSILON = 1e-6
 
 
 class ResNet18(nn.Module):
-    """He et al. 2016, table 1: stem, then four stages of two residual blocks."""
+    """Define the ResNet-18 of He et al. 2016, table 1: stem, then four stages of two residual blocks."""
 
     width: int = 64
 
@@ -49,7 +48,7 @@ class _Block(nn.Module):
 
 
 class AlexNet(nn.Module):
-    """The five convolutions of Krizhevsky 2014 (one column), padded so that small images pass."""
+    """Define the five convolutions of Krizhevsky 2014 (one column), padded so that small images pass."""
 
     width: int = 64
 
@@ -67,7 +66,7 @@ class AlexNet(nn.Module):
 
 
 class Network(nn.Module):
-    """A backbone and the head of a task."""
+    """Join a backbone and the head of a task."""
 
     task: str
     """rooms: two layers with leaky ReLU; passages: an output a length, never more for a longer
@@ -107,7 +106,7 @@ class Network(nn.Module):
 
 
 class Contrast(nn.Module):
-    """A backbone and the expander of VICReg."""
+    """Join a backbone and the expander of VICReg."""
 
     backbone: str = "resnet18"
     width: int = 64
@@ -222,7 +221,7 @@ class Places(NamedTuple):
 def localisation_scores(queries: Places, nodes: Places) -> dict[str, float]:
     """Return how well `nearest_node` does in one scene.
 
-    `node` is the share of queries given the node that is nearest in truth; `room`: share given a node of their own
+    `node` is the share of queries given the node that is nearest in truth; `room`: share given a node of the same
     room; `error_m`: median distance to the node given; `least_error_m`: the same for the nearest in truth.
     """
     each = queries.embeddings.shape[1]

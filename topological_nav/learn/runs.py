@@ -1,4 +1,4 @@
-"""A run folder's files: settings that a run is bound to, epochs with metrics, checkpoints to go on from."""
+"""Write and read a run folder's files: settings, epochs with metrics, checkpoints to go on from."""
 
 import contextlib
 import dataclasses
@@ -117,7 +117,7 @@ def weights_file(run: Path) -> Path:
 
 @dataclasses.dataclass(frozen=True)
 class _Description:
-    """The fields that every network.json needs."""
+    """Hold the fields that every network.json needs."""
 
     task: str
     digest: str

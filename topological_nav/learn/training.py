@@ -55,7 +55,7 @@ SAME = ("robot", "engine", "width", "height", "fov_deg")
 
 @dataclasses.dataclass(frozen=True)
 class Trained:
-    """A network and its weights."""
+    """Hold a network and its weights."""
 
     network: Network
     variables: dict[str, Any]
@@ -101,7 +101,7 @@ def _applied(network: Network, method: str, variables: Any, images: jax.Array) -
 
 @dataclasses.dataclass(frozen=True)
 class _Work:
-    """The images that a run learns from and is scored by."""
+    """Hold the images that a run learns from and is scored by."""
 
     rooms: RoomImages
     images: np.ndarray
@@ -249,7 +249,7 @@ def localisation(
 ) -> dict[str, Any]:
     """Score an embedding: training positions as nodes, every third level image of test positions as queries.
 
-    Each scene on its own; `mean` weighs them by queries. See `networks.localisation_scores`. Queries are images of
+    Each scene counts alone; `mean` weighs them by queries. See `networks.localisation_scores`. Queries are images of
     `other_rooms` (default: the same) that `other` embeds (default: the same); scenes are those of both, by name.
     """
     other, other_rooms = other or trained, other_rooms or rooms

@@ -27,8 +27,7 @@ from topological_nav.learn.training import Networks, Trained, load_networks
 from topological_nav.maps.graph import TopologicalMap, assemble, lengths, place_nodes
 from topological_nav.maps.sight import NetworkSight, Sight, place_distances
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
-from topological_nav.scenes.rooms import Rooms, scene_rooms
-from topological_nav.scenes.space import FreeSpace, free_space
+from topological_nav.scenes.space import FreeSpace, Rooms, free_space, scene_rooms
 
 CHUNK = 252
 """Images drawn between two reports: fourteen calls of the renderer."""

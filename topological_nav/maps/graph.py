@@ -26,8 +26,7 @@ from interactive_nav_common.grids import MOVES_4, cell_centres, follow, grid_gra
 from interactive_nav_common.untrusted.reading import read_npz
 from topological_nav.config import MapConfig
 from topological_nav.errors import MapError
-from topological_nav.scenes.rooms import Rooms
-from topological_nav.scenes.space import FreeSpace
+from topological_nav.scenes.space import FreeSpace, Rooms
 
 FORMAT = 1
 """Of map files; raised whenever older ones would be read wrongly."""

@@ -1,1 +1,1 @@
-"""Images in, velocities out."""
+"""Command velocities by images."""

@@ -103,7 +103,7 @@ class Events:
 
 
 class Work(types.SimpleNamespace):
-    """A copy of a state that a step writes into, and its events."""
+    """Hold a copy of a state that a step writes into, and its events."""
 
     def __init__(self, state: State, batch: int):
         """Copy the state of a batch."""

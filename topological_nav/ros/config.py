@@ -10,7 +10,7 @@ from interactive_nav_common.errors import UserError
 
 @dataclasses.dataclass(frozen=True)
 class SimulatorConfig(Settings):
-    """What is simulated and sensed."""
+    """Set what is simulated and sensed."""
 
     seed: Annotated[int, (0, 2**31 - 1)] = 0
     """Of the start, where none is given, and of sensor noise."""

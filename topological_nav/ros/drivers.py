@@ -27,7 +27,7 @@ from topological_nav.weights.export import Choice
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """The velocity that a driver commands until its next step."""
+    """Hold the velocity that a driver commands until its next step."""
 
     linear_mps: float
     angular_radps: float
@@ -42,7 +42,7 @@ class Command:
 
 
 class Driver(Protocol):
-    """Drives one episode; its `step` is called once for each picture that arrives."""
+    """Drive one episode; its `step` is called once for each picture that arrives."""
 
     @property
     def lens(self) -> Lens | None:

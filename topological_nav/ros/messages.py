@@ -61,7 +61,7 @@ OPTICAL_QUAT = Quaternion(x=-0.5, y=0.5, z=-0.5, w=0.5)
 
 
 class MessageError(UserError):
-    """A message that cannot be read."""
+    """Report a message that cannot be read."""
 
 
 def qos(topic: str, depth: int = 10, reading: bool = False) -> QoSProfile:

@@ -30,14 +30,14 @@ LOST_S = 1.0
 _PATIENCE_S = 180.0
 """Wall-clock time to wait for other nodes."""
 _DELIVERY_S = 1.0
-"""Between the last message and the end of a node: DDS sends in threads of its own."""
+"""Between the last message and the end of a node: DDS sends in other threads."""
 Stop = Callable[[], bool]
 """Returns whether to stop."""
 Say = Callable[[str], None]
 
 
 class RosError(UserError):
-    """Another node is missing or silent."""
+    """Report that another node is missing or silent."""
 
 
 @contextlib.contextmanager
@@ -67,7 +67,7 @@ def ros_node(name: str) -> Iterator[Node]:
 
 
 class SimulatorNode:
-    """Publishes the sensors of a simulated robot, and drives it by velocity commands."""
+    """Publish the sensors of a simulated robot, and drive it by velocity commands."""
 
     def __init__(self, node: Node, simulator: RosSimulator, pace: Pace, say: Say = lambda _: None):
         """Create its publishers and subscriptions on a node of `ros_node`."""
@@ -185,7 +185,7 @@ class SimulatorNode:
 
 
 class Headings:
-    """The last headings by time; not safe for several threads at once."""
+    """Hold the last headings by time; not safe for several threads at once."""
 
     def __init__(self, kept: int = 256):
         self._pairs: deque[tuple[float, float]] = deque(maxlen=kept)
@@ -210,7 +210,7 @@ class Headings:
 
 
 class NavigatorNode:
-    """Hands each picture and its heading to a driver, and publishes the driver's commands.
+    """Hand each picture and its heading to a driver, and publish the driver's commands.
 
     It does not know whether a robot or a simulator is behind the topics: time is that of the pictures.
     """
@@ -225,8 +225,7 @@ class NavigatorNode:
     ):
         """Create its publishers and subscriptions on a node of `ros_node`.
 
-        Args:
-            heading_offset_rad: yaw of that sensor's frame in the map's, added to the heading.
+        The offset is the yaw of the heading sensor's frame in the map's, added to the heading.
         """
         self._driver, self._offset, self._say = driver, heading_offset_rad, say
         self._news = threading.Condition()

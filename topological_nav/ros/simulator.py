@@ -29,7 +29,7 @@ LIDAR_POS_M = LIDAR_B[ROBOT]
 
 @dataclasses.dataclass(frozen=True)
 class Sensed:
-    """One moment as sensors measure it, and the ground truth for scoring."""
+    """Hold one moment as sensors measure it, and the ground truth for scoring."""
 
     time_s: float
     rgb: np.ndarray
@@ -54,7 +54,7 @@ class Sensed:
 
 @dataclasses.dataclass(frozen=True)
 class Pace:
-    """How simulated time runs."""
+    """Set how simulated time runs."""
 
     factor: float = 1.0
     """Simulated seconds per second; 0: as fast as possible."""
@@ -68,7 +68,7 @@ class Pace:
 
 @dataclasses.dataclass
 class Tally:
-    """Totals of an episode, from the simulator's ground truth."""
+    """Sum up an episode, from the simulator's ground truth."""
 
     seconds: float = 0.0
     path_m: float = 0.0
@@ -94,7 +94,7 @@ class Tally:
 
 
 class RosSimulator:
-    """One robot in one scene."""
+    """Simulate one robot in one scene."""
 
     range_min_m, lidar_pos_m = LIDAR_NEAR_M, LIDAR_POS_M
 

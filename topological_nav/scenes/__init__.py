@@ -1,1 +1,1 @@
-"""A scene at rest: free space, rooms, images, a robot that drives in it."""
+"""Use a scene at rest: its free space, rooms and images, and a robot that drives in it."""

@@ -51,7 +51,7 @@ def episode_starts(start_xy_w: Any, yaw_rad: Any, goal_xy_w: Any, objects: int, 
 
 @dataclasses.dataclass(frozen=True)
 class Snapshot:
-    """Where a batch of robots is."""
+    """Hold where a batch of robots is."""
 
     xy_w: np.ndarray
     """[B, 2] m."""

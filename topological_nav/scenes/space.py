@@ -1,16 +1,27 @@
-"""A scene in, its free space out: where a robot may stand, and whether a straight way is free.
+"""Compute the free space of a scene, where a robot may stand and which straight ways are free, and its rooms.
 
-Obstacles are the walls and everything movable where it stands at rest, up to the robot's height, doors included.
+Obstacles are the walls and everything movable where it stands at rest, up to the robot's height, doors included. Rooms
+are clusters of free positions by their coordinates alone. Where a scene's plan is recorded (plans.json: the generated
+scenes, drawn by `converters.generate.design_building`), they are compared with it by the adjusted Rand index.
 """
 
 import dataclasses
+import json
+from pathlib import Path
 
 import numpy as np
 import shapely
+from scipy.spatial import cKDTree
+from sklearn.cluster import KMeans, SpectralClustering
+from sklearn.metrics import adjusted_rand_score, silhouette_score
+from sklearn.mixture import GaussianMixture
+from threadpoolctl import threadpool_limits
 
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.topdown import shadow
+from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.grids import cell_centres, clearance
+from topological_nav.config import DataConfig
 from topological_nav.errors import SpaceError
 
 _FREE_M = 1e-6
@@ -19,7 +30,7 @@ _FREE_M = 1e-6
 
 @dataclasses.dataclass(frozen=True)
 class FreeSpace:
-    """A grid of distances to the nearest obstacle."""
+    """Hold a grid of distances to the nearest obstacle."""
 
     clearance_m: np.ndarray
     """[rows along y, columns along x] from a cell's centre; 0 where blocked."""
@@ -36,16 +47,16 @@ class FreeSpace:
         return cell_centres(self.free(least_m), self.resolution_m, self.origin_w)
 
     def cells(self, xy_w: np.ndarray) -> np.ndarray:
-        """[..., 2] int, column and row of the cells that hold points [..., 2], inside the map or not."""
+        """Return the column and row [..., 2] of the cells that hold points [..., 2], inside the map or not."""
         return np.floor((np.asarray(xy_w, float) - self.origin_w) / self.resolution_m).astype(int)
 
     def inner_cells(self, xy_w: np.ndarray) -> np.ndarray:
-        """The same, of the map's cells nearest to them."""
+        """Return the same, of the map's cells nearest to them."""
         rows, columns = self.clearance_m.shape
         return np.clip(self.cells(xy_w), 0, (columns - 1, rows - 1))
 
     def at(self, xy_w: np.ndarray) -> np.ndarray:
-        """[...] m: clearance of the cells that hold points [..., 2]; 0 outside the map."""
+        """Return the clearance [...] (m) of the cells that hold points [..., 2]; 0 outside the map."""
         cell = self.inner_cells(xy_w)
         inside = (cell == self.cells(xy_w)).all(-1)
         return np.where(inside, self.clearance_m[cell[..., 1], cell[..., 0]], 0.0)
@@ -62,7 +73,7 @@ class FreeSpace:
         return np.asarray((self.at(along) >= max(margin_m, _FREE_M) - 1e-9).all(-1))
 
     def sample(self, rng: np.random.Generator, count: int, least_m: float) -> np.ndarray:
-        """[count, 2] m: different cell centres with at least this clearance, uniform over them."""
+        """Draw different cell centres [count, 2] with at least this clearance, uniform over them."""
         centres = self.centres(least_m)
         if len(centres) < count:
             raise SpaceError(
@@ -97,3 +108,127 @@ def spread(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarr
         picked.append(nearest)
         away = np.minimum(away, np.linalg.norm(points - points[nearest], axis=1))
     return np.asarray(picked)
+
+
+METHODS = ("kmeans", "gmm", "spectral")
+MAX_ROOMS = 15
+"""Most rooms that a choice by BIC or silhouette considers."""
+CLUSTERED = 1000
+"""Free positions that are clustered: enough that a doorway holds several."""
+_PLANS = json.loads(Path(__file__).with_name("plans.json").read_text(encoding="utf-8"))
+RECORDED: dict[str, tuple[tuple[float, ...], ...]] = {
+    plan["digest"]: tuple(map(tuple, plan["rooms"])) for plan in _PLANS.values()
+}
+"""Digest of a scene -> x0, y0, x1, y1 (m, world) of the clear inside of each room that its building was drawn with."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Rooms:
+    """Hold the rooms of a scene, given by the nearest of many labelled positions."""
+
+    points_w: np.ndarray
+    """[n, 2] m."""
+    labels: np.ndarray
+    """[n] i32, 0 to count - 1, in the order of the rooms' means by x, then y."""
+    method: str
+    chosen_by: str
+    """What decided their number: config, recorded, bic or silhouette."""
+
+    @property
+    def count(self) -> int:
+        """Return the number of rooms."""
+        return int(self.labels.max()) + 1
+
+    def of(self, xy_w: np.ndarray) -> np.ndarray:
+        """Return the room [...] of each point [..., 2]."""
+        _, nearest = cKDTree(self.points_w).query(np.asarray(xy_w, float))
+        return self.labels[nearest]
+
+
+def cluster(points: np.ndarray, method: str, count: int, seed: int) -> np.ndarray:
+    """Return labels [n] i32 of points [n, 2] (m), numbered by the clusters' means along x, then y."""
+    if method not in METHODS:
+        raise ConfigError(f"method is '{method}', expected one of {', '.join(METHODS)}")
+    if not 1 <= count <= len(points):
+        raise ConfigError(f"count is {count}, expected between 1 and the {len(points)} points")
+    if count == 1:
+        return np.zeros(len(points), np.int32)
+    with threadpool_limits(1):  # on problems this small, threads cost more than they give
+        if method == "kmeans":
+            labels = KMeans(count, n_init=10, random_state=seed).fit_predict(points)  # type: ignore[arg-type]
+        elif method == "gmm":
+            labels = _mixture(points, count, seed).predict(points)
+        else:
+            near = min(10, len(points) - 1)
+            labels = SpectralClustering(
+                count, affinity="nearest_neighbors", n_neighbors=near, assign_labels="cluster_qr", random_state=seed
+            ).fit_predict(points)
+    return _ordered(points, np.asarray(labels))
+
+
+def choose_count(points: np.ndarray, method: str, seed: int, most: int = MAX_ROOMS) -> tuple[int, str]:
+    """Choose a number of clusters where none is given; return it and the criterion's name.
+
+    The Gaussian mixture takes the least Bayesian information criterion, the others the greatest silhouette, which
+    needs at least two clusters.
+    """
+    most = min(most, len(points) - 1)
+    if method == "gmm":
+        with threadpool_limits(1):
+            scores = [_mixture(points, k, seed).bic(points) for k in range(1, most + 1)]
+        return 1 + int(np.argmin(scores)), "bic"
+    scores = [silhouette_score(points, cluster(points, method, k, seed)) for k in range(2, most + 1)]
+    return 2 + int(np.argmax(scores)), "silhouette"
+
+
+def find_rooms(
+    space: FreeSpace, method: str, num_rooms: int | None, recorded: np.ndarray | None, seed: int, clearance_m: float
+) -> Rooms:
+    """Cluster a scene's free positions."""
+    centres = space.centres(clearance_m)
+    rng = np.random.default_rng([seed, 1])
+    points = centres[np.sort(rng.choice(len(centres), min(CLUSTERED, len(centres)), replace=False))]
+    if num_rooms is not None:
+        count, by = num_rooms, "config"
+    elif recorded is not None:
+        count, by = len(recorded), "recorded"
+    else:
+        count, by = choose_count(points, method, seed)
+    if count > len(points):
+        raise SpaceError(f"{count} rooms in {len(points)} free cells; expected fewer rooms or a finer map")
+    return Rooms(points, cluster(points, method, count, seed), method, by)
+
+
+def scene_rooms(scene: Scene, space: FreeSpace, config: DataConfig) -> Rooms:
+    """Return a scene's rooms as a dataset of these settings has them; see `find_rooms`."""
+    recorded = recorded_rooms(scene.digest)
+    return find_rooms(space, config.room_method, config.num_rooms, recorded, config.seed, config.clearance_m)
+
+
+def recorded_rooms(digest: str) -> np.ndarray | None:
+    """Return x0, y0, x1, y1 (m, world) of a scene's rooms [k, 4], by its digest; None where no plan is recorded."""
+    return np.array(RECORDED[digest]) if digest in RECORDED else None
+
+
+def room_of(recorded: np.ndarray, xy_w: np.ndarray) -> np.ndarray:
+    """Return the recorded room [n] that holds each point [n, 2], or in a doorway the nearest one."""
+    low, high = recorded[None, :, :2], recorded[None, :, 2:]
+    outside = np.maximum(np.maximum(low - xy_w[:, None], xy_w[:, None] - high), 0.0)
+    return np.linalg.norm(outside, axis=-1).argmin(1).astype(np.int32)
+
+
+def agreement(rooms: Rooms, recorded: np.ndarray) -> float:
+    """Return the adjusted Rand index of the rooms with the recorded ones: 1 the same, 0 as good as chance."""
+    return float(adjusted_rand_score(room_of(recorded, rooms.points_w), rooms.labels))
+
+
+def _mixture(points: np.ndarray, count: int, seed: int) -> GaussianMixture:
+    return GaussianMixture(count, covariance_type="full", n_init=5, reg_covar=1e-4, random_state=seed).fit(points)
+
+
+def _ordered(points: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    used = np.unique(labels)
+    means = np.array([points[labels == k].mean(0) for k in used])
+    place = np.empty(len(used), np.int32)
+    place[np.lexsort((means[:, 1], means[:, 0]))] = np.arange(len(used))
+    return place[np.searchsorted(used, labels)]

@@ -1,1 +1,1 @@
-"""Networks and maps that come with the package."""
+"""Export networks and maps, and choose those that come with the package."""

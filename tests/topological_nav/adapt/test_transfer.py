@@ -13,10 +13,10 @@ from PIL import Image
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.records import read_metrics
+from topological_nav import adaptation
 from topological_nav.__main__ import main
-from topological_nav.adapt import adaptation
-from topological_nav.adapt.config import AdaptConfig
 from topological_nav.data.dataset import load_passages, load_rooms
+from topological_nav.data.domains import AdaptConfig
 from topological_nav.errors import DatasetError, Host, RunError, Stopped
 from topological_nav.learn.runs import run_epochs
 from topological_nav.learn.training import load_trained, localisation

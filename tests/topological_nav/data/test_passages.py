@@ -10,8 +10,7 @@ from interactive_nav_common.errors import ConfigError
 from tests.topological_nav.maps.test_sight import two_rooms_space
 from topological_nav.config import DataConfig
 from topological_nav.data.dataset import balanced, draw_passages, free_lengths, held_out, logits_at
-from topological_nav.scenes.rooms import find_rooms
-from topological_nav.scenes.space import free_space
+from topological_nav.scenes.space import find_rooms, free_space
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ from topological_nav.maps.build import drawn_for
 from topological_nav.maps.graph import load_map, save_map
 from topological_nav.navigate.state import DRIVE
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose
-from topological_nav.scenes.rooms import RECORDED
+from topological_nav.scenes.space import RECORDED
 
 WORDS = ("episodes=2", "batch=2", "images=6", "limit_s=12", "backend=native", "max_turn_rad_s=2.0", "passable=0.05")
 CONFIG = EvaluationConfig.of(

@@ -28,8 +28,8 @@ from topological_nav.evaluate import contest as contests
 from topological_nav.evaluate.contest import Contest, ContestScene, _stem, contest_scenes, play_contest
 from topological_nav.evaluate.evaluation import Contender, DrivenEpisodes, count_of, draw_episodes, learned
 from topological_nav.navigate.state import Events
-from topological_nav.scenes.rooms import RECORDED, find_rooms
 from topological_nav.scenes.simulation import Snapshot, episode_starts
+from topological_nav.scenes.space import RECORDED, find_rooms
 from topological_nav.weights import export as packaged
 from train.config import EnvConfig, TrainConfig
 from train.config_io import to_yaml

@@ -13,8 +13,7 @@ from interactive_nav.scenes.scene import load_scene
 from topological_nav.config import MapConfig
 from topological_nav.errors import MapError
 from topological_nav.maps import graph
-from topological_nav.scenes.rooms import find_rooms
-from topological_nav.scenes.space import free_space, spread
+from topological_nav.scenes.space import find_rooms, free_space, spread
 
 
 def hand_map(probability: dict[tuple[int, int], float], xy=((0.0, 0.0), (2.0, 0.0), (2.0, 2.0), (0.0, 9.0))):

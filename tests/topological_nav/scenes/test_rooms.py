@@ -10,9 +10,8 @@ from converters.generate import design_building
 from converters.recipes import load_recipes
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.errors import UserError
-from topological_nav.scenes import rooms
-from topological_nav.scenes.rooms import RECORDED
-from topological_nav.scenes.space import free_space
+from topological_nav.scenes import space as rooms
+from topological_nav.scenes.space import RECORDED, free_space
 
 SCENE = Path(__file__).parents[3] / "scenes_mjcf" / "apartment_0"
 

@@ -24,8 +24,7 @@ from topological_nav.maps.graph import load_map, save_map
 from topological_nav.ros.__main__ import _networks
 from topological_nav.ros.__main__ import parser as ros_parser
 from topological_nav.scenes.rendering import camera_pose
-from topological_nav.scenes.rooms import find_rooms, recorded_rooms
-from topological_nav.scenes.space import free_space
+from topological_nav.scenes.space import find_rooms, free_space, recorded_rooms
 from topological_nav.weights import export as packaged
 from topological_nav.weights.export import choose, fitting_map, packaged_weights, sizes_of
 

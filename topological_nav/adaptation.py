@@ -28,10 +28,9 @@ from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.config import to_dict
 from interactive_nav_common.rows import digest_of
-from topological_nav.adapt.config import AdaptConfig
 from topological_nav.config import PITCHES
 from topological_nav.data.dataset import PassageImages, RoomImages, balanced, load_passages, load_rooms, read_header
-from topological_nav.data.domains import as_seen, preset
+from topological_nav.data.domains import AdaptConfig, as_seen, preset
 from topological_nav.errors import ALONE, DatasetError, Host, MapError, RunError
 from topological_nav.learn.learning import (
     Learner,
@@ -65,7 +64,7 @@ ROOMS_STREAM, PASSAGES_STREAM = 1, 2
 
 
 class Critic(nn.Module):
-    """Two layers with leaky ReLU; one output, positive for the source."""
+    """Judge embeddings by two layers with leaky ReLU; one output, positive for the source."""
 
     hidden: int
 
@@ -80,7 +79,7 @@ class Critic(nn.Module):
 
 @flax.struct.dataclass
 class Adapting:
-    """What an epoch changes."""
+    """Hold what an epoch changes."""
 
     params: Any
     """Of the target's network; its heads stay the source's."""

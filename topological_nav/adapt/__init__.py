@@ -1,1 +1,0 @@
-"""Networks and maps carried to another domain."""

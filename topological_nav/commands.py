@@ -1,0 +1,389 @@
+"""Run the commands: make datasets, train and adapt networks, build maps, play and score episodes, export."""
+
+import argparse
+import dataclasses
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+
+from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.config import field_docs, overridden, refuse_unused
+from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.files import write_text
+from interactive_nav_common.jobs.progress import SafeConsole, progress_bar
+from interactive_nav_common.records import read_metrics
+from interactive_nav_common.rows import where
+from interactive_nav_common.signals import stop_signals
+from scenes_mjcf.sets import scene_folders
+from topological_nav import adaptation
+from topological_nav import config as configs
+from topological_nav.config import ADAPTED, DATASET, DRIVES, PASSAGE_POLICY, RUNS, MapConfig
+from topological_nav.data.dataset import load_passages, load_rooms, make_dataset
+from topological_nav.data.domains import AdaptConfig, as_seen, preset
+from topological_nav.data.folders import folder_bytes
+from topological_nav.drives.dataset import draw_drives, simulate_drives, summary
+from topological_nav.drives.driving import embed_drives
+from topological_nav.drives.imitation import grid_table, train_grid, train_policy
+from topological_nav.errors import Host, Progress, Stopped, say
+from topological_nav.evaluate import scores
+from topological_nav.evaluate.contest import Contest, contest_scenes, play_contest, tracks_of
+from topological_nav.figures import learning as figures
+from topological_nav.figures.maps import dataset_figure, drive_episode, film, journeys_figure, map_figure, save
+from topological_nav.learn.networks import in_words
+from topological_nav.learn.training import train
+from topological_nav.maps.build import Built, build_map, forget
+from topological_nav.maps.graph import save_map
+from topological_nav.weights.export import choose, export, fitting_map, size_lines
+
+
+@contextmanager
+def terminal() -> Iterator[Host]:
+    """Show lines on stdout, at once, and stop at a signal."""
+    with stop_signals() as stops:
+        yield Host(lambda line: print(line, flush=True), lambda: stops[0] if stops else 0)
+
+
+@contextmanager
+def bar(signals: list[int] | None = None) -> Iterator[Progress]:
+    """Show a bar with the time left on a terminal, a line every tenth elsewhere; raise `Stopped` before the end.
+
+    `signals` are those of a `stop_signals` around it; None: it collects them itself.
+    """
+    console = SafeConsole(stderr=True)
+    collected = stop_signals() if signals is None else nullcontext(signals)
+    with collected as stops, progress_bar(console, "starting") as update:
+        tenths = 0
+        # Neither compiling before the first step nor what an earlier run has done says how fast it goes.
+        first: tuple[float, int] | None = None
+
+        def report(what: str, done: int, total: int) -> None:
+            nonlocal tenths, first
+            first = first or (time.perf_counter(), done)
+            update(description=what, completed=done, total=total)
+            if not console.is_terminal and done * 10 // max(total, 1) > tenths:
+                tenths, (began, before), left = done * 10 // total, first, ""
+                if done > before:
+                    left = f", {(time.perf_counter() - began) / (done - before) * (total - done):.0f} s left"
+                console.print(f"{what}: {done:,} of {total:,}{left}", highlight=False, soft_wrap=True)
+            if stops and done < total:
+                raise Stopped(stops[0])
+
+        yield report
+
+
+def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: Sequence[str], out: Path):
+    """Return the contest that is requested; choose networks and maps that are not named, and build missing maps."""
+    contest = Contest(
+        scenes=tuple(Path(scene) for scene in scene_folders(scenes)),
+        contenders=tuple(contenders),
+        out=out,
+        config=overridden(configs.EvaluationConfig(), arguments.settings),
+        truth=arguments.truth,
+        policy=arguments.policy or PASSAGE_POLICY,
+        ppo=getattr(arguments, "ppo", None),
+        domain=arguments.domain,
+    )
+    _refuse_unused(arguments, contest)
+    if arguments.truth or not {"dense", "sparse"} & set(contenders):
+        return contest
+    chosen = choose(arguments.localiser, arguments.detector, arguments.policy)
+    chosen.report()
+    maps, files = arguments.maps or chosen.maps[0], {}
+    for folder in contest.scenes if arguments.maps is None else ():
+        scene = load_scene(folder)
+        there = fitting_map(chosen, scene.name, scene.digest)
+        default = maps / f"{scene.name}.npz"
+        # One that was built by hand with other networks is refused later, in words, and not written over.
+        if there is None and (chosen.renewed or not default.is_file()):
+            say(f"{scene.name} has no map of these networks yet; it is made once and kept in {default}")
+            build(folder, chosen.localiser, chosen.detector, MapConfig(), default)
+        files[scene.name] = there or default
+    runs = {"localiser": chosen.localiser, "detector": chosen.detector, "policy": chosen.policy}
+    return dataclasses.replace(contest, maps=maps, map_files=files, **runs)
+
+
+def _refuse_unused(arguments: argparse.Namespace, contest: Contest) -> None:
+    """Refuse settings that change nothing for these contenders."""
+    names = set(contest.contenders)
+    who = f"without a contender that needs it (contenders: {', '.join(contest.contenders)})"
+    if not names & {"dense", "sparse"}:
+        navigators = {f.name for f in dataclasses.fields(configs.NavigatorConfig)} - {"limit_s", "run_s"}
+        refuse_unused(arguments, "--truth --maps --localiser --detector --policy supersample", who)
+        if arguments.domain != "clean":
+            refuse_unused(arguments, "--domain", who)
+        refuse_unused(arguments, " ".join(sorted(navigators)), who)
+    if "sparse" not in names:
+        refuse_unused(arguments, "thinned", who)
+    if arguments.truth:
+        refuse_unused(arguments, "--maps --localiser --detector match supersample", "with --truth")
+    if not contest.config.glance:
+        refuse_unused(arguments, "watch_s", "with glance=false")
+
+
+def run_navigate(arguments: argparse.Namespace) -> None:
+    """Drive one episode and draw it."""
+    if arguments.video and arguments.video.suffix != ".mp4":
+        raise ConfigError(f"--video {arguments.video}: expected a name that ends in .mp4")
+    refuse_unused(arguments, "batch", "in 'navigate', which drives one episode")
+    contest = _contest(arguments, [arguments.scene], ["sparse" if arguments.sparse else "dense"], RUNS)
+    name = Path(arguments.scene).resolve().name
+    out = arguments.out or RUNS / "navigate" / f"{name}-{arguments.episode}.png"
+    with bar() as report:
+        limit_s = int(contest.config.limit_s)
+
+        def on_time(time_s: float) -> None:
+            report(f"{name}, simulated s", int(time_s), limit_s)
+
+        driven = drive_episode(contest, arguments.episode, bool(arguments.video), on_time)
+    for line in driven.log:
+        print(line)
+    save(driven.figure(), out)
+    print(f"{out}: {driven.outcome}")
+    if arguments.video:
+        print(f"{arguments.video}: {film(driven, arguments.video)} frames")
+
+
+def run_evaluate(arguments: argparse.Namespace) -> None:
+    """Play episodes and score them."""
+    names = ("dense", "sparse", "expert", *(["ppo"] if arguments.ppo else []))
+    names = arguments.contenders.split(",") if arguments.contenders else names
+    if "ppo" not in names:
+        refuse_unused(arguments, "--ppo", f"without contender ppo (--contenders {arguments.contenders})")
+    contest = _contest(arguments, arguments.scenes, names, arguments.out)
+    with bar() as report:
+        venues = contest_scenes(contest)
+        rows = play_contest(contest, venues, report)
+    for venue in venues:
+        panels = {}
+        for name in contest.contenders:
+            played = where(rows, scene=venue.scene.name, contender=name).to_pylist()
+            graph = venue.map_of(name) if name in ("dense", "sparse") else None
+            panels[name] = (graph, tracks_of(contest, venue, name), {row["episode"]: row for row in played})
+        figure = journeys_figure(venue.scene.name, venue.space, panels, contest.config.passable)
+        save(figure, contest.out / f"{venue.scene.name}.png")
+    lines, compared = scores.summary(rows), scores.differences(rows)
+    write_text(contest.out / "summary.md", scores.markdown(lines, compared))
+    SafeConsole(width=None if sys.stdout.isatty() else 160).print(scores.console_table(lines))
+    for difference in compared:
+        print(difference)
+    print(f"{contest.out}: {len(rows)} episodes; tables in summary.md, a picture a scene")
+
+
+def run_map(arguments: argparse.Namespace) -> None:
+    """Build a map and draw it."""
+    config = overridden(MapConfig(), arguments.settings)
+    chosen = choose(arguments.localiser, arguments.detector, PASSAGE_POLICY)
+    chosen.report(policy=False)
+    out = arguments.out or chosen.maps[0] / f"{Path(arguments.scene).resolve().name}.npz"
+    build(Path(arguments.scene), chosen.localiser, chosen.detector, config, out, arguments.route)
+
+
+def build(
+    scene: Path, localiser: Path, detector: Path, config: MapConfig, out: Path, ends: Sequence[int] | None = None
+) -> None:
+    """Build a map, draw and describe it."""
+    parts = out.with_name(f"{out.name}.parts")
+    with bar() as report:
+        built = build_map(scene, localiser, detector, config, report, parts)
+    keep_map(built, out, ends)
+    forget(parts)
+
+
+def keep_map(built: Built, out: Path, ends: Sequence[int] | None = None) -> None:
+    """Write, draw and describe a map, with the path between two nodes if requested."""
+    save_map(built.map, out)
+    route = None
+    if ends:
+        route = built.map.plan(*ends)
+        print(f"{ends[0]} to {ends[1]}: {' '.join(map(str, route.nodes))}, cost {route.cost:.2f}")
+    picture = out.with_suffix(".png")
+    save(map_figure(built, route), picture)
+    for name, value in built.scores.items():
+        print(f"{name}: {value}")
+    print(
+        f"{out}: {len(built.map.xy_w)} nodes, {len(built.map.edges)} edges, {out.stat().st_size / 1024:.0f} KiB; "
+        f"drawn in {picture}"
+    )
+
+
+def run_export(arguments: argparse.Namespace) -> None:
+    """Write finished runs as a small folder."""
+    config = overridden(configs.ExportConfig(), arguments.settings)
+    with bar() as report:
+        runs = (arguments.localiser, arguments.detector, arguments.policy, arguments.maps)
+        sizes, compared = export(*runs, arguments.images, arguments.out, config, report)
+    picture = arguments.picture or arguments.out.with_name(f"{arguments.out.name}.png")
+    save(figures.export_figure(sizes, compared, config.limit_mib), picture)
+    for name, value in compared.scores.items():
+        print(f"{name.replace('_', ' ')}: {value:.3g}")
+    print(f"{arguments.out}: {size_lines(sizes, config.limit_mib)}; drawn in {picture}")
+
+
+def run_data(arguments: argparse.Namespace) -> None:
+    """Render a dataset, or drives of the expert."""
+    if arguments.drives:
+        return _drives(arguments)
+    config = overridden(configs.DataConfig(), arguments.settings)
+    out = arguments.out or DATASET
+    with bar() as report:
+        header = make_dataset([Path(s) for s in scene_folders(arguments.scenes)], out, config, report)
+    save(dataset_figure(out), out / "preview.png")
+    images = sum(s["positions"] * 3 * config.headings + s["passages"] for s in header["scenes"])
+    for s in header["scenes"]:
+        rand = "" if s["rooms_agreement"] is None else f", adjusted Rand index {s['rooms_agreement']:.2f}"
+        print(
+            f"{s['name']}: {s['rooms']} rooms ({s['rooms_chosen_by']}{rand}), {s['positions']} positions "
+            f"({s['test_positions']} for testing), {s['passages']} passages ({s['test_passages']})"
+        )
+    print(_size_line(out, images, config))
+
+
+def _size_line(out: Path, images: int, config: configs.CameraConfig) -> str:
+    return f"{out}: {images:,} images of {config.width} x {config.height}, {folder_bytes(out) / 2**20:.1f} MiB"
+
+
+def _drives(arguments: argparse.Namespace) -> None:
+    config = overridden(configs.DriveConfig(), arguments.settings)
+    out, scenes = arguments.out or DRIVES, [Path(s) for s in scene_folders(arguments.scenes)]
+    with stop_signals() as stops:
+        with bar(stops) as report:
+            drives = simulate_drives(scenes, out, config, report)
+        with bar(stops) as report:
+            draw_drives(scenes, out, report)
+    save(figures.drives_figure(scenes, out), out / "preview.png")
+    row = summary(drives)
+    print(
+        f"{row['drives']:,} drives: reached {row['reached']:.3f}, in contact {row['touched']:.3f} "
+        f"({row['contact_s']:.2f} s a drive), kept {int(drives.kept.sum()):,}; {row['seconds']:.1f} s long, "
+        f"{row['m_s']:.2f} m/s, turning in {row['turning']:.2f} of the steps"
+    )
+    print(_size_line(out, int(drives.steps[drives.kept].sum()), config))
+
+
+def run_train(arguments: argparse.Namespace) -> None:
+    """Train a network or a local policy."""
+    if arguments.task == "policy":
+        return _policy(arguments)
+    refuse_unused(arguments, "--localiser --detector --grid", f"in 'train {arguments.task}'")
+    if arguments.task == "passages":
+        refuse_unused(arguments, "hidden pitch label_smoothing", "in 'train passages'")
+    config = overridden(configs.TASKS[arguments.task], arguments.settings)
+    if config.init != "selfsup":
+        refuse_unused(arguments, "selfsup_epochs selfsup_batch selfsup_learning_rate", f"with init={config.init}")
+    out = arguments.out or RUNS / arguments.task
+    with terminal() as host:
+        results = train(arguments.task, arguments.data or DATASET, out, config, host)
+    save(figures.curves_figure(read_metrics(out / "metrics.jsonl")), out / "curves.png")
+    for name, row in results.get("groups", {}).items():
+        print(f"{name:<8}{row['images']:>7} images  accuracy {row['accuracy']:.3f}  macro F1 {row['macro_f1']:.3f}")
+    if rows := results.get("lengths"):
+        print("ahead:  " + ",  ".join(f"{row['ahead_m']:g} m {row['accuracy']:.3f}" for row in rows) + "  right")
+    if mean := results["localisation"].get("mean"):
+        print(f"localisation: {in_words(mean)}")
+    print(f"{out}: {results['parameters']:,} parameters")
+
+
+def _policy(arguments: argparse.Namespace) -> None:
+    config = overridden(configs.PolicyConfig(), arguments.settings)
+    if arguments.grid:
+        refuse_unused(arguments, "alpha lam", "with --grid, which takes every pair of the report's")
+    out = arguments.out or RUNS / ("policy-grid" if arguments.grid else "policy")
+    with terminal() as host:
+        runs = arguments.localiser or RUNS / "rooms", arguments.detector or RUNS / "passages"
+        frames = embed_drives(arguments.data or DRIVES, *runs, config.mirror, host)
+        learn = train_grid if arguments.grid else train_policy
+        results = learn(frames, out, config, host)
+    if isinstance(results, list):
+        for row in results:
+            folder = out / f"alpha-{row['alpha']:g}-lambda-{row['lambda']:g}"
+            save(figures.policy_figure(read_metrics(folder / "metrics.jsonl"), row), folder / "curves.png")
+        print(grid_table(results), end="")
+        return
+    save(figures.policy_figure(read_metrics(out / "metrics.jsonl"), results), out / "curves.png")
+    if test := results.get("test"):
+        for name in ("linear", "angular"):
+            print(
+                f"{name:<8} {test['steps']:,} held-out steps  accuracy {test[name]['accuracy']:.3f} "
+                f"(the commonest class {test[name]['commonest']:.3f})  macro F1 {test[name]['macro_f1']:.3f}"
+            )
+        print(f"forward model: error {test['forward']:.4f}, of no change {test['no_change']:.4f}")
+    print(
+        f"{out}: {results['sequences']:,} sequences ({results['nearly_straight']:.2f} of all are nearly straight), "
+        f"{results['parameters']:,} parameters"
+    )
+
+
+def run_adapt(arguments: argparse.Namespace) -> None:
+    """Take networks, and a map, to another domain."""
+    config = overridden(AdaptConfig(), arguments.settings)
+    if (arguments.what == "map") != bool(arguments.scene):
+        raise ConfigError("adapt map takes a scene folder, adapt features and adapt passages none")
+    _refuse_unused_to_adapt(arguments)
+    arguments.data = arguments.data or DATASET
+    arguments.target = arguments.target or arguments.data
+    needs = _NEEDS[arguments.what]
+    chosen = choose(arguments.localiser, arguments.detector, needs=needs)
+    arguments.localiser, arguments.detector = chosen.localiser, chosen.detector
+    chosen.report(policy=False)
+    with terminal() as host:
+        ADAPTATIONS[arguments.what](arguments, config, host)
+
+
+def _refuse_unused_to_adapt(arguments: argparse.Namespace) -> None:
+    """Refuse settings of other adaptations; the settings' docstrings say whose they are."""
+    what = arguments.what
+    why = f"in 'adapt {what}'"
+    docs = field_docs(AdaptConfig)
+    others = [name for name, doc in docs.items() if doc.partition(":")[0] in _NEEDS and not doc.startswith(f"{what}:")]
+    refuse_unused(arguments, " ".join(others), why)
+    if what == "map":
+        refuse_unused(arguments, "seed", why)
+    if "rooms" not in _NEEDS[what]:
+        refuse_unused(arguments, "--localiser", why)
+    if "passages" not in _NEEDS[what]:
+        refuse_unused(arguments, "--detector", why)
+    elif arguments.target:
+        refuse_unused(arguments, "--data", f"{why} with --target")
+
+
+def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, host: Host) -> None:
+    out = arguments.out or ADAPTED / "features"
+    results = adaptation.adapt_features(arguments.localiser, arguments.data, arguments.target, out, config, host)
+    rendered, captured = load_rooms(arguments.target).images, adaptation.target_rooms(arguments.target, config).images
+    level = configs.PITCHES.index("level")
+    figure = figures.features_figure(
+        rendered[:, level, 0], captured[:, level, 0], read_metrics(out / "metrics.jsonl"), results
+    )
+    save(figure, out / "adaptation.png")
+    for name in ("source", "before", "statistics", "after"):
+        print(f"{name:<11}{in_words(results[name]['mean'])}")
+    print(f"{out}: {results['target_images']:,} target images, {results['before']['queries']} queries")
+
+
+def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, host: Host) -> None:
+    out = arguments.out or ADAPTED / "passages"
+    results = adaptation.passage_configurations(arguments.detector, arguments.target, out, config, host)
+    images = load_passages(arguments.target).images
+    captured = as_seen(images, preset(config.domain))
+    save(
+        figures.passages_figure(images, captured, read_metrics(out / "metrics.jsonl"), results),
+        out / "configurations.png",
+    )
+    for name, (from_source, tunes) in adaptation.CONFIGURATIONS.items():
+        row, start = results[name], "the source's weights" if from_source else "fresh weights"
+        how = f"{start}{', fine-tuned' if tunes else ''}"
+        print(f"{name}  {how:<33}accuracy {row['accuracy']:.3f}  macro F1 {row['macro_f1']:.3f}")
+    print(f"{out}: fine-tuned on {results['fine_tuned_on']} images, tested on {results['tested_on']}")
+
+
+def _adapt_map(arguments: argparse.Namespace, config: AdaptConfig, host: Host) -> None:
+    del host
+    scene = Path(arguments.scene)
+    out = arguments.out or ADAPTED / f"{scene.resolve().name}.npz"
+    keep_map(adaptation.collected_map(scene, arguments.target, arguments.localiser, arguments.detector, config), out)
+
+
+_NEEDS = {"features": ("rooms",), "passages": ("passages",), "map": ("rooms", "passages")}
+ADAPTATIONS = {"features": _adapt_features, "passages": _adapt_passages, "map": _adapt_map}

@@ -1,1 +1,0 @@
-"""Words in, files and pictures out: what `python -m topological_nav` runs."""
