@@ -17,10 +17,6 @@ from jax import custom_batching
 from interactive_nav.config import TaskRules
 
 
-def _flatten(tree: Any, outer: int, inner: int) -> Any:
-    return jax.tree.map(lambda x: x.reshape((outer * inner, *x.shape[2:])), tree)
-
-
 def _broadcast(tree: Any, batched: Any, size: int) -> Any:
     return jax.tree.map(lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape)), tree, batched)
 
@@ -34,7 +30,7 @@ def _many(batch: Callable[..., Any], args: tuple) -> Any:
     def rule(axis_size, in_batched, *args):
         args = _broadcast(args, tuple(in_batched), axis_size)
         inner = jax.tree.leaves(args)[0].shape[1]
-        out = _many(batch, _flatten(args, axis_size, inner))
+        out = _many(batch, jax.tree.map(lambda x: x.reshape((axis_size * inner, *x.shape[2:])), args))
         out = jax.tree.map(lambda x: x.reshape((axis_size, inner, *x.shape[1:])), out)
         return out, jax.tree.map(lambda _: True, out)
 
