@@ -8,7 +8,6 @@ a sphere can stand for a thin wheel without standing out at its sides.
 
 import dataclasses
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -74,8 +73,6 @@ class WheeledBase:
     """Joints that mode `whole_body` drives by velocity, beside the wheels."""
     gripper: tuple[str, ...] = ()
     """Finger joints that mode `whole_body` opens and closes together, by position."""
-    path: Path | None = None
-    """MJCF or URDF; none: the builtin file of the robot's name."""
 
     @property
     def wheel_rows(self) -> tuple[tuple[float, float], ...]:
@@ -235,21 +232,23 @@ def _twist_map(base: WheeledBase, mode: str, num_actions: int) -> TwistMap | Non
 def wheeled_robot(
     control_mode: str,
     base: WheeledBase,
-    prepare: Callable[[mujoco.MjSpec], None] | None = None,
+    child: mujoco.MjSpec | None = None,
     *,
     base_body: str = "base",
     camera: RobotCamera,
     rolling: tuple[str, ...] = (),
     **figures: Any,
 ) -> RobotSpec:
-    """Return the spec of a wheeled robot in a control mode; `base_body` is the file's body with the free joint, and
-    bodies of the camera and of wheels (`rolling`; by default the driven ones) are without the robot's name."""
+    """Return the spec of a wheeled robot in a control mode, from a parsed file or the builtin one of its name.
+
+    `base_body` is the file's body with the free joint; bodies of the camera and of wheels (`rolling`; by default the
+    driven ones) are without the robot's name.
+    """
     check_mode(base.name, control_mode, base.modes)
     prefix = f"{base.name}_"
-    path, joints = base.path or FOLDER / f"{base.name}.xml", base.joints
-    child = read_file(path, base_body)
-    if prepare is not None:
-        prepare(child)
+    path, joints = FOLDER / f"{base.name}.xml", base.joints
+    if child is None:
+        child = read_file(path, base_body)
     missing = [j.name for j in joints if child.joint(j.name) is None or child.actuator(j.name) is None]
     if missing:
         raise ConfigError(f"robot file {path}: no joint and actuator named '{missing[0]}'")

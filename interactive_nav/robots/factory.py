@@ -7,7 +7,6 @@ Control modes come from `build.py`.
 
 import functools
 import re
-import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -131,32 +130,24 @@ def _base(
         max_angular_rad_s=max_angular_rad_s or 2 * fastest / track_m,
         yaw_gain=1.0 if len(facts.wheels) > 2 else 0.0,
         whole_body=tuple(joint.name for joint in others),
-        path=path,
     )
 
 
 def _factory(
     base: WheeledBase,
+    child: mujoco.MjSpec,
     facts: Facts,
     base_body: str,
     casters: tuple[str, ...],
-    change: Callable[[mujoco.MjSpec], None],
+    source: str,
     camera: RobotCamera | None,
     body_width_m: float | None,
 ) -> Callable[[str], RobotSpec]:
-    """Return control mode -> spec, with the figures that its outline gives; `change` warns here, and then no more."""
-
-    def quietly(parsed: mujoco.MjSpec) -> None:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            change(parsed)
-
-    assert base.path is not None
-    change(read_file(base.path, base_body))
+    """Return control mode -> spec, with the figures that its outline gives."""
     build = functools.partial(
         wheeled_robot,
         base=base,
-        prepare=quietly,
+        child=child,
         base_body=base_body,
         rolling=(*(w.body for w in facts.wheels), *casters),
         spawn_height_m=-facts.bottom_m,
@@ -174,7 +165,7 @@ def _factory(
         mass_kg=mass,
         size_m=size,
         drive_type="skid steer" if base.yaw_gain else "differential",
-        source=base.path.name,
+        source=source,
     )
     build("native")
     return build
@@ -235,5 +226,6 @@ def from_file(
     units = {j.name: "m" if j.type == mujoco.mjtJoint.mjJNT_SLIDE else "rad" for j in child.joints}
     others = tuple(Joint(j, speed, dict(home or {}).get(j, 0.0), unit=units[j]) for j, speed in driven.items())
     base = _base(name, path, facts, max_wheel_speed_rad_s, others, track_m, max_linear_m_s, max_angular_rad_s)
-    change = functools.partial(complete, path, facts, base, base_body, casters, limits, dict(home or {}))
-    return _factory(base, facts, base_body, casters, change, camera, body_width_m)
+    child = read_file(path, base_body)
+    complete(path, facts, base, base_body, casters, limits, dict(home or {}), child)
+    return _factory(base, child, facts, base_body, casters, path.name, camera, body_width_m)
