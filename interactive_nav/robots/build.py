@@ -232,7 +232,7 @@ def _twist_map(base: WheeledBase, mode: str, num_actions: int) -> TwistMap | Non
 def wheeled_robot(
     control_mode: str,
     base: WheeledBase,
-    child: mujoco.MjSpec | None = None,
+    parsed: mujoco.MjSpec | None = None,
     *,
     base_body: str = "base",
     camera: RobotCamera,
@@ -247,8 +247,7 @@ def wheeled_robot(
     check_mode(base.name, control_mode, base.modes)
     prefix = f"{base.name}_"
     path, joints = FOLDER / f"{base.name}.xml", base.joints
-    if child is None:
-        child = read_file(path, base_body)
+    child = read_file(path, base_body) if parsed is None else parsed
     missing = [j.name for j in joints if child.joint(j.name) is None or child.actuator(j.name) is None]
     if missing:
         raise ConfigError(f"robot file {path}: no joint and actuator named '{missing[0]}'")

@@ -147,7 +147,7 @@ def _factory(
     build = functools.partial(
         wheeled_robot,
         base=base,
-        child=child,
+        parsed=child,
         base_body=base_body,
         rolling=(*(w.body for w in facts.wheels), *casters),
         spawn_height_m=-facts.bottom_m,
