@@ -133,6 +133,7 @@ def _all(arguments: argparse.Namespace, stops: list[int]) -> None:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 node.wait(_GRACE_S)
             node.kill()
+            node.wait()  # gone before this command ends
     if failed and not stops:
         raise UserError(f"{', '.join(failed)}; its message is above")
 
