@@ -41,6 +41,7 @@ def test_two_people_in_one_folder_and_a_missing_scan_are_one_line(scan2cad_raw, 
             assert "works there; wait for it or choose another folder (-o)" in capsys.readouterr().err
         finally:
             first.terminate()
+            first.communicate(timeout=60)  # it may print once more: a closed pipe would end it otherwise
     assert first.returncode == 143
     with contextlib.suppress(SystemExit):
         assert main(["annotate", str(tmp_path / "no.ply"), "-o", str(tmp_path / "other")]) == 2

@@ -112,7 +112,7 @@ def test_rooms_have_the_use_that_their_size_suits(seed):
 
 def test_the_kitchen_is_exchanged_to_lie_beside_the_living_room():
     rooms = (Rect(0, 0, 3, 3), Rect(3.1, 0, 6.1, 3), Rect(6.2, 0, 12, 3), Rect(12.1, 0, 15.1, 3))
-    plan = Plan(rooms, Rect(0, 0, 15.1, 3), (), (), (), (), 3, 2.5, 2.0)
+    plan = Plan(rooms, Rect(0, 0, 15.1, 3), (), (), (), (), 3, 2.5)
     uses, _ = assign_uses(plan, ["living", "kitchen", "bedroom"])
     assert uses == ["bedroom", "kitchen", "living", "hall"]
 

@@ -71,16 +71,16 @@ def make_world(folder, **settings):
         scenes.append(load_scene(folder / str(i)))
     config = NavConfig.of(num_objects=0, sleep=False, **settings)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(spec_module, "_add_sensors", _with_floor_sensors)
+        patch.setattr(spec_module, "_finish", _with_floor_sensors)
         return build_world(get_robot("turtlebot"), tuple(scenes), config), config
 
 
-_add_sensors = spec_module._add_sensors
+_finish = spec_module._finish
 
 
-def _with_floor_sensors(spec, robot, slots, config):
+def _with_floor_sensors(spec, robot, walls, count, slots, config):
     """The environment's sensors, and after them the same of the floor on each body."""
-    _add_sensors(spec, robot, slots, config)
+    _finish(spec, robot, walls, count, slots, config)
     for i, (name, _) in enumerate([*slots, ("structure", "")]):
         spec.add_sensor(
             name=f"floor_{i}",
@@ -130,7 +130,7 @@ def run(world, config, backend, cases: Sequence[int] = range(len(CASES))) -> Pus
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(native_backend, "summarise_forces", watched)
         patch.setattr(mjx_batch, "summarise_forces", watched)
-        patch.setattr(spec_module, "_add_sensors", _with_floor_sensors)
+        patch.setattr(spec_module, "_finish", _with_floor_sensors)
         physics = make_physics(world, replace(config, backend=backend))
         _read_both(physics, world)
         step = jax.jit(jax.vmap(physics.step))

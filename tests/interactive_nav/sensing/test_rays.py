@@ -25,6 +25,16 @@ HAS_WARP = importlib.util.find_spec("warp") is not None
 LENS = Lens(68, 68, 120.0)
 
 
+def depth_and_classes(renderer):
+    """Of one environment, as `render_batch` returns them of a batch."""
+
+    def draw(*of_one):
+        images = renderer.images(("depth", "segmentation"), *of_one)
+        return images["depth"], images["segmentation"]
+
+    return draw
+
+
 @pytest.fixture(scope="module")
 def drawn(boxes, jumble):
     scene, qpos, eye, forward = jumble
@@ -154,16 +164,16 @@ def test_padding_and_parked_objects_are_never_seen(world, boxes):
 def test_nested_vmaps_reach_the_renderer_as_one_batch(boxes, jumble, drawn):
     scene, qpos, eye, forward = jumble
     renderer, executed = RayRenderer(boxes, LENS), []
-    batch = renderer.render_batch
+    batch = renderer.images_batch
 
-    def counted(scene, *rest):
+    def counted(names, scene, *rest):
         jax.debug.callback(lambda: executed.append(scene.shape[0]))
-        return batch(scene, *rest)
+        return batch(names, scene, *rest)
 
-    renderer.render_batch = counted  # type: ignore[method-assign]
+    renderer.images_batch = counted  # type: ignore[method-assign]
     camera = look_along(eye, forward)
     folded = jax.tree.map(lambda x: jnp.asarray(x).reshape(2, 3, *x.shape[1:]), (scene, qpos, camera))
-    out = jax.jit(jax.vmap(jax.vmap(renderer.render)))(*folded)
+    out = jax.jit(jax.vmap(jax.vmap(depth_and_classes(renderer))))(*folded)
     np.testing.assert_allclose(out[0].reshape(drawn[0].shape), drawn[0], atol=1e-5)
     jax.effects_barrier()
     assert executed == [6]
@@ -193,7 +203,7 @@ def test_mjx_warp_draws_the_same(world, boxes, jumble, drawn):
     boxes = boxes.replace(class_id=jnp.where(boxes.class_id == 2, jnp.uint8(32), boxes.class_id), classes="all")
     renderer = WarpRenderer(boxes, LENS)
     camera = look_along(eye, forward)
-    draw = jax.jit(jax.vmap(renderer.render))
+    draw = jax.jit(jax.vmap(depth_and_classes(renderer)))
     depth, ids = draw(scene, qpos, camera)
     assert np.mean(np.abs(depth - drawn[0]) < 0.01) > 0.99
     assert np.mean(ids == np.where(drawn[1] == 2, 32, drawn[1])) > 0.99 and (np.asarray(ids) == 32).any()
