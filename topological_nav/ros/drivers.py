@@ -26,7 +26,7 @@ from topological_nav.weights.export import Choice
 
 
 @dataclasses.dataclass(frozen=True)
-class Command:
+class VelocityCommand:
     """Hold the velocity that a driver commands until its next step."""
 
     linear_mps: float
@@ -49,7 +49,7 @@ class Driver(Protocol):
         """Return the lens that its pictures must have; None: any."""
         ...
 
-    def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> Command:
+    def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> VelocityCommand:
         """Return the next command, by a level image [H, W, 3] u8 straight ahead and the yaw in the map's frame."""
         ...
 
@@ -63,7 +63,7 @@ class HeadingDriver:
         self._config = config
         self._since: float | None = None
 
-    def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> Command:
+    def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> VelocityCommand:
         """See `Driver.step`."""
         del image
         config = self._config
@@ -71,11 +71,11 @@ class HeadingDriver:
         turn = min(max(config.gain * error, -config.max_angular_radps), config.max_angular_radps)
         if self._since is None:
             if abs(error) > config.tolerance_rad:
-                return Command(0.0, turn)
+                return VelocityCommand(0.0, turn)
             self._since = time_s
         if time_s - self._since >= config.drive_s - 1e-6:
-            return Command(0.0, 0.0, done=True)
-        return Command(config.linear_mps, turn)
+            return VelocityCommand(0.0, 0.0, done=True)
+        return VelocityCommand(config.linear_mps, turn)
 
 
 class PilotDriver:
@@ -85,12 +85,12 @@ class PilotDriver:
         """Take the navigator and its state, of `Navigator.start`."""
         self._navigator, self._state, self.lens = navigator, state, lens
 
-    def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> Command:
+    def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> VelocityCommand:
         """See `Driver.step`."""
         now = image[None], np.array([heading_rad]), np.array([time_s])
         self._state, linear, angular, events = self._navigator.step(self._state, *now)
         done = bool(events.arrived[0]) or bool(events.timed_out[0])
-        return Command(0.0, 0.0, done=True) if done else Command(float(linear[0]), float(angular[0]))
+        return VelocityCommand(0.0, 0.0, done=True) if done else VelocityCommand(float(linear[0]), float(angular[0]))
 
 
 def topological_driver(

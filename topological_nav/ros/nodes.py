@@ -20,7 +20,7 @@ from std_msgs.msg import Bool, Float32
 from interactive_nav_common.errors import UserError, missing, optional
 from scenes_mjcf.look import Lens
 from topological_nav.ros import messages as ros
-from topological_nav.ros.drivers import Command, Driver
+from topological_nav.ros.drivers import Driver, VelocityCommand
 from topological_nav.ros.simulator import Pace, RosSimulator, Sensed, Tally
 
 COMMAND_HOLDS_S = 0.5
@@ -252,7 +252,7 @@ class NavigatorNode:
                     silent_s = time.monotonic() - came
                     if moving and silent_s > LOST_S:
                         self._say(f"navigator: no picture came on {ros.IMAGE} for {LOST_S:g} s; the robot stops")
-                        self._send(Command(0.0, 0.0))
+                        self._send(VelocityCommand(0.0, 0.0))
                         moving = False
                     if silent_s > _PATIENCE_S:
                         raise RosError(f"waited {_PATIENCE_S:.0f} s: no picture came on {ros.IMAGE}")
@@ -281,9 +281,9 @@ class NavigatorNode:
                     return True
             return False
         finally:
-            self._send(Command(0.0, 0.0))
+            self._send(VelocityCommand(0.0, 0.0))
 
-    def _send(self, command: Command) -> None:
+    def _send(self, command: VelocityCommand) -> None:
         # Whether it is done comes first: in lockstep the simulator goes on with the command.
         if command.done:
             self._done.publish(Bool(data=True))

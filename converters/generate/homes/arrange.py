@@ -107,7 +107,7 @@ TOUCH_M = 0.004
 
 
 @dataclasses.dataclass(frozen=True)
-class Piece:
+class GroupMember:
     """Describe one piece of furniture in its group's frame."""
 
     model: CadModel
@@ -143,7 +143,7 @@ class Arrangement:
     """Hold a group with models chosen."""
 
     group: Group
-    pieces: tuple[Piece, ...]
+    pieces: tuple[GroupMember, ...]
     """The anchor first."""
     front: tuple[float, float, float, float] | None
     """u0, v0, u1, v1 of the floor that stays free."""
@@ -161,22 +161,22 @@ def on_floor(origin: np.ndarray, facing_rad: float, u: float, v: float) -> np.nd
     return origin + np.array([s * u + c * v, -c * u + s * v])
 
 
-def stand(piece: Piece, origin: np.ndarray, facing_rad: float) -> Instance:
+def stand(piece: GroupMember, origin: np.ndarray, facing_rad: float) -> Instance:
     """Return a piece where it stands, its group's origin at (2,) `origin` and the v axis along `facing_rad`."""
     xy = on_floor(origin, facing_rad, piece.u, piece.v)
     return place(piece.model, piece.scale, xy, facing_rad + piece.turn_rad)
 
 
-def draw_set(models: Models, rng: np.random.Generator) -> Callable[[str], Piece]:
+def draw_set(models: Models, rng: np.random.Generator) -> Callable[[str], GroupMember]:
     """Return what draws a piece of a category at the origin, facing along v.
 
     Each category is of one model and size, as a table's chairs are; of boxes no two are alike.
     """
-    drawn: dict[str, Piece] = {}
+    drawn: dict[str, GroupMember] = {}
 
-    def piece(category: str) -> Piece:
+    def piece(category: str) -> GroupMember:
         if category not in drawn or category == "box":
-            drawn[category] = Piece(*models.draw(category, rng), 0.0, 0.0, 0.0)
+            drawn[category] = GroupMember(*models.draw(category, rng), 0.0, 0.0, 0.0)
         return drawn[category]
 
     return piece
@@ -192,7 +192,7 @@ def apart(a: Instance, b: Instance, gap_m: float = TOUCH_M) -> bool:
     )
 
 
-def _at(host: Piece, piece: Piece, right_m: float, ahead_m: float, turn_rad: float) -> Piece:
+def _at(host: GroupMember, piece: GroupMember, right_m: float, ahead_m: float, turn_rad: float) -> GroupMember:
     """Return a piece so far to the right of and ahead of its host's middle, turned against it."""
     c, s = math.cos(host.turn_rad), math.sin(host.turn_rad)
     u, v = host.u + c * right_m - s * ahead_m, host.v + s * right_m + c * ahead_m
@@ -200,8 +200,14 @@ def _at(host: Piece, piece: Piece, right_m: float, ahead_m: float, turn_rad: flo
 
 
 def _facing(
-    host: Piece, seat: Piece, side: int, slide_m: float, gap_m: float, turn_rad: float, others: list[Piece]
-) -> Piece | None:
+    host: GroupMember,
+    seat: GroupMember,
+    side: int,
+    slide_m: float,
+    gap_m: float,
+    turn_rad: float,
+    others: list[GroupMember],
+) -> GroupMember | None:
     """Return a piece at a side of its host (0 front, 1 left, 2 back, 3 right), facing it; as near as parts allow.
 
     `gap_m` is where it should be; under the host it is drawn out step by step until nothing touches.
@@ -220,7 +226,7 @@ def _facing(
     return None
 
 
-def _seats(host: Piece, count: int, at_wall: bool, rng: np.random.Generator) -> list[tuple[int, float]]:
+def _seats(host: GroupMember, count: int, at_wall: bool, rng: np.random.Generator) -> list[tuple[int, float]]:
     """Return (side, slide along it) of seats round a table: long sides first, as many as fit beside each other."""
     width, _, depth = host.size_m
     places: list[tuple[int, float]] = []
@@ -234,15 +240,15 @@ def _seats(host: Piece, count: int, at_wall: bool, rng: np.random.Generator) -> 
 
 
 def _satellites(
-    satellite: Satellite, count: int, host: Piece, row: list[Piece], draw: Callable[[str], Piece],
+    satellite: Satellite, count: int, host: GroupMember, row: list[GroupMember], draw: Callable[[str], GroupMember],
     rng: np.random.Generator,
-) -> list[Piece]:  # fmt: skip
+) -> list[GroupMember]:  # fmt: skip
     """Return the satellites of one kind, in the frame of the group."""
 
     def turned() -> float:
         return math.radians(rng.uniform(-satellite.turn_deg, satellite.turn_deg))
 
-    out: list[Piece] = []
+    out: list[GroupMember] = []
     sides = list(rng.permutation([1, -1]))
     seats = _seats(host, count, host.v > 0, rng) if satellite.relation == "around" else []
     for k in range(len(seats) or count):

@@ -14,7 +14,7 @@ from converters.generate.homes.arrange import (
     PLENTY_M2,
     TABLES,
     Arrangement,
-    Piece,
+    GroupMember,
     RoomSet,
     arrange,
     on_floor,
@@ -147,7 +147,7 @@ def settle(home: Home, name: str, arrangement: Arrangement, room: int, radius_m:
 
 def _few(home: Home, arrangement: Arrangement, room: int) -> Arrangement | None:
     """Return a group without the pieces that are too many of a kind; None where it needs one of them."""
-    kept: list[Piece] = []
+    kept: list[GroupMember] = []
     for piece in arrangement.pieces:
         if home.takes([p.model.category for p in (*kept, piece)], room):
             kept.append(piece)

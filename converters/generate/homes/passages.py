@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from converters.generate.design.config import GenerationError
-from converters.generate.homes.arrange import TABLES, Arrangement, Group, Piece
+from converters.generate.homes.arrange import TABLES, Arrangement, Group, GroupMember
 from converters.generate.homes.config import SHARE_TOLERANCE, Range
 from converters.generate.homes.floor import CELL_M, Standing
 from converters.generate.homes.furnish import Home, clutter_category, settle
@@ -213,7 +213,7 @@ def _clear(home: Home, passages: Passages) -> None:
     piece = light[rng.integers(len(light))]
     model, scale = piece.item.model, piece.item.scale
     group = Group(model.category, "anywhere")
-    alone = Arrangement(group, (Piece(model, scale, 0.0, 0.0, float(rng.uniform(-math.pi, math.pi))),), None)
+    alone = Arrangement(group, (GroupMember(model, scale, 0.0, 0.0, float(rng.uniform(-math.pi, math.pi))),), None)
     rooms = [piece.room, *(int(k) for k in rng.permutation(len(home.plan.rooms))[:3])]
 
     def change() -> bool:

@@ -9,7 +9,7 @@ import pytest
 from interactive_nav_common.errors import UserError
 from scenes_mjcf.look import Lens
 from topological_nav.ros.config import HeadingConfig
-from topological_nav.ros.drivers import Command, HeadingDriver, PilotDriver
+from topological_nav.ros.drivers import HeadingDriver, PilotDriver, VelocityCommand
 
 PICTURE = np.zeros((2, 2, 3), np.uint8)
 
@@ -26,8 +26,8 @@ def test_it_turns_the_short_way_then_drives_for_its_time():
         x += 0.1 * command.linear_mps * math.cos(heading)
         y += 0.1 * command.linear_mps * math.sin(heading)
     # A quarter turn to the right at 1 rad/s, slower at its end.
-    assert commands[0] == Command(0.0, -1.0)
-    assert commands[-1] == Command(0.0, 0.0, done=True)
+    assert commands[0] == VelocityCommand(0.0, -1.0)
+    assert commands[-1] == VelocityCommand(0.0, 0.0, done=True)
     moving = [c for c in commands if c.linear_mps]
     assert len(moving) == 20 and {c.linear_mps for c in moving} == {0.5}
     assert abs(math.remainder(heading - math.pi, math.tau)) < 0.01
@@ -52,7 +52,7 @@ def test_the_navigator_is_asked_as_a_batch_of_one_and_ends_the_episode(how):
     navigator, lens = Three(how), Lens(4, 3, 90.0)
     driver = PilotDriver(navigator, 0, lens)  # type: ignore[arg-type]
     commands = [driver.step(np.zeros((3, 4, 3), np.uint8), 0.5, 1.0 + 0.1 * k) for k in range(3)]
-    assert commands == [Command(0.3, -0.2), Command(0.3, -0.2), Command(0.0, 0.0, done=True)]
+    assert commands == [VelocityCommand(0.3, -0.2), VelocityCommand(0.3, -0.2), VelocityCommand(0.0, 0.0, done=True)]
     assert (
         driver._state == 3
         and navigator.asked == [((1, 3, 4, 3), [0.5], [1.0 + 0.1 * k]) for k in range(3)]
@@ -61,6 +61,6 @@ def test_the_navigator_is_asked_as_a_batch_of_one_and_ends_the_episode(how):
 
 
 def test_velocities_that_are_not_finite_are_refused():
-    assert Command(0.1, 0.2).angular_radps == 0.2
+    assert VelocityCommand(0.1, 0.2).angular_radps == 0.2
     with pytest.raises(UserError, match="commands nan m/s"):
-        Command(math.nan, 0.0)
+        VelocityCommand(math.nan, 0.0)

@@ -12,7 +12,7 @@ import pytest
 from scenes_mjcf.look import Lens
 from topological_nav.ros import messages, nodes
 from topological_nav.ros.config import HeadingConfig, SimulatorConfig
-from topological_nav.ros.drivers import Command, HeadingDriver
+from topological_nav.ros.drivers import HeadingDriver, VelocityCommand
 from topological_nav.ros.nodes import NavigatorNode, RosError, SimulatorNode, ros_node
 from topological_nav.ros.simulator import Pace, Sensed
 
@@ -158,7 +158,7 @@ class Watcher:
 
     def step(self, image, heading_rad, time_s):
         self.shown.append((image, heading_rad, time_s))
-        return Command(0.2, 0.0, done=len(self.shown) == self.steps)
+        return VelocityCommand(0.2, 0.0, done=len(self.shown) == self.steps)
 
 
 def test_pictures_have_the_drivers_lens_and_headings_are_in_the_maps_frame(bus):
