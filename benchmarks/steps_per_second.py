@@ -49,9 +49,9 @@ PACKAGES = ("mujoco", "mujoco-mjx", "warp-lang", "jax", "brax")
 
 
 def command_line(description: str | None, rows: str = "", settings: bool = False) -> argparse.ArgumentParser:
-    """The words that benchmarks share: of one that writes `rows`, a file in `RESULTS`, if not empty.
+    """Return a parser with the options that benchmarks share; `rows` names a file in `RESULTS` to write.
 
-    With `settings` it makes an environment, by `--set key=value`.
+    With `settings`, `--set key=value` changes the environment.
     """
     made = Parser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     if settings:
@@ -71,7 +71,7 @@ def command_line(description: str | None, rows: str = "", settings: bool = False
 
 
 def origin(commit_told: str | None = None, packages: Sequence[str] = PACKAGES) -> dict[str, Any]:
-    """The columns of a row that say where it comes from: device, versions, commit and date."""
+    """Return the columns of a row that say where it comes from: device, versions, commit and date."""
     device, found = jax.devices()[0], commit() or "unknown"
     return {
         "device": device.device_kind if device.platform != "cpu" else f"cpu, {os.cpu_count()} cores",
@@ -91,7 +91,7 @@ def append_row(path: Path, row: dict[str, Any], hidden: Sequence[str] | None = (
 
 
 def timed(call: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
-    """What a call gives, once it is there, and the seconds until then."""
+    """Return the result of a call once it has been computed, and the seconds that it took."""
     began = time.perf_counter()
     out = jax.block_until_ready(call(*arguments))
     return out, time.perf_counter() - began
@@ -130,7 +130,7 @@ SETTINGS = {"free": "active_furniture", "small": "active_small", "hinge": "activ
 
 @functools.lru_cache(maxsize=1)
 def _make(robot: str, scenes: tuple[str, ...], backend: str, settings: str):
-    """The environment; kept for the next mode, since the tables of many large scenes take a minute."""
+    """Build the environment; keep it for the next mode, since the tables of many large scenes take a minute."""
     return interactive_nav.make(robot, scenes, backend=backend, **json.loads(settings))
 
 
@@ -167,7 +167,7 @@ def _physics_only(env, num_envs: int):
 
 
 def _without_reset(env, num_envs: int, observe: bool):
-    """The task, with or without observing, but without new episodes."""
+    """Return a step of the task, with or without observing, but without new episodes."""
 
     def step(state, action):
         state = jax.vmap(env.advance)(state, action)
@@ -188,7 +188,7 @@ def step_of(env: Any, part: str, num_envs: int, batch: Any = None) -> Any:
 
 
 def _counting(step: Any) -> Any:
-    """The step, and what is counted in it."""
+    """Return a step that also returns the quantities to count."""
 
     def counted(state, action):
         state = step(state, action)
@@ -257,7 +257,7 @@ def simulation(
 def windows(
     robot: str, scenes: list[str], backend: str, num_envs: int, steps: int, settings: dict[str, Any]
 ) -> dict[str, Any]:
-    """How much each environment needs in its window, over random driving; counted every tenth step.
+    """Measure how much each environment needs in its window while it drives at random, at every tenth step.
 
     Best on `native`, which simulates everything: a window would hide what it left out.
     """

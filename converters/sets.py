@@ -175,8 +175,8 @@ def generate_scenes(wanted: Wanted, report: Report, log: Callable[[str], None]) 
 def make_packaged(names: Sequence[str], jobs: int, report: Report, log: Callable[[str], None]) -> list[str]:
     """Generate scenes of the package's sets in the cache folder, unless the package has them.
 
-    What the cache has in a scene's place and is not the listed scene is replaced. Return the names of those that fail,
-    do not pass every gate, or are not what the set lists.
+    Replace cached folders that hold a scene other than the listed one. Return the names of scenes that fail, miss a
+    gate, or differ from the set's list.
     """
     sets = {name: packaged_set(name).scenes for name in PACKAGED}
     words = [word for name, members in sets.items() for word in (name, f"{name}/train", f"{name}/test", *members)]

@@ -1,7 +1,7 @@
-"""What is known of each category of things, in one table, `categories.yaml`: a name in, its record out.
+"""Look up the record of an object category in the one table, `categories.yaml`.
 
-Whatever another module must know of every category (a class of a mask, a colour, a material, a library's key) is a
-field here, so that a new category is one new row and no two places differ.
+Every property of a category that any module needs (mask class, colour, material, key in a library) is a field here,
+so that a new category is one new row.
 """
 
 import dataclasses

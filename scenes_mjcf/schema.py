@@ -1,4 +1,4 @@
-"""The scene folder's contract: `scene.json` and `maps.npz` in, typed and checked records out, and back.
+"""Define the scene folder's contract: read and write `scene.json` and `maps.npz` as typed, checked records.
 
 A scene folder holds `scene.xml` (MJCF), `scene.json` (this module's `SceneManifest`), `maps.npz`
 (`SceneMaps`) and `assets/`. World frame: z up, metres, floor at z = 0. See `scenes_mjcf/README.md`.

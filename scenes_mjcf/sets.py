@@ -1,4 +1,4 @@
-"""Names of sets of scenes in, scene folders out.
+"""Resolve names of sets of scenes to scene folders.
 
 A set is a file that lists scenes, their splits and the digests of their tasks: `OUT/set.json`, which
 `python -m converters generate-scenes OUT` writes, or a committed one of this package. Wherever scenes are listed,
@@ -73,7 +73,7 @@ def scene_digest(folder: Path) -> str:
 
 
 def _rounded(text: str) -> str:
-    """An attribute's numbers with four decimals; -0 is 0; other text as it is."""
+    """Return an attribute's numbers with four decimals, -0 as 0; other text unchanged."""
     try:
         return " ".join(f"{round(float(word), 4) + 0.0:.4f}" for word in text.split())
     except ValueError:
@@ -94,17 +94,17 @@ def write_set(scenes: SceneSet, path: Path) -> None:
 
 
 def packaged_set(name: str) -> SceneSet:
-    """One of `PACKAGED`."""
+    """Return the set of a name in `PACKAGED`."""
     return read_set(next(p for p in (PACKAGED[name] / FILE, COMMITTED / f"{name}.json") if p.is_file()))
 
 
 def in_cache(path: Path) -> Path:
-    """Where the cache folder has what lies at a path of the package."""
+    """Return the path in the cache folder that corresponds to a path of the package."""
     return cache_folder() / path.relative_to(HERE.parent)
 
 
 def is_listed(folder: Path, member: Member) -> bool:
-    """Whether a folder holds the scene of a set's list; not where it cannot be read."""
+    """Return whether a folder holds the scene that a set lists; False if it cannot be read."""
     try:
         return scene_digest(folder) == member.digest
     except SceneError:
@@ -112,7 +112,7 @@ def is_listed(folder: Path, member: Member) -> bool:
 
 
 def installed(path: str | Path) -> Path:
-    """A path as it is; else, where nothing is there, the package's or the cache's of the same name."""
+    """Return a path if it exists, else the path of the same name in the package or in the cache."""
     found = Path(path)
     roots = () if found.exists() or found.is_absolute() else (HERE.parent, cache_folder())
     place = next((root / found for root in roots if (root / found).exists()), found)
@@ -137,7 +137,7 @@ def meant(word: str) -> str:
 
 
 def _file_of(name: str) -> Path | None:
-    """The file that describes a set: in a folder of that name, or the package's."""
+    """Return the file that describes a set: in a folder of that name, or in the package."""
     for path in (Path(name) / FILE, HERE / name / FILE, COMMITTED / f"{name}.json"):
         if path.is_file():
             return path

@@ -278,7 +278,7 @@ class ExpertConfig(Settings):
     lidar_fov_deg: Annotated[float, (1.0, 360.0)] = 270.0
     """Angle that they cover."""
     lidar_range_m: Annotated[float, (0.1, 100.0)] = 4.0
-    """What is farther is not measured."""
+    """Largest distance that the scanner measures, m."""
     radius_m: Annotated[float, (0.001, 10.0)] = 0.27
     """The planned way keeps its middle this far from obstacles."""
     near_m: Annotated[float, (0.001, 10.0)] = 0.3

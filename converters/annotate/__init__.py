@@ -1,1 +1,1 @@
-"""A scan annotated by a person in the browser: which CAD model stands where."""
+"""Let a person annotate a scan in the browser: which CAD model stands where."""

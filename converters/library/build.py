@@ -191,7 +191,7 @@ class Chosen:
 
     @property
     def key(self) -> str:
-        """Of the piece and of what stands on it: `Scopia/desk+Scopia/lamp`."""
+        """Return the keys of the piece and of the models that stand on it: `Scopia/desk+Scopia/lamp`."""
         return "+".join((self.piece.key, *(piece.key for _, piece in self.riders)))
 
 

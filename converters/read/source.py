@@ -1,4 +1,4 @@
-"""A raw folder in any layout that we read in, `RawScene` out."""
+"""Read a raw folder in any supported layout into a `RawScene`."""
 
 import dataclasses
 import functools
@@ -53,7 +53,7 @@ def detect_format(source: Path) -> str:
 
 
 def root_of(source: Path) -> Path:
-    """The folder that names of a source's files are relative to."""
+    """Return the folder that names of a source's files are relative to."""
     if source.is_dir():
         return source
     of_home = (root for endings, (root, _) in FILES.items() if source.name.lower().endswith(endings))

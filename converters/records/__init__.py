@@ -1,1 +1,1 @@
-"""What every reader fills and every stage takes."""
+"""Define the records that readers fill and stages take."""

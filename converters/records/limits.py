@@ -60,7 +60,7 @@ class Gate:
     passed: bool
     limit: Limit
     warnings: tuple[str, ...] = ()
-    """What the value does not show, passed or not."""
+    """Problems that the value does not show, whether the gate passed or not."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return what scene.json says of it."""

@@ -355,7 +355,7 @@ def noisy_depth(
         along = normals[..., 2] - normals[..., 0] * across - normals[..., 1] * upward
         met &= along > math.sin(math.radians(noise.depth_grazing_deg)) * jnp.sqrt(1.0 + across**2 + upward**2)
     if noise.depth_edge_m:
-        # What is nearer hides the projector from what is behind it.
+        # A nearer surface hides the projector from the surfaces behind it.
         wide = jnp.pad(jnp.where(depth > 0, depth, jnp.inf), 1, mode="edge")
         beside = [wide[1:-1, :-2], wide[1:-1, 2:], wide[:-2, 1:-1], wide[2:, 1:-1]]
         met &= depth - jnp.min(jnp.stack(beside), 0) <= noise.depth_edge_m

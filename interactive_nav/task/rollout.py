@@ -184,7 +184,7 @@ class Player:
         episode_of = np.arange(size)  # episode played by each place in the batch
         finished = episode_of >= count
         act: Any = policy  # a pytree argument of the program, so that its numbers are none of its constants
-        if hasattr(policy, "start"):
+        if hasattr(policy, "start") and not isinstance(policy, HostPolicy):
             memory = self._remember(policy, state, jnp.asarray(done + episode_of))
             state = state.replace(info=state.info | {"policy": memory})
         elif not isinstance(policy, (jax.tree_util.Partial, HostPolicy)):

@@ -30,7 +30,7 @@ LEARNER, ENV_STATE, META = "learner.msgpack", "env_state.npz", "meta.json"
 POLICY = "policy.safetensors"
 """Holds the policy alone: it acts nearly as the original (docs/results.md says how nearly) and cannot be trained."""
 STEP = 0.5
-"""What its large weights are rounded to, in standard deviations of an output's weights: about 3 bits a weight."""
+"""Step to which large weights are rounded, in standard deviations of an output's weights: about 3 bits a weight."""
 SHOWN = ("algorithm", "robot", "observations", "observation_size", "action_size", "env_steps")
 """Fields of `CheckpointMeta` that a policy's file repeats."""
 

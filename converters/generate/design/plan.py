@@ -146,7 +146,7 @@ class Building:
     floor_height_m: float
     """The floor in the scan's frame."""
     uses: tuple[str, ...] = ()
-    """What each room of a home is used as, keys of `converters.generate.homes.design.USES`; empty: just rooms."""
+    """Use of each room of a home, keys of `converters.generate.homes.design.USES`; empty if rooms have no use."""
     measured: dict[str, Any] = dataclasses.field(default_factory=dict)
     """How much of a home's floor furniture covers (`furniture_share`), and how much of it is behind furniture: robot ->
     share of the pairs of places between which it has no path round the movables (`must_push_share`)."""

@@ -23,7 +23,7 @@ class RoomUse:
     weight: float
     """Area against that of the other rooms."""
     least_side_m: float
-    """What its furniture needs."""
+    """Least length of its shorter side, m, so that its furniture fits."""
     beside: tuple[str, ...] = ()
     """It lies next to one of these, where the home has one."""
     most: int = 1

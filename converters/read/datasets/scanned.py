@@ -1,4 +1,4 @@
-"""A scene of a published collection of scans in, `RawScene` with labels out; the package scenezoo reads the files.
+"""Read a scene of a published collection of scans into a labelled `RawScene`; the package scenezoo reads the files.
 
 The folder of one scene is the source, where its collection's own download put it. Labels become NYU40's by the names of
 their classes. scenezoo may fetch a collection's tables of splits and classes, where they do not lie beside the scans.

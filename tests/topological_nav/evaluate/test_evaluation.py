@@ -40,7 +40,7 @@ APARTMENT = "scenes_mjcf/apartment_0"
 
 
 class Rails:
-    """A player of robots on a line: each drives 0.2 m a step and touches where it is told to."""
+    """A player of robots on a line: each drives 0.2 m per step and touches objects in the given steps."""
 
     def __init__(self):
         world = SimpleNamespace(small_objects=())
