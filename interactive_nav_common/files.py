@@ -2,7 +2,6 @@
 
 import contextlib
 import errno
-import fcntl
 import os
 import re
 import secrets
@@ -15,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import platformdirs
+from filelock import lock_descriptor
 
 from interactive_nav_common.errors import FileError, UserError, regular
 from interactive_nav_common.locks import is_locked, release, take_lock
@@ -69,7 +69,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
                 regular(path)
             lock = os.open(partial, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
             with contextlib.suppress(OSError):  # a file system without locks: what a killed writer leaves stays there
-                fcntl.flock(lock, fcntl.LOCK_EX)
+                lock_descriptor(lock)
             yield partial
             with contextlib.suppress(OSError):  # none stands there, or it is another user's
                 os.chmod(partial, stat.S_IMODE(path.stat().st_mode))

@@ -8,6 +8,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from filelock import lock_descriptor
+
 from interactive_nav_common.errors import FileError, regular
 
 PATIENCE_S = 0.5
@@ -17,7 +19,8 @@ PATIENCE_S = 0.5
 def take_lock(path: Path) -> int | None:
     """Hold a lock as long as the file descriptor that it returns is open, here or in a child.
 
-    A lock and not a process id in a file: ids are used again, and mean nothing in another container.
+    A lock and not a process id in a file: ids are used again, and mean nothing in another container. And a descriptor
+    and not a `filelock.FileLock`, which opens no folders, and whose release frees what a child has inherited.
 
     Args:
         path: of a folder that is there, or of a file, which is created and names its holder.
@@ -28,15 +31,14 @@ def take_lock(path: Path) -> int | None:
     is_folder = path.is_dir()
     descriptor = _open(path, os.O_RDONLY if is_folder else os.O_CREAT | os.O_RDWR)
     until = time.monotonic() + PATIENCE_S
-    try:
-        while not _flock(descriptor, path, fcntl.LOCK_EX):
-            if is_locked(path) or time.monotonic() > until:
-                os.close(descriptor)
-                return None
-            time.sleep(0.02)
-    except FileError:
-        os.close(descriptor)
-        raise
+    with contextlib.ExitStack() as unless_held:
+        unless_held.callback(os.close, descriptor)
+        with _needs_locks(path):
+            while not lock_descriptor(descriptor, blocking=False):
+                if is_locked(path) or time.monotonic() > until:
+                    return None
+                time.sleep(0.02)
+        unless_held.pop_all()
     if not is_folder:
         os.ftruncate(descriptor, 0)
         os.write(descriptor, f"{os.getpid()} {socket.gethostname()}\n".encode())
@@ -57,8 +59,12 @@ def is_locked(path: Path) -> bool:
         if isinstance(error.__cause__, FileNotFoundError | NotADirectoryError):  # by now another may have created it
             return False
         raise
-    try:
-        return not _flock(descriptor, path, fcntl.LOCK_SH)
+    try:  # filelock has no shared lock on a descriptor, and two that looked with exclusive ones would see each other
+        with _needs_locks(path):
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return False
+    except BlockingIOError:
+        return True
     finally:
         os.close(descriptor)
 
@@ -97,16 +103,16 @@ def _open(path: Path, flags: int) -> int:
         raise FileError(f"{path}: cannot be opened ({error.strerror}); expected a writable folder") from error
 
 
-def _flock(descriptor: int, path: Path, kind: int) -> bool:
+@contextlib.contextmanager
+def _needs_locks(path: Path) -> Iterator[None]:
     try:
-        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+        yield
     except BlockingIOError:
-        return False
+        raise
     except OSError as error:
         raise FileError(
             f"{path}: its file system has no locks ({error.strerror}); choose a folder on one that does"
         ) from None
-    return True
 
 
 LOCK = ".lock"
@@ -114,7 +120,7 @@ LOCK = ".lock"
 
 @contextlib.contextmanager
 def alone_in(out: Path) -> Iterator[None]:
-    """Create a folder and keeps other processes out of it for the block."""
+    """Create a folder and keep other processes out of it for the block."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
