@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from interactive_nav_common.signals import raise_stop
+
 STAGES = dict(read=1.0, align=0.5, decompose=25.0, cut=3.0, map=1.0, settle=4.0, texture=10.0, write=1.0, gates=3.0)
 """Stage -> seconds it took on the sample room on two cores: weights of the progress bar."""
 
@@ -41,6 +43,7 @@ class Clock:
         start = time.monotonic()
 
         def inner(share: float) -> None:
+            raise_stop()
             self.report(name, min((self._before + STAGES[name] * min(share, 1.0)) / total, 1.0))
 
         inner(0.0)

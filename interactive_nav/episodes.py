@@ -31,6 +31,7 @@ from interactive_nav_common.config import Natural, NotNegative, Seed
 from interactive_nav_common.errors import ConfigError, UserError, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.records import Reader
+from interactive_nav_common.signals import signals_wait
 from interactive_nav_common.untrusted.reading import read_bytes, unpack
 from interactive_nav_common.words import Parser, add_words, read_commands
 
@@ -88,9 +89,11 @@ def draw_episode_file(env: InteractiveNav, episodes: int, seed: int) -> EpisodeF
     if episodes < 1:
         raise ConfigError(f"episodes is {episodes}, expected at least 1")
     keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.PRNGKey(seed)))(jnp.arange(episodes))
-    starts, lengths = jax.jit(jax.vmap(lambda key: _with_length(env, env.draw_start(jax.random.split(key)[1]))))(keys)
-    starts, lengths = jax.tree.map(np.asarray, (starts, lengths))
-    qpos, ways = np.asarray(jax.jit(jax.vmap(lambda start: env.initial_physics(start).qpos))(starts)), Ways(env, None)
+    with signals_wait():  # a compilation that is left crashes the interpreter at its end
+        started = jax.jit(jax.vmap(lambda key: _with_length(env, env.draw_start(jax.random.split(key)[1]))))(keys)
+        starts, lengths = jax.tree.map(np.asarray, started)
+        qpos = np.asarray(jax.jit(jax.vmap(lambda start: env.initial_physics(start).qpos))(starts))
+    ways = Ways(env, None)
     rows = []
     for i in range(episodes):
         scene, start, goal = int(starts.scene_index[i]), starts.start_xy_w[i], starts.goal_xy_w[i]
@@ -191,7 +194,7 @@ def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -
         small_yaw_rad=jnp.asarray(poses[..., 2]),
         small_placed=jnp.asarray([[o is not None for o in row["objects"]] for row in rows], bool),
     )
-    _, lengths = jax.jit(jax.vmap(lambda start: _with_length(env, start)))(starts)
+    _, lengths = signals_wait()(jax.jit(jax.vmap(lambda start: _with_length(env, start))))(starts)
     wrong = np.abs(np.asarray(lengths) - np.asarray(f32("shortest_path_m"))) > LENGTH_TOLERANCE_M
     if wrong.any():
         i = int(np.argmax(wrong))

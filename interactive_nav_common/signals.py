@@ -1,88 +1,59 @@
-"""Collect SIGINT, SIGTERM and SIGHUP for programs that save before they end, hold them back, or never lose them."""
+"""Record SIGINT, SIGTERM and SIGHUP for loops that look between two pieces of work, or raise them at once."""
 
 import contextlib
-import os
 import signal
-import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from types import FrameType
 from typing import Any
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """SIGHUP comes when the terminal closes; under nohup it is ignored, and stays so."""
-Handler = Callable[[int, FrameType | None], Any]
-_AGAIN_S = 0.05
-_LOST_IN = ("<frozen importlib._bootstrap>", "jax/_src/compiler.py", "jax/_src/callback.py")
-
-
-def heard(handler: Handler) -> Handler:
-    """Wrap a handler that raises, so that what it raises is not lost.
-
-    Some modules catch all that happens while they import others, and nothing leaves a destructor or a callback of the
-    garbage collector or of a weak reference. JAX turns what leaves a callback into another error, and a compilation
-    that is left runs on and crashes the interpreter at its end. There the signal comes again a moment later.
-    """
-
-    def raising(number: int, frame: FrameType | None) -> None:
-        within = frame
-        while within:
-            if within.f_code.co_filename.endswith(_LOST_IN):
-                return _come_again(number)
-            within = within.f_back
-        try:
-            handler(number, frame)
-        except BaseException as raised:
-            raised.signal_number = number  # type: ignore[attr-defined]
-            raise
-
-    if not hasattr(sys.unraisablehook, "before"):
-        sys.unraisablehook = _lost_again(sys.unraisablehook)
-    return raising
+_came: list[BaseException] = []
+"""What the handlers of `interrupts_heard` have recorded, whether they raised it or not."""
 
 
 def number_of(stop: KeyboardInterrupt) -> int:
     """Return the signal that raised it."""
-    return getattr(stop, "signal_number", signal.SIGINT)
+    return stop.args[0] if stop.args else signal.SIGINT
 
 
-def _lost_again(before: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    def hook(unraisable: Any) -> None:
-        """Handle what Python cannot raise: a signal comes again, all else is for the hook before."""
-        number = getattr(unraisable.exc_value, "signal_number", None)
-        _come_again(number) if number else before(unraisable)
+def raise_stop() -> None:
+    """Raise the first signal within `interrupts_heard` that is still without effect; call it between pieces of work.
 
-    hook.before = before  # type: ignore[attr-defined]
-    return hook
-
-
-def _come_again(number: int) -> None:
-    timer = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), number))
-    timer.daemon = True
-    timer.start()
+    It was only recorded, or Python lost what its handler raised: some modules catch all that happens while they import
+    others, and nothing leaves a destructor or a callback of the garbage collector or of a weak reference.
+    """
+    if _came:
+        raise _came.pop(0)
 
 
 @contextlib.contextmanager
-def interrupts_heard(*also: int) -> Iterator[None]:
-    """Raise KeyboardInterrupt at SIGINT as always, but where it is not lost, and SystemExit at other stops.
+def interrupts_heard(*also: int, at_once: bool = True) -> Iterator[None]:
+    """Raise KeyboardInterrupt at SIGINT as always, and SystemExit at other stops, which would end the process at once.
 
-    The latter, where they would end the process at once: so nothing unfinished stays behind. Signals that others
-    handle, or that are ignored, are left alone.
+    So nothing unfinished stays behind. Signals that others handle, or that are ignored, are left alone.
 
     Args:
         *also: signals that raise KeyboardInterrupt, too, unless they are ignored. `number_of` tells which.
+        at_once: False leaves the first one to `raise_stop`, and raises the next: JAX turns what leaves a callback into
+            another error, and a compilation that is left runs on and crashes the interpreter at its end.
     """
+
+    def handler(number: int, _: FrameType | None) -> None:
+        _came.append(KeyboardInterrupt(number) if number in (signal.SIGINT, *also) else SystemExit(128 + number))
+        if at_once or len(_came) > 1:
+            raise _came[-1]
+
     mine = threading.current_thread() is threading.main_thread()
     usual = {n: signal.getsignal(n) for n in STOPS if mine}
-    keyboard, ends = (heard(h) for h in (signal.default_int_handler, lambda number, _: sys.exit(128 + number)))
-    others = (signal.SIG_IGN, None)
-    chosen: dict[int, Any] = {
-        n: keyboard if n in also or h is signal.default_int_handler else ends
-        for n, h in usual.items()
-        if h in (signal.default_int_handler, signal.SIG_DFL) or n in also and h not in others
-    }
-    with _handled(chosen):
-        yield
+    ours, others = (signal.default_int_handler, signal.SIG_DFL), (signal.SIG_IGN, None)
+    chosen = [n for n, h in usual.items() if h in ours or n in also and h not in others]
+    try:
+        with _handled(dict.fromkeys(chosen, handler)):
+            yield
+    finally:
+        _came.clear()
 
 
 @contextlib.contextmanager

@@ -18,7 +18,7 @@ from interactive_nav_common.config import refuse_unused, replace
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.rows import write_parquet
-from interactive_nav_common.signals import STOPS, interrupts_heard, number_of
+from interactive_nav_common.signals import STOPS, interrupts_heard, number_of, raise_stop
 from interactive_nav_common.words import program
 from scenes_mjcf.sets import installed, scene_folders
 from train import config_io
@@ -119,8 +119,10 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
     """Evaluate; return 0 when done, 2 on a user's error, 128 + signal when stopped, which keeps what is played."""
     kept: dict[Path, str] = {}
     try:
-        with interrupts_heard(*STOPS):
-            return _run(parser().parse_intermixed_args(argv), build_env, kept)
+        with interrupts_heard(*STOPS, at_once=False):  # progress raises it, between two chunks
+            code = _run(parser().parse_intermixed_args(argv), build_env, kept)
+            raise_stop()
+            return code
     except KeyboardInterrupt as stop:
         saved = "; ".join(kept.values()) or "nothing, no policy had played all"
         number = number_of(stop)
@@ -169,7 +171,9 @@ def _run(arguments: argparse.Namespace, build_env: Callable[[EnvConfig], Any], k
         console.print(f"{config.run.name}: {summary}; loading and compiling first", highlight=False, soft_wrap=True)
         if player is None or kinds[i] != built:
             player = None  # the old one's memory goes before the new one's comes
-            player, built = BatchPlayer(build_env(config.env)), kinds[i]
+            env = build_env(config.env)
+            raise_stop()
+            player, built = BatchPlayer(env), kinds[i]
         trained_steps = folder.origin().get("env_steps") if folder else None
         notes = {"asked": json.dumps(dataclasses.asdict(request)), "trained_steps": json.dumps(trained_steps)}
         rows, stood = pa.table({}), out.exists()

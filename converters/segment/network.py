@@ -19,6 +19,7 @@ from converters.records.errors import SceneRejected
 from converters.segment.voxels import BELOW_M, FEATURES, LAYERS, NAMES, VOXEL_M, Voxels
 from interactive_nav_common.errors import readable
 from interactive_nav_common.runs import weights
+from interactive_nav_common.signals import signals_wait
 
 WEIGHTS = Path(__file__).with_name("weights.safetensors")
 """The packaged ones."""
@@ -87,6 +88,7 @@ Scores = Callable[[jax.Array, jax.Array, tuple[int, int]], jax.Array]
 def make_scores(net: VoxelNet, variables: Any) -> Scores:
     """Return a network with weights, compiled once a shape."""
 
+    @signals_wait()  # a compilation that is left crashes the interpreter at its end
     @functools.partial(jax.jit, static_argnums=2)
     def scores(index: jax.Array, features: jax.Array, shape: tuple[int, int]) -> jax.Array:
         out = net.apply(variables, dense(index, features, shape))

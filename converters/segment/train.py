@@ -28,6 +28,7 @@ from converters.segment.voxels import FEATURES, NAMES, UNKNOWN, intersection_ove
 from interactive_nav_common.config import AtLeastOne, Count, Positive, Seed, Settings
 from interactive_nav_common.files import append_text, whole_file
 from interactive_nav_common.records import METRICS, cut_metrics
+from interactive_nav_common.signals import signals_wait
 
 HELD_OUT_SEED = 900_000
 State = tuple[Any, Any]
@@ -93,6 +94,7 @@ def batch_of(crops: Sequence[Crop], config: SegmentConfig, rng: np.random.Genera
     return index, features, classes
 
 
+@signals_wait()  # a compilation that is left crashes the interpreter at its end
 @functools.partial(jax.jit, static_argnums=(0, 4))
 def _scores_at(net: VoxelNet, params: Any, index: jax.Array, features: jax.Array, side: int) -> jax.Array:
     out = net.apply({"params": params}, dense(index, features, (side, side)))
@@ -114,6 +116,7 @@ def make_step(net: VoxelNet, config: SegmentConfig) -> tuple[Callable[[Any], Sta
         loss = optax.softmax_cross_entropy_with_integer_labels(scores, classes)
         return (weight * loss).sum() / jnp.maximum(weight.sum(), 1.0)
 
+    @signals_wait()
     @functools.partial(jax.jit, donate_argnums=0)
     def step(state: State, rate: jax.Array, *batch: jax.Array) -> tuple[State, jax.Array]:
         loss, gradient = jax.value_and_grad(loss_of)(state[0], *batch)

@@ -111,10 +111,11 @@ class Player:
         self._at_start, self._at_end, self._at_step = (
             {name: r.read for name, r in recorders.items() if r.at == when} for when in ("start", "end", "step")
         )
-        self._reset = jax.jit(jax.vmap(env.reset))
-        self._reset_to = jax.jit(jax.vmap(env.reset_to)) if hasattr(env, "reset_to") else None
-        self._begin = jax.jit(self._carry)
-        self._remember = jax.jit(lambda policy, *of: jax.vmap(policy.start)(*of))
+        held = signals_wait()  # a compilation that is left crashes the interpreter at its end
+        self._reset = held(jax.jit(jax.vmap(env.reset)))
+        self._reset_to = held(jax.jit(jax.vmap(env.reset_to))) if hasattr(env, "reset_to") else None
+        self._begin = held(jax.jit(self._carry))
+        self._remember = held(jax.jit(lambda policy, *of: jax.vmap(policy.start)(*of)))
         self._chunk = jax.jit(self._play_chunk, compiler_options=compiler_options())
         # For buffers that have moved MJX-Warp captures its graphs anew: a step writes where the state lay.
         self._step = jax.jit(

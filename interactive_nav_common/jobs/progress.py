@@ -17,6 +17,7 @@ from rich.progress import (
 from rich.text import Text
 
 from interactive_nav_common.errors import printable
+from interactive_nav_common.signals import raise_stop
 
 
 class SafeConsole(Console):
@@ -31,14 +32,23 @@ class SafeConsole(Console):
 def progress_bar(
     console: Console, what: str, total: float | None = None, transient: bool = False
 ) -> Iterator[Callable[..., None]]:
-    """Show a bar on a terminal, nothing elsewhere; yield its update, with `Progress.update`'s words and a `status`."""
+    """Show a bar on a terminal, nothing elsewhere; yield its update, with `Progress.update`'s words and a `status`.
+
+    The update raises a signal that was left to `raise_stop`.
+    """
     plain = functools.partial(TextColumn, markup=False)
     columns = (
         *(plain("{task.description:<14}"), BarColumn(bar_width=24), TaskProgressColumn(), TimeElapsedColumn()),
         *(plain("left", style="dim"), TimeRemainingColumn(), plain("{task.fields[status]}")),
     )
     with Progress(*columns, console=console, transient=transient, disable=not console.is_terminal) as bar:
-        yield functools.partial(bar.update, bar.add_task(what, total=total, status=""))
+        task = bar.add_task(what, total=total, status="")
+
+        def update(**fields: Any) -> None:
+            raise_stop()
+            bar.update(task, **fields)
+
+        yield update
 
 
 @contextlib.contextmanager

@@ -1,17 +1,19 @@
-"""Signals that come where Python loses what their handlers raise."""
+"""Signals are raised, recorded, or held back; the next piece of work raises those that had no effect."""
 
+import contextlib
 import gc
 import os
 import signal
 import sys
 import threading
-import time
 import weakref
 
 import jax
 import pytest
+from rich.console import Console
 
-from interactive_nav_common.signals import heard, interrupts_heard, number_of, stop_signals
+from interactive_nav_common.jobs.progress import progress_bar
+from interactive_nav_common.signals import interrupts_heard, number_of, raise_stop, signals_wait, stop_signals
 
 DEAF = """
 import signal
@@ -29,7 +31,7 @@ def test_an_interrupt_within_an_import_that_catches_all_comes_after_it(tmp_path,
         import deaf_to_interrupts  # type: ignore[import-not-found]  # noqa: F401
 
         assert "deaf_to_interrupts" in sys.modules
-        time.sleep(5)
+        raise_stop()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
@@ -56,13 +58,14 @@ def unreferenced() -> None:
     assert reference() is None
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("lose", [collected, unreferenced, Interrupted], ids=["collector", "weak reference", "__del__"])
 def test_one_where_nothing_can_be_raised_comes_after_it(lose):
     reached = []
     with pytest.raises(KeyboardInterrupt), interrupts_heard():
         lose()
         reached.append(lose)
-        time.sleep(5)
+        raise_stop()
     assert reached
 
 
@@ -75,8 +78,10 @@ def compiled() -> None:
         return x
 
     lowered = jax.jit(long).lower(jax.numpy.ones((8, 8)))
-    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+    signalling = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
+    signalling.start()
     lowered.compile()
+    signalling.join()
 
 
 def called_back() -> None:
@@ -88,20 +93,43 @@ def called_back() -> None:
 
 
 @pytest.mark.parametrize("run", [compiled, called_back])
-def test_one_within_jax_comes_after_it(run):
+@pytest.mark.parametrize("waits", [True, False])
+def test_one_within_jax_comes_after_it(run, waits):
     """A compilation left behind crashes the interpreter at its end; in a callback what is raised is JAX's error."""
     reached = []
-    with pytest.raises(KeyboardInterrupt), interrupts_heard():
-        run()
-        reached.append(run)
-        time.sleep(5)
-    assert reached
+    jax.clear_caches()
+    with pytest.raises(KeyboardInterrupt), interrupts_heard(at_once=waits):
+        with signals_wait() if waits else contextlib.nullcontext():
+            run()
+            reached.append(run)
+        assert not waits
+        raise_stop()
+    assert reached == [run]
 
 
-def test_elsewhere_a_handler_acts_at_once():
-    seen = []
-    heard(lambda number, frame: seen.append(number))(signal.SIGTERM, sys._getframe())
-    assert seen == [signal.SIGTERM]
+def test_one_that_is_only_recorded_is_raised_once_and_the_second_at_once():
+    with interrupts_heard(signal.SIGTERM, at_once=False):
+        signal.raise_signal(signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt) as first:
+            raise_stop()
+        raise_stop()
+        signal.raise_signal(signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt) as second:
+            signal.raise_signal(signal.SIGINT)
+    assert [number_of(stop.value) for stop in (first, second)] == [signal.SIGTERM, signal.SIGINT]
+    raise_stop()  # none of a block that is over
+
+
+def test_progress_raises_it():
+    reached = []
+    raises = pytest.raises(KeyboardInterrupt)
+    with raises, interrupts_heard(at_once=False), progress_bar(Console(), "work", 3) as update:
+        for done in range(3):
+            update(completed=done)
+            reached.append(done)
+            if done == 1:
+                signal.raise_signal(signal.SIGINT)
+    assert reached == [0, 1]
 
 
 def test_others_raise_it_too_and_are_told_apart():
