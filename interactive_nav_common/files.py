@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import json
 import os
 import re
 import secrets
@@ -105,6 +106,12 @@ def write_text(path: str | Path, text: str) -> None:
     """Write a text file (UTF-8) whole or not at all."""
     with whole_file(path) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def write_json(path: str | Path, content: Any) -> Any:
+    """Write a JSON file whole or not at all; return its content."""
+    write_text(path, json.dumps(content, indent=1) + "\n")
+    return content
 
 
 def write_arrays(path: str | Path, **arrays: Any) -> None:

@@ -183,7 +183,7 @@ def runs() -> dict[str, Target]:
     from interactive_nav_common.runs.weights import rounded, write_weights
     from tests.train.sweep.test_sweep import write_sweep
     from tests.train.toy_run import toy_config
-    from topological_nav.learn.runs import read_description, read_weights, write_network
+    from topological_nav.learn.learning import read_description, read_weights, write_network
     from topological_nav.maps.graph import TopologicalMap, load_map, save_map
     from train.config_io import to_yaml
     from train.runs import checkpoint

@@ -14,11 +14,11 @@ from typing import Any
 
 from interactive_nav_common.config import settings_help
 from interactive_nav_common.errors import reports_errors
+from interactive_nav_common.jobs.progress import Stopped
 from interactive_nav_common.words import Parser, add_words, read_commands
 from topological_nav import config as configs
 from topological_nav.config import ADAPTED, DATASET, DRIVES, RUNS
 from topological_nav.data.domains import AdaptConfig
-from topological_nav.errors import Stopped
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "data": {"": configs.DataConfig(), " of drives": configs.DriveConfig()},

@@ -24,15 +24,19 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from interactive_nav.robots import get_robot
-from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav import get_robot, load_scene
+from interactive_nav.scenes.scene import Scene
 from interactive_nav_common.config import to_dict
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.files import write_json
+from interactive_nav_common.jobs.progress import ALONE, Host
 from interactive_nav_common.rows import digest_of
+from interactive_nav_common.runs.folder import claimed, run_epochs
 from topological_nav.config import PITCHES
 from topological_nav.data.dataset import PassageImages, RoomImages, balanced, load_passages, load_rooms, read_header
 from topological_nav.data.domains import AdaptConfig, as_seen, preset
-from topological_nav.errors import ALONE, DatasetError, Host, MapError, RunError
 from topological_nav.learn.learning import (
+    RESULTS,
     Learner,
     compiled_epoch,
     initial,
@@ -43,7 +47,6 @@ from topological_nav.learn.learning import (
     phase_key,
 )
 from topological_nav.learn.networks import Network, Places, in_words, joined, localisation_scores, normalised
-from topological_nav.learn.runs import claimed, run_epochs, write_results
 from topological_nav.learn.training import (
     Networks,
     Trained,
@@ -190,7 +193,7 @@ def adapt_features(
         for name, network in (("before", trained), ("statistics", fitted), ("after", adapted)):
             nodes = (trained, near) if same else (network, far)
             results[name] = localisation_between(*nodes, network, far)
-        return write_results(out, results)
+        return write_json(out / RESULTS, results)
 
 
 def adapted_about(trained: Trained, config: AdaptConfig) -> dict[str, Any]:
@@ -210,7 +213,7 @@ def localisation_between(
     """Score queries of one domain on nodes of another, see `training.localisation`; return their number too."""
     rows = localisation(node_network, node_rooms, query_network, query_rooms)
     if not rows:
-        raise RunError("source and target have no scene in common with positions for training and for testing")
+        raise FileError("source and target have no scene in common with positions for training and for testing")
     places = sum(
         int((mine & query_rooms.test).sum()) for name, mine in rows_by_scene(query_rooms).items() if name in rows
     )
@@ -255,7 +258,7 @@ def passage_configurations(
             results[name] = _scores(tuned, tested)
             if name == "D":
                 save_trained(out, dataclasses.replace(tuned, about=adapted_about(trained, config)))
-        return write_results(out, results)
+        return write_json(out / RESULTS, results)
 
 
 def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detector_run: Path, config: AdaptConfig):
@@ -275,7 +278,7 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
     shown, xy, label = level[nodes], rooms.xy_w[nodes], rooms.label[nodes]
     room = label - rooms.label[here].min()
     if not len(near_pairs(xy, config.edge_m)):
-        raise MapError(f"no two positions of '{scene.name}' in {target} are within {config.edge_m} m; collect more")
+        raise FileError(f"no two positions of '{scene.name}' in {target} are within {config.edge_m} m; collect more")
     about = {"settings": to_dict(config), "data": header["settings"], "domain": to_dict(preset(config.domain))}
     space, networks = free_space(scene, get_robot(data.robot).height_m), Networks(localiser, detector)
     built = judged_map(scene, space, xy, room, shown, networks, config.edge_m, config.passable, about)
@@ -291,7 +294,7 @@ def _index_of(scene: Scene, header: dict[str, Any], target: Path) -> int:
     digests = [there["digest"] for there in header["scenes"]]
     if scene.digest not in digests:
         names = ", ".join(there["name"] for there in header["scenes"])
-        raise DatasetError(f"{target}: holds images of {names} as they were, not of '{scene.name}' as it is")
+        raise FileError(f"{target}: holds images of {names} as they were, not of '{scene.name}' as it is")
     return digests.index(scene.digest)
 
 
@@ -300,7 +303,7 @@ def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> 
     passages = load_passages(target)
     if list(passages.lengths_m) != list(lengths_m):
         lengths = ",".join(f"{length:g}" for length in lengths_m)
-        raise DatasetError(
+        raise FileError(
             f"{target}: passages are labelled for {list(passages.lengths_m)} m, the detector judges {list(lengths_m)}; "
             f"make it again with passage_lengths_m=[{lengths}]"
         )
@@ -313,7 +316,7 @@ def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> 
         rows = np.sort(np.concatenate([yes, no]))
         if not len(rows):
             what = "for testing" if held else "to learn from"
-            raise DatasetError(f"{target}: has no passages {what}; make it with more passage_sources or test_share")
+            raise FileError(f"{target}: has no passages {what}; make it with more passage_sources or test_share")
         chosen = {name: getattr(passages, name)[rows] for name in ("free", "scene", "test")}
         parts.append(dataclasses.replace(passages, images=images[rows], **chosen))
     return parts[0], parts[1]

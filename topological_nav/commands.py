@@ -8,11 +8,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
-from interactive_nav.scenes.scene import load_scene
+from interactive_nav import load_scene
 from interactive_nav_common.config import field_docs, overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import write_text
-from interactive_nav_common.jobs.progress import SafeConsole, progress_bar
+from interactive_nav_common.jobs.progress import Host, Progress, SafeConsole, Stopped, progress_bar, say
 from interactive_nav_common.records import read_metrics
 from interactive_nav_common.rows import where
 from interactive_nav_common.signals import stop_signals
@@ -26,7 +26,6 @@ from topological_nav.data.folders import folder_bytes
 from topological_nav.drives.dataset import draw_drives, simulate_drives, summary
 from topological_nav.drives.driving import embed_drives
 from topological_nav.drives.imitation import grid_table, train_grid, train_policy
-from topological_nav.errors import Host, Progress, Stopped, say
 from topological_nav.evaluate import scores
 from topological_nav.evaluate.contest import Contest, contest_scenes, play_contest, tracks_of
 from topological_nav.figures import learning as figures

@@ -7,7 +7,6 @@ OUT/crops/SEED.npz   labelled voxels of a generated building, held_out/SEED.npz 
 import contextlib
 import dataclasses
 import functools
-import json
 import multiprocessing
 import os
 import signal
@@ -26,8 +25,8 @@ from converters.segment.network import VoxelNet, dense, save_network
 from converters.segment.samples import Crop, generate_crops, read_crops
 from converters.segment.voxels import FEATURES, NAMES, UNKNOWN, intersection_over_union
 from interactive_nav_common.config import AtLeastOne, Count, Positive, Seed, Settings
-from interactive_nav_common.files import append_text, whole_file
 from interactive_nav_common.records import METRICS, cut_metrics
+from interactive_nav_common.runs.folder import CHECKPOINT, append_metrics, read_state, write_state
 from interactive_nav_common.signals import signals_wait
 
 HELD_OUT_SEED = 900_000
@@ -175,8 +174,8 @@ class _Learner:
         params = jax.jit(self.net.init)(jax.random.key(config.seed), nothing)["params"]
         self.at: dict[str, Any] = {"state": start(params), "steps": 0, "seconds": 0.0}
         self.loss: Any = float("nan")
-        if (out / "checkpoint.msgpack").is_file():
-            self.at = flax.serialization.from_bytes(self.at, (out / "checkpoint.msgpack").read_bytes())
+        if saved := read_state(out / CHECKPOINT):
+            self.at = flax.serialization.from_state_dict(self.at, saved)
         cut_metrics(out / METRICS, lambda row: row["step"] <= self.at["steps"])
 
     def take(self, wait_s: float | None) -> None:
@@ -209,8 +208,7 @@ class _Learner:
     def save(self) -> None:
         """Write checkpoint and weights."""
         if self.at["steps"]:
-            with whole_file(self.out / "checkpoint.msgpack") as partial:
-                partial.write_bytes(flax.serialization.to_bytes(jax.device_get(self.at)))
+            write_state(self.out / CHECKPOINT, self.at)
             save_network(self.out / "weights.safetensors", self.net, {"params": self.at["state"][0]})
 
     def score(self, most: int) -> dict[str, float]:
@@ -219,7 +217,7 @@ class _Learner:
         scores["mean"] = float(np.mean(list(scores.values()))) if scores else 0.0
         steps, seconds, loss = self.at["steps"], self.at["seconds"], float(self.loss)
         row = {"step": steps, "seconds": round(seconds, 1), "loss": None if np.isnan(loss) else loss, "iou": scores}
-        append_text(self.out / METRICS, json.dumps(row) + "\n")
-        self.log(f"step {steps}, {seconds:.0f} s, {len(self.crops['crops'])} crops: loss {loss:.3f}, "
-                  f"held-out mIoU {scores['mean']:.3f}")  # fmt: skip
+        append_metrics(self.out, row)
+        scored = f"loss {loss:.3f}, held-out mIoU {scores['mean']:.3f}"
+        self.log(f"step {steps}, {seconds:.0f} s, {len(self.crops['crops'])} crops: {scored}")
         return scores

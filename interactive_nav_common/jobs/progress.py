@@ -1,19 +1,15 @@
 """Show the share of work that is done as a bar on the console."""
 
 import contextlib
+import dataclasses
 import functools
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import rich.progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.text import Text
 
 from interactive_nav_common.errors import printable
@@ -41,7 +37,7 @@ def progress_bar(
         *(plain("{task.description:<14}"), BarColumn(bar_width=24), TaskProgressColumn(), TimeElapsedColumn()),
         *(plain("left", style="dim"), TimeRemainingColumn(), plain("{task.fields[status]}")),
     )
-    with Progress(*columns, console=console, transient=transient, disable=not console.is_terminal) as bar:
+    with rich.progress.Progress(*columns, console=console, transient=transient, disable=not console.is_terminal) as bar:
         task = bar.add_task(what, total=total, status="")
 
         def update(**fields: Any) -> None:
@@ -68,3 +64,29 @@ def warn_once(console: Console) -> Callable[[str], None]:
             console.print(f"warning: {warning}", soft_wrap=True, highlight=False)
 
     return warn
+
+
+class Stopped(Exception):
+    """Stop at a signal, whose number it carries. What was done is kept, and the same command goes on."""
+
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is done, how much of it, and of how much; may raise to stop."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Host:
+    """Show the lines of long work, and stop it between two steps."""
+
+    show: Callable[[str], None] = lambda _: None
+    signal: Callable[[], int] = lambda: 0
+    """Return the number of the signal that wants the work to stop; 0: go on."""
+
+
+ALONE = Host()
+"""Shows nothing and never stops."""
+
+
+def say(line: str) -> None:
+    """Print a line to stderr, at once."""
+    print(line, file=sys.stderr, flush=True)

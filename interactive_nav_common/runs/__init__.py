@@ -1,1 +1,1 @@
-"""Write and read the files of runs: weights."""
+"""Write and read the files of runs: settings, metrics, checkpoints, weights."""

@@ -6,9 +6,9 @@ import pytest
 
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.locks import alone_in, release, take_lock
+from interactive_nav_common.runs.folder import claimed
 from topological_nav.__main__ import main
 from topological_nav.drives.dataset import draw_drives
-from topological_nav.learn.runs import claimed
 
 
 def test_a_folder_in_use_is_refused_and_named(tmp_path):

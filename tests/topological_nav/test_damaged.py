@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from interactive_nav_common.errors import UserError
+from interactive_nav_common.runs.folder import claimed
 from topological_nav.__main__ import main
 from topological_nav.data.dataset import load_plan
 from topological_nav.data.folders import read_arrays as read_batch
 from topological_nav.data.folders import read_shard
 from topological_nav.drives.driving import load_policy
-from topological_nav.learn.runs import claimed
 from topological_nav.learn.training import load_trained
 from topological_nav.maps.graph import load_map
 from topological_nav.weights.export import Choice, fitting_map

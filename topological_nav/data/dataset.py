@@ -17,14 +17,15 @@ from typing import Any
 
 import numpy as np
 
-from interactive_nav.robots import RobotSpec, get_robot
+from interactive_nav import get_robot
+from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.scene import Scene
-from interactive_nav_common.errors import readable
+from interactive_nav_common.errors import ConfigError, FileError, readable
 from interactive_nav_common.files import write_arrays
+from interactive_nav_common.jobs.progress import Progress
 from interactive_nav_common.rows import Rows
 from topological_nav.config import DataConfig
 from topological_nav.data.folders import Folder, draw_missing, load_scenes, numbered, read_arrays, read_shards
-from topological_nav.errors import DatasetError, Progress, SpaceError
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.space import FreeSpace, Rooms, agreement, free_space, recorded_rooms, scene_rooms, spread
 
@@ -120,8 +121,8 @@ def plan_scene(scene: Scene, space: FreeSpace, config: DataConfig) -> ScenePlan:
     rooms = scene_rooms(scene, space, config)
     try:
         drawn = space.sample(rng, config.positions, config.clearance_m)
-    except SpaceError as error:
-        raise SpaceError(f"{scene.path}: {error}") from None
+    except ConfigError as error:
+        raise ConfigError(f"{scene.path}: {error}") from None
     label = rooms.of(drawn)
     kept, test = [], []
     for k in range(rooms.count):
@@ -198,7 +199,7 @@ def load_plan(folder: Path, scene: str) -> ScenePlan:
     """Read where a scene's images were taken."""
     path = Path(folder) / scene / "plan.npz"
     arrays = read_arrays(path)
-    with readable(path, DatasetError, "run 'data' again"):
+    with readable(path, FileError, "run 'data' again"):
         rooms = Rooms(arrays["cluster_xy_w"], arrays["cluster_label"], *(str(w) for w in arrays["how"]))
         passages = Passages(*(arrays[f"passage_{f.name}"] for f in dataclasses.fields(Passages)))
         return ScenePlan(rooms, arrays["xy_w"], arrays["room"], arrays["test"], passages)
@@ -239,9 +240,7 @@ def _read_all(folder: Path, kind: str, count: int, config: DataConfig) -> np.nda
     shape = (config.height, config.width, 3)
     joined = np.concatenate(images) if images else np.zeros((0, *shape), np.uint8)
     if joined.shape != (count, *shape):
-        raise DatasetError(
-            f"{folder}: {kind} are {joined.shape}, expected {(count, *shape)}; delete them and make again"
-        )
+        raise FileError(f"{folder}: {kind} are {joined.shape}, expected {(count, *shape)}; delete them and make again")
     return joined
 
 

@@ -15,17 +15,19 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from PIL import Image
 
-from interactive_nav.robots import RobotSpec, get_robot
-from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav import get_robot, load_scene
+from interactive_nav.robots import RobotSpec
+from interactive_nav.scenes.scene import Scene
 from interactive_nav_common.config import overlay, to_dict
-from interactive_nav_common.errors import readable
-from interactive_nav_common.files import whole_file, write_text
+from interactive_nav_common.errors import FileError, readable
+from interactive_nav_common.files import whole_file, write_json
+from interactive_nav_common.jobs.progress import Progress
 from interactive_nav_common.locks import alone_in
+from interactive_nav_common.runs.folder import refuse_changes
 from interactive_nav_common.untrusted.reading import read_npz
 from interactive_nav_common.versions import usable_cores
 from scenes_mjcf.look import CameraPose, Lens
 from topological_nav.config import CameraConfig
-from topological_nav.errors import DatasetError, Progress
 from topological_nav.scenes.rendering import SceneRenderer, need_engine
 
 Config = TypeVar("Config", bound=CameraConfig)
@@ -50,13 +52,13 @@ class Folder(Generic[Config]):
         """Return the description of a folder, and the settings in it."""
         path = Path(folder) / self.file
         if not path.is_file():
-            raise DatasetError(f"{folder}: {self.none}")
-        with readable(path, DatasetError, f"delete the folder and {self.again}"):
+            raise FileError(f"{folder}: {self.none}")
+        with readable(path, FileError, f"delete the folder and {self.again}"):
             header = json.loads(path.read_text(encoding="utf-8"))
             version = header["format"]
             settings = header["settings"] if version == self.version else {}
         if version != self.version:
-            raise DatasetError(f"{path}: format {version}, expected {self.version}; {self.again}")
+            raise FileError(f"{path}: format {version}, expected {self.version}; {self.again}")
         return header, overlay(self.base, settings, str(path))
 
     def describe(self, config: Config, scenes: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -77,19 +79,15 @@ class Folder(Generic[Config]):
             path = out / self.file
             if path.is_file():
                 there, settings = self.read(out)
-                for name, value in to_dict(settings).items():
-                    if header["settings"][name] != value:
-                        raise DatasetError(
-                            f"{out}: was made with {name} = {value!r}, expected {header['settings'][name]!r}; "
-                            "choose another folder or delete it"
-                        )
+                remedy = "choose another folder or delete it"
+                refuse_changes(out, to_dict(settings), header["settings"], remedy, "dataset")
                 if there["scenes"] != header["scenes"]:
-                    raise DatasetError(
+                    raise FileError(
                         f"{out}: is of {', '.join(s['name'] for s in there['scenes'])} as they were; "
-                        "the scenes differ: choose another folder or delete it"
+                        f"the scenes differ: {remedy}"
                     )
             else:
-                write_text(path, json.dumps(header, indent=1) + "\n")
+                write_json(path, header)
             yield
 
 
@@ -99,7 +97,7 @@ def load_scenes(folders: Sequence[Path], engine: str) -> list[Scene]:
     need_engine(engine)
     names = [scene.name for scene in scenes]
     if len(set(names)) != len(names) or not names:
-        raise DatasetError(f"scenes are {', '.join(names) or 'none'}, expected one or more with different names")
+        raise FileError(f"scenes are {', '.join(names) or 'none'}, expected one or more with different names")
     return scenes
 
 
@@ -194,21 +192,21 @@ def read_arrays(path: Path, command: str = "data") -> dict[str, np.ndarray]:
     """Read the arrays of an npz file that a command wrote."""
     need_files([path], command)
     remedy = f"delete it and run '{command}' again"
-    with read_npz(path, DatasetError, remedy) as arrays:
+    with read_npz(path, FileError, remedy) as arrays:
         return dict(arrays)
 
 
 def need_files(paths: Iterable[Path], command: str = "data") -> None:
-    """Raise DatasetError where one is missing."""
+    """Raise FileError where one is missing."""
     missing = next((path for path in paths if not path.is_file()), None)
     if missing:
-        raise DatasetError(f"{missing} is missing; the same '{command}' command goes on where it stopped")
+        raise FileError(f"{missing} is missing; the same '{command}' command goes on where it stopped")
 
 
 def read_shard(path: Path) -> np.ndarray:
     """Read all images [N, H, W, 3] u8 of a file, in the order they were written."""
     stored = read_arrays(path)
-    with readable(path, DatasetError, "delete it and run 'data' again"):
+    with readable(path, FileError, "delete it and run 'data' again"):
         height, width = (int(v) for v in stored["size"])
         sheets = np.split(stored["data"], stored["ends"][:-1])
         pairs = zip(sheets, stored["counts"], strict=True)

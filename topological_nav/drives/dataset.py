@@ -19,17 +19,18 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from interactive_nav.robots import get_robot
-from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav import get_robot, load_scene
+from interactive_nav.scenes.scene import Scene
 from interactive_nav.task.rollout import Player
+from interactive_nav_common.errors import ConfigError, FileError
 from interactive_nav_common.files import write_arrays
+from interactive_nav_common.jobs.progress import Progress
 from interactive_nav_common.locks import alone_in
 from interactive_nav_common.rotations import wrap_angle
 from scenes_mjcf.look import CameraPose
 from topological_nav.config import DataConfig, DriveConfig, MapConfig
 from topological_nav.data.folders import Folder, draw_missing, load_scenes, numbered, read_arrays, read_shards
 from topological_nav.drives.expert import CONTROL_S, RECORDERS, Tasks, Terrain, drive, drive_env, way_field
-from topological_nav.errors import DatasetError, Progress, SpaceError
 from topological_nav.maps.graph import angles, near_pairs, place_nodes
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.space import FreeSpace, free_space, scene_rooms
@@ -136,7 +137,7 @@ def draw_routes(
     for testing.
     """
     if not len(edges):
-        raise SpaceError(f"no two of {len(nodes_w)} nodes are joined by a way to drive; use a larger edge_m or detour")
+        raise ConfigError(f"no two of {len(nodes_w)} nodes are joined by a way to drive; use a larger edge_m or detour")
     heading = angles(nodes_w, edges)
     length = np.linalg.norm(nodes_w[edges[:, 1]] - nodes_w[edges[:, 0]], axis=1)
     begins = np.flatnonzero(length >= min(config.least_edge_m, length.max()))
@@ -190,8 +191,8 @@ def plan_drives(scenes: Sequence[Scene], config: DriveConfig) -> tuple[Tasks, np
         rng = np.random.default_rng([config.seed, 6, int(scene.digest[:8], 16)])
         try:
             routes = draw_routes(space, xy, joined, config, rng)
-        except SpaceError as error:
-            raise SpaceError(f"{scene.path}: {error}") from None
+        except ConfigError as error:
+            raise ConfigError(f"{scene.path}: {error}") from None
         ahead, where = routes.nodes[:, 1:], np.full(config.drives, index, np.int32)
         goals = ahead + sum(map(len, fields))
         parts.append(Tasks(where, goals, xy[ahead], routes.legs, routes.start_xy_w, routes.start_yaw_rad))
@@ -255,7 +256,7 @@ def draw_drives(scene_folders: Sequence[Path], out: Path, progress: Progress = l
         def scene(folder: Path, digest: str) -> Scene:
             there = load_scene(folder)
             if there.digest != digest:
-                raise DatasetError(f"{folder}: is not the scene that was driven in; drive again")
+                raise FileError(f"{folder}: is not the scene that was driven in; drive again")
             return there
 
         def files(index: int, name: str) -> Iterator[tuple[Path, list[CameraPose]]]:
@@ -288,7 +289,7 @@ def drive_images(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     for (path, rows), images in zip(files, read_shards([path for path, _ in files], AGAIN), strict=True):
         shape = (int(drives.steps[rows].sum()), config.height, config.width, 3)
         if images.shape != shape:
-            raise DatasetError(f"{path}: holds {images.shape}, expected {shape}; delete it and draw again")
+            raise FileError(f"{path}: holds {images.shape}, expected {shape}; delete it and draw again")
         yield rows, images
 
 

@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.jobs.progress import ALONE, Host, Stopped
 from topological_nav.config import PASSAGE_POLICY, DriveConfig, NavigatorConfig
 from topological_nav.drives.dataset import Drives, drive_images, load_drives, read_drives_header
-from topological_nav.errors import ALONE, Host, RunError, Stopped
-from topological_nav.learn.learning import in_batches, initial
-from topological_nav.learn.runs import read_description, read_weights
+from topological_nav.learn.learning import in_batches, initial, read_description, read_weights
 from topological_nav.learn.training import SAME, Networks, Trained, camera_settings, load_networks, need_task
-from topological_nav.maps.sight import PassagePolicy, Sight
+from topological_nav.maps.build import PassagePolicy, Sight
 
 Memory = tuple[jax.Array, jax.Array]
 """Hidden states [B, H] of the cell for linear and of the one for angular velocity."""
@@ -174,7 +174,7 @@ def embed_drives(folder: Path, localiser_run: Path, detector_run: Path, mirror: 
     mine, theirs = {**header["settings"], "fov_deg": header["fov_deg"]}, camera_settings(networks.localiser)
     for name in SAME:
         if mine[name] != theirs[name]:
-            raise RunError(
+            raise FileError(
                 f"{folder}: images have {name} = {mine[name]!r}, the networks learned from {theirs[name]!r}; drive "
                 f"again with {name}={theirs[name]}"
             )
@@ -193,7 +193,7 @@ def embed_drives(folder: Path, localiser_run: Path, detector_run: Path, mirror: 
         if stop := host.signal():
             raise Stopped(stop)
     if features is None:
-        raise RunError(f"{folder}: none of {len(drives)} drives was kept; drive more, or in other scenes")
+        raise FileError(f"{folder}: none of {len(drives)} drives was kept; drive more, or in other scenes")
     return Frames(drives, config, header, features, networks)
 
 
@@ -249,7 +249,7 @@ class TrainedPolicy:
     def act(self, state: Any, images: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
         """See `LocalPolicy`."""
         if images.shape[1:] != self._shape:
-            raise RunError(f"images are {images.shape[1:]}, expected {self._shape}, the size that it learned from")
+            raise FileError(f"images are {images.shape[1:]}, expected {self._shape}, the size that it learned from")
         state, (linear, angular) = jax.device_get(self._step(self._weights, state, jnp.asarray(images)))
         return state, np.asarray(self.about["linear_m_s"])[linear], np.asarray(self.about["angular_rad_s"])[angular]
 
@@ -275,7 +275,7 @@ def load_policy(
     networks = load_networks(*paths, classifies=True, same=SAME)
     for network, learned in zip(networks, about["networks"], strict=True):
         if learned["digest"] not in (network.about["digest"], network.about.get("adapted_from")):
-            raise RunError(f"{network.run}: is not the network that {run} learned with; train the policy again")
+            raise FileError(f"{network.run}: is not the network that {run} learned with; train the policy again")
     policy = Policy(about["hidden"], about["projection"], len(about["linear_m_s"]), len(about["angular_rad_s"]))
     width = about["width"]
     template = {

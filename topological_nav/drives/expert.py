@@ -20,7 +20,7 @@ import numpy as np
 import scipy.ndimage
 from scipy.sparse.csgraph import dijkstra
 
-from interactive_nav.task.env import InteractiveNav
+from interactive_nav import InteractiveNav
 from interactive_nav.task.rollout import Player, Recorder
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.grids import MOVES_32, cell_centres, grid_graph, nearest_cell
@@ -28,7 +28,7 @@ from interactive_nav_common.rotations import wrap_angle
 from interactive_nav_common.rows import Rows
 from scenes_mjcf.robot_facts import ROBOTS
 from topological_nav.config import DriveConfig, ExpertConfig
-from topological_nav.scenes.simulation import episode_starts, make_env
+from topological_nav.scenes.rendering import episode_starts, make_env
 from topological_nav.scenes.space import FreeSpace
 
 CONTROL_S = 0.1

@@ -8,7 +8,6 @@ RUN/config.yaml      settings; a run that is started again with the same ones go
 
 import dataclasses
 import functools
-import json
 import math
 import os
 from pathlib import Path
@@ -21,15 +20,16 @@ import numpy as np
 import optax
 
 from interactive_nav_common.config import to_dict
-from interactive_nav_common.files import write_text
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.files import write_json, write_text
+from interactive_nav_common.jobs.progress import ALONE, Host
 from interactive_nav_common.rows import Rows, markdown
+from interactive_nav_common.runs.folder import claimed, run_epochs
 from topological_nav.config import PolicyConfig
 from topological_nav.drives.dataset import Drives
 from topological_nav.drives.driving import Forward, Frames, Policy, fresh_params, policy_loss, standardised, unrolled
 from topological_nav.drives.expert import CONTROL_S
-from topological_nav.errors import ALONE, Host, RunError
-from topological_nav.learn.learning import Epoch, Learner, descent_epoch, shuffled
-from topological_nav.learn.runs import claimed, run_epochs, write_network, write_results
+from topological_nav.learn.learning import RESULTS, Epoch, Learner, descent_epoch, shuffled, write_network
 from topological_nav.learn.training import class_scores
 
 GRID = [(alpha, lam) for alpha in (0.1, 10.0, 50.0) for lam in (0.1, 0.5, 1.0)]
@@ -123,7 +123,7 @@ def mirrored(sequences: Sequences, frames: int, config: PolicyConfig) -> Sequenc
 def train_policy(frames: Frames, out: Path, config: PolicyConfig, host: Host = ALONE) -> dict[str, Any]:
     """Train a policy, or continue the run at `out`; return the content of results.json."""
     if config.mirror and not frames.mirrored:
-        raise RunError("mirror is set, but mirrored images were not embedded; embed them too or set mirror=false")
+        raise FileError("mirror is set, but mirrored images were not embedded; embed them too or set mirror=false")
     values = class_values(config, frames.config.linear_m_s, frames.config.angular_rad_s)
     every, learned, held_out = _split(frames.drives, config, values)
     digests = [network.about["digest"] for network in frames.networks]
@@ -156,7 +156,7 @@ def train_policy(frames: Frames, out: Path, config: PolicyConfig, host: Host = A
         }
         if len(held_out):
             results["test"] = _scores(frames.features, learner, policy, forward, held_out, config)
-        return write_results(out, results)
+        return write_json(out / RESULTS, results)
 
 
 def _split(drives: Drives, config: PolicyConfig, values: tuple[np.ndarray, np.ndarray]):
@@ -165,7 +165,7 @@ def _split(drives: Drives, config: PolicyConfig, values: tuple[np.ndarray, np.nd
     held_out = make_sequences(drives, np.flatnonzero(drives.kept & drives.test), config, values, 0.0)
     learned = thinned(every, config)
     if not len(learned):
-        raise RunError(f"no sequence to learn from in {len(drives)} drives; drive more or set straight_kept=1")
+        raise FileError(f"no sequence to learn from in {len(drives)} drives; drive more or set straight_kept=1")
     if config.mirror:
         learned = Sequences.joined([learned, mirrored(learned, len(drives.command), config)])
     return every, learned, held_out
@@ -290,7 +290,7 @@ def train_grid(frames: Frames, out: Path, config: PolicyConfig, host: Host = ALO
         one = dataclasses.replace(config, alpha=alpha, lam=lam)
         host.show(f"alpha {alpha:g}, lambda {lam:g}: {len(rows) + 1} of {len(GRID)}")
         rows.append(train_policy(frames, out / f"alpha-{alpha:g}-lambda-{lam:g}", one, host))
-    write_text(out / "grid.json", json.dumps(rows, indent=1) + "\n")
+    write_json(out / "grid.json", rows)
     write_text(out / "grid.md", grid_table(rows))
     return rows
 

@@ -21,13 +21,14 @@ import jax
 import numpy as np
 import pyarrow as pa
 
-from interactive_nav.robots import RobotSpec, get_robot
-from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav import get_robot, load_scene
+from interactive_nav.robots import RobotSpec
+from interactive_nav.scenes.scene import Scene
 from interactive_nav.task.rollout import Player
 from interactive_nav_common.config import overlay, to_dict
-from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.errors import ConfigError, FileError
 from interactive_nav_common.files import write_arrays
-from interactive_nav_common.jobs.progress import SafeConsole
+from interactive_nav_common.jobs.progress import Progress, SafeConsole
 from interactive_nav_common.rows import Columns, digest_of, read_rows, write_parquet
 from interactive_nav_common.untrusted.reading import read_npz
 from interactive_nav_common.versions import versions
@@ -36,7 +37,6 @@ from topological_nav.data.domains import as_seen_from, preset
 from topological_nav.data.folders import lens_of
 from topological_nav.drives import driving
 from topological_nav.drives.driving import LocalPolicy
-from topological_nav.errors import Progress, RunError
 from topological_nav.evaluate.evaluation import (
     Contender,
     DrivenEpisodes,
@@ -49,11 +49,10 @@ from topological_nav.evaluate.evaluation import (
     learned,
 )
 from topological_nav.learn.training import Networks, load_networks
-from topological_nav.maps.build import drawn_for, renderer_of, true_map
+from topological_nav.maps.build import NetworkSight, Sight, TrueSight, drawn_for, renderer_of, true_map
 from topological_nav.maps.graph import TopologicalMap, load_map
-from topological_nav.maps.sight import NetworkSight, Sight, TrueSight
 from topological_nav.navigate.navigator import Navigator
-from topological_nav.scenes.simulation import CONTROL, Camera, make_env, pose_camera, scene_camera
+from topological_nav.scenes.rendering import CONTROL, Camera, make_env, pose_camera, scene_camera
 from topological_nav.scenes.space import FreeSpace, free_space, scene_rooms
 from train.runs import checkpoint
 from train.runs.run_folder import RunFolder
@@ -237,7 +236,7 @@ def _digest_of(policy: str) -> str:
         p for p in Path(policy).glob("*") if p.suffix in (".safetensors", ".xz", ".json") and "check" not in p.name
     )
     if not files:
-        raise RunError(f"{policy}: holds no trained policy; name the run folder of one, or {PASSAGE_POLICY}")
+        raise FileError(f"{policy}: holds no trained policy; name the run folder of one, or {PASSAGE_POLICY}")
     return hashlib.sha256(b"".join(p.read_bytes() for p in files)).hexdigest()
 
 
@@ -356,6 +355,6 @@ def tracks_of(contest: Contest, scene: ContestScene, contender: str) -> dict[int
     """Return episode number -> [t, 2] m, of what has been played."""
     tracks: dict[int, np.ndarray] = {}
     for path in sorted((contest.out / "tracks").glob(f"{_stem(scene, contender)}-*.npz")):
-        with read_npz(path, RunError, "delete it and evaluate again") as stored:
+        with read_npz(path, FileError, "delete it and evaluate again") as stored:
             tracks = {int(number): stored[number] for number in stored.files} | tracks
     return tracks

@@ -18,13 +18,13 @@ from interactive_nav.metrics import path_efficiency
 from interactive_nav.navigation.ways import PathGrid
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.task.rollout import HostPolicy, Player, episode_keys
+from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.grids import label
-from interactive_nav_common.rows import Rows
+from interactive_nav_common.rows import Rows, column, fresh
 from topological_nav.config import EvaluationConfig
-from topological_nav.errors import SpaceError
 from topological_nav.navigate.navigator import Navigator
 from topological_nav.navigate.state import Events, State
-from topological_nav.scenes.simulation import Camera, Snapshot, episode_starts
+from topological_nav.scenes.rendering import Camera, Snapshot, episode_starts
 from topological_nav.scenes.space import FreeSpace, Rooms
 from train.scoring.policies import Planner
 
@@ -66,7 +66,7 @@ def draw_episodes(digest: str, space: FreeSpace, rooms: Rooms, count: int, confi
     parts, _ = label(space.clearance_m >= CONNECTED_M)
     places = space.centres(config.clearance_m)
     if len(places) < 2:
-        raise SpaceError(f"{len(places)} places are {config.clearance_m} m from obstacles; ask for less clearance_m")
+        raise ConfigError(f"{len(places)} places are {config.clearance_m} m from obstacles; ask for less clearance_m")
     column, row = space.cells(places).T
     part, room = parts[row, column], rooms.of(places)
     rng = np.random.default_rng([config.seed, 17, int(digest[:8], 16)])
@@ -76,7 +76,7 @@ def draw_episodes(digest: str, space: FreeSpace, rooms: Rooms, count: int, confi
         yaw = rng.uniform(-np.pi, np.pi)
         tries += 1
         if tries > 2000 * (len(drawn) + 1):
-            raise SpaceError(
+            raise ConfigError(
                 f"after {tries:,} draws {len(drawn)} of {count} episodes have start and goal in different rooms, more "
                 f"than {config.min_goal_m} m apart and joined by a way; ask for less clearance_m or min_goal_m"
             )
@@ -108,31 +108,31 @@ EXPERT_WEIGHT = 1.0
 class Played:
     """Hold the outcome of n episodes."""
 
-    success: np.ndarray
+    success: np.ndarray = column(False, bool)
     """[n] bool."""
-    arrived: np.ndarray
+    arrived: np.ndarray = column(False, bool)
     """[n] bool: ended because the navigator localised at the goal's node."""
-    goal_m: np.ndarray
+    goal_m: np.ndarray = column(0.0)
     """[n] distance to the goal at the end."""
-    path_m: np.ndarray
+    path_m: np.ndarray = column(0.0)
     """[n]."""
-    duration_s: np.ndarray
+    duration_s: np.ndarray = column(0.0)
     """[n]."""
-    runs: np.ndarray
-    """[n] int, runs driven."""
-    contact_runs: np.ndarray
+    runs: np.ndarray = column(0, int)
+    """[n] int, runs driven; one that the end of its episode cuts short counts as the whole run."""
+    contact_runs: np.ndarray = column(0, int)
     """[n] int, of them with a contact."""
-    contact_s: np.ndarray
+    contact_s: np.ndarray = column(0.0)
     """[n] seconds of control steps with a contact, turning included."""
-    wall_s: np.ndarray
+    wall_s: np.ndarray = column(0.0)
     """[n] of them with a wall."""
-    localisations: np.ndarray
-    blocked: np.ndarray
-    lost: np.ndarray
+    localisations: np.ndarray = column(0, int)
+    blocked: np.ndarray = column(0, int)
+    lost: np.ndarray = column(0, int)
     """[n] int, such events of the navigator; 0 for others."""
-    broken: np.ndarray
+    broken: np.ndarray = column(False, bool)
     """[n] bool: the physics gave up, which ends an episode as failed."""
-    track_w: list[np.ndarray]
+    track_w: list[Any]
     """n paths [t, 2], m, a point every `TRACK_S`."""
 
 
@@ -163,18 +163,42 @@ class Contender(HostPolicy):
         """See `HostPolicy`."""
         number = np.minimum(episode, len(self._episodes) - 1)  # a batch may be padded
         if step == 0:
-            self._log = self._logs[int(episode[0])] = []
+            for name, values in fresh(Played, len(number)).items():
+                getattr(self._played, name)[number] = values
+            self._runs[:, number] = 0
+            for i in number:
+                self._played.track_w[i] = []
             self.begin(self._episodes.take(number))
         elif len(episode) < len(self._batch):
             self.keep(np.array([np.flatnonzero(self._batch == one)[0] for one in episode]))
         self._batch, now = episode, self.look(state)
         actions, events = self.step(state, now, running, step)
+        return actions, self._note(number, now, events, running, step)
+
+    def _note(self, number: np.ndarray, now: Snapshot, events: Events, running: np.ndarray, step: int) -> np.ndarray:
+        """Add the moment before a step to the outcomes of the running episodes; return which it ends, [B] bool."""
+        dt_s, played, rows = self.player.env.dt, self._played, number[running]
         goal_m = np.linalg.norm(now.xy_w - self._episodes.goal_xy_w[number], axis=-1)
         near = events.run_ended & (goal_m < self.config.success_m)
-        moment = {"xy_w": now.xy_w.astype(np.float32), "path_m": now.path_m.astype(np.float32), "goal_m": goal_m}
-        moment |= {"running": running, "contact": now.movable | now.wall, "wall": now.wall, "broken": now.broken}
-        self._log.append((episode, {**moment, "near": near, **vars(events)}))
-        return actions, near | events.arrived | now.broken | events.timed_out
+        last = {"success": (near | events.arrived) & ~now.broken, "arrived": events.arrived & ~near, "goal_m": goal_m}
+        last |= {"path_m": now.path_m.astype(np.float32), "broken": now.broken}
+        last |= {"duration_s": np.full(len(number), step * dt_s), "runs": self._runs[0, number]}
+        for name, values in last.items():
+            getattr(played, name)[rows] = values[running]
+        sums = {"localisations": events.localised, "blocked": events.blocked, "lost": events.lost}
+        if step:  # what the step before touched
+            contact, (started, ended, counted) = now.movable | now.wall, self._runs[:, number]
+            new = running & contact & (started > ended) & (counted < started)
+            self._runs[2, number[new]] = started[new]
+            sums |= {"contact_s": dt_s * contact, "wall_s": dt_s * now.wall, "contact_runs": new}
+        for name, values in sums.items():
+            getattr(played, name)[rows] += values[running]
+        self._runs[:2, rows] += np.stack([events.run_started, events.run_ended])[:, running]
+        self._last_w[rows] = now.xy_w[running]
+        if step % max(1, round(TRACK_S / dt_s)) == 0:
+            for i in rows:
+                played.track_w[i].append(self._last_w[i].copy())
+        return near | events.arrived | now.broken | events.timed_out
 
     def play(self, episodes: DrivenEpisodes, on_progress: Callable[[int, float], None] = lambda *_: None) -> Played:
         """Play episodes to their ends, in one batch; noise and small objects depend on their numbers and the seed.
@@ -186,53 +210,17 @@ class Contender(HostPolicy):
         starts = episode_starts(*begin, len(env.world.small_objects))
         if self.config.objects:
             starts = self._strew(keys, starts)
-        self._episodes = episodes
-        self._logs: dict[int, list[tuple[np.ndarray, dict[str, np.ndarray]]]] = {}
+        n, self._episodes = len(episodes), episodes
+        self._played = Played(track_w=[[] for _ in range(n)], **fresh(Played, n))
+        self._runs, self._last_w = np.zeros((3, n), int), np.zeros((n, 2), np.float32)
+        """Runs started, ended, and the last one with a contact; places."""
         self.player.rollout(
             self, keys, starts, fewest=2, on_progress=lambda over, step: on_progress(over, step * env.dt)
         )
-        rows = [row for log in self._logs.values() for row in _outcomes(log, env.dt)][: len(episodes)]
-        columns = {name: [row[name] for row in rows] for name in rows[0]}
-        return Played(track_w=columns.pop("track_w"), **{name: np.array(column) for name, column in columns.items()})
-
-
-def _outcomes(log: list[tuple[np.ndarray, dict[str, np.ndarray]]], dt_s: float) -> list[dict[str, Any]]:
-    """Return `Played`'s fields of each episode, by the moments before all steps of a batch."""
-    size, first, moment = len(log[0][0]), log[0][0][0], log[0][1]
-    table = {name: np.zeros((len(log), size, *x.shape[1:]), x.dtype) for name, x in moment.items()}
-    for step, (episode, moment) in enumerate(log):
-        for name, values in moment.items():
-            table[name][step, episode - first] = values
-    steps = table["running"].sum(0)
-    return [_outcome({name: x[: steps[row], row] for name, x in table.items()}, dt_s) for row in range(size)]
-
-
-def _outcome(moments: dict[str, np.ndarray], dt_s: float) -> dict[str, Any]:
-    """Return `Played`'s fields of one episode, by its moments [t]; each shows what the step before it touched."""
-    last, end = {name: values[-1] for name, values in moments.items()}, len(moments["running"]) - 1
-    run, ended = (np.cumsum(moments[name])[:-1] for name in ("run_started", "run_ended"))
-    contact, every = moments["contact"][1:], max(1, round(TRACK_S / dt_s))
-
-    def seconds(flags: np.ndarray) -> float:
-        return float(np.cumsum(dt_s * flags)[-1]) if len(flags) else 0.0
-
-    return {
-        "success": (last["near"] | last["arrived"]) & ~last["broken"],
-        "arrived": last["arrived"] & ~last["near"],
-        "goal_m": last["goal_m"],
-        "path_m": float(last["path_m"]),
-        "duration_s": end * dt_s,
-        # A run that the end of its episode cuts short counts, as the whole run that it is scored as.
-        "runs": run[-1] if end else 0,
-        "contact_runs": len(np.unique(run[contact & (run > ended)])),
-        "contact_s": seconds(contact),
-        "wall_s": seconds(moments["wall"][1:]),
-        "localisations": moments["localised"].sum(),
-        "blocked": moments["blocked"].sum(),
-        "lost": moments["lost"].sum(),
-        "broken": last["broken"],
-        "track_w": moments["xy_w"][[*range(0, end + 1, every), end]].astype(float),
-    }
+        tracks = [
+            np.array([*track, last], float) for track, last in zip(self._played.track_w, self._last_w, strict=True)
+        ]
+        return dataclasses.replace(self._played, track_w=tracks)
 
 
 class NavigatorPlayer(Contender):

@@ -10,8 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-from interactive_nav.robots import get_robot
-from interactive_nav.scenes.scene import load_scene
+from interactive_nav import get_robot, load_scene
 from interactive_nav_common.figures import BLUE, ORANGE, RC, VERMILION, curves, panels, parts, plt, scene_axes
 from topological_nav.drives.dataset import drive_images, load_drives, read_drives_header
 from topological_nav.figures.maps import floor_plan

@@ -26,7 +26,7 @@ from topological_nav.evaluate.evaluation import DrivenEpisodes, NavigatorPlayer,
 from topological_nav.maps.build import Built
 from topological_nav.maps.graph import Route, TopologicalMap
 from topological_nav.navigate.state import FACE, PHASES, Events, State
-from topological_nav.scenes.simulation import Snapshot
+from topological_nav.scenes.rendering import Snapshot
 from topological_nav.scenes.space import FreeSpace
 
 WON, LOST = BLUE, VERMILION

@@ -4,8 +4,10 @@ The images stay on the device as u8. An epoch's order and augmentation follow fr
 run that goes on from a checkpoint ends where an uninterrupted one does.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Self
 
 import flax.linen as nn
@@ -15,7 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from topological_nav.errors import RunError
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.files import write_json
+from interactive_nav_common.records import Reader
+from interactive_nav_common.runs import weights
 from topological_nav.learn.networks import Contrast, Network, augmented, vicreg_loss
 from topological_nav.scenes.rendering import batched
 
@@ -86,7 +91,7 @@ def with_backbone(learner: Learner, donor: dict[str, Any]) -> Learner:
     mine, theirs = learner.params["body"], donor["params"]["body"]
     shapes = [jax.tree.map(jnp.shape, tree) for tree in (mine, theirs)]
     if shapes[0] != shapes[1]:
-        raise RunError("its backbone differs in kind or width")
+        raise FileError("its backbone differs in kind or width")
     stats = dict(learner.batch_stats)
     if "body" in stats:
         stats["body"] = donor["batch_stats"]["body"]
@@ -226,3 +231,53 @@ def padded_size(count: int) -> int:
     if jax.default_backend() == "cpu":
         return 1 << (count - 1).bit_length()
     return max(16, 1 << ((count - 1).bit_length() + 1) // 2 * 2)
+
+
+WEIGHTS, DESCRIPTION, RESULTS = "weights.safetensors", "network.json", "results.json"
+PACKED_WEIGHTS = f"{WEIGHTS}.xz"
+"""Of an exported run."""
+
+
+def write_network(out: Path, tensors: Any, about: dict[str, Any], precision: str = "") -> None:
+    """Write weights and their description, which gains their digest; with a precision those of an export, packed."""
+    header = {name: about[name] for name in ("task", "parameters", "commit") if name in about}
+    path = out / (PACKED_WEIGHTS if precision else WEIGHTS)
+    digest = weights.write_weights(path, weights.flat(jax.device_get(tensors)), header)["digest"]
+    about |= {"export": {"precision": precision, "weights_digest": digest}} if precision else {"digest": digest}
+    write_json(out / DESCRIPTION, {k: v for k, v in about.items() if k != "commit"})
+
+
+def weights_file(run: Path) -> Path:
+    """Return where the weights of a run are, whether it was exported or not."""
+    packed = run / PACKED_WEIGHTS
+    return packed if packed.is_file() else run / WEIGHTS
+
+
+@dataclasses.dataclass(frozen=True)
+class _Description:
+    """Hold the fields that every network.json needs."""
+
+    task: str
+    digest: str
+    export: dict[str, str] = dataclasses.field(default_factory=dict)
+
+
+def read_description(run: Path, kind: str, task: str) -> dict[str, Any]:
+    """Return the network.json of a finished run."""
+    path = run / DESCRIPTION
+    if not path.is_file():
+        raise FileError(f"{run}: holds no trained {kind}; finish it: python -m topological_nav train {task} -o {run}")
+    reader = Reader(FileError, "train again", finite=False)
+    about = reader.json(path)
+    reader.record(about, _Description, str(path), others=True)
+    return about
+
+
+def read_weights(run: Path, template: Any, about: dict[str, Any]) -> Any:
+    """Return the variables of a finished run, in the template's precision."""
+    path, again = weights_file(run), "train again"
+    tensors, header = weights.read_weights(path, FileError, again)
+    if about.get("export", {}).get("weights_digest", header["digest"]) != header["digest"]:
+        raise FileError(f"{path}: is not the file that was exported with its {DESCRIPTION}; export the run again")
+    variables = weights.fill(template, tensors, path, lambda: weights.flat(template), FileError, again)
+    return weights.fitting(template, variables, path, FileError)

@@ -21,11 +21,15 @@ import optax
 from sklearn.metrics import confusion_matrix, f1_score
 
 from interactive_nav_common.config import overlay, to_dict
-from interactive_nav_common.errors import readable
+from interactive_nav_common.errors import FileError, readable
+from interactive_nav_common.files import write_json
+from interactive_nav_common.jobs.progress import ALONE, Host
+from interactive_nav_common.runs.folder import CHECKPOINT, claimed, read_state, run_epochs
 from topological_nav.config import PITCHES, DataConfig, NetworkTrainConfig
 from topological_nav.data.dataset import RoomImages, load_passages, load_rooms, logits_at, read_header
-from topological_nav.errors import ALONE, Host, RunError
 from topological_nav.learn.learning import (
+    DESCRIPTION,
+    RESULTS,
     Learner,
     in_batches,
     labelled_epoch,
@@ -33,21 +37,13 @@ from topological_nav.learn.learning import (
     over,
     paired_epoch,
     phase_key,
-    variable_shapes,
-    with_backbone,
-)
-from topological_nav.learn.networks import Contrast, Network, Places, localisation_scores
-from topological_nav.learn.runs import (
-    CHECKPOINT,
-    DESCRIPTION,
-    claimed,
-    read_checkpoint,
     read_description,
     read_weights,
-    run_epochs,
+    variable_shapes,
+    with_backbone,
     write_network,
-    write_results,
 )
+from topological_nav.learn.networks import Contrast, Network, Places, localisation_scores
 
 SAME = ("robot", "engine", "width", "height", "fov_deg")
 """What two networks' images must have in common to look through one camera."""
@@ -85,7 +81,7 @@ class Trained:
     def _rows(self, images: np.ndarray, method: str) -> np.ndarray:
         expected = (self.about["data"]["height"], self.about["data"]["width"], 3)
         if images.shape[-3:] != expected:
-            raise RunError(
+            raise FileError(
                 f"images are {images.shape[-3:]}, expected {expected}, the size that the network learned from"
             )
         method_of = functools.partial(_applied, self.network, method, self.variables)
@@ -147,14 +143,14 @@ def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host:
             "fov_deg": header["fov_deg"],
             "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params))),
         }
-        return write_results(out, _scores(save_trained(out, Trained(network, learner.variables, about)), work))
+        return write_json(out / RESULTS, _scores(save_trained(out, Trained(network, learner.variables, about)), work))
 
 
 def _learned_without_labels(
     learner: Learner, rooms: RoomImages, out: Path, config: NetworkTrainConfig, host: Host
 ) -> Learner:
     """Return the learner with a backbone that learned from pairs of images."""
-    saved = read_checkpoint(out / CHECKPOINT)
+    saved = read_state(out / CHECKPOINT)
     if saved and saved["phase"] != "pairs":
         return learner  # a checkpoint of the later phase holds this one's outcome
     places = rooms.images[~rooms.test].reshape(-1, *rooms.images.shape[2:])  # the headings of a place and pitch
@@ -177,11 +173,11 @@ def load_trained(run: Path) -> Trained:
     run = Path(run)
     about = read_description(run, "network", "TASK")
     if about["task"] == "passages" and "lengths_m" not in about:
-        raise RunError(
+        raise FileError(
             f"{run}: does not say for which lengths it judges passages (lengths_m): it is of an older version; make "
             "its dataset again and train it again"
         )
-    with readable(run / DESCRIPTION, RunError, "train again"):
+    with readable(run / DESCRIPTION, FileError, "train again"):
         network = Network(about["task"], about["backbone"], about["width"], about["hidden"], about["outputs"])
         template = variable_shapes(network, (about["data"]["height"], about["data"]["width"]))
     return Trained(network, read_weights(run, template, about), about, run)
@@ -282,8 +278,8 @@ def _started_from(learner: Learner, run: Path) -> Learner:
     donor = load_trained(run)
     try:
         return with_backbone(learner, donor.variables)
-    except RunError as error:
-        raise RunError(
+    except FileError as error:
+        raise FileError(
             f"init: {run} does not fit: {error}; it is {donor.about['backbone']} of width {donor.about['width']}"
         ) from None
 
@@ -296,7 +292,7 @@ def camera_settings(network: Trained) -> dict[str, Any]:
 def need_task(about: dict[str, Any], task: str, who: str) -> None:
     """Refuse a run of another task."""
     if about["task"] != task:
-        raise RunError(f"{who} was trained for '{about['task']}', expected a run of 'train {task}'")
+        raise FileError(f"{who} was trained for '{about['task']}', expected a run of 'train {task}'")
 
 
 class Networks(NamedTuple):
@@ -330,7 +326,7 @@ def load_networks(
     first, second = map(camera_settings, networks)
     for name in same:
         if first[name] != second[name]:
-            raise RunError(
+            raise FileError(
                 f"the localiser learned from images with {name} = {first[name]!r}, the detector {second[name]!r}; "
                 "train both on one dataset"
             )

@@ -21,11 +21,11 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial.distance import cdist
 
+from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import write_arrays
 from interactive_nav_common.grids import MOVES_4, cell_centres, follow, grid_graph
 from interactive_nav_common.untrusted.reading import read_npz
 from topological_nav.config import MapConfig
-from topological_nav.errors import MapError
 from topological_nav.scenes.space import FreeSpace, Rooms
 
 FORMAT = 1
@@ -76,10 +76,10 @@ class TopologicalMap:
         """Return the cheapest way between two nodes, by Dijkstra's algorithm."""
         for node in (start, goal):
             if not 0 <= node < len(self.xy_w):
-                raise MapError(f"node {node} is not in the map of '{self.scene}', expected 0 to {len(self.xy_w) - 1}")
+                raise FileError(f"node {node} is not in the map of '{self.scene}', expected 0 to {len(self.xy_w) - 1}")
         cost, before = dijkstra(self._matrix(self.weight), indices=start, return_predecessors=True)
         if not np.isfinite(cost[goal]):
-            raise MapError(f"no way from node {start} to {goal} in the map of '{self.scene}'; make it denser")
+            raise FileError(f"no way from node {start} to {goal} in the map of '{self.scene}'; make it denser")
         return Route(tuple(reversed(follow(before, goal, start))), float(cost[goal]))
 
     @functools.cached_property
@@ -215,15 +215,15 @@ def load_map(path: Path, digest: str | None = None) -> TopologicalMap:
         path: of the file.
         digest: of the scene that it is to be used in; None: not checked.
     """
-    with read_npz(path, MapError, "build the map: python -m topological_nav map SCENE") as stored:
+    with read_npz(path, FileError, "build the map: python -m topological_nav map SCENE") as stored:
         header = json.loads(stored["header"].tobytes())
         arrays = {name: stored[name] for name in _ARRAYS}
         arrays["embeddings"] = arrays["embeddings"].astype(np.float32)  # exported maps hold them in half precision
         version, scene, built_in, about = (header[k] for k in ("format", "scene", "digest", "about"))
     if version != FORMAT:
-        raise MapError(f"{path}: format {version}, expected {FORMAT}; build the map again")
+        raise FileError(f"{path}: format {version}, expected {FORMAT}; build the map again")
     if digest is not None and built_in != digest:
-        raise MapError(
+        raise FileError(
             f"{path}: made in scene '{scene}' with digest {built_in[:12]}, the scene here has {digest[:12]}; "
             "build the map of this scene"
         )

@@ -12,7 +12,7 @@
               edge that was driven in vain costs more from now on. Plan anew from there: FACE
 
 `Navigator.step` is a pure function of arrays, a phase for each episode, so that thousands run in one batch. It never
-sees a position, and looks at images only through `sight.Sight`.
+sees a position, and looks at images only through `maps.build.Sight`.
 """
 
 import dataclasses
@@ -26,8 +26,8 @@ from interactive_nav_common.rows import fresh
 from topological_nav.config import NavigatorConfig
 from topological_nav.drives.driving import LocalPolicy
 from topological_nav.learn.learning import padded_size
+from topological_nav.maps.build import Sight, place_distances
 from topological_nav.maps.graph import TopologicalMap
-from topological_nav.maps.sight import Sight, place_distances
 from topological_nav.navigate.state import (
     ARRIVED,
     DRIVE,

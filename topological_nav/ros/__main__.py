@@ -20,10 +20,10 @@ from typing import Any
 from interactive_nav_common.config import overridden, refuse_unused, settings_help
 from interactive_nav_common.errors import UserError, missing, optional, reports_errors
 from interactive_nav_common.jobs.processes import GUARD
+from interactive_nav_common.jobs.progress import say
 from interactive_nav_common.signals import stop_signals
 from interactive_nav_common.words import Parser, add_words, read_commands
 from topological_nav.config import RUNS, NavigatorConfig
-from topological_nav.errors import say
 from topological_nav.ros.config import HeadingConfig, SimulatorConfig
 
 DRIVERS = {"heading": HeadingConfig, "topological": NavigatorConfig}

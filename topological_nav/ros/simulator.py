@@ -19,8 +19,7 @@ from interactive_nav_common.errors import UserError
 from scenes_mjcf.look import Lens
 from topological_nav.drives.expert import LIDAR_B
 from topological_nav.ros.config import SimulatorConfig
-from topological_nav.scenes.rendering import need_engine, shrink
-from topological_nav.scenes.simulation import make_env
+from topological_nav.scenes.rendering import make_env, need_engine, shrink
 from topological_nav.scenes.space import free_space
 
 ROBOT = "ttbot"

@@ -22,7 +22,6 @@ from interactive_nav.topdown import shadow
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.grids import cell_centres, clearance
 from topological_nav.config import DataConfig
-from topological_nav.errors import SpaceError
 
 _FREE_M = 1e-6
 """Clearance of a cell that is free at all."""
@@ -76,7 +75,7 @@ class FreeSpace:
         """Draw different cell centres [count, 2] with at least this clearance, uniform over them."""
         centres = self.centres(least_m)
         if len(centres) < count:
-            raise SpaceError(
+            raise ConfigError(
                 f"{len(centres)} cells are at least {least_m} m from obstacles, expected {count}; "
                 "ask for fewer positions or less clearance"
             )
@@ -195,7 +194,7 @@ def find_rooms(
     else:
         count, by = choose_count(points, method, seed)
     if count > len(points):
-        raise SpaceError(f"{count} rooms in {len(points)} free cells; expected fewer rooms or a finer map")
+        raise ConfigError(f"{count} rooms in {len(points)} free cells; expected fewer rooms or a finer map")
     return Rooms(points, cluster(points, method, count, seed), method, by)
 
 

@@ -24,23 +24,21 @@ from typing import Any
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from interactive_nav.robots import get_robot
-from interactive_nav.scenes.scene import load_scene
-from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.files import whole_folder, write_text
+from interactive_nav import get_robot, load_scene
+from interactive_nav_common.errors import ConfigError, FileError
+from interactive_nav_common.files import whole_folder, write_json
+from interactive_nav_common.jobs.progress import Progress, say
 from interactive_nav_common.records import Reader
+from interactive_nav_common.runs.folder import CONFIG, VERSIONS
 from interactive_nav_common.runs.weights import half, read_weights
 from interactive_nav_common.versions import versions
 from topological_nav.config import PASSAGE_POLICY, PITCHES, RUNS, ExportConfig
 from topological_nav.data.dataset import headings, load_rooms
 from topological_nav.drives.driving import TrainedPolicy, load_policy
-from topological_nav.errors import MapError, Progress, RunError, say
-from topological_nav.learn.runs import (
-    CONFIG,
+from topological_nav.learn.learning import (
     DESCRIPTION,
     PACKED_WEIGHTS,
     RESULTS,
-    VERSIONS,
     read_description,
     weights_file,
     write_network,
@@ -82,11 +80,11 @@ def export(
     """
     out = Path(os.path.abspath(out))
     if out.exists() and not (out / ABOUT).is_file() and (not out.is_dir() or any(out.iterdir())):
-        raise RunError(f"{out}: is something else than an export; choose another folder (-o)")
+        raise FileError(f"{out}: is something else than an export; choose another folder (-o)")
     runs = {"rooms": localiser, "passages": detector} | ({"policy": policy} if policy else {})
     files = sorted(maps.glob("*.npz")) if maps else []
     if maps and not files:
-        raise MapError(f"{maps}: holds no map; make some: python -m topological_nav map SCENE -o {maps}/SCENE.npz")
+        raise FileError(f"{maps}: holds no map; make some: python -m topological_nav map SCENE -o {maps}/SCENE.npz")
     networks = load_networks(runs["rooms"], runs["passages"], classifies=True)
     driver = load_policy(policy, localiser, detector) if policy else None
     pictures = level_images(images, networks, config.places, progress)
@@ -104,15 +102,15 @@ def export(
         compared = compare(networks, exported, driver, load_policy(part / "policy") if driver else None, pictures)
         for name in ("largest_embedding_distance", "largest_probability_difference"):
             if not compared.scores[name] <= config.tolerance:
-                raise RunError(
+                raise FileError(
                     f"{PRECISION} changes the predictions: {name} is {compared.scores[name]:.2g}, expected at most "
                     f"{config.tolerance:g} (tolerance)"
                 )
         about |= {"compared": compared.scores, "exported_by": {"commit": versions()["commit"]}}
-        write_text(part / ABOUT, json.dumps(about, indent=1) + "\n")
+        write_json(part / ABOUT, about)
         sizes = sizes_of(part)
         if sum(sizes.values()) > config.limit_mib * 2**20:
-            raise RunError(f"{out}: {size_lines(sizes, config.limit_mib)}")
+            raise FileError(f"{out}: {size_lines(sizes, config.limit_mib)}")
     progress("comparing", total, total)
     return sizes, compared
 
@@ -200,21 +198,21 @@ def _export_run(task: str, run: Path, out: Path, config: ExportConfig) -> dict[s
     """Write a run's folder and return where it comes from."""
     for name in (CONFIG, VERSIONS, RESULTS):
         if not (run / name).is_file():
-            raise RunError(f"{run}: has no {name}; finish the run first")
-    reader = Reader(RunError, "finish the run first", finite=False)
+            raise FileError(f"{run}: has no {name}; finish the run first")
+    reader = Reader(FileError, "finish the run first", finite=False)
     origin = reader.typed(reader.json(run / VERSIONS), dict[str, Any], f"{run / VERSIONS}")
     origin["commit"] = origin.get("commit") or config.commit
     origin["argv"] = [_without_folder(word) for word in origin.get("argv", [])]
     device = reader.typed(origin.get("device", {}), dict[str, Any], f"{run / VERSIONS}: device").get("kind")
     if not origin["commit"] or not device:
-        raise RunError(f"{run}: {VERSIONS} names no {'device' if origin['commit'] else 'commit'}; say commit=HASH")
+        raise FileError(f"{run}: {VERSIONS} names no {'device' if origin['commit'] else 'commit'}; say commit=HASH")
     about = {**read_description(run, "network", task), "commit": origin["commit"]}
     if task == "policy":
         for network, other in zip(about["networks"], ("rooms", "passages"), strict=True):
             network["run"] = f"../{other}"
-    tensors, _ = read_weights(weights_file(run), RunError, "train again")
+    tensors, _ = read_weights(weights_file(run), FileError, "train again")
     write_network(out, half(tensors), about, PRECISION)
-    write_text(out / VERSIONS, json.dumps(origin, indent=1) + "\n")
+    write_json(out / VERSIONS, origin)
     for name in (CONFIG, RESULTS):
         shutil.copyfile(run / name, out / name)
     kept = {name: about[name] for name in ("digest", "parameters", "commit")}
@@ -226,7 +224,7 @@ def _export_map(path: Path, out: Path, networks: Networks) -> dict[str, Any]:
     built = load_map(path)
     for name, digest in networks.digests.items():
         if built.about.get(name) != digest:
-            raise MapError(f"{path}: was built with another {name}; build the map again with the exported one")
+            raise FileError(f"{path}: was built with another {name}; build the map again with the exported one")
     save_map(dataclasses.replace(built, embeddings=built.embeddings.astype(np.float16)), out)
     return {"scene_digest": built.digest, "nodes": len(built.xy_w), "edges": len(built.edges)}
 
@@ -284,7 +282,7 @@ def choose(
     if place is None:
         what = " and ".join(missing)
         options = " or ".join({"rooms": "--localiser RUN", "passages": "--detector RUN"}[task] for task in missing)
-        raise RunError(
+        raise FileError(
             f"no trained networks of {what}: neither {RUNS} nor the installed package has them; train them (python -m "
             f"topological_nav train {missing[0]}) or name a run folder: {options}"
         )
@@ -310,7 +308,7 @@ def fitting_map(choice: Choice, scene: str, digest: str) -> Path | None:
         if path.is_file():
             try:
                 about = load_map(path, digest).about
-            except MapError:
+            except FileError:
                 continue
             if [about.get(name) for name in ("localiser", "detector")] == networks:
                 return path

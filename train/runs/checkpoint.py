@@ -22,9 +22,10 @@ from interactive_nav_common.errors import regular
 from interactive_nav_common.files import check_name, remove_stale, whole_folder, write_text, writing
 from interactive_nav_common.records import Reader
 from interactive_nav_common.runs import weights
+from interactive_nav_common.runs.folder import GOES_ON, write_state
 from interactive_nav_common.untrusted.reading import read_npz
 from train.errors import CheckpointError
-from train.runs.run_folder import GOES_ON, RunFolder
+from train.runs.run_folder import RunFolder
 
 LEARNER, ENV_STATE, META = "learner.msgpack", "env_state.npz", "meta.json"
 POLICY = "policy.safetensors"
@@ -66,7 +67,7 @@ def save_snapshot(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, en
     """
     final = root / f"{meta.env_steps:012d}"
     with writing(final, GOES_ON, "cannot write the checkpoint"), whole_folder(final, overwrite=True) as part:
-        (part / LEARNER).write_bytes(flax.serialization.to_bytes(jax.device_get(snapshot.learner)))
+        write_state(part / LEARNER, snapshot.learner)
         if snapshot.env_state is not None and megabytes(snapshot.env_state) <= env_state_limit_mb:
             np.savez(part / ENV_STATE, *(np.asarray(_raw(leaf)) for leaf in jax.tree.leaves(snapshot.env_state)))
         meta = dataclasses.replace(meta, sha256={p.name: _sha256(p) for p in sorted(part.iterdir())})

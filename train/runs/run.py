@@ -2,14 +2,12 @@
 
 import contextlib
 import dataclasses
-import json
 import time
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import flax.serialization
 import jax
 import numpy as np
 from rich.console import Console
@@ -22,9 +20,10 @@ from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import FAILURES
 from interactive_nav_common.config import flatten, replace
 from interactive_nav_common.errors import ConfigError, UserError
-from interactive_nav_common.files import write_text, writing
+from interactive_nav_common.files import write_json, writing
 from interactive_nav_common.locks import locked
 from interactive_nav_common.records import mean_over_episodes
+from interactive_nav_common.runs.folder import GOES_ON, append_metrics, write_state
 from interactive_nav_common.signals import stop_signals
 from interactive_nav_common.versions import versions
 from scenes_mjcf.sets import scene_folders
@@ -35,7 +34,7 @@ from train.learners.algorithms import ALGORITHMS
 from train.learners.learner import Snapshot, TrainResult, Update
 from train.runs import checkpoint, tracking
 from train.runs.checkpoint import CheckpointMeta
-from train.runs.run_folder import GOES_ON, RunFolder, claim
+from train.runs.run_folder import RunFolder, claim
 from train.runs.tracking import TrainingDisplay, describe
 
 
@@ -162,7 +161,7 @@ class FolderCallbacks:
 
     def on_log(self, env_steps: int, metrics: dict[str, float]) -> None:
         """Write a line of metrics.jsonl and a TensorBoard point for each value; show a status on the console."""
-        self._folder.append_metrics({"env_steps": env_steps, "wall_s": round(self._wall_s(), 3), **metrics})
+        append_metrics(self._folder.path, {"env_steps": env_steps, "wall_s": round(self._wall_s(), 3), **metrics})
         if self._events:
             with writing(self._folder.tensorboard, GOES_ON):
                 self._events.log(env_steps, metrics)
@@ -200,7 +199,7 @@ class FolderCallbacks:
         path = self._folder.path / f"diverged-{before.env_steps:012d}"
         with writing(path, "make room"):
             path.mkdir(exist_ok=True)
-            (path / checkpoint.LEARNER).write_bytes(flax.serialization.to_bytes(jax.device_get(before.learner)))
+            write_state(path / checkpoint.LEARNER, before.learner)
             named = jax.tree_util.tree_leaves_with_path(update.batch)
             arrays = {jax.tree_util.keystr(name): np.asarray(leaf) for name, leaf in named}
             np.savez_compressed(path / "batch.npz", **arrays)  # type: ignore[arg-type]
@@ -288,7 +287,7 @@ def _train_in(
         finally:
             callbacks.close()
         metrics = result.metrics or last_metrics(folder)
-        write_text(folder.summary, json.dumps(summary(config, folder, result, metrics), indent=1) + "\n")
+        write_json(folder.summary, summary(config, folder, result, metrics))
     best = checkpoint.best_checkpoint(checkpoint.list_checkpoints(folder.checkpoints))
     console.print(
         f"{folder.path}: {'done' if result.completed else 'stopped'} at {result.snapshot.env_steps:,} steps; "

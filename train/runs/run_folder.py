@@ -11,7 +11,6 @@
 """
 
 import dataclasses
-import json
 import re
 import shutil
 import tempfile
@@ -20,9 +19,10 @@ from typing import Any
 
 from interactive_nav_common.config import Natural, NotNegative, flatten, replace
 from interactive_nav_common.errors import FileError
-from interactive_nav_common.files import append_text, write_text, writing
+from interactive_nav_common.files import write_json, write_text, writing
 from interactive_nav_common.records import METRICS, RUNS, cut_metrics, read_metrics
 from interactive_nav_common.rows import digest_of
+from interactive_nav_common.runs.folder import CONFIG, VERSIONS, refuse_changes
 from interactive_nav_common.versions import versions
 from train.config import TrainConfig
 from train.config_io import from_yaml, to_yaml
@@ -34,8 +34,6 @@ MAY_CHANGE = (
 )
 """Settings that a run may be continued with at other values: they do not change what an update does."""
 HEADROOM_MB = 64.0
-VERSIONS = "versions.json"
-GOES_ON = "make room and start again: the run continues from its last checkpoint"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +52,7 @@ class RunFolder:
 
     def __init__(self, path: Path):
         self.path = path
-        self.config = path / "config.yaml"
+        self.config = path / CONFIG
         self.metrics = path / METRICS
         self.checkpoints = path / "checkpoints"
         self.tensorboard = path / "tensorboard"
@@ -97,15 +95,11 @@ class RunFolder:
             old, new, robot = flatten(self.read_config()), flatten(config), self._kept_robot()
             old["env.robot"] = robot[1] if robot else old["env.robot"]
             new["env.robot"] = identity(config.env.robot)
-            for name, value in new.items():
-                if old[name] != value and name not in MAY_CHANGE:
-                    raise FileError(
-                        f"{self.path}: the run there has {name} = {old[name]!r}, this one {value!r}; "
-                        "set run.name to begin another run, or remove the folder"
-                    )
+            fixed = {name: value for name, value in new.items() if name not in MAY_CHANGE}
+            refuse_changes(self.path, old, fixed, "set run.name to begin another run, or remove the folder")
         write_text(self.config, to_yaml(config))
         record_robot(config.env.robot, self.robot)
-        write_text(self.path / VERSIONS, json.dumps(versions(), indent=1) + "\n")
+        write_json(self.path / VERSIONS, versions())
         return exists
 
     def origin(self) -> dict[str, Any]:
@@ -116,11 +110,6 @@ class RunFolder:
             read = RUNS.record(given, _Origin, str(path), others=True)
             origin = dataclasses.replace(origin, **{k: v for k, v in vars(read).items() if k in given})
         return {**vars(origin), "device": (origin.device or {}).get("kind")}
-
-    def append_metrics(self, line: dict[str, Any]) -> None:
-        """Add one line to metrics.jsonl."""
-        with writing(self.metrics, GOES_ON):
-            append_text(self.metrics, json.dumps(line) + "\n")
 
     def read_metrics(self) -> list[dict[str, Any]]:
         """Return the lines of metrics.jsonl; none where nothing was logged."""

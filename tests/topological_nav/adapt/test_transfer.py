@@ -11,14 +11,14 @@ import pytest
 from PIL import Image
 
 from interactive_nav.scenes.scene import load_scene
-from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.errors import ConfigError, FileError
+from interactive_nav_common.jobs.progress import Host, Stopped
 from interactive_nav_common.records import read_metrics
+from interactive_nav_common.runs.folder import run_epochs
 from topological_nav import adaptation
 from topological_nav.__main__ import main
 from topological_nav.data.dataset import load_passages, load_rooms
 from topological_nav.data.domains import AdaptConfig
-from topological_nav.errors import DatasetError, Host, RunError, Stopped
-from topological_nav.learn.runs import run_epochs
 from topological_nav.learn.training import load_trained, localisation
 from topological_nav.maps.graph import load_map
 
@@ -61,7 +61,7 @@ def test_localisation_on_nodes_of_the_same_domain_is_what_training_says(made):
 def test_without_a_scene_in_common_there_is_nothing_to_score(made):
     trained, rooms = load_trained(made.rooms), load_rooms(made.data)
     other = rooms.__class__(**{**vars(rooms), "names": tuple(f"x{n}" for n in rooms.names)})
-    with pytest.raises(RunError, match="no scene in common"):
+    with pytest.raises(FileError, match="no scene in common"):
         adaptation.localisation_between(trained, rooms, trained, other)
 
 
@@ -159,7 +159,7 @@ def test_epochs_go_on_where_they_stopped_and_lines_that_were_lost_are_written_ag
     assert lines == [("count", 1, 1.0), ("count", 2, 3.0), ("other", 9, 1.0), ("count", 3, 7.0), ("count", 4, 15.0)]
     assert counting(out, 4) == (31, 0)
     (out / "checkpoint.msgpack").write_bytes(b"no")
-    with pytest.raises(RunError, match="not readable"):
+    with pytest.raises(FileError, match="not readable"):
         counting(out, 4)
 
 
@@ -295,24 +295,24 @@ def test_an_exported_embedding_is_adapted(made, exported, tmp_path):
 def test_what_does_not_fit_is_refused(made, adapted, painted, tmp_path, capsys):
     with pytest.raises(ConfigError, match="domain is 'fog', expected one of clean"):
         AdaptConfig(domain="fog")
-    with pytest.raises(RunError, match="was trained for 'rooms', expected a run of 'train passages'"):
+    with pytest.raises(FileError, match="was trained for 'rooms', expected a run of 'train passages'"):
         adaptation.passage_configurations(made.rooms, made.data, tmp_path / "x", SHORT)
     other = tmp_path / "other"
     shutil.copytree(made.data, other)
     header = json.loads((other / "dataset.json").read_text())
     header["settings"]["passage_lengths_m"] = [1.2, 1.8, 2.5]
     (other / "dataset.json").write_text(json.dumps(header))
-    with pytest.raises(DatasetError, match=r"detector judges \[0.6, 1.2, 1.8\]; make it again with passage_lengths_m="):
+    with pytest.raises(FileError, match=r"detector judges \[0.6, 1.2, 1.8\]; make it again with passage_lengths_m="):
         adaptation.passage_configurations(made.passages, other, tmp_path / "y", SHORT)
-    with pytest.raises(RunError, match="was trained for 'rooms'"):
+    with pytest.raises(FileError, match="was trained for 'rooms'"):
         adaptation.collected_map(made.scene, made.data, made.rooms, made.rooms, SHORT)
     changed = tmp_path / "painted"
     shutil.copytree(painted, changed)
     (changed / "scene.xml").write_text((changed / "scene.xml").read_text() + "\n")
-    with pytest.raises(DatasetError, match="holds images of painted as they were, not of 'painted' as it is"):
+    with pytest.raises(FileError, match="holds images of painted as they were, not of 'painted' as it is"):
         adaptation.collected_map(changed, made.data, made.rooms, made.passages, SHORT)
     there = adapted[0]
-    with pytest.raises(RunError, match="the run there has domain = 'light', this one 'blur'"):
+    with pytest.raises(FileError, match="the run there has domain = 'light', this one 'blur'"):
         adaptation.adapt_features(made.rooms, made.data, made.data, there, AdaptConfig(domain="blur"))
     assert main(["adapt", "map"]) == 2
     assert "adapt map takes a scene folder" in capsys.readouterr().err

@@ -8,10 +8,10 @@ import pytest
 
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.config import overridden
+from interactive_nav_common.errors import FileError
 from tests.topological_nav.conftest import WORDS
 from topological_nav.config import DataConfig
 from topological_nav.data import dataset
-from topological_nav.errors import DatasetError
 from topological_nav.scenes.space import free_space
 
 CONFIG = overridden(DataConfig(), WORDS)
@@ -68,7 +68,7 @@ def test_a_stopped_rendering_goes_on_where_it_was(made, tmp_path):
     lost, kept = copy / "painted" / "rooms-001.npz", copy / "painted" / "rooms-000.npz"
     whole, stamp = lost.read_bytes(), kept.stat().st_mtime_ns
     lost.unlink()
-    with pytest.raises(DatasetError, match="rooms-001.npz is missing; the same 'data' command goes on"):
+    with pytest.raises(FileError, match="rooms-001.npz is missing; the same 'data' command goes on"):
         dataset.load_rooms(copy)
     told = []
     dataset.make_dataset([made.scene], copy, CONFIG, lambda *step: told.append(step))
@@ -77,7 +77,7 @@ def test_a_stopped_rendering_goes_on_where_it_was(made, tmp_path):
 
 
 def test_another_dataset_in_the_folder_is_refused(made):
-    with pytest.raises(DatasetError, match="was made with seed = 0, expected 1; choose another folder"):
+    with pytest.raises(FileError, match="the dataset there has seed = 0, this one 1; choose another folder"):
         dataset.make_dataset([made.scene], made.data, overridden(CONFIG, ["seed=1"]))
 
 
@@ -87,7 +87,7 @@ def test_a_changed_scene_is_refused(made, tmp_path):
     header = json.loads((copy / "dataset.json").read_text())
     header["scenes"][0]["digest"] = "0" * 64
     (copy / "dataset.json").write_text(json.dumps(header))
-    with pytest.raises(DatasetError, match="is of painted as they were; the scenes differ"):
+    with pytest.raises(FileError, match="is of painted as they were; the scenes differ"):
         dataset.make_dataset([made.scene], copy, CONFIG)
 
 
@@ -96,7 +96,7 @@ def test_a_dataset_of_an_older_format_is_refused(made, tmp_path):
     shutil.copytree(made.data, copy)
     header = json.loads((copy / "dataset.json").read_text())
     (copy / "dataset.json").write_text(json.dumps({**header, "format": 1}))
-    with pytest.raises(DatasetError, match="format 1, expected 2; make the dataset again"):
+    with pytest.raises(FileError, match="format 1, expected 2; make the dataset again"):
         dataset.load_passages(copy)
 
 
@@ -109,5 +109,5 @@ def test_seeds_draw_other_positions(made):
 
 
 def test_a_folder_that_is_no_dataset_is_refused(tmp_path):
-    with pytest.raises(DatasetError, match="is no dataset .no dataset.json.; make one: python -m topological_nav data"):
+    with pytest.raises(FileError, match="is no dataset .no dataset.json.; make one: python -m topological_nav data"):
         dataset.load_rooms(tmp_path)

@@ -7,9 +7,8 @@ import threading
 import numpy as np
 import pytest
 
-from interactive_nav_common.errors import UserError
+from interactive_nav_common.errors import FileError, UserError
 from topological_nav.data import folders as shards
-from topological_nav.errors import DatasetError
 
 
 def smooth(count: int, height: int = 16, width: int = 24) -> np.ndarray:
@@ -45,7 +44,7 @@ def test_a_damaged_file_is_refused_by_name(tmp_path):
     path = tmp_path / "rooms-000.npz"
     shards.write_shard(path, [smooth(4)], 100)
     path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(DatasetError, match="rooms-000.npz: not readable .* delete it and run 'data' again"):
+    with pytest.raises(FileError, match="rooms-000.npz: not readable .* delete it and run 'data' again"):
         shards.read_shard(path)
 
 

@@ -12,14 +12,13 @@ from PIL import Image
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.config import overridden
-from interactive_nav_common.errors import UserError
+from interactive_nav_common.errors import FileError, UserError
 from tests.topological_nav.conftest import DRIVEN
 from topological_nav.__main__ import main
 from topological_nav.config import DriveConfig
 from topological_nav.data.folders import lens_of, read_shard
 from topological_nav.drives import dataset as driving
 from topological_nav.drives.expert import drive_env
-from topological_nav.errors import DatasetError
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose
 
 CONFIG = overridden(DriveConfig(), DRIVEN)
@@ -101,7 +100,7 @@ def test_an_interrupted_folder_is_completed_to_the_same(drives, driven, painted,
     stamp = (copy / "batch-000.npz").stat().st_mtime_ns
     (copy / "batch-001.npz").unlink()
     kept[-1].unlink()
-    with pytest.raises(DatasetError, match="batch-001.npz is missing; the same 'data --drives' command goes on"):
+    with pytest.raises(FileError, match="batch-001.npz is missing; the same 'data --drives' command goes on"):
         driving.load_drives(copy)
     told = []
     again = driving.simulate_drives([painted], copy, CONFIG, lambda *x: told.append(x))
@@ -109,23 +108,23 @@ def test_an_interrupted_folder_is_completed_to_the_same(drives, driven, painted,
     assert told[0] == ("drives", 6, 10) and told[-1] == ("drives", 10, 10)
     for field in dataclasses.fields(drives):
         assert (getattr(again, field.name) == getattr(drives, field.name)).all(), field.name
-    with pytest.raises(DatasetError, match="images-00. is missing|images-00..npz is missing"):
+    with pytest.raises(FileError, match="images-00. is missing|images-00..npz is missing"):
         list(driving.drive_images(copy))
     driving.draw_drives([painted], copy)
     assert (read_shard(kept[-1]) == before).all()
 
 
 def test_other_settings_and_other_folders_are_refused(driven, painted, tmp_path, capsys):
-    with pytest.raises(DatasetError, match="was made with legs = 3, expected 2"):
+    with pytest.raises(FileError, match="the dataset there has legs = 3, this one 2"):
         driving.simulate_drives([painted], driven, dataclasses.replace(CONFIG, legs=2))
     copy = tmp_path / "drives"
     copy.mkdir()
     header = json.loads((driven / "drives.json").read_text())
     header["scenes"][0]["digest"] = "0" * 64
     (copy / "drives.json").write_text(json.dumps(header))
-    with pytest.raises(DatasetError, match="is of painted as they were; the scenes differ"):
+    with pytest.raises(FileError, match="is of painted as they were; the scenes differ"):
         driving.simulate_drives([painted], copy, CONFIG)
-    with pytest.raises(DatasetError, match="holds no drives"):
+    with pytest.raises(FileError, match="holds no drives"):
         driving.load_drives(tmp_path)
     assert main(["data", "--drives", str(painted), "-o", str(tmp_path / "new"), "leg=2"]) == 2
     assert "unknown key 'leg', did you mean 'legs'?" in capsys.readouterr().err

@@ -11,13 +11,14 @@ import optax
 import pytest
 
 from interactive_nav_common.config import overridden
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.jobs.progress import Host, Stopped
 from interactive_nav_common.records import read_metrics
 from topological_nav.__main__ import main
 from topological_nav.config import PolicyConfig
 from topological_nav.drives import imitation
 from topological_nav.drives.dataset import drive_images
 from topological_nav.drives.driving import Forward, Policy, embed_drives, load_policy
-from topological_nav.errors import Host, RunError, Stopped
 from topological_nav.learn.learning import Learner
 
 WORDS = (
@@ -91,7 +92,7 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(frames, run, tmp_pat
     out = tmp_path / "run"
     with pytest.raises(Stopped):
         imitation.train_policy(frames, out, CONFIG, Host(told.append, lambda: len(told) >= 4))
-    with pytest.raises(RunError, match="holds no trained policy; finish it"):
+    with pytest.raises(FileError, match="holds no trained policy; finish it"):
         load_policy(out)
     assert imitation.train_policy(frames, out, CONFIG, Host(told.append)) is not None
     assert len(told) == 10
@@ -99,7 +100,7 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(frames, run, tmp_pat
     lines = [read_metrics(path / "metrics.jsonl") for path in (out, run)]
     strip = [[{k: v for k, v in line.items() if k != "seconds"} for line in one] for one in lines]
     assert strip[0] == strip[1]
-    with pytest.raises(RunError, match="the run there has lam = 0.5, this one 1.0"):
+    with pytest.raises(FileError, match="the run there has lam = 0.5, this one 1.0"):
         imitation.train_policy(frames, out, dataclasses.replace(CONFIG, lam=1.0))
 
 
@@ -120,7 +121,7 @@ def test_what_is_loaded_acts_as_the_cells_do_step_by_step(frames, run, made, dri
     for t in range(min(steps, 8)):
         alone, linear, angular = policy.act(alone, both[1:, t])
         assert (linear[0], angular[0]) == (found[t][0][1], found[t][1][1])
-    with pytest.raises(RunError, match=r"images are \(16, 16, 3\), expected \(32, 32, 3\)"):
+    with pytest.raises(FileError, match=r"images are \(16, 16, 3\), expected \(32, 32, 3\)"):
         policy.act(policy.start(1), np.zeros((1, 16, 16, 3), np.uint8))
 
 
@@ -130,11 +131,11 @@ def test_networks_are_found_from_the_run_and_must_be_the_same(frames, run, made,
     shutil.copytree(made.rooms, other)
     about = json.loads((other / "network.json").read_text())
     (other / "network.json").write_text(json.dumps({**about, "digest": "0" * 64}))
-    with pytest.raises(RunError, match="is not the network that .* learned with; train the policy again"):
+    with pytest.raises(FileError, match="is not the network that .* learned with; train the policy again"):
         load_policy(run, localiser=other)
-    with pytest.raises(RunError, match="was trained for 'rooms', expected a run of 'train policy'"):
+    with pytest.raises(FileError, match="was trained for 'rooms', expected a run of 'train policy'"):
         load_policy(made.rooms)
-    with pytest.raises(RunError, match="was trained for 'passages', expected a run of 'train rooms'"):
+    with pytest.raises(FileError, match="was trained for 'passages', expected a run of 'train rooms'"):
         load_policy(run, localiser=made.passages)
 
 
@@ -160,6 +161,6 @@ def test_drives_seen_through_another_camera_are_refused(made, driven, tmp_path):
     header["settings"]["width"] = 48
     (copy / "drives.json").write_text(json.dumps(header))
     with pytest.raises(
-        RunError, match="images have width = 48, the networks learned from 32; drive again with width=32"
+        FileError, match="images have width = 48, the networks learned from 32; drive again with width=32"
     ):
         embed_drives(copy, made.rooms, made.passages, False)

@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.grids import clearance
 from topological_nav.config import DriveConfig
 from topological_nav.drives.dataset import draw_routes, drivable
 from topological_nav.drives.expert import way_field
-from topological_nav.errors import SpaceError
 from topological_nav.scenes.space import FreeSpace
 
 CONFIG = DriveConfig(drives=200, turn_deg=50.0)
@@ -76,5 +76,5 @@ def test_short_edges_begin_no_drive(space):
 
 
 def test_a_scene_without_edges_is_refused(space):
-    with pytest.raises(SpaceError, match="no two of 1 nodes are joined"):
+    with pytest.raises(ConfigError, match="no two of 1 nodes are joined"):
         draw_routes(space, NODES[:1], np.zeros((0, 2), int), CONFIG, np.random.default_rng(0))

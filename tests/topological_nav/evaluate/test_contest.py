@@ -10,18 +10,17 @@ import pytest
 from interactive_nav.pictures.scene_model import world_poses
 from interactive_nav.robots import get_robot
 from interactive_nav_common.config import replace
-from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.errors import ConfigError, FileError
 from interactive_nav_common.rows import read_rows
 from scenes_mjcf.look import Lens
 from tests.topological_nav.conftest import Made
 from topological_nav.__main__ import main
 from topological_nav.config import DataConfig, EvaluationConfig
 from topological_nav.data.domains import as_seen_from, preset
-from topological_nav.errors import RunError
 from topological_nav.evaluate import contest as rows
 from topological_nav.evaluate.contest import Contest, contest_scenes, local_policy
 from topological_nav.evaluate.evaluation import NavigatorPlayer
-from topological_nav.learn.runs import WEIGHTS
+from topological_nav.learn.learning import WEIGHTS
 from topological_nav.learn.training import load_trained, save_trained
 from topological_nav.maps.build import drawn_for
 from topological_nav.maps.graph import load_map, save_map
@@ -216,7 +215,7 @@ def test_a_map_collected_in_the_target_domain_is_driven_on_there(contest, made, 
     # Not through others that it never met.
     saved = save_trained(adapted, dataclasses.replace(saved, about={**about, "adapted_from": "another"}))
     (venue,) = contest_scenes(there)
-    with pytest.raises(RunError, match="is not the network that .* learned with"):
+    with pytest.raises(FileError, match="is not the network that .* learned with"):
         local_policy(there, None, venue.networks)  # type: ignore[arg-type]
 
 

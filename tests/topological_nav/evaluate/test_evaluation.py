@@ -17,18 +17,17 @@ import interactive_nav
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.task.rollout import Player, episode_keys
 from interactive_nav_common.config import replace
-from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.errors import ConfigError, FileError
 from interactive_nav_common.rows import read_rows
 from tests.topological_nav.maps.test_sight import two_rooms_space
 from tests.toys import write_room
 from topological_nav.__main__ import main
 from topological_nav.config import EvaluationConfig
-from topological_nav.errors import RunError, SpaceError
 from topological_nav.evaluate import contest as contests
 from topological_nav.evaluate.contest import Contest, ContestScene, _stem, contest_scenes, play_contest
 from topological_nav.evaluate.evaluation import Contender, DrivenEpisodes, count_of, draw_episodes, learned
 from topological_nav.navigate.state import Events
-from topological_nav.scenes.simulation import Snapshot, episode_starts
+from topological_nav.scenes.rendering import Snapshot, episode_starts
 from topological_nav.scenes.space import RECORDED, find_rooms
 from topological_nav.weights import export as packaged
 from train.config import EnvConfig, TrainConfig
@@ -176,7 +175,7 @@ def test_the_shortest_way_is_as_long_as_over_eight_neighbours_or_shorter(rooms):
 
 def test_a_scene_without_such_episodes_is_refused(rooms):
     space, labels = rooms
-    with pytest.raises(SpaceError, match="0 of 3 episodes .* more than 50.0 m apart"):
+    with pytest.raises(ConfigError, match="0 of 3 episodes .* more than 50.0 m apart"):
         draw_episodes("ab" * 32, space, labels, 3, EvaluationConfig.of(min_goal_m=50.0))
 
 
@@ -329,7 +328,7 @@ def test_a_policy_that_learned_on_a_gpu_is_played_without_one(toy, tmp_path, mon
 
 def test_a_policy_must_be_there_and_look_at_images(toy, tmp_path):
     contest = dataclasses.replace(held(toy, tmp_path), policy=str(tmp_path / "gone"))
-    with pytest.raises(RunError, match="gone: holds no trained policy"):
+    with pytest.raises(FileError, match="gone: holds no trained policy"):
         play_contest(contest, contest_scenes(contest))
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / "policy.json").write_text("{}")

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from interactive_nav_common.config import overridden
+from interactive_nav_common.errors import FileError
+from interactive_nav_common.jobs.progress import Host, Stopped
 from interactive_nav_common.records import read_metrics
 from topological_nav.config import NetworkTrainConfig
 from topological_nav.data.dataset import load_passages, load_rooms
-from topological_nav.errors import Host, RunError, Stopped
 from topological_nav.learn import training
 from topological_nav.learn.learning import compiled_epoch, in_batches, padded_size
 
@@ -76,7 +77,7 @@ def test_a_detector_that_does_not_say_its_lengths_is_refused(made, tmp_path):
     about = json.loads((run / "network.json").read_text())
     del about["lengths_m"]
     (run / "network.json").write_text(json.dumps(about))
-    with pytest.raises(RunError, match="does not say for which lengths .* make its dataset again and train it again"):
+    with pytest.raises(FileError, match="does not say for which lengths .* make its dataset again and train it again"):
         training.load_trained(run)
 
 
@@ -107,7 +108,7 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(made, whole, tmp_pat
         with pytest.raises(Stopped):
             training.train("rooms", made.data, out, config, Host(told.append, lambda n=stop_after: len(told) >= n))
         assert len(told) == stop_after
-    with pytest.raises(RunError, match="holds no trained network; finish it"):
+    with pytest.raises(FileError, match="holds no trained network; finish it"):
         training.load_trained(out)
     assert training.train("rooms", made.data, out, config, Host(told.append)) is not None
     assert len(told) == 4
@@ -126,7 +127,7 @@ def test_a_finished_run_is_left_as_it_is(made, whole):
 
 def test_other_settings_are_refused(made, whole):
     config = overridden(whole[1], ["width=8"])
-    with pytest.raises(RunError, match="the run there has width = 4, this one 8; choose another folder"):
+    with pytest.raises(FileError, match="the run there has width = 4, this one 8; choose another folder"):
         training.train("rooms", made.data, whole[0], config)
 
 
@@ -137,12 +138,12 @@ def test_a_backbone_is_taken_from_another_run(made, whole, tmp_path):
     pairs = zip(*(jax.tree.leaves(weights(r)["body"]) for r in (tmp_path / "run", whole[0])), strict=True)
     assert all(np.allclose(a, b, atol=1e-6) for a, b in pairs)
     wider = overridden(NetworkTrainConfig(), [*WORDS, f"init={whole[0]}", "width=8"])
-    with pytest.raises(RunError, match="does not fit: its backbone differs in kind or width; it is alexnet of width 4"):
+    with pytest.raises(FileError, match="does not fit: its backbone differs .* or width; it is alexnet of width 4"):
         training.train("passages", made.data, tmp_path / "wider", wider)
 
 
 def test_images_of_another_size_are_refused(whole):
-    with pytest.raises(RunError, match=r"images are \(16, 16, 3\), expected \(32, 32, 3\)"):
+    with pytest.raises(FileError, match=r"images are \(16, 16, 3\), expected \(32, 32, 3\)"):
         training.load_trained(whole[0]).logits(np.zeros((2, 16, 16, 3), np.uint8))
 
 
@@ -150,7 +151,7 @@ def test_damaged_weights_are_refused(whole, tmp_path):
     shutil.copytree(whole[0], tmp_path / "run")
     path = tmp_path / "run" / "weights.safetensors"
     path.write_bytes(path.read_bytes()[:-50])
-    with pytest.raises(RunError, match="weights.safetensors: not readable .* train again"):
+    with pytest.raises(FileError, match="weights.safetensors: not readable .* train again"):
         training.load_trained(tmp_path / "run")
 
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import dijkstra
 
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.errors import FileError
 from topological_nav.config import MapConfig
-from topological_nav.errors import MapError
 from topological_nav.maps import graph
 from topological_nav.scenes.space import find_rooms, free_space, spread
 
@@ -68,9 +68,9 @@ def test_certain_edges_stay_finite_and_cost_something():
 
 def test_no_way_and_no_node_are_refused():
     made = hand_map({})
-    with pytest.raises(MapError, match="no way from node 0 to 3 in the map of 'hand'"):
+    with pytest.raises(FileError, match="no way from node 0 to 3 in the map of 'hand'"):
         made.plan(0, 3)
-    with pytest.raises(MapError, match="node 4 is not in the map of 'hand', expected 0 to 3"):
+    with pytest.raises(FileError, match="node 4 is not in the map of 'hand', expected 0 to 3"):
         made.plan(0, 4)
 
 
@@ -92,7 +92,7 @@ def test_ways_cost_what_scipy_finds(seed):
             legs = zip(route.nodes, route.nodes[1:], strict=False)
             assert sum(dense[a, b] for a, b in legs) == pytest.approx(route.cost, rel=1e-5, abs=1e-9)
         else:
-            with pytest.raises(MapError):
+            with pytest.raises(FileError):
                 made.plan(0, goal)
 
 
@@ -111,11 +111,11 @@ def test_a_map_is_one_file_and_of_one_scene(tmp_path):
         assert (getattr(back, name) == getattr(made, name)).all()
     assert [p.name for p in tmp_path.iterdir()] == ["map.npz"]
     with pytest.raises(
-        MapError, match="made in scene 'hand' with digest dddddddddddd, the scene here has eeeeeeeeeeee"
+        FileError, match="made in scene 'hand' with digest dddddddddddd, the scene here has eeeeeeeeeeee"
     ):
         graph.load_map(path, "e" * 64)
     path.write_bytes(path.read_bytes()[:300])
-    with pytest.raises(MapError, match="not readable"):
+    with pytest.raises(FileError, match="not readable"):
         graph.load_map(path)
 
 
@@ -123,7 +123,7 @@ def test_another_format_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(graph, "FORMAT", 2)
     graph.save_map(hand_map({}), tmp_path / "map.npz")
     monkeypatch.undo()
-    with pytest.raises(MapError, match="format 2, expected 1; build the map again"):
+    with pytest.raises(FileError, match="format 2, expected 1; build the map again"):
         graph.load_map(tmp_path / "map.npz")
 
 

@@ -5,11 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from interactive_nav_common.errors import FileError
 from tests.topological_nav.maps.test_graph import hand_map
-from topological_nav.errors import MapError
 from topological_nav.learn.training import Networks, Trained
-from topological_nav.maps.build import localisation_check
-from topological_nav.maps.sight import OUT_OF_SIGHT_M, NetworkSight, PassagePolicy, TrueSight
+from topological_nav.maps.build import OUT_OF_SIGHT_M, NetworkSight, PassagePolicy, TrueSight, localisation_check
 from topological_nav.scenes.space import FreeSpace
 
 
@@ -70,9 +69,9 @@ def test_nearest_images_are_compared_with_all(made):
 
 
 def test_a_map_of_other_networks_is_refused(made):
-    with pytest.raises(MapError, match="built with localiser one, this one is three"):
+    with pytest.raises(FileError, match="built with localiser one, this one is three"):
         NetworkSight(made, Networks(Fake("three"), Fake("two")))  # type: ignore[arg-type]
-    with pytest.raises(MapError, match="built with detector two, this one is three"):
+    with pytest.raises(FileError, match="built with detector two, this one is three"):
         NetworkSight(made, Networks(Fake("one"), Fake("three")))  # type: ignore[arg-type]
 
 

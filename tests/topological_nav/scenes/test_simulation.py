@@ -12,8 +12,14 @@ from interactive_nav.scenes.objects import body_names
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.task.rollout import episode_keys
 from scenes_mjcf.look import Lens, trace
-from topological_nav.scenes.rendering import SceneRenderer, camera_pose
-from topological_nav.scenes.simulation import Snapshot, episode_starts, make_env, scene_camera
+from topological_nav.scenes.rendering import (
+    SceneRenderer,
+    Snapshot,
+    camera_pose,
+    episode_starts,
+    make_env,
+    scene_camera,
+)
 
 
 def test_an_episode_with_lost_contacts_or_left_out_bodies_is_broken(room):

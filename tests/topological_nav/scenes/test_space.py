@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from interactive_nav.scenes.scene import load_scene
-from topological_nav.errors import SpaceError
+from interactive_nav_common.errors import ConfigError
 from topological_nav.scenes.space import FreeSpace, free_space, spread
 
 
@@ -68,7 +68,7 @@ def test_sampled_places_have_the_clearance_and_differ(space, seed, least):
 
 
 def test_too_little_space_is_said(space):
-    with pytest.raises(SpaceError, match="cells are at least 1.4 m from obstacles, expected 100"):
+    with pytest.raises(ConfigError, match="cells are at least 1.4 m from obstacles, expected 100"):
         space.sample(np.random.default_rng(0), 100, 1.4)
 
 

@@ -10,15 +10,15 @@ import pytest
 from PIL import Image
 
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.errors import FileError
 from interactive_nav_common.runs.weights import read_weights, write_weights
 from topological_nav.__main__ import main
 from topological_nav.data.dataset import load_passages, load_rooms
 from topological_nav.drives.driving import load_policy
-from topological_nav.errors import RunError
-from topological_nav.learn.runs import weights_file
+from topological_nav.learn.learning import weights_file
 from topological_nav.learn.training import load_networks, load_trained, save_trained
+from topological_nav.maps.build import NetworkSight
 from topological_nav.maps.graph import load_map, save_map
-from topological_nav.maps.sight import NetworkSight
 from topological_nav.weights.export import level_images, size_lines, sizes_of
 
 pytestmark = pytest.mark.heavy
@@ -32,7 +32,7 @@ def words(made, out, *more):
 def test_matrices_are_stored_in_half_precision_and_nothing_but_weights(made, steered, exported):
     for task, run in (("rooms", made.rooms), ("passages", made.passages), ("policy", steered)):
         (before, _), (after, header) = (
-            read_weights(weights_file(folder), RunError, "") for folder in (run, exported / task)
+            read_weights(weights_file(folder), FileError, "") for folder in (run, exported / task)
         )
         assert list(before) == list(after) and header["task"] == task
         assert (
@@ -183,9 +183,9 @@ def test_what_does_not_belong_is_refused(made, tmp_path, capsys):
 
 def test_weights_that_were_not_exported_with_it_are_refused(made, exported, tmp_path):
     shutil.copytree(exported / "rooms", tmp_path / "rooms")
-    tensors, header = read_weights(made.rooms / "weights.safetensors", RunError, "")
+    tensors, header = read_weights(made.rooms / "weights.safetensors", FileError, "")
     write_weights(tmp_path / "rooms" / "weights.safetensors.xz", tensors, header)
-    with pytest.raises(RunError, match=r"is not the file that was exported with its network.json"):
+    with pytest.raises(FileError, match=r"is not the file that was exported with its network.json"):
         load_trained(tmp_path / "rooms")
 
 

@@ -13,11 +13,11 @@ from PIL import Image
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.config import overlay
+from interactive_nav_common.errors import FileError
 from topological_nav.__main__ import main
 from topological_nav.config import RUNS, DataConfig
 from topological_nav.data.dataset import draw_passages
 from topological_nav.drives.driving import load_policy
-from topological_nav.errors import RunError
 from topological_nav.learn.training import load_networks
 from topological_nav.maps.build import renderer_of
 from topological_nav.maps.graph import load_map, save_map
@@ -84,9 +84,9 @@ def test_the_package_is_used_where_a_run_is_missing_or_not_finished(here):
 
 
 def test_without_any_the_remedy_is_named(here, capsys):
-    with pytest.raises(RunError, match=r"of rooms and passages: neither runs/topological nor .* rooms\)"):
+    with pytest.raises(FileError, match=r"of rooms and passages: neither runs/topological nor .* rooms\)"):
         choose(None, None)
-    with pytest.raises(RunError, match=r"networks of passages.*train passages\) or name a run folder: --detector RUN"):
+    with pytest.raises(FileError, match=r"networks of passages.*train passages\) or name a run folder: --detector RUN"):
         choose(Path("mine"), None)
     for words in (
         ["map", "nowhere"],

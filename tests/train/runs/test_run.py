@@ -22,7 +22,7 @@ from rich.console import Console
 
 from interactive_nav_common import versions
 from interactive_nav_common.errors import ConfigError, FileError
-from interactive_nav_common.files import write_text
+from interactive_nav_common.files import write_json
 from interactive_nav_common.locks import release, take_lock
 from interactive_nav_common.records import mean_over_episodes, read_metrics
 from tests.train.toy_env import ToyConfig, ToyEnv
@@ -178,13 +178,13 @@ def test_a_checkpoint_that_goes_is_gone_for_readers_at_once(tmp_path, monkeypatc
 
 
 def test_a_signal_after_the_last_update_leaves_a_summary(tmp_path, monkeypatch):
-    def signalled(path, text):
+    def signalled(path, content):
         if path.name == "summary.json":
             signal.raise_signal(signal.SIGTERM)
-        write_text(path, text)
+        write_json(path, content)
 
     usual = signal.signal(signal.SIGTERM, lambda *_: pytest.fail("too late to be collected"))
-    monkeypatch.setattr(run, "write_text", signalled)
+    monkeypatch.setattr(run, "write_json", signalled)
     try:
         result, folder, stopped_by = train_run(toy_config(tmp_path, updates=2), quiet(), build_env=build_toy)
     finally:
