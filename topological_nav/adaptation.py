@@ -25,7 +25,6 @@ import numpy as np
 import optax
 
 from interactive_nav import get_robot, load_scene
-from interactive_nav.scenes.scene import Scene
 from interactive_nav_common.config import to_dict
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import write_json
@@ -255,7 +254,9 @@ def passage_configurations(
                 kept = f"checkpoint-{name}.msgpack"
                 learner = run_epochs(out, name, learner, one, config.fine_tune_epochs, keys, host, kept)
             tuned = Trained(network, learner.variables, trained.about)
-            results[name] = _scores(tuned, tested)
+            logits, scored = tuned.logits(tested.images), tested.scored
+            results[name] = class_scores(tested.free[:, scored], logits[:, scored] > 0, 2)
+            results[name]["lengths"] = length_scores(logits, tested.free, trained.about["lengths_m"])
             if name == "D":
                 save_trained(out, dataclasses.replace(tuned, about=adapted_about(trained, config)))
         return write_json(out / RESULTS, results)
@@ -272,7 +273,11 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
     scene = load_scene(scene_folder)
     header, data = read_header(target)
     rooms = target_rooms(target, config)
-    here = rooms.scene == _index_of(scene, header, target)
+    digests = [there["digest"] for there in header["scenes"]]
+    if scene.digest not in digests:
+        names = ", ".join(there["name"] for there in header["scenes"])
+        raise FileError(f"{target}: holds images of {names} as they were, not of '{scene.name}' as it is")
+    here = rooms.scene == digests.index(scene.digest)
     nodes, held = here & ~rooms.test, here & rooms.test
     level = rooms.images[:, PITCHES.index("level")]
     shown, xy, label = level[nodes], rooms.xy_w[nodes], rooms.label[nodes]
@@ -287,15 +292,6 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
         nodes = Places(built.map.embeddings, built.map.xy_w, label)
         built.scores["held-out images localised"] = in_words(localisation_scores(queries, nodes))
     return built
-
-
-def _index_of(scene: Scene, header: dict[str, Any], target: Path) -> int:
-    """Return which scene of a dataset it is."""
-    digests = [there["digest"] for there in header["scenes"]]
-    if scene.digest not in digests:
-        names = ", ".join(there["name"] for there in header["scenes"])
-        raise FileError(f"{target}: holds images of {names} as they were, not of '{scene.name}' as it is")
-    return digests.index(scene.digest)
 
 
 def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> tuple[PassageImages, PassageImages]:
@@ -320,12 +316,3 @@ def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> 
         chosen = {name: getattr(passages, name)[rows] for name in ("free", "scene", "test")}
         parts.append(dataclasses.replace(passages, images=images[rows], **chosen))
     return parts[0], parts[1]
-
-
-def _scores(trained: Trained, tested: PassageImages) -> dict[str, Any]:
-    logits = trained.logits(tested.images)
-    predicted, truth = logits[:, tested.scored] > 0, tested.free[:, tested.scored]
-    return {
-        **class_scores(truth, predicted, 2),
-        "lengths": length_scores(logits, tested.free, trained.about["lengths_m"]),
-    }

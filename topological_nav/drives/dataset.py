@@ -242,7 +242,10 @@ def simulate_drives(
 
                 # Padded by its last drive: one size, one program.
                 rows = np.minimum(mine[0] + np.arange(config.batch), total - 1)
-                _write_batch(path, drive(player, terrain, tasks.take(rows), config, report), len(mine))
+                driven = drive(player, terrain, tasks.take(rows), config, report)
+                driven = {name: values[: len(mine)] for name, values in driven.items()}
+                on = np.arange(driven["pose_w"].shape[1]) < driven["steps"][:, None]  # not after its end
+                write_arrays(path, **{n: row[on] if row.shape[:2] == on.shape else row for n, row in driven.items()})
             progress("drives", int(mine[-1]) + 1, total)
         return load_drives(out)
 
@@ -303,13 +306,6 @@ def load_drives(folder: Path) -> Drives:
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     first = np.concatenate([[0], np.cumsum(joined.pop("steps"))])
     return Drives(scene=plan["scene"], test=plan["test"], goal_w=plan["goal_w"], first=first, **joined)
-
-
-def _write_batch(path: Path, driven: dict[str, np.ndarray], count: int) -> None:
-    """Write the first drives of a batch, without what came after their ends."""
-    on = np.arange(driven["pose_w"].shape[1]) < driven["steps"][:count, None]
-    rows = {name: values[:count] for name, values in driven.items()}
-    write_arrays(path, **{name: row[on] if row.shape[:2] == on.shape else row for name, row in rows.items()})
 
 
 def summary(drives: Drives) -> dict[str, float]:

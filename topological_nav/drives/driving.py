@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -180,7 +180,14 @@ def embed_drives(folder: Path, localiser_run: Path, detector_run: Path, mirror: 
             )
     count, total, done = len(drives.command), int(drives.steps[drives.kept].sum()), 0
     features: np.ndarray | None = None
-    embed = _embedder(networks, mirror)
+
+    @jax.jit
+    def sides(weights: Any, images: jax.Array) -> jax.Array:
+        """Map images [N, H, W, 3] to [N, 1 or 2, D] f16: all networks' embeddings, then those of the mirrored."""
+        shown = (images, images[:, :, ::-1]) if mirror else (images,)
+        return jnp.stack([embedded(networks, weights, side) for side in shown], 1).astype(jnp.float16)
+
+    embed = functools.partial(sides, [network.variables for network in networks])
     for i, (rows, images) in enumerate(drive_images(folder)):
         at, part = drives.rows(rows), in_batches(embed, images)
         if features is None:
@@ -201,17 +208,6 @@ def embedded(networks: Sequence[Trained], weights: Any, images: jax.Array) -> ja
     """Embed images [N, H, W, 3] by all networks, one after the other: [N, D]."""
     pairs = zip(networks, weights, strict=True)
     return jnp.concatenate([network.network.apply(w, images, method="embed") for network, w in pairs], -1)  # type: ignore[arg-type]
-
-
-def _embedder(networks: Sequence[Trained], mirror: bool) -> Callable[[jax.Array], jax.Array]:
-    """Compile images [N, H, W, 3] to [N, 1 or 2, D] f16: all networks' embeddings, then those of the mirrored."""
-
-    @jax.jit
-    def sides(weights: Any, images: jax.Array) -> jax.Array:
-        shown = (images, images[:, :, ::-1]) if mirror else (images,)
-        return jnp.stack([embedded(networks, weights, side) for side in shown], 1).astype(jnp.float16)
-
-    return functools.partial(sides, [network.variables for network in networks])
 
 
 class LocalPolicy(Protocol):

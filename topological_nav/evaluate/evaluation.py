@@ -26,7 +26,6 @@ from topological_nav.navigate.navigator import Navigator
 from topological_nav.navigate.state import Events, State
 from topological_nav.scenes.rendering import Camera, Snapshot, episode_starts
 from topological_nav.scenes.space import FreeSpace, Rooms
-from train.scoring.policies import Planner
 
 CONNECTED_M = 0.25
 """Start and goal are joined by a way with this clearance: half of TTbot's width and the grid's rounding."""
@@ -50,7 +49,8 @@ class DrivenEpisodes(Rows):
     goal_room: np.ndarray
     """[n] i32."""
     shortest_m: np.ndarray
-    """[n] length of the shortest way round walls and furniture, for half of the robot's width."""
+    """[n] length of the shortest way round walls and furniture, for half of the robot's width, over a grid of 16
+    directions: at most 2.7 % too long."""
 
 
 def count_of(scene: Scene, config: EvaluationConfig) -> int:
@@ -85,23 +85,15 @@ def draw_episodes(digest: str, space: FreeSpace, rooms: Rooms, count: int, confi
         if np.linalg.norm(places[a] - places[b]) > config.min_goal_m:
             drawn.append((a, b, yaw))
     a, b, yaws = map(np.array, zip(*drawn, strict=True))
-    shortest = _shortest_m(space, places[a], places[b])
-    return DrivenEpisodes(np.arange(count), places[a], yaws, places[b], room[a], room[b], shortest)
-
-
-def _shortest_m(space: FreeSpace, starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
-    """Return [n] m: shortest ways between places [n, 2] over a grid of 16 directions, at most 2.7 % too long."""
-    free = space.clearance_m >= CONNECTED_M
-    grid = PathGrid(free, np.ones(free.shape))
-    ends = zip(space.cells(starts)[:, ::-1], space.cells(goals)[:, ::-1], strict=True)
+    grid = PathGrid(space.clearance_m >= CONNECTED_M, np.ones(space.clearance_m.shape))
+    ends = zip(space.cells(places[a])[:, ::-1], space.cells(places[b])[:, ::-1], strict=True)
     ways = [grid.path(tuple(start), tuple(goal)) for start, goal in ends]
-    return np.array([np.linalg.norm(np.diff(way, axis=0), axis=1).sum() for way in ways]) * space.resolution_m
+    shortest = np.array([np.linalg.norm(np.diff(way, axis=0), axis=1).sum() for way in ways]) * space.resolution_m
+    return DrivenEpisodes(np.arange(count), places[a], yaws, places[b], room[a], room[b], shortest)
 
 
 TRACK_S = 0.5
 """Between two points of a recorded path."""
-EXPERT_WEIGHT = 1.0
-"""Of path against effort: objects are pushed only where no way is free."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -161,7 +153,7 @@ class Contender(HostPolicy):
 
     def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> tuple[Any, np.ndarray]:
         """See `HostPolicy`."""
-        number = np.minimum(episode, len(self._episodes) - 1)  # a batch may be padded
+        self._rows = number = np.minimum(episode, len(self._episodes) - 1)  # a batch may be padded
         if step == 0:
             for name, values in fresh(Played, len(number)).items():
                 getattr(self._played, name)[number] = values
@@ -280,11 +272,7 @@ class ActionPlayer(Contender):
 
     def begin(self, episodes: DrivenEpisodes) -> None:
         """See `Contender`."""
-        self._number, self._act = episodes.number, self._make_act()
-
-    def keep(self, rows: np.ndarray) -> None:
-        """See `Contender`."""
-        self._number = self._number[rows]
+        self._act = self._make_act()
 
     def step(self, state: Any, now: Snapshot, running: np.ndarray, step: int) -> tuple[Any, Events]:
         """See `Contender`."""
@@ -297,16 +285,7 @@ class ActionPlayer(Contender):
             run_ended=edge & (step > 0),
             timed_out=running & (step * dt_s >= config.limit_s - 1e-3),
         )
-        return self._act(state, self._number, running, step), events
-
-
-def expert(player: Player, config: EvaluationConfig) -> ActionPlayer:
-    """Return the planner of `train.scoring.policies`, which has the map and all poses, and drives round what it can.
-
-    Where its grid leaves no way between an object and a wall, it takes the one through the least of objects: episodes
-    are joined by ways 0.25 m from everything, which is nearer than it otherwise goes.
-    """
-    return ActionPlayer(player, config, lambda: Planner(player.env, EXPERT_WEIGHT).act)
+        return self._act(state, self._episodes.number[self._rows], running, step), events
 
 
 def learned(player: Player, config: EvaluationConfig, policy: Any) -> ActionPlayer:
@@ -326,24 +305,16 @@ def learned(player: Player, config: EvaluationConfig, policy: Any) -> ActionPlay
 def columns(episodes: DrivenEpisodes, played: Played, config: EvaluationConfig) -> dict[str, np.ndarray]:
     """Return the numbers of each row, an array each; SPL, RC and AADC are means of them (see `scores`)."""
 
-    def of(*names: str) -> dict[str, np.ndarray]:
-        return {name: getattr(played, name) for name in names}
-
+    kept = ("contact_s", "wall_s", "duration_s", "path_m", "goal_m", "runs", "contact_runs", "localisations", "blocked")
+    ends = {"start": episodes.start_xy_w, "goal": episodes.goal_xy_w}
     return {
         "success": played.success.astype(np.float64),
         "spl": np.asarray(path_efficiency(played.success, episodes.shortest_m, played.path_m), np.float64),
         "within": (played.goal_m < config.success_m).astype(np.float64),
-        "arrived": played.arrived,
         "contact": (played.contact_s > 0).astype(np.float64),
         "aadc_s": played.contact_runs * config.run_s,
-        **of("contact_s", "wall_s", "duration_s", "path_m"),
-        "shortest_m": episodes.shortest_m,
-        **of("goal_m", "runs", "contact_runs", "localisations", "blocked", "lost", "broken"),
-        "start_room": episodes.start_room,
-        "goal_room": episodes.goal_room,
-        "start_x_w": episodes.start_xy_w[:, 0],
-        "start_y_w": episodes.start_xy_w[:, 1],
+        **{name: getattr(played, name) for name in ("arrived", *kept, "lost", "broken")},
+        **{name: getattr(episodes, name) for name in ("shortest_m", "start_room", "goal_room")},
+        **{f"{end}_{axis}_w": xy_w[:, k] for end, xy_w in ends.items() for k, axis in enumerate("xy")},
         "start_yaw_rad": episodes.yaw_rad,
-        "goal_x_w": episodes.goal_xy_w[:, 0],
-        "goal_y_w": episodes.goal_xy_w[:, 1],
     }

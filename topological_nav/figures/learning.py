@@ -73,25 +73,20 @@ def drives_figure(scene_folders: Sequence[Path], folder: Path) -> Figure:
 
 
 def _some(folder: Path, count: int) -> list[tuple[int, np.ndarray]]:
-    """Return a few drives with their images, from files all over the folder."""
-    files = [(int(rows[len(rows) // 2]), rows, images) for rows, images in _thin(drive_images(folder), count)]
-    drives, out = load_drives(folder), []
-    for k, rows, images in files:
-        ends = np.cumsum(drives.steps[rows])
-        at = int(np.flatnonzero(rows == k)[0])
-        out.append((k, images[ends[at] - drives.steps[k] : ends[at]]))
-    return out
-
-
-def _thin(files, count: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return `count` of an iterable, evenly; it is gone through once and a few are held."""
+    """Return a few drives with their images, from files all over the folder: it is read once and a few are held."""
     held, every = [], 1
-    for i, item in enumerate(files):
+    for i, item in enumerate(drive_images(folder)):
         if i % every == 0:
             held.append(item)
         if len(held) == 2 * count:
             held, every = held[::2], 2 * every
-    return held[:count]
+    drives, out = load_drives(folder), []
+    for rows, images in held[:count]:
+        k = int(rows[len(rows) // 2])
+        ends = np.cumsum(drives.steps[rows])
+        at = int(np.flatnonzero(rows == k)[0])
+        out.append((k, images[ends[at] - drives.steps[k] : ends[at]]))
+    return out
 
 
 def _shares(axes: Any, drives: Any) -> None:

@@ -86,12 +86,12 @@ def initial(shapes: dict[str, Any], seed: int) -> dict[str, Any]:
     return jax.tree_util.tree_map_with_path(value, shapes)
 
 
-def with_backbone(learner: Learner, donor: dict[str, Any]) -> Learner:
+def with_backbone(learner: Learner, donor: dict[str, Any], fault: str = "", about: str = "") -> Learner:
     """Return the learner with the backbone of other variables (`params`, `batch_stats`); raise if it differs."""
     mine, theirs = learner.params["body"], donor["params"]["body"]
     shapes = [jax.tree.map(jnp.shape, tree) for tree in (mine, theirs)]
     if shapes[0] != shapes[1]:
-        raise FileError("its backbone differs in kind or width")
+        raise FileError(f"{fault}: its backbone differs in kind or width; {about}")
     stats = dict(learner.batch_stats)
     if "body" in stats:
         stats["body"] = donor["batch_stats"]["body"]

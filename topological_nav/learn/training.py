@@ -127,7 +127,9 @@ def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host:
         if config.init == "selfsup":
             learner = _learned_without_labels(learner, work.rooms, out, config, host)
         elif config.init != "scratch":
-            learner = _started_from(learner, Path(config.init))
+            donor = load_trained(Path(config.init))
+            about = f"it is {donor.about['backbone']} of width {donor.about['width']}"
+            learner = with_backbone(learner, donor.variables, f"init: {config.init} does not fit", about)
         epoch = labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment, work.scored)
         one = over(epoch, work.images, work.labels)
         learner = run_epochs(out, "labels", learner, one, config.epochs, phase_key(config.seed, 2), host)
@@ -272,16 +274,6 @@ def rows_by_scene(rooms: RoomImages) -> dict[str, np.ndarray]:
     """Return scene name -> [P] bool."""
     names = np.array([rooms.names[label].rpartition("/")[0] for label in rooms.label])
     return {str(name): names == name for name in dict.fromkeys(names.tolist())}
-
-
-def _started_from(learner: Learner, run: Path) -> Learner:
-    donor = load_trained(run)
-    try:
-        return with_backbone(learner, donor.variables)
-    except FileError as error:
-        raise FileError(
-            f"init: {run} does not fit: {error}; it is {donor.about['backbone']} of width {donor.about['width']}"
-        ) from None
 
 
 def camera_settings(network: Trained) -> dict[str, Any]:

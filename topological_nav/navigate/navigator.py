@@ -73,7 +73,9 @@ class Navigator:
         self._near = np.eye(len(nav_map.xy_w), dtype=bool)
         self._all_round = int(np.ceil(360.0 / config.swing_deg)) - 1
         self._near[nav_map.edges[:, 0], nav_map.edges[:, 1]] = True
-        self._ask_m = _judged_m(nav_map.length_m, config)
+        # How far (m) the way must be free to drive along each edge, and, last, along none: [E + 1].
+        ahead_m = nav_map.length_m - np.minimum(config.slack_m, 0.5 * nav_map.length_m)
+        self._ask_m = np.append(np.minimum(ahead_m, config.ahead_m), config.clear_m)
 
     def goal_nodes(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
         """Return the nodes [B] nearest to goals, by images [B, K, ...] taken there along headings [K]."""
@@ -311,12 +313,6 @@ class Navigator:
         s.linear[rows] = 0.0
         s.angular[rows] = np.clip(config.kp * error + s.integral[rows] + config.kd * rate, -most, most)
         s.error_rad[rows] = error
-
-
-def _judged_m(length_m: np.ndarray, config: NavigatorConfig) -> np.ndarray:
-    """Return how far (m) the way must be free to drive along edges of lengths [E], and, last, along none: [E + 1]."""
-    ahead = np.minimum(length_m - np.minimum(config.slack_m, 0.5 * length_m), config.ahead_m)
-    return np.append(ahead, config.clear_m)
 
 
 def _any_of(phase: np.ndarray, phases: tuple[int, ...]) -> np.ndarray:

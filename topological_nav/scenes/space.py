@@ -162,7 +162,11 @@ def cluster(points: np.ndarray, method: str, count: int, seed: int) -> np.ndarra
             labels = SpectralClustering(
                 count, affinity="nearest_neighbors", n_neighbors=near, assign_labels="cluster_qr", random_state=seed
             ).fit_predict(points)
-    return _ordered(points, np.asarray(labels))
+    used, labels = np.unique(labels, return_inverse=True)
+    means = np.array([points[labels == k].mean(0) for k in range(len(used))])
+    place = np.empty(len(used), np.int32)
+    place[np.lexsort((means[:, 1], means[:, 0]))] = np.arange(len(used))
+    return place[labels]
 
 
 def choose_count(points: np.ndarray, method: str, seed: int, most: int = MAX_ROOMS) -> tuple[int, str]:
@@ -223,11 +227,3 @@ def agreement(rooms: Rooms, recorded: np.ndarray) -> float:
 
 def _mixture(points: np.ndarray, count: int, seed: int) -> GaussianMixture:
     return GaussianMixture(count, covariance_type="full", n_init=5, reg_covar=1e-4, random_state=seed).fit(points)
-
-
-def _ordered(points: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    used = np.unique(labels)
-    means = np.array([points[labels == k].mean(0) for k in used])
-    place = np.empty(len(used), np.int32)
-    place[np.lexsort((means[:, 1], means[:, 0]))] = np.arange(len(used))
-    return place[np.searchsorted(used, labels)]
