@@ -92,7 +92,7 @@ class Adapting:
 
 
 def embed_training(network: Network, variables: Any, images: jax.Array) -> tuple[jax.Array, Any]:
-    """Return embeddings [N, D] by the batch's own statistics, and the running ones updated."""
+    """Return embeddings [N, D] by the batch's statistics, and the running ones updated."""
     embeddings, new = network.apply(
         variables, images, method=lambda module, x: joined(module.body(normalised(x), True)), mutable=["batch_stats"]
     )

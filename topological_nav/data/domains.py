@@ -1,7 +1,7 @@
 """Turn rendered images into those that another camera would have taken: a stand-in for the real world.
 
 In the order of a real camera: lens (narrower, distorted, darker corners), motion blur, exposure and white balance in
-linear light, sensor noise, the camera's own tone curve. Pure functions of images and a seed; where images come from
+linear light, sensor noise, the camera's tone curve. Pure functions of images and a seed; where images come from
 (rendered again through another lens or engine, or a scanned room) is a dataset's business, see `config.DataConfig`.
 """
 

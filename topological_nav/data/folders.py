@@ -119,8 +119,11 @@ def draw_missing(
         for name, load, files in scenes:
             renderer = functools.cache(lambda load=load: SceneRenderer(load(), lens, config.supersample, config.engine))
             for path, poses in files:
-                sheets = [] if path.is_file() else _draw_sheets(renderer(), poses)
-                yield functools.partial(_write, path, sheets, config.quality, name, sum(len(p.pos_w) for p in poses))
+                ends, sheets = np.cumsum([len(pose.pos_w) for pose in poses]), []
+                if not path.is_file():  # drawn together, in full batches
+                    every = (np.concatenate([getattr(p, leaf) for p in poses]) for leaf in ("pos_w", "axes_w"))
+                    sheets = np.split(renderer().draw(CameraPose(*every)), ends[:-1])
+                yield functools.partial(_write, path, sheets, config.quality, name, int(ends[-1]))
 
     done = 0
     with contextlib.closing(in_order(missing(), 2 * THREADS)) as written:
@@ -133,13 +136,6 @@ def _write(path: Path, sheets: list[np.ndarray], quality: int, name: str, count:
     if sheets:
         write_shard(path, sheets, quality)
     return name, count
-
-
-def _draw_sheets(renderer: SceneRenderer, poses: Sequence[CameraPose]) -> list[np.ndarray]:
-    """Draw images [n_i, H, W, 3] of groups of cameras together, in full batches."""
-    together = CameraPose(*(np.concatenate([getattr(pose, name) for pose in poses]) for name in ("pos_w", "axes_w")))
-    images = renderer.draw(together)
-    return np.split(images, np.cumsum([len(pose.pos_w) for pose in poses])[:-1])
 
 
 def folder_bytes(folder: Path) -> int:

@@ -1,4 +1,4 @@
-"""Train a local policy on drives seen by two networks, into a run folder; or one for every alpha and lambda.
+"""Train a local policy on drives as two networks see them, into a run folder; or one for every alpha and lambda.
 
 RUN/config.yaml      settings; a run that is started again with the same ones goes on
     versions.json, metrics.jsonl, checkpoint.msgpack, results.json, curves.png   as in `training`
@@ -131,7 +131,10 @@ def train_policy(frames: Frames, out: Path, config: PolicyConfig, host: Host = A
         policy = Policy(config.hidden, config.projection, config.linear_classes, config.angular_classes)
         forward = Forward(config.forward_hidden)
         params = fresh_params(policy, forward, frames.features.shape[1], config.seed)
-        scale = _scale(frames.features[np.unique(learned.rows)])
+        # Features that hardly vary here must not become large where they do.
+        used = frames.features[np.unique(learned.rows)].astype(np.float32)
+        deviation = np.maximum(used.std(0), LEAST_SPREAD * used.std(0).mean() + 1e-6)
+        scale = {"mean": jnp.asarray(used.mean(0)), "deviation": jnp.asarray(deviation)}
         learner = Learner(params, scale, optax.adam(config.learning_rate).init(params))
         alone = math.ceil(config.alone * config.epochs - 1e-9)
         weights = {"alpha": jnp.float32(config.alpha), "lam": jnp.float32(config.lam)}
@@ -169,14 +172,6 @@ def _split(drives: Drives, config: PolicyConfig, values: tuple[np.ndarray, np.nd
     if config.mirror:
         learned = Sequences.joined([learned, mirrored(learned, len(drives.command), config)])
     return every, learned, held_out
-
-
-def _scale(features: np.ndarray) -> dict[str, jax.Array]:
-    """Return how features [F, D] are scaled: those that hardly vary here must not become large where they do."""
-    used = features.astype(np.float32)
-    spread = used.std(0)
-    deviation = np.maximum(spread, LEAST_SPREAD * spread.mean() + 1e-6)
-    return {"mean": jnp.asarray(used.mean(0)), "deviation": jnp.asarray(deviation)}
 
 
 def _applied(policy: Policy, forward: Forward, params: Any, scale: Any, u: jax.Array):

@@ -170,7 +170,7 @@ def dataset_figure(folder: Path) -> Figure:
 
 
 def map_figure(built: Built, route: Route | None = None) -> Figure:
-    """Draw a map over the floor plan, a route on top: edges from blocked to free, each direction on its own half."""
+    """Draw a map over the floor plan, a route on top: edges from blocked to free, each direction on half of it."""
     graph = built.map
     extent = np.ptp(built.space.centres(0.0), axis=0)
     figure, axis = plt.subplots(figsize=(7.2, 1.2 + 7.0 * extent[1] / extent[0]), layout="constrained")

@@ -30,7 +30,6 @@ from topological_nav.data.dataset import RoomImages, load_passages, load_rooms, 
 from topological_nav.learn.learning import (
     DESCRIPTION,
     RESULTS,
-    Learner,
     in_batches,
     labelled_epoch,
     make_learner,
@@ -125,7 +124,16 @@ def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host:
         network = Network(task, config.network, config.width, config.hidden, outputs)
         learner = make_learner(network, (data.height, data.width), tx, config.seed)
         if config.init == "selfsup":
-            learner = _learned_without_labels(learner, work.rooms, out, config, host)
+            saved = read_state(out / CHECKPOINT)
+            if not saved or saved["phase"] == "pairs":  # that of the later phase holds this one's outcome
+                places = work.rooms.images[~work.rooms.test]
+                places = places.reshape(-1, *places.shape[2:])  # the headings of a place and pitch
+                contrast, pairs_tx = Contrast(config.network, config.width), optax.adam(config.selfsup_learning_rate)
+                one = over(paired_epoch(contrast, pairs_tx, config.selfsup_batch), places, np.zeros(0, np.int32))
+                paired = make_learner(contrast, places.shape[2:4], pairs_tx, config.seed)
+                key, epochs = phase_key(config.seed, 1), config.selfsup_epochs
+                paired = run_epochs(out, "pairs", paired, one, epochs, key, host)
+                learner = with_backbone(learner, paired.variables)
         elif config.init != "scratch":
             donor = load_trained(Path(config.init))
             about = f"it is {donor.about['backbone']} of width {donor.about['width']}"
@@ -146,21 +154,6 @@ def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host:
             "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params))),
         }
         return write_json(out / RESULTS, _scores(save_trained(out, Trained(network, learner.variables, about)), work))
-
-
-def _learned_without_labels(
-    learner: Learner, rooms: RoomImages, out: Path, config: NetworkTrainConfig, host: Host
-) -> Learner:
-    """Return the learner with a backbone that learned from pairs of images."""
-    saved = read_state(out / CHECKPOINT)
-    if saved and saved["phase"] != "pairs":
-        return learner  # a checkpoint of the later phase holds this one's outcome
-    places = rooms.images[~rooms.test].reshape(-1, *rooms.images.shape[2:])  # the headings of a place and pitch
-    contrast, tx = Contrast(config.network, config.width), optax.adam(config.selfsup_learning_rate)
-    epoch = over(paired_epoch(contrast, tx, config.selfsup_batch), places, np.zeros(0, np.int32))
-    paired = make_learner(contrast, places.shape[2:4], tx, config.seed)
-    paired = run_epochs(out, "pairs", paired, epoch, config.selfsup_epochs, phase_key(config.seed, 1), host)
-    return with_backbone(learner, paired.variables)
 
 
 def save_trained(out: Path, trained: Trained) -> Trained:

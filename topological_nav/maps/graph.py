@@ -90,16 +90,11 @@ class TopologicalMap:
     def next_edge(self, start: int, goal: int, penalty: np.ndarray | None = None) -> int:
         """Return the first edge of the cheapest way between two different nodes; -1 where there is none.
 
-        Args:
-            start: node.
-            goal: node.
-            penalty: [E] added to the edges' weights.
+        `penalty` [E] is added to the edges' weights.
         """
-        if penalty is None or not penalty.any():
-            weight, left = self.weight, self.left[goal]
-        else:
-            weight = self.weight + penalty
-            left = self._left_to(weight, goal)
+        changed = penalty is not None and bool(penalty.any())
+        weight = self.weight + penalty if changed else self.weight
+        left = self._left_to(weight, goal) if changed else self.left[goal]
         out = np.flatnonzero(self.edges[:, 0] == start)
         total = weight[out] + left[self.edges[out, 1]]
         return int(out[total.argmin()]) if len(out) and np.isfinite(total.min()) else -1
@@ -121,12 +116,7 @@ class TopologicalMap:
         return parts_of(self.edges[self.p >= passable], len(self.xy_w), both_ways=True)
 
     def thinned(self, share: float, seed: int) -> TopologicalMap:
-        """Return the map with fewer nodes: a sparse one that may fall apart.
-
-        Args:
-            share: of each room's nodes that stay, drawn at random; at least one a room.
-            seed: of the draw.
-        """
+        """Return the map with a share of each room's nodes, drawn by a seed, at least one: it may fall apart."""
         rng = np.random.default_rng([seed, 11])
         kept = []
         for room in np.unique(self.room):

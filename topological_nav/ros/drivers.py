@@ -103,15 +103,13 @@ def topological_driver(
     policy = local_policy(choice.policy, sight, config, networks)
     if not goals:
         raise ConfigError("the navigator has no goal; name a picture taken there: --goal PICTURE")
-    pictures = np.stack([seen_through(_picture(path), lens.fov_deg, lens) for path in goals])
+    pictures = []
+    for path in goals:
+        try:
+            with Image.open(path) as image:
+                pictures.append(seen_through(np.asarray(image.convert("RGB")), lens.fov_deg, lens))
+        except OSError as error:
+            raise ConfigError(f"{path}: is no picture that can be read ({error})") from None
     around = goal_heading_rad + 2 * np.pi * np.arange(len(pictures)) / len(pictures)
     navigator = Navigator(built, sight, policy, config)
-    return PilotDriver(navigator, navigator.start(navigator.goal_nodes(pictures[None], around)), lens)
-
-
-def _picture(path: Path) -> np.ndarray:
-    try:
-        with Image.open(path) as image:
-            return np.asarray(image.convert("RGB"))
-    except OSError as error:
-        raise ConfigError(f"{path}: is no picture that can be read ({error})") from None
+    return PilotDriver(navigator, navigator.start(navigator.goal_nodes(np.stack(pictures)[None], around)), lens)

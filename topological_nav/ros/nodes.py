@@ -1,6 +1,7 @@
 """Connect the simulator and the navigator to topics; `messages` decides what is in a message."""
 
 import contextlib
+import functools
 import math
 import threading
 import time
@@ -234,11 +235,8 @@ class NavigatorNode:
             node.create_publisher(ros.TOPICS[name], name, ros.qos(name)) for name in (ros.COMMAND, ros.DONE)
         )
         self._heading_topic = ros.HEADING_TOPICS[heading_from]
-        for name, heard in (
-            (self._heading_topic, self._on_heading),
-            (ros.INFO, self._on_info),
-            (ros.IMAGE, self._on_image),
-        ):
+        for name in (self._heading_topic, ros.INFO, ros.IMAGE):
+            heard = functools.partial(self._on_message, name)
             node.create_subscription(ros.TOPICS[name], name, heard, ros.qos(name, reading=True))
 
     def run(self, stop: Stop) -> bool:
@@ -247,7 +245,9 @@ class NavigatorNode:
         moving = False
         try:
             while not stop():
-                message = self._take(stop)
+                with self._news:
+                    self._news.wait_for(lambda: self._image is not None or stop(), 0.2)
+                    message, self._image = self._image, None
                 if message is None:
                     silent_s = time.monotonic() - came
                     if moving and silent_s > LOST_S:
@@ -289,12 +289,6 @@ class NavigatorNode:
             self._done.publish(Bool(data=True))
         self._command.publish(ros.twist_message(command.linear_mps, command.angular_radps))
 
-    def _take(self, stop: Stop) -> Any:
-        with self._news:
-            self._news.wait_for(lambda: self._image is not None or stop(), 0.2)
-            message, self._image = self._image, None
-        return message
-
     def _heading_at(self, time_s: float, stop: Stop) -> float | None:
         """Return the heading when a picture was taken; wait a little for one that is not older."""
         with self._news:
@@ -309,24 +303,16 @@ class NavigatorNode:
         lens = self._lens
         return lens.fov_deg if isinstance(lens, Lens) else math.nan
 
-    def _on_image(self, message: Any) -> None:
-        with self._reading(ros.IMAGE):
-            self._image = message
-
-    def _on_heading(self, message: Any) -> None:
-        quat = message.orientation if self._heading_topic == ros.HEADING else message.pose.pose.orientation
-        with self._reading(self._heading_topic):
-            self._headings.add(ros.seconds(message.header.stamp), ros.quat_yaw(quat))
-
-    def _on_info(self, message: Any) -> None:
-        with self._reading(ros.INFO):
-            self._lens = ros.info_lens(message)
-
-    @contextlib.contextmanager
-    def _reading(self, topic: str) -> Iterator[None]:
+    def _on_message(self, topic: str, message: Any) -> None:
         with self._news:
             try:
-                yield
+                if topic == ros.IMAGE:
+                    self._image = message
+                elif topic == ros.INFO:
+                    self._lens = ros.info_lens(message)
+                else:
+                    quat = message.orientation if topic == ros.HEADING else message.pose.pose.orientation
+                    self._headings.add(ros.seconds(message.header.stamp), ros.quat_yaw(quat))
                 self._news.notify_all()
             except ros.MessageError as error:
                 self._say(f"navigator: {topic}: {error}")

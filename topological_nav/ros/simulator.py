@@ -116,7 +116,10 @@ class RosSimulator:
         start = self._env.draw_start(key)
         if config.start:
             x, y, yaw = config.start
-            self._refuse_blocked(x, y)
+            clear = float(free_space(self._env.scenes[0], self._env.robot.height_m).at(np.array([x, y])))
+            least = self._env.robot.body_width_m / 2
+            if clear < least:
+                raise UserError(f"start ({x}, {y}) is {clear:.2f} m from obstacles, expected at least {least} m")
             start = start.replace(start_xy_w=jnp.asarray([x, y], jnp.float32), start_yaw_rad=jnp.float32(yaw))
         self._state = jax.jit(self._env.reset_to)(start, jax.random.fold_in(key, 1))
         self._force_before = 0.0
@@ -138,7 +141,9 @@ class RosSimulator:
 
     def sense(self) -> Sensed:
         """Return what the sensors measure now."""
-        nav, values = self._state.info["nav"], self._parts()
+        nav, sizes = self._state.info["nav"], self._env.sensors.sizes
+        ends = np.cumsum(list(sizes.values()))
+        values: Any = dict(zip(sizes, np.split(np.asarray(self._state.obs), ends[:-1]), strict=True))
         by = self.config.supersample
         drawn = self._camera.frame(self._state, self.lens.width * by, self.lens.height * by, ("rgb",), "robot")["rgb"]
         movable, structure = (bool(t) for t in np.asarray(nav.memory["touching"]))
@@ -155,16 +160,3 @@ class RosSimulator:
             force_n=float(nav.memory["force_sum_n"]) - self._force_before,
             truth_w=values["localisation"],
         )
-
-    def _parts(self) -> dict[str, np.ndarray]:
-        sizes: dict[str, Any] = self._env.sensors.sizes
-        ends = np.cumsum(list(sizes.values()))
-        return dict(zip(sizes, np.split(np.asarray(self._state.obs), ends[:-1]), strict=True))
-
-    def _refuse_blocked(self, x: float, y: float) -> None:
-        robot = self._env.robot
-        clear = float(free_space(self._env.scenes[0], robot.height_m).at(np.array([x, y])))
-        if clear < robot.body_width_m / 2:
-            raise UserError(
-                f"start ({x}, {y}) is {clear:.2f} m from obstacles, expected at least {robot.body_width_m / 2} m"
-            )

@@ -96,7 +96,14 @@ def export(
             about["networks"][task] = _export_run(task, run, part / task, config)
         for done, path in enumerate(files, len(runs)):
             progress(path.stem, done, total)
-            about["maps"][path.stem] = _export_map(path, part / "maps" / path.name, networks)
+            built = load_map(path)
+            for name, digest in networks.digests.items():
+                if built.about.get(name) != digest:
+                    raise FileError(f"{path}: was built with another {name}; build the map again with the exported one")
+            halved = dataclasses.replace(built, embeddings=built.embeddings.astype(np.float16))
+            save_map(halved, part / "maps" / path.name)
+            facts = {"scene_digest": built.digest, "nodes": len(built.xy_w), "edges": len(built.edges)}
+            about["maps"][path.stem] = facts
         progress("comparing", total - 1, total)
         exported = Networks(load_trained(part / "rooms"), load_trained(part / "passages"))
         compared = compare(networks, exported, driver, load_policy(part / "policy") if driver else None, pictures)
@@ -217,16 +224,6 @@ def _export_run(task: str, run: Path, out: Path, config: ExportConfig) -> dict[s
         shutil.copyfile(run / name, out / name)
     kept = {name: about[name] for name in ("digest", "parameters", "commit")}
     return {**kept, "device": device, "command": origin["argv"]}
-
-
-def _export_map(path: Path, out: Path, networks: Networks) -> dict[str, Any]:
-    """Write a map with embeddings in half precision and return its facts."""
-    built = load_map(path)
-    for name, digest in networks.digests.items():
-        if built.about.get(name) != digest:
-            raise FileError(f"{path}: was built with another {name}; build the map again with the exported one")
-    save_map(dataclasses.replace(built, embeddings=built.embeddings.astype(np.float16)), out)
-    return {"scene_digest": built.digest, "nodes": len(built.xy_w), "edges": len(built.edges)}
 
 
 def _without_folder(word: str) -> str:
