@@ -4,10 +4,10 @@ Each scene has a process (`generate-scenes --only NAME`), so that one that fails
 that reaches the folder can run it.
 """
 
+import contextlib
 import dataclasses
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from converters.generate.design.config import GenerationError
 from converters.recipes import Recipes, chosen, load_recipes, make_scenes, parse_recipes
 from interactive_nav_common.config import nearest
 from interactive_nav_common.files import write_text
-from interactive_nav_common.jobs.processes import LOST, Job, Launcher, LocalLauncher
+from interactive_nav_common.jobs.processes import LOST, Job, Launcher, LocalLauncher, run_jobs
 from scenes_mjcf.schema import load_manifest
 from scenes_mjcf.sets import (
     FILE,
@@ -133,22 +133,15 @@ def run_side_by_side(
     """
     failed: list[str] = []
     folder.mkdir(parents=True, exist_ok=True)
-    todo, running, count = list(commands), 0, len(commands)
-    report(f"0/{count} {what}", 0.0)
+    report(f"0/{len(commands)} {what}", 0.0)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".jobs-") as logs:
-        try:
-            while todo or running:
-                while todo and launcher.start(Job(todo[0], tuple(commands[todo[0]]), Path(logs, todo[0]).absolute())):
-                    todo, running = todo[1:], running + 1
-                for job, code in launcher.ended():
-                    running -= 1
-                    printed = job.log.read_text(errors="replace").partition("\n")[2] if code != LOST else "lost"
-                    log(ended(job.name, -1 if code == LOST else code, printed))
-                    failed += [job.name] if code else []
-                    report(f"{count - len(todo) - running}/{count} {what}", 1 - (len(todo) + running) / count)
-                time.sleep(0.05)
-        finally:
-            launcher.end(GRACE_S)
+        jobs = (Job(name, tuple(words), Path(logs, name).absolute()) for name, words in commands.items())
+        with contextlib.closing(run_jobs(launcher, jobs, GRACE_S)) as results:
+            for done, (job, code) in enumerate(results, 1):
+                printed = job.log.read_text(errors="replace").partition("\n")[2] if code != LOST else "lost"
+                log(ended(job.name, -1 if code == LOST else code, printed))
+                failed += [job.name] if code else []
+                report(f"{done}/{len(commands)} {what}", done / len(commands))
     return failed
 
 

@@ -5,6 +5,7 @@ import sys
 import coacd
 import numpy as np
 
+from converters.clock import peak_memory_mib
 from converters.records.errors import CANNOT_WRITE
 
 
@@ -21,7 +22,7 @@ def main(source: str, target: str) -> None:
     if not parts:
         raise ValueError("coacd returned no part")
     try:
-        np.savez(target, count=len(parts), **arrays)  # pyright: ignore[reportArgumentType]
+        np.savez(target, count=len(parts), peak_mib=peak_memory_mib(), **arrays)  # pyright: ignore[reportArgumentType]
     except OSError as error:
         print(error)
         sys.exit(CANNOT_WRITE)

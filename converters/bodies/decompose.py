@@ -6,26 +6,21 @@ coacd runs outside this process because it prints its log to the terminal, may c
 cannot be interrupted from Python. A model is decomposed once, unscaled: scaling keeps a hull convex.
 """
 
-import concurrent.futures
 import contextlib
 import dataclasses
 import errno
-import os
-import subprocess
 import sys
 import tempfile
-import threading
-import time
 from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from converters.clock import peak_memory_mib
 from converters.geometry.boxes import Hull, convex_hull
 from converters.records.cache import MISSING, NOT_HASHED, StageCache
 from converters.records.errors import CANNOT_WRITE, StageFailed
 from interactive_nav_common import files
+from interactive_nav_common.jobs.processes import LATE, Job, LocalLauncher, our_env, run_jobs
 
 WORKER = "converters.bodies.coacd_worker"
 
@@ -124,50 +119,36 @@ def _results(
     configs: Mapping[str, DecomposeConfig],
     jobs: int,
 ) -> Generator[tuple[tuple[str, str], tuple[tuple[Hull, ...] | None, str, float]], None, None]:
-    """Yield key and name, and what `_run` returns, of each that waits, as they end; closed early, end what runs."""
-    stop = threading.Event()
-    with tempfile.TemporaryDirectory(prefix="hulls-") as folder, concurrent.futures.ThreadPoolExecutor(jobs) as pool:
-        try:
-            begun = {
-                pool.submit(_run, *one, *meshes[one[1]], configs[one[1]], Path(folder), stop): one for one in waiting
-            }
-            yield from ((begun[done], done.result()) for done in concurrent.futures.as_completed(begun))
-        finally:
-            stop.set()
-            pool.shutdown(cancel_futures=True)
+    """Yield key and name, and what `_result` returns, of each that waits, as they end; closed early, end what runs."""
+    names = dict(waiting)
+    with tempfile.TemporaryDirectory(prefix="hulls-") as folder:
+        todo = (_job(key, name, *meshes[name], configs[name], Path(folder)) for key, name in waiting)
+        with contextlib.closing(run_jobs(LocalLauncher(jobs), todo, grace_s=0.0)) as ended:
+            for job, code in ended:
+                name = names[job.name]
+                yield (job.name, name), _result(job, code, name)
 
 
-def _run(
-    key: str, name: str, vertices: np.ndarray, faces: np.ndarray, config: DecomposeConfig, scratch: Path,
-    stop: threading.Event,
-) -> tuple[tuple[Hull, ...] | None, str, float]:  # fmt: skip
-    """Return hulls, or None and the reason, and its memory, MiB; kill what is out of time or to stop."""
-    mesh_path, output = scratch / f"{key}.in.npz", scratch / f"{key}.npz"
+def _job(key: str, name: str, vertices: np.ndarray, faces: np.ndarray, config: DecomposeConfig, scratch: Path) -> Job:
+    """Write a mesh, and return the job that decomposes it."""
+    source = scratch / f"{key}.in.npz"
     parameters = {k: v for k, v in dataclasses.asdict(config).items() if k != "timeout_s"}
-    np.savez(mesh_path, vertices=vertices, faces=faces, **parameters)  # pyright: ignore[reportArgumentType]
-    with output.with_suffix(".log").open("wb") as log:
-        process = subprocess.Popen(
-            [sys.executable, "-m", WORKER, str(mesh_path), str(output)],
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            # One thread each: results then do not depend on the machine's load, and `jobs` is what it says.
-            env=os.environ | {"OMP_NUM_THREADS": "1"},
-            stdin=subprocess.DEVNULL,
-            cwd=Path(__file__).resolve().parents[2],
-        )
-    peak_mib, until = 0.0, time.monotonic() + config.timeout_s
-    while process.poll() is None and time.monotonic() < until and not stop.wait(0.05):
-        peak_mib = max(peak_mib, peak_memory_mib(process.pid))
-    if process.poll() is None:
-        process.kill()
-        process.wait()
-        return None, f"coacd ran past {config.timeout_s:g} s on {name}", peak_mib
-    code = process.returncode
+    np.savez(source, vertices=vertices, faces=faces, **parameters)  # pyright: ignore[reportArgumentType]
+    command = sys.executable, "-m", WORKER, str(source), str(scratch / f"{key}.npz")
+    # One thread each: results then do not depend on the machine's load, and `jobs` is what it says.
+    env = our_env() | {"OMP_NUM_THREADS": "1"}
+    return Job(key, command, scratch / f"{key}.log", env=env, timeout_s=config.timeout_s)
+
+
+def _result(job: Job, code: int, name: str) -> tuple[tuple[Hull, ...] | None, str, float]:
+    """Return a job's hulls, or None and the reason, and the memory that it took, MiB."""
+    if code == LATE:
+        return None, f"coacd ran past {job.timeout_s:g} s on {name}", 0.0
     if code == CANNOT_WRITE:
-        raise OSError(errno.ENOSPC, "the decomposition's result cannot be written", str(scratch))
-    if code == 0:
-        with np.load(output, allow_pickle=False) as arrays:
-            hulls = tuple(Hull(arrays[f"v{i}"], arrays[f"f{i}"]) for i in range(int(arrays["count"])))
-        return hulls, "", peak_mib
-    log = output.with_suffix(".log").read_text(errors="replace").strip().splitlines()
-    return None, f"coacd failed on {name} (exit code {code}: {log[-1] if log else 'no message'})", peak_mib
+        raise OSError(errno.ENOSPC, "the decomposition's result cannot be written", str(job.log.parent))
+    if code:
+        _, *printed = job.log.read_text(errors="replace").strip().splitlines()
+        return None, f"coacd failed on {name} (exit code {code}: {(printed or ['no message'])[-1]})", 0.0
+    with np.load(job.log.with_suffix(".npz"), allow_pickle=False) as arrays:
+        hulls = tuple(Hull(arrays[f"v{i}"], arrays[f"f{i}"]) for i in range(int(arrays["count"])))
+        return hulls, "", float(arrays["peak_mib"])

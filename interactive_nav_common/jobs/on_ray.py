@@ -5,7 +5,7 @@ import os
 from typing import Any
 
 from interactive_nav_common.errors import ConfigError, missing, optional
-from interactive_nav_common.jobs.processes import LOST, Begun, Child, Job, Launcher
+from interactive_nav_common.jobs.processes import LOST, Child, Job, Launcher, Share
 
 
 class Worker(Child):
@@ -66,22 +66,23 @@ class RayLauncher(Launcher):
                 ) from None
         remote: Any = ray.remote
         self._worker = remote(max_concurrency=2, max_restarts=0)(Worker)
-        self._given = 0.0
-        """GPUs."""
 
-    def _begin(self, job: Job) -> Begun | None:
+    def take(self, job: Job) -> Share | None:
+        """Return the part of a GPU that a job gets, of the cluster's if it has any."""
         total = self._ray.cluster_resources()
-        cpus = total.get("CPU", 0.0) - sum(other.cpus for other, *_ in self._running)
+        cpus = total.get("CPU", 0.0) - sum(other.cpus for other, *_ in self.running)
+        gpus = total.get("GPU", 0.0) - sum(fraction for *_, (_, fraction) in self.running)
         fraction = job.gpus if total.get("GPU") else 0.0
-        if cpus < job.cpus or total.get("GPU", 0.0) - self._given < fraction - 1e-9:
-            return None
-        room = self._worker.options(num_cpus=job.cpus, num_gpus=fraction)
-        self._given += fraction
+        return None if cpus < job.cpus or gpus < fraction - 1e-9 else (None, fraction)
 
-        def give_back() -> None:
-            self._given -= fraction
+    def begin(self, job: Job, share: Share) -> Actor:
+        """Start an actor."""
+        room = self._worker.options(num_cpus=job.cpus, num_gpus=share[1])
+        return Actor(self._ray, room.remote(job, os.getcwd(), share[1]))
 
-        return Actor(self._ray, room.remote(job, os.getcwd(), fraction)), "ray", give_back
+    def start(self, job: Job) -> str | None:
+        """Start a job; which node runs it, the cluster decides."""
+        return super().start(job) and "ray"
 
     def close(self) -> None:
         """Leave the cluster."""

@@ -1,12 +1,14 @@
 """Run commands as processes that end with whoever started them, and on request; return their exit codes."""
 
+import contextlib
 import dataclasses
+import math
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,18 @@ LOCKED = -1000
 """In place of an exit code: somebody else holds one of the locks."""
 LOST = -1001
 """In place of an exit code: the node that it ran on, or its worker there, is gone."""
+LATE = -1002
+"""In place of an exit code: it ran past its time limit and was killed."""
+POLL_S = 0.05
+Share = tuple[str | None, float]
+"""Part of a machine for one job: a GPU's name, if it has any, and a fraction of its memory or of the cores."""
+
+
+def our_env() -> dict[str, str]:
+    """Return the environment of a child that runs our programs: the same code as here, from whatever folder."""
+    ours = str(Path(__file__).resolve().parents[2])
+    paths = [ours, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    return {"PYTHONPATH": os.pathsep.join(dict.fromkeys(paths)), "PYTHONUNBUFFERED": "1"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,14 +50,15 @@ class Job:
     log: Path
     """What it prints is added there."""
     locks: tuple[Path, ...] = ()
-    env: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    env: Mapping[str, str] = dataclasses.field(default_factory=our_env)
+    timeout_s: float = math.inf
     cpus: float = 1.0
     """Cores, of a cluster's."""
     gpus: float = 0.0
     """GPUs, of a cluster's that has any."""
 
     def env_on(self, gpu: str | None, part: float) -> Mapping[str, str]:
-        """Return more environment for a node of a cluster, with this part of its GPU of this name."""
+        """Return more environment, to keep to a share of a machine."""
         return {}
 
 
@@ -52,34 +67,38 @@ class Child:
 
     def __init__(self, job: Job, env: Mapping[str, str]):
         self._process: subprocess.Popen[bytes] | None = None
-        held = []
-        for path in job.locks:
-            descriptor = take_lock(path)
-            if descriptor is None:
-                break
-            held.append(descriptor)
-        try:
-            if len(held) < len(job.locks):
-                return
-            with open(job.log, "ab") as log:
-                log.write(f"== {time.strftime('%Y-%m-%d %H:%M:%S')} {job.name}\n".encode())
-                log.flush()
-                self._process = subprocess.Popen(
-                    [sys.executable, "-c", GUARD, *job.command],
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
-                    stderr=subprocess.STDOUT,
-                    env={**os.environ, **job.env, **env},
-                    pass_fds=held,
-                    start_new_session=True,  # Ctrl-C is for us: the child gets it once, as SIGTERM
-                )
-        finally:
-            for descriptor in held:
-                os.close(descriptor)
+        self._until = time.monotonic() + job.timeout_s
+        held: list[int] = []
+        with contextlib.ExitStack() as here:
+            for path in job.locks:
+                descriptor = take_lock(path)
+                if descriptor is None:
+                    return
+                here.callback(os.close, descriptor)
+                held.append(descriptor)
+            log = here.enter_context(open(job.log, "ab"))
+            log.write(f"== {time.strftime('%Y-%m-%d %H:%M:%S')} {job.name}\n".encode())
+            log.flush()
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", GUARD, *job.command],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, **job.env, **env},
+                pass_fds=held,
+                start_new_session=True,  # Ctrl-C is for us: the child gets it once, as SIGTERM
+            )
 
     def poll(self) -> int | None:
-        """Return the exit code, `LOCKED`, or None while it runs."""
-        return LOCKED if self._process is None else self._process.poll()
+        """Return the exit code, `LOCKED`, `LATE`, or None while it runs."""
+        if self._process is None:
+            return LOCKED
+        code = self._process.poll()
+        if code is None and time.monotonic() > self._until:
+            self.kill()
+            self._process.wait()
+            return LATE
+        return code
 
     def wait(self) -> int:
         """Wait until it has ended; return what `poll` does."""
@@ -101,61 +120,52 @@ class Child:
                 self._process.send_signal(number)
 
 
-Begun = tuple[Any, str, Callable[[], None]]
-"""A job's process, where it runs in a few words, and what to do when it has ended."""
-
-
 class Launcher:
     """Where jobs run."""
 
     def __init__(self) -> None:
-        self._running: list[tuple[Job, Any, Callable[[], None]]] = []
-        """Job, its process (a `Child`, or what has its `poll`, `stop` and `kill`), and what to do when it has ended."""
+        self.running: list[tuple[Any, Any, Share]] = []
+        """Job, its process (a `Child`, or what has its `poll`, `stop` and `kill`), and its share."""
 
-    def _begin(self, job: Job) -> Begun | None:
-        """Start a job; return None where there is no room now."""
+    def take(self, job: Any) -> Share | None:
+        """Return a share for a job, beside those that run; None where there is no room now."""
         raise NotImplementedError
+
+    def begin(self, job: Job, share: Share) -> Any:
+        """Start the process of a job in its share."""
+        return Child(job, job.env_on(*share))
 
     def start(self, job: Job) -> str | None:
         """Start a job; return where in a few words, or None where there is no room now."""
-        begun = self._begin(job)
-        if begun is None:
+        share = self.take(job)
+        if share is None:
             return None
-        process, where, give_back = begun
-        self._running.append((job, process, give_back))
-        return where
+        self.running.append((job, self.begin(job, share), share))
+        return "cpu" if share[0] is None else f"gpu {share[0]}"
 
     def ended(self) -> list[tuple[Any, int]]:
         """Return the jobs that have ended since the last call, with their exit codes (`LOCKED`: not started)."""
-        over, still = [], []
-        for running in self._running:
-            job, process, give_back = running
-            code = process.poll()
-            if code is None:
-                still.append(running)
-            else:
-                give_back()
-                over.append((job, code))
-        self._running = still
-        return over
+        polled = [(one, one[1].poll()) for one in self.running]
+        self.running = [one for one, code in polled if code is None]
+        return [(job, code) for (job, *_), code in polled if code is not None]
 
     def stop(self) -> None:
         """Ask every job to save and end."""
-        for _, process, _ in self._running:
+        for _, process, _ in self.running:
             process.stop()
 
     def kill(self) -> None:
         """End every job."""
-        for _, process, _ in self._running:
+        for _, process, _ in self.running:
             process.kill()
 
     def end(self, grace_s: float) -> None:
-        """Stop what still runs, kills it after `grace_s`, and closes."""
+        """Stop what still runs, kill it after `grace_s`, and close."""
         self.stop()
         deadline = time.monotonic() + grace_s
-        while self._running and time.monotonic() < deadline:
+        while self.running and time.monotonic() < deadline:
             self.ended()
-            time.sleep(0.05)
+            time.sleep(POLL_S)
         self.kill()
         self.close()
 
@@ -170,5 +180,23 @@ class LocalLauncher(Launcher):
         super().__init__()
         self._side_by_side = side_by_side
 
-    def _begin(self, job: Job) -> Begun | None:
-        return (Child(job, {}), "here", lambda: None) if len(self._running) < self._side_by_side else None
+    def take(self, job: Any) -> Share | None:
+        """Return an equal part of the cores."""
+        return (None, 1.0 / self._side_by_side) if len(self.running) < self._side_by_side else None
+
+
+def run_jobs(launcher: Launcher, jobs: Iterable[Job], grace_s: float) -> Generator[tuple[Job, int], None, None]:
+    """Run jobs where there is room; yield each, with its exit code, as it ends: one that fails stops no other.
+
+    A job is drawn from `jobs` once the one before has room. Closed early, by a signal or an error, it ends what runs.
+    """
+    left = iter(jobs)
+    job = next(left, None)
+    try:
+        while job or launcher.running:
+            while job and launcher.start(job):
+                job = next(left, None)
+            yield from launcher.ended()
+            time.sleep(POLL_S)
+    finally:
+        launcher.end(grace_s)

@@ -64,12 +64,12 @@ def test_an_open_non_manifold_model_with_dead_faces_converts(gibson_raw, tmp_pat
 
 
 def test_coacd_failing_on_one_object(gibson_raw, tmp_path, monkeypatch):
-    run = decompose._run
+    job_of = decompose._job
 
     def crash(key, name, vertices, faces, *others):
-        return run(key, name, vertices, faces + 10**6 * (name == "table-a"), *others)
+        return job_of(key, name, vertices, faces + 10**6 * (name == "table-a"), *others)
 
-    monkeypatch.setattr(decompose, "_run", crash)
+    monkeypatch.setattr(decompose, "_job", crash)
     convert(gibson_raw, tmp_path / "out", SMALL, cache=tmp_path / "cache")
     manifest = load_manifest(tmp_path / "out")
     assert manifest.collision["convex_hull_only"] == ["table-a"]

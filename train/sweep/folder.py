@@ -210,13 +210,6 @@ def log_tail(path: Path, count: int = 6) -> list[str]:
     return lines[begun + 1 :][-count:]
 
 
-def programs_env() -> dict[str, str]:
-    """Return the environment of a child that runs our programs: the same code as here, from whatever folder."""
-    ours = str(Path(__file__).resolve().parents[2])
-    paths = [ours, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    return {"PYTHONPATH": os.pathsep.join(dict.fromkeys(paths)), "PYTHONUNBUFFERED": "1"}
-
-
 def words_of_evaluation(folder: SweepFolder, runs: list[str], program: tuple[str, ...]) -> list[str]:
     """Return the command that evaluates runs of one environment."""
     wanted = folder.sweep.config.evaluate

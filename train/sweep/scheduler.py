@@ -11,13 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from interactive_nav_common.config import replace
-from interactive_nav_common.jobs.processes import LOCKED, LOST, Begun, Child, Job, Launcher
+from interactive_nav_common.jobs.processes import LOCKED, LOST, Job, Launcher, LocalLauncher, Share
 from train.sweep.folder import (
     RunState,
     SweepDisplay,
     SweepFolder,
     log_tail,
-    programs_env,
     words_of_evaluation,
 )
 from train.sweep.spec import LaunchConfig
@@ -51,10 +50,6 @@ class Gpu:
     memory_gb: float
 
 
-Share = tuple[str | None, float]
-"""Part of a machine for one run: a GPU's name, if it has any, and a fraction of its memory or of the cores."""
-
-
 def find_gpus() -> list[Gpu]:
     """Return the NVIDIA GPUs that this process may use."""
     return parse_gpus(gpu_listing("index,uuid,memory.total"), os.environ.get("CUDA_VISIBLE_DEVICES"))
@@ -83,40 +78,24 @@ def parse_gpus(listing: str, visible: str | None) -> list[Gpu]:
     return [gpus[name] for name in names if name in gpus]
 
 
-class Machine(Launcher):
+class Machine(LocalLauncher):
     """Processes on this machine, each with its share of a GPU or of the cores."""
 
     def __init__(self, gpus: list[Gpu], slots: int):
-        super().__init__()
-        self._gpus, self._slots = gpus, slots
-        self._shares: list[Share] = []
+        super().__init__(slots)
+        self._gpus = gpus
 
-    def take(self, launch: LaunchConfig, factor: float = 1.0) -> Share | None:
-        """Take a share for a run; None where there is no room."""
-        share, room = (None, 1.0 / self._slots), self._slots > len(self._shares)
-        if self._gpus:
-            free = {gpu: 1.0 - sum(part for name, part in self._shares if name == gpu.name) for gpu in self._gpus}
-            gpu, runs = max(free, key=lambda g: free[g]), launch.runs_per_gpu
-            if launch.gpu_memory_gb:
-                runs = max(1, min(runs, int(USABLE * gpu.memory_gb / launch.gpu_memory_gb)))
-            share = gpu.name, min(1.0, factor * (1.0 / runs))
-            room = share[1] <= free[gpu] + 1e-9
-        if not room:
-            return None
-        self._shares.append(share)
-        return share
-
-    def give_back(self, share: Share) -> None:
-        """Free the share of a run that is over."""
-        self._shares.remove(share)
-
-    def _begin(self, job: Job) -> Begun | None:
-        assert isinstance(job, RunJob)
-        share = self.take(job.launch, job.factor)
-        if share is None:
-            return None
-        where = "cpu" if share[0] is None else f"gpu {share[0]}"
-        return Child(job, job.env_on(*share)), where, lambda: self.give_back(share)
+    def take(self, job: "RunJob") -> Share | None:
+        """Return a share of the emptiest GPU, or of the cores where there is none."""
+        if not self._gpus:
+            return super().take(job)
+        taken = [share for *_, share in self.running]
+        free = {gpu: 1.0 - sum(part for name, part in taken if name == gpu.name) for gpu in self._gpus}
+        gpu, runs = max(free, key=lambda g: free[g]), job.launch.runs_per_gpu
+        if job.launch.gpu_memory_gb:
+            runs = max(1, min(runs, int(USABLE * gpu.memory_gb / job.launch.gpu_memory_gb)))
+        part = min(1.0, job.factor * (1.0 / runs))
+        return (gpu.name, part) if part <= free[gpu] + 1e-9 else None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -287,7 +266,6 @@ class Scheduler:
             command=tuple(command),
             log=log,
             locks=tuple(self._folder.lock(name) for name in names),
-            env=programs_env(),
             launch=launch,
             factor=factor,
             cpus=launch.cpus_per_run,

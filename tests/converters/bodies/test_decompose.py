@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import types
 
 import joblib
 import numpy as np
@@ -54,7 +53,7 @@ def test_the_cache_is_used_and_a_damaged_entry_is_made_again(tmp_path, hull_cach
     def no_process(*args, **kwargs):
         raise AssertionError("a cached mesh must not be decomposed")
 
-    monkeypatch.setattr(decompose, "_run", no_process)
+    monkeypatch.setattr(decompose, "_job", no_process)
     there = decompose_all({"a": (vertices, faces), "b": (vertices, faces)}, CONFIG, 1, tmp_path)
     cached = there.hulls
     assert there.worker_mib == 0
@@ -84,12 +83,12 @@ def test_a_failing_and_a_slow_model_get_their_convex_hull(tmp_path):
 
 
 def test_a_crash_of_coacd_gets_the_convex_hull(tmp_path, monkeypatch):
-    run = decompose._run
+    job_of = decompose._job
 
     def crash(key, name, vertices, faces, *others):
-        return run(key, name, vertices, faces + 10**6 * (name == "broken"), *others)
+        return job_of(key, name, vertices, faces + 10**6 * (name == "broken"), *others)
 
-    monkeypatch.setattr(decompose, "_run", crash)  # faces of vertices that are not there
+    monkeypatch.setattr(decompose, "_job", crash)  # faces of vertices that are not there
     done = decompose_all({"broken": table(), "copy": table()}, CONFIG, 1, tmp_path)
     assert (
         list(done.fallbacks) == ["broken", "copy"] and "coacd failed on broken (exit code" in done.fallbacks["broken"]
@@ -104,8 +103,9 @@ def test_strictly_a_slow_model_is_an_error(tmp_path):
 
 
 def test_a_full_disk_is_no_fault_of_the_model(tmp_path, monkeypatch):
-    ended = types.SimpleNamespace(pid=1, returncode=decompose.CANNOT_WRITE, poll=lambda: decompose.CANNOT_WRITE)
-    monkeypatch.setattr(decompose.subprocess, "Popen", lambda *_, **__: ended)
+    (tmp_path / "full.py").write_text(f"raise SystemExit({decompose.CANNOT_WRITE})")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(decompose, "WORKER", "full")
     with pytest.raises(OSError, match="cannot be written"):
         decompose_all({"table": table()}, CONFIG, 1, tmp_path)
 

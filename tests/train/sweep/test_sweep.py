@@ -396,21 +396,27 @@ def test_shares_of_a_machine(tmp_path):
     assert [g.name for g in parse_gpus(listing, "GPU-bb,GPU-aa")] == ["GPU-bb", "GPU-aa"]
     assert parse_gpus(listing, "") == []
     launch = LaunchConfig(runs_per_gpu=4, gpu_memory_gb=60.0, jax_memory_share=0.5)
+    job = RunJob("job", (), tmp_path / "log", kind="train", runs=(), launch=launch)
+
+    def taken(machine: Machine):
+        if (share := machine.take(job)) is not None:
+            machine.running.append((job, None, share))
+        return share
+
     machine = Machine(gpus, 1)
-    shares = [machine.take(launch) for _ in range(5)]
+    shares = [taken(machine) for _ in range(5)]
     # 0.95 * 150.75 GB hold two runs of 60 GB, not four; the emptier GPU comes first.
     assert [share[0] if share else None for share in shares] == ["0", "1", "0", "1", None]
     assert shares[0] is not None
-    assert RunJob("job", (), tmp_path / "log", kind="train", runs=(), launch=launch).env_on(*shares[0]) == {
+    assert job.env_on(*shares[0]) == {
         "CUDA_DEVICE_ORDER": "PCI_BUS_ID",
         "CUDA_VISIBLE_DEVICES": "0",
         "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.237",
     }
-    machine.give_back(shares[0])
-    assert machine.take(launch) is not None and machine.take(launch) is None
+    del machine.running[0]
+    assert taken(machine) == shares[0] and taken(machine) is None
     cpu = Machine([], 2)
-    first = cpu.take(launch)
-    assert first is not None and first[0] is None and cpu.take(launch) is not None and cpu.take(launch) is None
+    assert [taken(cpu) for _ in range(3)] == [(None, 0.5), (None, 0.5), None]
 
 
 def test_exit_codes():
