@@ -251,7 +251,7 @@ def _annotate(arguments: argparse.Namespace, console: Console) -> int:
     from converters.propose.proposals import propose_instances
     from converters.propose.retrieval import read_library
     from converters.read.source import read_source
-    from interactive_nav_common.locks import alone_in
+    from interactive_nav_common.files import alone_in
     from interactive_nav_common.untrusted.guard import guarded_server
 
     with alone_in(arguments.output):

@@ -1,12 +1,14 @@
-"""Write files and folders whole or not at all."""
+"""Lock files and folders, and write them whole or not at all."""
 
 import contextlib
 import errno
+import fcntl
 import json
 import os
 import re
 import secrets
 import shutil
+import socket
 import stat
 import time
 from collections.abc import Iterator, Mapping
@@ -18,7 +20,6 @@ import platformdirs
 from filelock import lock_descriptor
 
 from interactive_nav_common.errors import FileError, UserError, regular
-from interactive_nav_common.locks import is_locked, release, take_lock
 from interactive_nav_common.signals import signals_wait
 
 STALE_S = 1.0
@@ -53,6 +54,105 @@ def writing(place: object, remedy: str, what: str = "cannot be written") -> Iter
         yield
     except OSError as error:
         raise FileError(f"{place}: {what} ({error.strerror or error}); {remedy}") from None
+
+
+PATIENCE_S = 0.5
+"""How long a lock is tried for: whoever only looks (`is_locked`) holds it for an instant."""
+LOCK = ".lock"
+NO_LOCKS = "choose a folder on one that does", "its file system has no locks"
+
+
+def take_lock(path: Path) -> int | None:
+    """Hold a lock as long as the file descriptor that it returns is open, here or in a child.
+
+    The system frees it however its holder ends. A lock and not a process id in a file: ids are used again, and mean
+    nothing in another container. And a descriptor and not a `filelock.FileLock`, which opens no folders, and whose
+    release frees what a child has inherited.
+
+    Args:
+        path: of a folder that is there, or of a file, which is created and names its holder.
+
+    Returns:
+        The descriptor, or None where another holds the lock.
+    """
+    is_folder = path.is_dir()
+    with contextlib.ExitStack() as unless_held:
+        with writing(path, "expected a writable folder", "cannot be opened"):
+            descriptor = _open(path, os.O_RDONLY if is_folder else os.O_CREAT | os.O_RDWR)
+        unless_held.callback(os.close, descriptor)
+        until = time.monotonic() + PATIENCE_S
+        with writing(path, *NO_LOCKS):
+            while not lock_descriptor(descriptor, blocking=False):
+                if is_locked(path) or time.monotonic() > until:
+                    return None
+                time.sleep(0.02)
+        unless_held.pop_all()
+    if not is_folder:
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, f"{os.getpid()} {socket.gethostname()}\n".encode())
+    return descriptor
+
+
+def release(descriptor: int | None) -> None:
+    """Free a lock; None is none."""
+    if descriptor is not None:
+        os.close(descriptor)
+
+
+def is_locked(path: Path) -> bool:
+    """Return whether another process holds the lock; the check does not take it."""
+    with writing(path, "expected a writable folder", "cannot be opened"):
+        try:
+            descriptor = _open(path, os.O_RDONLY)
+        except (FileNotFoundError, NotADirectoryError):  # by now another may have created it
+            return False
+    try:  # filelock has no shared lock on a descriptor, and two that looked with exclusive ones would see each other
+        with writing(path, *NO_LOCKS), contextlib.suppress(BlockingIOError):
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            return False
+        return True
+    finally:
+        os.close(descriptor)
+
+
+def _open(path: Path, flags: int) -> int:
+    if path.exists():  # a link would let the lock's text replace what it leads to, a FIFO would block
+        regular(path)
+    return os.open(path, flags if path.is_dir() else flags | os.O_NOFOLLOW, 0o644)
+
+
+def holder(path: Path) -> str:
+    """Return who holds a lock file, as the file says: `process 123 on host`."""
+    with contextlib.suppress(OSError, ValueError):
+        pid, host = path.read_text().split()
+        return f"process {pid} on {host}"
+    return "another process"
+
+
+@contextlib.contextmanager
+def locked(path: Path, busy: str) -> Iterator[None]:
+    """Hold a lock file for the block.
+
+    Args:
+        path: of the lock file.
+        busy: what to say where it is held, with `{holder}` in it.
+    """
+    descriptor = take_lock(path)
+    if descriptor is None:
+        raise FileError(busy.replace("{holder}", holder(path)))  # a path in it may have braces
+    try:
+        yield
+    finally:
+        release(descriptor)
+
+
+@contextlib.contextmanager
+def alone_in(out: Path) -> Iterator[None]:
+    """Create a folder and keep other processes out of it for the block."""
+    with writing(out, "choose another one (-o)", "cannot create a folder there"):
+        out.mkdir(parents=True, exist_ok=True)
+    with locked(out / LOCK, f"{out}: {{holder}} works there; wait for it or choose another folder (-o)"):
+        yield
 
 
 @contextlib.contextmanager

@@ -199,7 +199,7 @@ def with_annotations(raw: RawScene, path: Path, library_root: Path | None) -> Ra
 
 
 class Store:
-    """The folder of one session. Nobody else may write there meanwhile (`interactive_nav_common.locks.alone_in`)."""
+    """The folder of one session. Nobody else may write there meanwhile (`interactive_nav_common.files.alone_in`)."""
 
     def __init__(self, folder: Path, library: Mapping[str, CadModel]) -> None:
         """Open a folder, with the models that annotations may name."""

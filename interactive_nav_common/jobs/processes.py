@@ -12,7 +12,7 @@ from collections.abc import Generator, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from interactive_nav_common.locks import take_lock
+from interactive_nav_common.files import take_lock
 
 # The child gets SIGTERM (it saves and ends) when its parent dies, however that happens: a run that nobody watches
 # would be in the way of the same command given again. Linux only; elsewhere the lock alone guards.

@@ -13,9 +13,8 @@ import numpy as np
 import yaml
 
 from interactive_nav_common.errors import FileError, readable
-from interactive_nav_common.files import append_text, whole_file, write_json, write_text, writing
+from interactive_nav_common.files import alone_in, append_text, whole_file, write_json, write_text, writing
 from interactive_nav_common.jobs.progress import Host, Stopped
-from interactive_nav_common.locks import alone_in
 from interactive_nav_common.records import METRICS, cut_metrics
 from interactive_nav_common.runs.weights import fitting
 from interactive_nav_common.untrusted.reading import Loader

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from interactive_nav_common.errors import FileError
-from interactive_nav_common.locks import holder, is_locked, locked, release, take_lock
+from interactive_nav_common.files import holder, is_locked, locked, release, take_lock
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
@@ -72,7 +72,7 @@ def test_a_lock_that_cannot_be_opened_is_told(tmp_path):
 def test_the_other_process_is_named_and_frees_it_by_ending(tmp_path):
     path = tmp_path / "lock"
     code = (
-        "import sys, pathlib; from interactive_nav_common.locks import take_lock; take_lock(pathlib.Path(sys.argv[1]))"
+        "import sys, pathlib; from interactive_nav_common.files import take_lock; take_lock(pathlib.Path(sys.argv[1]))"
     )
     code += "; print('held', flush=True); sys.stdin.read()"
     with subprocess.Popen(

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from interactive_nav_common.errors import FileError
-from interactive_nav_common.locks import alone_in, release, take_lock
+from interactive_nav_common.files import alone_in, release, take_lock
 from interactive_nav_common.runs.folder import claimed
 from topological_nav.__main__ import main
 from topological_nav.drives.dataset import draw_drives

@@ -20,9 +20,8 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.scene import Scene
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import FileError, readable
-from interactive_nav_common.files import whole_file, write_json
+from interactive_nav_common.files import alone_in, whole_file, write_json
 from interactive_nav_common.jobs.progress import Progress
-from interactive_nav_common.locks import alone_in
 from interactive_nav_common.runs.folder import refuse_changes
 from interactive_nav_common.untrusted.reading import read_npz
 from interactive_nav_common.versions import usable_cores

@@ -23,9 +23,8 @@ from interactive_nav import get_robot, load_scene
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.task.rollout import Player
 from interactive_nav_common.errors import ConfigError, FileError
-from interactive_nav_common.files import write_arrays
+from interactive_nav_common.files import alone_in, write_arrays
 from interactive_nav_common.jobs.progress import Progress
-from interactive_nav_common.locks import alone_in
 from interactive_nav_common.rotations import wrap_angle
 from scenes_mjcf.look import CameraPose
 from topological_nav.config import DataConfig, DriveConfig, MapConfig

@@ -20,8 +20,7 @@ from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import FAILURES
 from interactive_nav_common.config import flatten, replace
 from interactive_nav_common.errors import ConfigError, UserError
-from interactive_nav_common.files import write_json, writing
-from interactive_nav_common.locks import locked
+from interactive_nav_common.files import locked, write_json, writing
 from interactive_nav_common.records import mean_over_episodes
 from interactive_nav_common.runs.folder import GOES_ON, append_metrics, write_state
 from interactive_nav_common.signals import stop_signals

@@ -27,8 +27,7 @@ from rich.table import Table
 from rich.text import Text
 
 from interactive_nav_common.errors import FileError, regular
-from interactive_nav_common.files import remove_partial, write_text
-from interactive_nav_common.locks import is_locked
+from interactive_nav_common.files import is_locked, remove_partial, write_text
 from interactive_nav_common.records import RUNS
 from interactive_nav_common.rows import read_notes
 from train.config_io import to_yaml

@@ -16,7 +16,7 @@ from interactive_nav.scenes.objects import load_object
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.config import read_words
 from interactive_nav_common.errors import ConfigError, FileError, UserError, readable
-from interactive_nav_common.locks import is_locked, locked
+from interactive_nav_common.files import is_locked, locked
 from interactive_nav_common.records import Reader, read_metrics
 from interactive_nav_common.rows import read_rows
 from interactive_nav_common.runs.weights import read_weights

@@ -22,8 +22,7 @@ from rich.console import Console
 
 from interactive_nav_common import versions
 from interactive_nav_common.errors import ConfigError, FileError
-from interactive_nav_common.files import write_json
-from interactive_nav_common.locks import release, take_lock
+from interactive_nav_common.files import release, take_lock, write_json
 from interactive_nav_common.records import mean_over_episodes, read_metrics
 from tests.train.toy_env import ToyConfig, ToyEnv
 from tests.train.toy_run import UPDATE_STEPS, build_toy, toy_config

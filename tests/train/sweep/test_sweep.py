@@ -18,8 +18,8 @@ import pytest
 import yaml
 from rich.console import Console
 
+from interactive_nav_common.files import is_locked, take_lock
 from interactive_nav_common.jobs import processes as jobs
-from interactive_nav_common.locks import is_locked, take_lock
 from train.sweep import spec
 from train.sweep.__main__ import main
 from train.sweep.folder import RunState, SweepDisplay, SweepFolder, last_line, totals
