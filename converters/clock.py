@@ -28,7 +28,7 @@ def peak_memory_mib(pid: int | str = "self") -> float:
 
 
 class Clock:
-    """Times the stages and turns their shares into one progress number."""
+    """Time the stages and turn their shares into one progress number."""
 
     def __init__(self, report: Report) -> None:
         self.report = report

@@ -45,8 +45,7 @@ def interrupts_heard(*also: int, at_once: bool = True) -> Iterator[None]:
         if at_once or len(_came) > 1:
             raise _came[-1]
 
-    mine = threading.current_thread() is threading.main_thread()
-    usual = {n: signal.getsignal(n) for n in STOPS if mine}
+    usual = {n: signal.getsignal(n) for n in STOPS}
     ours, others = (signal.default_int_handler, signal.SIG_DFL), (signal.SIG_IGN, None)
     chosen = [n for n, h in usual.items() if h in ours or n in also and h not in others]
     try:
@@ -58,6 +57,8 @@ def interrupts_heard(*also: int, at_once: bool = True) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _handled(handlers: dict[int, Any]) -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        handlers = {}  # Python sets handlers, and runs them, in the main thread only
     usual = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         yield
@@ -94,9 +95,6 @@ def signals_wait() -> Iterator[None]:
 
     By handlers and not by a mask, which would hold for this thread only: libraries run others.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield  # Python runs handlers in the main thread only
-        return
     with stop_signals(second_ends=False) as came:
         yield
     for number in came[:1]:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.physics import compiler_options
-from interactive_nav_common.signals import signals_wait
+from interactive_nav_common.signals import raise_stop, signals_wait
 
 CHUNK_STEPS = 50
 """Control steps in one call of the compiled program."""
@@ -262,6 +262,7 @@ class Player:
         """Play a chunk as `_play_chunk`, with a policy on the host."""
         tracks = []
         for t in range(CHUNK_STEPS):
+            raise_stop()  # a policy on the host may take its time
             running = ~np.asarray(carry[1])
             if not running.any():
                 break

@@ -17,7 +17,7 @@ from interactive_nav_common.signals import raise_stop
 
 
 class SafeConsole(Console):
-    """Prints names as they are written: they may hold neither markup nor control characters that have an effect."""
+    """Print names as they are written: they may hold neither markup nor control characters that have an effect."""
 
     def render_str(self, text: str, **how: Any) -> Text:
         """Render text that is printed, or that stands in a table."""

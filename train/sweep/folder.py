@@ -205,8 +205,8 @@ def last_line(path: Path) -> dict[str, Any]:
 def log_tail(path: Path, count: int = 6) -> list[str]:
     """Return the last lines of a log that are not blank, of its last try: a line of `== time name` begins each."""
     lines = [line.rstrip() for line in _tail(path) if line.strip()]
-    begun = max((i for i, line in enumerate(lines) if re.match(r"== \d{4}-\d\d-\d\d ", line)), default=-1)
-    return lines[begun + 1 :][-count:]
+    start = max((i for i, line in enumerate(lines) if re.match(r"== \d{4}-\d\d-\d\d ", line)), default=-1)
+    return lines[start + 1 :][-count:]
 
 
 def words_of_evaluation(folder: SweepFolder, runs: list[str], program: tuple[str, ...]) -> list[str]:

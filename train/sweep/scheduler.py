@@ -26,7 +26,7 @@ POLL_S = 0.5
 EVALUATED_TOGETHER = 8
 """Runs of one environment that a process evaluates one after the other: it compiles once."""
 LAST_START_S = 60.0
-"""So shortly before the time limit (or its last tenth, if that is less) nothing is begun."""
+"""So shortly before the time limit (or its last tenth, if that is less) nothing is started."""
 ELSEWHERE_S = 10.0
 """Between two looks whether a run that somebody else works on is free."""
 REFUSED = 2
@@ -146,7 +146,7 @@ class Outcome:
 
 
 class Scheduler:
-    """Decides what runs next."""
+    """Decide what runs next."""
 
     def __init__(
         self,
@@ -179,7 +179,6 @@ class Scheduler:
         """
         began, deadline, killed = self._clock(), None, False
         timed_out = False
-        states = self._states()
         while True:
             for job, code in self._launcher.ended():
                 self._over(job, code)
@@ -199,20 +198,18 @@ class Scheduler:
                 killed = True
                 self._display.event("not waiting any longer: what they did since the last checkpoint is lost", "red")
                 self._launcher.kill()
-            states = self._states()
+            states = [self._folder.state(run) for run in self._runs.values()]
             late = time_limit_s is not None and time_limit_s - elapsed < min(LAST_START_S, 0.1 * time_limit_s)
             if not self._stopping and not late:
                 self._start(states)
             self._display.update(states, self._busy)
-            waiting = [] if self._stopping else self._waiting(states)
+            needed = (s.name for stage in STAGES for s in states if self._needs(stage, s))
+            waiting = set() if self._stopping else set(needed)
             elsewhere = {s.name for s in states if s.state == "running" and s.name in self._not_before}
-            if not self._busy and elsewhere >= set(waiting):
+            if not self._busy and elsewhere >= waiting:
                 break
             time.sleep(poll_s)
-        return Outcome(tuple(states), stops[0] if stops else None, timed_out, len(elsewhere.intersection(waiting)))
-
-    def _states(self) -> list[RunState]:
-        return [self._folder.state(run) for run in self._runs.values()]
+        return Outcome(tuple(states), stops[0] if stops else None, timed_out, len(elsewhere & waiting))
 
     def _needs(self, stage: str, state: RunState) -> bool:
         """Return whether a stage is to be run for a run as far as it is."""
@@ -222,9 +219,6 @@ class Scheduler:
             return not state.over
         far = state.over or (self._unfinished and state.env_steps > 0)
         return far and (state.name in self._redo or not self._folder.evaluated(self._runs[state.name]))
-
-    def _waiting(self, states: Sequence[RunState]) -> list[str]:
-        return [state.name for stage in STAGES for state in states if self._needs(stage, state)]
 
     def _free(self, stage: str, states: Sequence[RunState]) -> list[str]:
         """Return runs that need a stage and that nobody else works on, as far as is visible, started ones first."""
