@@ -23,7 +23,7 @@ from converters.clock import STAGES, peak_memory_mib
 from converters.pipeline import ConvertConfig, Converted, convert_building
 from converters.read.source import root_of
 from converters.records.errors import StageFailed
-from converters.sets import run_side_by_side
+from converters.sets import run_commands
 from interactive_nav_common.errors import ConfigError, FileError, UserError, readable
 from interactive_nav_common.files import check_name, write_text
 from interactive_nav_common.jobs.processes import Launcher
@@ -91,18 +91,19 @@ def convert_many(
             task = {"source": source, "target": into / name, "config": choices, "row": Path(folder, name)}
             commands[name] = [sys.executable, "-m", "converters.many", json.dumps(task, default=str)]
 
-        def ended(name: str, code: int, printed: str) -> str:
-            report_path = Path(folder, name)
-            killed = f"killed by signal {-code}" if code < -1 else f"exit code {code}, {printed[-200:].strip()}"
-            row = json.loads(report_path.read_text(encoding="utf-8")) if report_path.is_file() else {"error": killed}
-            scenes = (rows.get(name) or {}).get("scenes")  # of before: they still stand
-            rows[name] = {"scenes": scenes, "name": name, "source": str(named[name]), "exit_code": code, **row}
-            new = [Path(into, scene) for scene in row.get("scenes") or ()]
-            rows[name]["digest"] = digest_of(named[name], config, new) if new else digests[name]
-            write_parquet(pa.Table.from_pylist(list(rows.values()), SCHEMA), path)
-            return _line(rows[name])
-
-        return bad + run_side_by_side(commands, launcher, into, report, log, ended, "sources")
+        with contextlib.closing(run_commands(commands, launcher, into, report, "sources")) as results:
+            for name, code, printed in results:
+                row_path = Path(folder, name)
+                killed = f"killed by signal {-code}" if code < -1 else f"exit code {code}, {printed[-200:].strip()}"
+                row = json.loads(row_path.read_text(encoding="utf-8")) if row_path.is_file() else {"error": killed}
+                scenes = (rows.get(name) or {}).get("scenes")  # of before: they still stand
+                rows[name] = {"scenes": scenes, "name": name, "source": str(named[name]), "exit_code": code, **row}
+                new = [Path(into, scene) for scene in row.get("scenes") or ()]
+                rows[name]["digest"] = digest_of(named[name], config, new) if new else digests[name]
+                write_parquet(pa.Table.from_pylist(list(rows.values()), SCHEMA), path)
+                log(_line(rows[name]))
+                bad += [name] if code else []
+    return bad
 
 
 def _line(row: Mapping[str, Any]) -> str:

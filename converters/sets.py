@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 
 import yaml
@@ -123,15 +123,13 @@ def _last_line(name: str, code: int, printed: str) -> str:
     return lines[-1] if lines else f"{name}: exit code {code}, {printed.strip()[-200:]}"
 
 
-def run_side_by_side(
-    commands: Mapping[str, list[str]], launcher: Launcher, folder: Path, report: Report, log: Callable[[str], None],
-    ended: Callable[[str, int, str], str] = _last_line, what: str = "scenes",
-) -> list[str]:  # fmt: skip
-    """Run commands, several at a time; return the names of those that did not exit with 0.
+def run_commands(
+    commands: Mapping[str, list[str]], launcher: Launcher, folder: Path, report: Report, what: str
+) -> Generator[tuple[str, int, str], None, None]:
+    """Run commands, several at a time; yield the name, exit code and output of each as it ends.
 
-    A signal or an error ends what runs.
+    Closed early, by a signal or an error, it ends what runs.
     """
-    failed: list[str] = []
     folder.mkdir(parents=True, exist_ok=True)
     report(f"0/{len(commands)} {what}", 0.0)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".jobs-") as logs:
@@ -139,10 +137,8 @@ def run_side_by_side(
         with contextlib.closing(run_jobs(launcher, jobs, GRACE_S)) as results:
             for done, (job, code) in enumerate(results, 1):
                 printed = job.log.read_text(errors="replace").partition("\n")[2] if code != LOST else "lost"
-                log(ended(job.name, -1 if code == LOST else code, printed))
-                failed += [job.name] if code else []
+                yield job.name, -1 if code == LOST else code, printed
                 report(f"{done}/{len(commands)} {what}", done / len(commands))
-    return failed
 
 
 def generate_scenes(wanted: Wanted, report: Report, log: Callable[[str], None]) -> list[str]:
@@ -156,7 +152,11 @@ def generate_scenes(wanted: Wanted, report: Report, log: Callable[[str], None]) 
         launcher, _ = make_launcher(wanted.launcher, wanted.ray_address, wanted.jobs, len(todo))
         words = [sys.executable, "-m", "converters", "generate-scenes", str(wanted.out), "--recipes", str(path)]
         words += ["--jobs", "1", *(["--overwrite"] if wanted.overwrite else []), "--only"]
-        failed = run_side_by_side({r.name: [*words, r.name] for r in todo}, launcher, wanted.out, report, log)
+        commands, failed = {r.name: [*words, r.name] for r in todo}, []
+        with contextlib.closing(run_commands(commands, launcher, wanted.out, report, "scenes")) as results:
+            for name, code, printed in results:
+                log(_last_line(name, code, printed))
+                failed += [name] if code else []
     else:
         gates = make_scenes(todo, recipes.conversion, wanted.out, wanted.overwrite, wanted.jobs, report, log)
         failed = [name for name, failing in gates.items() if failing]
