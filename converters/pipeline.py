@@ -29,13 +29,20 @@ from converters.read.surfaces import split_storeys
 from converters.records.cache import NOT_HASHED, StageCache
 from converters.records.errors import SceneRejected
 from converters.records.limits import Gate
-from converters.records.raw import ATTRIBUTION, CATEGORY_LABELS, RawScene, at_origin
-from converters.records.visual import TexturedMesh, VisualMesh, joined_clouds
+from converters.records.raw import (
+    ATTRIBUTION,
+    CATEGORY_LABELS,
+    RawScene,
+    TexturedMesh,
+    VisualMesh,
+    at_origin,
+    joined_clouds,
+)
 from converters.structure.cut import CutResult, cut_furniture
 from converters.structure.fill import fill_holes, wall_planes
 from converters.structure.floor import LIFT_M, level_floor
-from converters.structure.maps import FloorPlan, main_direction, make_floor_plan, resample
-from converters.structure.walls import wall_boxes
+from converters.structure.maps import FloorPlan, make_floor_plan, resample
+from converters.structure.walls import main_direction, wall_boxes
 from converters.write.emit import SceneParts, write_scene
 from converters.write.manifest import make_manifest, scene_objects
 from converters.write.texture import Drawn, as_it_is, bake_structure, colour_cloud, draw_objects
@@ -119,7 +126,7 @@ def _structure_visual(
         return small
     kept = np.flatnonzero(keep)
     level = level_floor(vertices_w, raw.scan.faces, raw.scan.labels)
-    cloud = colour_cloud(raw.scan, level, raw.scan.faces, kept)
+    cloud = colour_cloud(raw.scan, level, kept)
     if raw.picture:
         drawn, faces = simplify_parts(raw.picture, config.structure_faces)
         drawn = drawn + (vertices_w[0] - raw.scan.vertices[0]) + lift
@@ -142,9 +149,7 @@ def _object_visuals(
         models.setdefault((placed.cad_id, placed.vertices_b.tobytes()), []).append(k)
     # A modelled structure shows nothing of what stands in it.
     shown = np.full_like(owner, -1) if raw.picture else owner
-    clouds = [
-        colour_cloud(raw.scan, vertices_w, raw.scan.faces, np.flatnonzero(shown == k)) for k in range(len(annotated))
-    ]
+    clouds = [colour_cloud(raw.scan, vertices_w, np.flatnonzero(shown == k)) for k in range(len(annotated))]
     groups = [([annotated[k] for k in of], [clouds[k] for k in of]) for of in models.values()]
     draw = functools.partial(draw_objects, most_faces=config.object_faces, size=config.object_texture)
     if config.jobs < 2 or len(groups) < PARALLEL_OBJECTS:
@@ -178,28 +183,6 @@ class Placed:
     maps: SceneMaps
     settled: Settled
 
-    def held_built_in(self) -> RawScene:
-        """Return the source with what settling could not part from its surroundings as structure."""
-        called = {o.name: o.cad_id for o in self.annotated}
-        held = self.settled.held
-        return built_in(self.raw, {k: called.get(held[k], "a wall, or what is built in") for k in held})
-
-
-def _decompose(raw: RawScene, config: ConvertConfig, cache: Path, progress: Callable[[float], None]) -> Decomposition:
-    """Return the hulls of every model: the convex pieces that it came with, else coacd's."""
-    bare = {k: c for k, c in sorted(raw.cads.items()) if c.pieces is None}
-    decomposed = decompose_all(
-        {k: (c.vertices, c.faces) for k, c in bare.items()},
-        config.search,
-        config.jobs,
-        cache,
-        progress,
-        {k: DOOR_OVERRIDES for k, c in bare.items() if c.category == "door"},
-        config.strict,
-    )
-    given = {k: tuple(Hull(*p) for p in c.pieces) for k, c in raw.cads.items() if c.pieces is not None}
-    return dataclasses.replace(decomposed, hulls=decomposed.hulls | given)
-
 
 def _place(raw: RawScene, config: ConvertConfig, clock: Clock, stages: StageCache, cache: Path) -> Placed:
     """Run the stages from `align` to `settle`."""
@@ -210,7 +193,13 @@ def _place(raw: RawScene, config: ConvertConfig, clock: Clock, stages: StageCach
         vertices_w = raw.scan.vertices - [0.0, 0.0, floor_m]
         yaw = main_direction(vertices_w, raw.scan.faces, raw.scan.labels)
     with clock.stage("decompose") as progress:
-        decomposed = _decompose(raw, config, cache, progress)
+        # The hulls of every model: the convex pieces that it came with, else coacd's.
+        bare = {k: c for k, c in sorted(raw.cads.items()) if c.pieces is None}
+        doors = {k: DOOR_OVERRIDES for k, c in bare.items() if c.category == "door"}
+        meshes = {k: (c.vertices, c.faces) for k, c in bare.items()}
+        decomposed = decompose_all(meshes, config.search, config.jobs, cache, progress, doors, config.strict)
+        given = {k: tuple(Hull(*p) for p in c.pieces) for k, c in raw.cads.items() if c.pieces is not None}
+        decomposed = dataclasses.replace(decomposed, hulls=decomposed.hulls | given)
         annotated = tuple(
             place_object(name, a, raw.cads[a.cad_id], decomposed.hulls[a.cad_id], pose, floor_m, yaw)
             for name, a, pose in zip(name_objects(raw.annotations), raw.annotations, poses, strict=True)
@@ -237,33 +226,6 @@ def _place(raw: RawScene, config: ConvertConfig, clock: Clock, stages: StageCach
     return Placed(raw, floor_m, vertices_w, rows, decomposed, annotated, cut, plan, maps, settled)
 
 
-def _write(placed: Placed, structure: VisualMesh, drawn: list[Drawn], folder: Path) -> SceneParts:
-    """Write the model and the maps of a floor; return what the model consists of."""
-    down = np.array([0.0, 0.0, placed.floor_m])
-    parts = dataclasses.replace(
-        placed.settled.parts,
-        structure_visual=structure,
-        object_visuals=tuple(one.mesh for one in drawn),
-        lamps=tuple(dataclasses.replace(p, at=p.at - down) for p in placed.raw.lamps),
-        windows=tuple(dataclasses.replace(w, middle=w.middle - down) for w in placed.raw.windows),
-    )
-    write_scene(parts, folder)
-    save_maps(placed.maps, folder)
-    return parts
-
-
-def _object_rows(placed: Placed, drawn: list[Drawn]) -> list[dict[str, Any]]:
-    """Return each object's row with how it settled, how much of it the scan showed and what is drawn of its surface."""
-    moves = zip(placed.settled.displacement_m, placed.settled.drop_m, strict=True)
-    rows = []
-    for row, (shift_m, drop_m), one, placed_object in zip(placed.rows, moves, drawn, placed.annotated, strict=True):
-        settled = {"settle_shift_m": shift_m, "settle_drop_m": drop_m, "texture_seen_share": round(one.shown_share, 3)}
-        shown = {"drawn_area_share": round(one.kept_share, 3), "drawn_off_m": round(one.off_m, 4)}
-        hinge = placed_object.hinge
-        rows.append(row | settled | shown | ({} if hinge is None else {"hinge_assumed": hinge.assumed}))
-    return rows
-
-
 def _judge(
     placed: Placed, parts: SceneParts, drawn: list[Drawn], config: ConvertConfig, folder: Path
 ) -> tuple[SceneManifest, tuple[Gate, ...]]:
@@ -274,7 +236,14 @@ def _judge(
         "scan_kept": kept_share(placed.vertices_w, faces, (structure.vertices, structure.faces)),
         "floor_open": plan.open_share,
     }
-    rows = _object_rows(placed, drawn)
+    # Of each object: how it settled, how much of it the scan showed and what is drawn of its surface.
+    moves = zip(placed.settled.displacement_m, placed.settled.drop_m, strict=True)
+    rows = []
+    for row, (shift_m, drop_m), one, placed_object in zip(placed.rows, moves, drawn, placed.annotated, strict=True):
+        settled = {"settle_shift_m": shift_m, "settle_drop_m": drop_m, "texture_seen_share": round(one.shown_share, 3)}
+        shown = {"drawn_area_share": round(one.kept_share, 3), "drawn_off_m": round(one.off_m, 4)}
+        hinge = placed_object.hinge
+        rows.append(row | settled | shown | ({} if hinge is None else {"hinge_assumed": hinge.assumed}))
     spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
     gates = evaluate(spec, placed.maps, scene_objects(parts), drawn_shares(rows), shares)
     area_m2, fallbacks = float(plan.traversable.sum()) * plan.grid.resolution_m**2, placed.decomposed.fallbacks
@@ -293,15 +262,25 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
     placed = _place(raw, config, clock, stages, cache)
     while placed.settled.held:
         # Structure that is new changes the map and the walls, and with them where everything else comes to rest.
-        config = dataclasses.replace(config, auto_align=False)
-        placed = _place(placed.held_built_in(), config, clock, stages, cache)
+        config, names = dataclasses.replace(config, auto_align=False), {o.name: o.cad_id for o in placed.annotated}
+        beside = {k: names.get(name, "a wall, or what is built in") for k, name in placed.settled.held.items()}
+        placed = _place(built_in(placed.raw, beside), config, clock, stages, cache)
     raw, vertices_w, cut = placed.raw, placed.vertices_w, placed.cut
     with clock.stage("texture") as progress:
         structure = stages.call(_structure_visual, raw, vertices_w, cut.keep, placed.plan, placed.annotated, config)
         progress(0.5)
         drawn = stages.call(_object_visuals, raw, vertices_w, cut.owner, placed.annotated, config)
     with clock.stage("write"):
-        parts = _write(placed, structure, drawn, folder)
+        down = np.array([0.0, 0.0, placed.floor_m])
+        parts = dataclasses.replace(
+            placed.settled.parts,
+            structure_visual=structure,
+            object_visuals=tuple(one.mesh for one in drawn),
+            lamps=tuple(dataclasses.replace(p, at=p.at - down) for p in placed.raw.lamps),
+            windows=tuple(dataclasses.replace(w, middle=w.middle - down) for w in placed.raw.windows),
+        )
+        write_scene(parts, folder)
+        save_maps(placed.maps, folder)
     with clock.stage("gates"):
         manifest, gates = _judge(placed, parts, drawn, config, folder)
     memory_mib = placed.decomposed.worker_mib

@@ -28,7 +28,7 @@ from converters.read.meshes import clean_surface, colours_of_faces, read_surface
 from converters.read.obj import TexturedMesh
 from converters.read.urdf import RigidObject, read_urdf
 from converters.records.errors import SceneRejected
-from converters.records.visual import VisualMesh
+from converters.records.raw import VisualMesh
 from converters.write.emit import SceneParts, build_spec, write_scene
 from converters.write.manifest import PACKAGES
 from converters.write.texture import as_it_is, bake_object, textured_cloud
@@ -70,16 +70,6 @@ def guess_category(*names: str) -> str | None:
     return max(((len(w), c.name) for c in TABLE for w in c.words if w in text), default=(0, None))[1]
 
 
-def _category(config: ObjectConfig, names: tuple[str, ...], source: SourceFolder) -> str:
-    category = config.category or guess_category(*names)
-    if category is None:
-        source.note(f"the name {names[0]} tells no category: it is 'other', unless --category says so")
-        return "other"
-    if category not in CATEGORIES:
-        raise SceneRejected(f"category is '{category}', expected one of {', '.join(CATEGORIES)}")
-    return category
-
-
 def read_object(path: Path, config: ObjectConfig) -> tuple[RigidObject, SourceFolder]:
     """Read a URDF or a mesh, in metres and z up."""
     source = SourceFolder(config.source or path.parent, config.strict)
@@ -109,15 +99,13 @@ def _level_feet(points: np.ndarray, foot_m: float) -> Hull:
 
 def _visual(surface: TexturedMesh, where: str, source: SourceFolder) -> VisualMesh:
     """Return the surface (body frame) as it is where it is small, else simplified with a new texture."""
-    vertices, faces, keep = merge_vertices(surface.vertices, surface.faces)
-    colours = colours_of_faces(surface)[keep]
-    vertices, faces, colours = clean_surface(source, where, vertices, faces, colours)
+    mesh = clean_surface(source, where, surface.vertices, surface.faces, colours_of_faces(surface))
     small = as_it_is(surface, FACES, TEXELS)
     if small is not None:
         return small
     # Points twice as dense as the texels of the picture.
-    cloud = textured_cloud(surface, max(float(np.ptp(vertices, axis=0).max()) / TEXELS, 1e-4))
-    return bake_object(vertices, faces, colours, cloud, simplify_to(vertices, faces, FACES), TEXELS)[0]
+    cloud = textured_cloud(surface, max(float(np.ptp(mesh[0], axis=0).max()) / TEXELS, 1e-4))
+    return bake_object(*mesh, cloud, simplify_to(*mesh[:2], FACES), TEXELS)[0]
 
 
 def convert_object(
@@ -139,7 +127,12 @@ def convert_object(
         raise SceneRejected(f"{path}: no such file; give a mesh (OBJ, PLY, STL, GLB, ...) or a URDF")
     with whole_folder(target, config.overwrite) as folder:
         item, source = read_object(path, config)
-        category = _category(config, (item.name, path.stem), source)
+        category = config.category or guess_category(item.name, path.stem)
+        if category is None:
+            source.note(f"the name {item.name} tells no category: it is 'other', unless --category says so")
+        elif category not in CATEGORIES:
+            raise SceneRejected(f"category is '{category}', expected one of {', '.join(CATEGORIES)}")
+        category = category or "other"
         for warning in source.warnings:
             warn(warning)
         low, high = item.surface.vertices.min(axis=0), item.surface.vertices.max(axis=0)

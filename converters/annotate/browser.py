@@ -21,8 +21,7 @@ from converters.check.pictures import camera_axes, mesh_picture
 from converters.propose.proposals import Proposal, bounds
 from converters.propose.report import floor_of
 from converters.propose.retrieval import retrieve
-from converters.read.meshes import textured_by_face
-from converters.read.obj import texels
+from converters.read.obj import texels, textured_by_face
 from converters.records.raw import CEILING, CadModel, RawScene, ScanMesh
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, yaw_matrix
@@ -148,11 +147,11 @@ class Page:
         self._image = gui.add_image(np.full((THUMBNAIL, SHOWN * THUMBNAIL, 3), 255, np.uint8))
         self._pick = gui.add_button_group("Model", [*map(str, range(1, SHOWN + 1)), "more"])
         self._fit = gui.add_markdown("")
-        for label, colour, action in (
-            ("Accept (A)", "green", Session.accepted), ("Skip (S)", "gray", Session.skipped),
-            ("Undo (U)", "gray", Session.undone),
-        ):  # fmt: skip
-            gui.add_button(label, color=colour).on_click(lambda _, action=action: self.do(action))
+        actions = {"Accept (A)": Session.accepted, "Skip (S)": Session.skipped, "Undo (U)": Session.undone}
+        for label, action in actions.items():
+            gui.add_button(label, color="green" if action is Session.accepted else "gray").on_click(
+                lambda _, action=action: self.do(action)
+            )
             gui.add_command(label, hotkey=label[-2]).on_trigger(lambda _, action=action: self.do(action))
         gui.add_button("Add an object", color="gray").on_click(lambda _: self._add())
         self._whole = gui.add_checkbox("Show the whole room", False)

@@ -14,14 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from converters.bodies.alignment import (
-    MIN_POINTS,
-    SYMMETRY_PERIOD_RAD,
-    Alignment,
-    AlignmentError,
-    apply_alignment,
-    solve_alignment,
-)
+from converters.bodies import alignment
 from converters.propose.proposals import Proposal, scan2cad_list, scan2cad_model
 from converters.propose.retrieval import read_library
 from converters.read.annotations import ANNOTATION, inside_scan, parse_annotations
@@ -68,9 +61,9 @@ class Item:
         """Return (pairs, 3) points of the model and of the scan."""
         return np.array(self.model[: self.pairs]), np.array(self.scan[: self.pairs])
 
-    def fit(self) -> Alignment:
+    def fit(self) -> alignment.Alignment:
         """Return the model's placement by the whole pairs, as `convert` would solve it."""
-        return solve_alignment(*self.points(), self.symmetry)
+        return alignment.solve_alignment(*self.points(), self.symmetry)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +85,7 @@ class Session:
     def item(self) -> Item:
         """Return the object that is worked on."""
         if not self.items:
-            raise AlignmentError("there is no object yet; add one first")
+            raise alignment.AlignmentError("there is no object yet; add one first")
         return self.items[self.at]
 
     def changed(self, **what: Any) -> Session:
@@ -115,7 +108,7 @@ class Session:
     def accepted(self) -> Session:
         """Accept the fit and go on to the next open object."""
         if not self.item.cad_id:
-            raise AlignmentError("no model is chosen; choose one, then click pairs")
+            raise alignment.AlignmentError("no model is chosen; choose one, then click pairs")
         self.item.fit()
         return self.changed(state="accepted").next_open()
 
@@ -173,7 +166,7 @@ def as_annotations(session: Session, library: Mapping[str, CadModel]) -> list[di
             continue
         cad, fit = library[item.cad_id], item.fit()
         of_model, of_scan = item.points()
-        pose, pairs = (fit.scale, fit.yaw, fit.translation), (apply_alignment(fit, of_model), of_scan)
+        pose, pairs = (fit.scale, fit.yaw, fit.translation), (alignment.apply_alignment(fit, of_model), of_scan)
         models.append(scan2cad_model(item.category, item.cad_id, pose, cad.vertices, item.symmetry, pairs))
     return scan2cad_list(session.scan_id, models)
 
@@ -233,7 +226,7 @@ class Store:
                 "choose another folder (-o), or give the scan that it was begun with"
             )
         for k, item in enumerate(session.items):
-            if item.category not in SYNSETS.values() or item.symmetry not in SYMMETRY_PERIOD_RAD:
+            if item.category not in SYNSETS.values() or item.symmetry not in alignment.SYMMETRY_PERIOD_RAD:
                 raise FileError(f"{path}: items[{k}] has class {item.category}, symmetry {item.symmetry}; mend them")
             if (item.cad_id or item.state == "accepted") and item.cad_id not in self.library:
                 raise FileError(f"{path}: items[{k}] names model {item.cad_id}, which is not there; give its --library")
@@ -261,4 +254,4 @@ class Store:
 
 def step_of(item: Item) -> int:
     """Return which step is next: 1 choose a model, 2 click pairs, 3 look and accept."""
-    return 1 if not item.cad_id else 2 if item.pairs < MIN_POINTS else 3
+    return 1 if not item.cad_id else 2 if item.pairs < alignment.MIN_POINTS else 3

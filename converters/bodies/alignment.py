@@ -206,15 +206,6 @@ def _inliers(p: np.ndarray, q: np.ndarray, round_model: bool) -> np.ndarray:
     return every
 
 
-def _canonical(fit: Alignment, period: float) -> Alignment:
-    """Return the equivalent pose whose yaw is the smallest; a quarter turn swaps the horizontal scales."""
-    if not period or period >= 2 * math.pi - 1e-9:
-        return dataclasses.replace(fit, yaw=wrap_angle(fit.yaw))
-    yaw = wrap_angle(fit.yaw, period)
-    swapped = round((fit.yaw - yaw) / (math.pi / 2)) % 2 == 1
-    return dataclasses.replace(fit, scale=fit.scale[[1, 0, 2]] if swapped else fit.scale, yaw=yaw)
-
-
 def solve_alignment(cad_points: np.ndarray, scan_points: np.ndarray, symmetry: str = "__SYM_NONE") -> Alignment:
     """Solve for scales, translation and yaw of least squared point-to-point distance, without gross outliers.
 
@@ -242,7 +233,11 @@ def solve_alignment(cad_points: np.ndarray, scan_points: np.ndarray, symmetry: s
     best = _robust_fit(p, q, round_model)
     if folds > 1:
         best = _fit_equivalents(p, q, best, folds)
-    return _canonical(best, period)
+    if round_model or period >= 2 * math.pi - 1e-9:
+        return dataclasses.replace(best, yaw=wrap_angle(best.yaw))
+    yaw = wrap_angle(best.yaw, period)
+    swapped = round((best.yaw - yaw) / (math.pi / 2)) % 2 == 1  # a quarter turn swaps the horizontal scales
+    return dataclasses.replace(best, scale=best.scale[[1, 0, 2]] if swapped else best.scale, yaw=yaw)
 
 
 def gross_outliers(cad_points: np.ndarray, scan_points: np.ndarray, symmetry: str = "__SYM_NONE") -> np.ndarray:

@@ -11,8 +11,7 @@ import trimesh
 
 from converters.bodies.alignment import Alignment
 from converters.geometry.boxes import MAX_PIECES, Hull, OrientedBox, convex_hull, fit_box
-from converters.records.raw import Annotation, CadModel
-from converters.records.visual import TexturedMesh
+from converters.records.raw import Annotation, CadModel, TexturedMesh
 from interactive_nav_common.rotations import matrix_from_quat, yaw_matrix
 from scenes_mjcf.categories import TABLE
 

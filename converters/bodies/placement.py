@@ -6,14 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.bodies.alignment import (
-    SYMMETRY_PERIOD_RAD,
-    Alignment,
-    AlignmentError,
-    apply_alignment,
-    gross_outliers,
-    solve_alignment,
-)
+from converters.bodies import alignment
 from converters.bodies.objects import name_objects
 from converters.records.raw import Annotation, RawScene
 from interactive_nav_common.rotations import transformed, wrap_angle, yaw_matrix
@@ -22,7 +15,7 @@ LYING_DEG = 15.0
 """Annotated tilt from which a scene's report says that the object was stood upright."""
 
 
-def upright(pose: np.ndarray, pivot_cad: np.ndarray) -> tuple[Alignment, float]:
+def upright(pose: np.ndarray, pivot_cad: np.ndarray) -> tuple[alignment.Alignment, float]:
     """Take the small roll and pitch out of an annotated pose, turning about the object's middle.
 
     `pose`: (4, 4) CAD frame -> scan frame, with scale.
@@ -35,11 +28,11 @@ def upright(pose: np.ndarray, pivot_cad: np.ndarray) -> tuple[Alignment, float]:
     place = pose[:3, :3] @ pivot_cad + pose[:3, 3]
     translation = place - yaw_matrix(yaw) @ (scale * pivot_cad)
     tilt = math.acos(float(np.clip(turn[2, 2], -1.0, 1.0)))
-    return Alignment(scale, translation, yaw, math.nan), tilt
+    return alignment.Alignment(scale, translation, yaw, math.nan), tilt
 
 
 def compare(
-    annotation: Annotation, placed: Alignment, tilt_rad: float, pivot_cad: np.ndarray, name: str
+    annotation: Annotation, placed: alignment.Alignment, tilt_rad: float, pivot_cad: np.ndarray, name: str
 ) -> dict[str, Any]:
     """Return one row of the alignment report: residual of the annotated pose, and the re-solved pose beside it.
 
@@ -62,9 +55,9 @@ def compare(
         distance2 = ((at - annotation.keypoints_scan) ** 2).sum(axis=1)
         row["annotated_rms_m"] = round(float(np.sqrt(distance2.mean())), 5)
     try:
-        solved = solve_alignment(annotation.keypoints_cad, annotation.keypoints_scan, annotation.symmetry)
-        outliers = gross_outliers(annotation.keypoints_cad, annotation.keypoints_scan, annotation.symmetry)
-    except AlignmentError as error:
+        solved = alignment.solve_alignment(annotation.keypoints_cad, annotation.keypoints_scan, annotation.symmetry)
+        outliers = alignment.gross_outliers(annotation.keypoints_cad, annotation.keypoints_scan, annotation.symmetry)
+    except alignment.AlignmentError as error:
         return row | {"solved": False, "reason": str(error)}
     difference = pose_difference(solved, placed, pivot_cad, annotation.symmetry)
     return row | {
@@ -88,14 +81,16 @@ class PoseDifference:
     """(3,) first / second along the second's axes."""
 
 
-def pose_difference(one: Alignment, other: Alignment, pivot_cad: np.ndarray, symmetry: str) -> PoseDifference:
+def pose_difference(
+    one: alignment.Alignment, other: alignment.Alignment, pivot_cad: np.ndarray, symmetry: str
+) -> PoseDifference:
     """Compare two poses of the same model at the pivot; turns that the symmetry allows do not count.
 
     `pivot_cad`: (3,) point of the CAD frame where translations are compared.
     `symmetry`: Scan2CAD's word; unknown words count as none.
     """
-    period = SYMMETRY_PERIOD_RAD.get(symmetry, 2 * math.pi)
-    at = [apply_alignment(a, pivot_cad[None])[0] for a in (one, other)]
+    period = alignment.SYMMETRY_PERIOD_RAD.get(symmetry, 2 * math.pi)
+    at = [alignment.apply_alignment(a, pivot_cad[None])[0] for a in (one, other)]
     turn = wrap_angle(one.yaw - other.yaw)
     yaw = wrap_angle(turn, period) if period else 0.0
     swapped = period and round((turn - yaw) / (math.pi / 2)) % 2
@@ -103,7 +98,7 @@ def pose_difference(one: Alignment, other: Alignment, pivot_cad: np.ndarray, sym
     return PoseDifference(float(np.linalg.norm(at[0] - at[1])), abs(yaw), scale / other.scale)
 
 
-def align_objects(raw: RawScene) -> tuple[list[Alignment], list[dict[str, Any]]]:
+def align_objects(raw: RawScene) -> tuple[list[alignment.Alignment], list[dict[str, Any]]]:
     """Return upright placements from the annotations, and the report that compares them with re-solved ones."""
     placements, rows = [], []
     for name, annotation in zip(name_objects(raw.annotations), raw.annotations, strict=True):

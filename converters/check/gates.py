@@ -273,8 +273,8 @@ def wall_values(model: mujoco.MjModel, maps: SceneMaps) -> dict[str, float]:
     for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE):
         body = model.jnt_bodyid[joint]
         far = np.linalg.norm(points - model.body_pos[body, :2], axis=-1)
-        leaf = max((float(np.linalg.norm(model.geom_pos[g]) + model.geom_rbound[g])
-                    for g in np.flatnonzero(model.geom_bodyid == body)), default=0.0)  # fmt: skip
+        geoms = np.flatnonzero(model.geom_bodyid == body)
+        leaf = max((float(np.linalg.norm(model.geom_pos[g]) + model.geom_rbound[g]) for g in geoms), default=0.0)
         rim &= far > leaf + side
     return {
         "rim_without_wall": float((rim & (outside > math.sqrt(2) * side)).sum() / max(rim.sum(), 1)),
@@ -298,7 +298,16 @@ def manifest_values(
         low, high = USUAL.get(item.category, ANY_MASS_KG)
         ratios.append(max(mass_kg / high, low / max(mass_kg, 1e-9)))
         friction += sliding_friction(model, body) or [item.friction]
-    changed = [f"{name} is {got}, expected {expected}" for name, got, expected in _physics(model) if got != expected]
+    floor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "floor")
+    solid = floor >= 0 and bool(model.geom_contype[floor]) and model.geom_pos[floor, 2] == 0
+    physics = [
+        ("gravity", tuple(np.round(model.opt.gravity, 6).tolist()), GRAVITY),
+        ("wind", tuple(model.opt.wind.tolist()), (0.0, 0.0, 0.0)),
+        *((name, float(getattr(model.opt, name)), 0.0) for name in ("density", "viscosity")),
+        ("disableflags", int(model.opt.disableflags), 0),
+        ("floor at z = 0", solid, True),
+    ]
+    changed = [f"{name} is {got}, expected {expected}" for name, got, expected in physics if got != expected]
     values = {
         "manifest_differs": float(len(differs)),
         "mass_ratio": max(ratios),
@@ -306,16 +315,3 @@ def manifest_values(
         "physics_changed": float(len(changed)),
     }
     return values, {"manifest_differs": differs, "physics_changed": tuple(changed)}
-
-
-def _physics(model: mujoco.MjModel) -> list[tuple[str, object, object]]:
-    """Return name, value and expected value of what every scene has alike."""
-    floor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "floor")
-    solid = floor >= 0 and bool(model.geom_contype[floor]) and model.geom_pos[floor, 2] == 0
-    return [
-        ("gravity", tuple(np.round(model.opt.gravity, 6).tolist()), GRAVITY),
-        ("wind", tuple(model.opt.wind.tolist()), (0.0, 0.0, 0.0)),
-        *((name, float(getattr(model.opt, name)), 0.0) for name in ("density", "viscosity")),
-        ("disableflags", int(model.opt.disableflags), 0),
-        ("floor at z = 0", solid, True),
-    ]

@@ -19,7 +19,8 @@ from converters.generate.models.cad import LIBRARY, cad_model
 from converters.generate.models.parts import MATERIALS
 from converters.geometry.faces import face_vectors, unit_normals
 from converters.read.obj import in_colour, join_meshes
-from converters.records.visual import TexturedMesh
+from converters.records.raw import TexturedMesh
+from converters.write.texture import box_pixels
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.grids import cell_centres, clearance
@@ -52,6 +53,8 @@ LABEL_PIXELS = 30
 COLUMNS = 8
 AZIMUTH_RAD, ABOVE_RAD = 0.6, 0.42
 """Where the reader stands: to the right of the front, and above."""
+Surfaces = dict[str, TexturedMesh]
+"""Body -> what is drawn of it, in the world."""
 
 
 class Picture:
@@ -100,8 +103,10 @@ class Picture:
             order = order[np.argsort(-far[order], kind="stable")]  # the nearest is written last
             face, share, where = face[order], share[order], where[order]
             self._depth[where] = far[order]
-            colours = _looked_up(texture, np.einsum("nc,ncd->nd", share, uv[face]), between)
-            self._colours[where] = colours * light[face, None]
+            u, v = np.einsum("nc,ncd->nd", share, uv[face]).T
+            texel = (np.stack([1 - v % 1, u % 1], axis=1) * texture.shape[:2]).T - 0.5  # the nearest, or between four
+            planes = [map_coordinates(texture[..., k], texel, order=int(between), mode="nearest") for k in range(3)]
+            self._colours[where] = np.stack(planes, -1) * light[face, None]
 
 
 def _areas(corners: np.ndarray) -> np.ndarray:
@@ -110,21 +115,12 @@ def _areas(corners: np.ndarray) -> np.ndarray:
     return np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
-def _looked_up(texture: np.ndarray, uv: np.ndarray, between: bool) -> np.ndarray:
-    """Return (n, 3) colours at texture coordinates (n, 2): the nearest texel's, or `between` four."""
-    at = (np.stack([1 - uv[:, 1] % 1, uv[:, 0] % 1], axis=1) * texture.shape[:2]).T - 0.5
-    return np.stack([map_coordinates(texture[..., k], at, order=int(between), mode="nearest") for k in range(3)], -1)
-
-
 def _fragments(low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Yield blocks of boxes: which boxes (p,), and of every pixel in them which of these (n,) and where (n, 2)."""
     count = (high - low).prod(axis=1)
     some = np.flatnonzero(count)
     for part in np.split(some, np.flatnonzero(np.diff(np.cumsum(count[some]) // FRAGMENTS)) + 1):
-        box = np.repeat(np.arange(len(part)), count[part])
-        step = np.arange(len(box)) - np.repeat(np.cumsum(count[part]) - count[part], count[part])
-        wide = (high - low)[part, 0][box]
-        yield part, box, low[part][box] + np.stack([step % wide, step // wide], axis=1)
+        yield part, *box_pixels(low[part], high[part])
 
 
 def _fitted(
@@ -142,8 +138,8 @@ def _fitted(
     return small, bool(per_pixel < SQUARE)
 
 
-def world_surfaces(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, TexturedMesh]:
-    """Return body -> what is drawn of it, in the world."""
+def world_surfaces(model: mujoco.MjModel, data: mujoco.MjData) -> Surfaces:
+    """Return what is drawn of each body."""
     surfaces = {}
     for geom in range(model.ngeom):
         name = model.geom(geom).name
@@ -154,7 +150,7 @@ def world_surfaces(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, Text
     return surfaces
 
 
-def _taken(pose: CameraPose, lens: Lens, surfaces: dict[str, TexturedMesh], cut_m: float = np.inf) -> np.ndarray:
+def _taken(pose: CameraPose, lens: Lens, surfaces: Surfaces, cut_m: float = np.inf) -> np.ndarray:
     """Draw the picture (rows, columns, 3) of bodies."""
     picture = Picture(pose, lens)
     for body, surface in surfaces.items():
@@ -163,9 +159,7 @@ def _taken(pose: CameraPose, lens: Lens, surfaces: dict[str, TexturedMesh], cut_
     return picture.image
 
 
-def from_the_south(
-    surfaces: dict[str, TexturedMesh], maps: SceneMaps, low: np.ndarray, high: np.ndarray, pixels: int
-) -> np.ndarray:
+def from_the_south(surfaces: Surfaces, maps: SceneMaps, low: np.ndarray, high: np.ndarray, pixels: int) -> np.ndarray:
     """Draw everything from (2,) low to (2,) high x and y, m, slantwise, `pixels` wide.
 
     Walls are cut at `CUT_M`; no ceiling or near wall hides a room.
@@ -174,26 +168,23 @@ def from_the_south(
     axes_w = np.array([[1.0, 0.0, 0.0], [0.0, sin, cos], [0.0, -cos, sin]])
     half = np.array([high[0] - low[0], sin * (high[1] - low[1]) + cos * CUT_M]) / 2
     middle = axes_w[:2] @ [*(low + high) / 2, CUT_M / 2]
-    surfaces = surfaces | {"structure": _without_near_side(surfaces["structure"], maps)}
-    return _taken(*over(axes_w, middle - half, middle + half, 2 * half[0] / pixels), surfaces, CUT_M)
-
-
-def _without_near_side(structure: TexturedMesh, maps: SceneMaps) -> TexturedMesh:
-    """Return the structure less upright faces that look south where no floor lies south of them."""
+    # Upright faces that look south, where no floor lies south of them, would hide rooms.
+    structure = surfaces["structure"]
     assert structure.corner_uv is not None
     normal, centre = face_vectors(structure.vertices, structure.faces), structure.vertices[structure.faces].mean(axis=1)
     first = np.where(maps.traversable.any(axis=0), maps.traversable.argmax(axis=0), len(maps.traversable))
     column = np.floor((centre[:, 0] - maps.origin_w[0]) / maps.resolution_m).astype(int)
     south_m = maps.origin_w[1] + maps.resolution_m * first[np.clip(column, 0, len(first) - 1)]
-    near = (centre[:, 1] < south_m) & (-normal[:, 1] > 0.7 * np.linalg.norm(normal, axis=1))
-    return dataclasses.replace(structure, faces=structure.faces[~near], corner_uv=structure.corner_uv[~near])
+    far = (centre[:, 1] >= south_m) | (-normal[:, 1] <= 0.7 * np.linalg.norm(normal, axis=1))
+    structure = dataclasses.replace(structure, faces=structure.faces[far], corner_uv=structure.corner_uv[far])
+    surfaces = surfaces | {"structure": structure}
+    return _taken(*over(axes_w, middle - half, middle + half, 2 * half[0] / pixels), surfaces, CUT_M)
 
 
 def at_eye_height(
-    model: mujoco.MjModel, data: mujoco.MjData, surfaces: dict[str, TexturedMesh], maps: SceneMaps,
-    shape: tuple[int, int],
-) -> np.ndarray:  # fmt: skip
-    """Draw what somebody sees from where most is visible."""
+    model: mujoco.MjModel, data: mujoco.MjData, surfaces: Surfaces, maps: SceneMaps, shape: tuple[int, int]
+) -> np.ndarray:
+    """Draw a (rows, columns, 3) picture, `shape` large, of what somebody sees from where most is visible."""
     eye, heading = _vantage(model, data, surfaces, maps)
     eye_w = np.array([*eye, EYE_M])
     tall = math.degrees(2 * math.atan(math.tan(EYE_VIEW_RAD / 2) * shape[0] / shape[1]))
@@ -203,39 +194,31 @@ def at_eye_height(
 
 
 def _vantage(
-    model: mujoco.MjModel, data: mujoco.MjData, surfaces: dict[str, TexturedMesh], maps: SceneMaps
+    model: mujoco.MjModel, data: mujoco.MjData, surfaces: Surfaces, maps: SceneMaps
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return place (2,) and heading (2,) with most objects, the larger and nearer the better, before no wall."""
     clear = clearance(maps.traversable, maps.resolution_m)
     places = cell_centres(clear >= min(FREE_M, 0.8 * float(clear.max())), maps.resolution_m, maps.origin_w)
     places = places[np.unique(np.linspace(0, len(places) - 1, PLACES).astype(int))]
-    boxes = [
-        np.stack([s.vertices[:, :2].min(axis=0), s.vertices[:, :2].max(axis=0)])
-        for body, s in surfaces.items() if body != "structure"
-    ]  # fmt: skip
-    low, high = np.array(boxes).reshape(-1, 2, 2).transpose(1, 0, 2)
+    plans = [surface.vertices[:, :2] for body, surface in surfaces.items() if body != "structure"]
+    low, high = np.array([(plan.min(axis=0), plan.max(axis=0)) for plan in plans]).reshape(-1, 2, 2).transpose(1, 0, 2)
     off = np.maximum(np.maximum(low - places[:, None], places[:, None] - high), 0.0)
     stands = (np.linalg.norm(off, axis=2) > FREE_M / 2).all(axis=1)
     places = places[stands] if stands.any() else places
     way = (low + high) / 2 - places[:, None]
     distance = np.linalg.norm(way, axis=2)
     weight = np.linalg.norm(high - low, axis=1) / np.maximum(distance, NEAR_M)
-    visible = (distance > NEAR_M) & (distance < FAR_M) & ~_hidden(model, data, places, way)
+    walls = [g for g in range(model.ngeom) if model.geom(g).name.startswith("wall_")]
+    stand = shapely.union_all([shapely.Polygon(geom_outline(model, data, g, np.eye(3))) for g in walls])
+    start = np.broadcast_to(places[:, None], way.shape)
+    hidden = np.asarray(shapely.intersects(shapely.linestrings(np.stack([start, start + way], axis=2)), stand))
+    visible = (distance > NEAR_M) & (distance < FAR_M) & ~hidden
     turns = np.arange(HEADINGS) * 2 * math.pi / HEADINGS
     headings = np.stack([np.cos(turns), np.sin(turns)], axis=1)
     ahead = way @ headings.T > math.cos(0.8 * EYE_VIEW_RAD / 2) * distance[..., None]
     score = np.einsum("pk,pkh->ph", np.where(visible, weight, 0.0), ahead)
     place, heading = np.unravel_index(score.argmax(), score.shape)
     return places[place], headings[heading]
-
-
-def _hidden(model: mujoco.MjModel, data: mujoco.MjData, places: np.ndarray, way: np.ndarray) -> np.ndarray:
-    """Return (p, k) whether a wall stands in the way (p, k, 2) from a place (p, 2)."""
-    walls = [g for g in range(model.ngeom) if model.geom(g).name.startswith("wall_")]
-    outlines = [shapely.Polygon(geom_outline(model, data, g, np.eye(3))) for g in walls]
-    start = np.broadcast_to(places[:, None], way.shape)
-    lines = shapely.linestrings(np.stack([start, start + way], axis=2))
-    return np.asarray(shapely.intersects(lines, shapely.union_all(outlines)))
 
 
 def camera_axes() -> np.ndarray:

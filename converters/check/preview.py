@@ -20,20 +20,11 @@ from matplotlib.patches import Patch
 from PIL import Image
 
 from converters.bodies.objects import PlacedObject
-from converters.check.pictures import (
-    CUT_M,
-    EYE_M,
-    EYE_VIEW_RAD,
-    Picture,
-    at_eye_height,
-    from_the_south,
-    world_surfaces,
-)
+from converters.check import pictures
 from converters.check.surfaces import geom_outline
 from converters.geometry.boxes import convex_hull
 from converters.read.obj import in_colour, textured_by_face
-from converters.records.raw import RawScene, ScanMesh
-from converters.records.visual import TexturedMesh
+from converters.records.raw import RawScene, TexturedMesh
 from converters.structure.cut import cut_furniture
 from interactive_nav_common.files import check_name, whole_file
 from scenes_mjcf.categories import CATEGORIES
@@ -103,7 +94,7 @@ def _draw_along(
 ) -> tuple[float, float, float, float]:
     """Draw meshes between corners (2,) m along `axes_w`, `sided` without backs; return the picture's extent."""
     pixel_m = float((high - low).max()) / SURFACE_PIXELS
-    picture = Picture(*over(axes_w, low, high, pixel_m))
+    picture = pictures.Picture(*over(axes_w, low, high, pixel_m))
     for mesh in meshes:
         picture.draw(mesh, one_sided=sided)
     rows, columns = picture.image.shape[:2]
@@ -120,26 +111,19 @@ def _draw_from_above(axes: Axes, scene: _Scene, meshes: Iterable[TexturedMesh], 
     _frame(axes, scene, title)
 
 
-def _scan_surface(scan: ScanMesh, vertices_w: np.ndarray, chosen: np.ndarray) -> TexturedMesh:
-    """Return some faces of a scan, in its colours."""
-    faces = scan.faces[chosen]
-    if scan.texture is not None and scan.corner_uv is not None:
-        return TexturedMesh(vertices_w, faces, scan.corner_uv[chosen], scan.texture)
-    assert scan.vertex_colours is not None
-    return textured_by_face(vertices_w, faces, scan.vertex_colours[faces].mean(axis=1))
-
-
 def _draw_views(slantwise: Axes, standing: Axes, scene: _Scene, width_in: float) -> None:
     """Draw everything at rest, viewed from the south and by somebody who stands there."""
     left, right, bottom, top = scene.maps.extent_w
     low, high = np.array([left, bottom]) - MARGIN_M, np.array([right, top]) + MARGIN_M
     wide = int(SLANTWISE * width_in * DPI)
-    slantwise.imshow(from_the_south(scene.surfaces, scene.maps, low, high, wide), interpolation="nearest")
-    slantwise.set_title(f"furnished, from the south; walls cut at {CUT_M:g} m", fontsize=10)
+    slantwise.imshow(pictures.from_the_south(scene.surfaces, scene.maps, low, high, wide), interpolation="nearest")
+    slantwise.set_title(f"furnished, from the south; walls cut at {pictures.CUT_M:g} m", fontsize=10)
     wide = int((1 - SLANTWISE) * width_in * DPI)
-    eye = at_eye_height(scene.model, scene.data, scene.surfaces, scene.maps, (int(0.75 * wide), wide))
+    eye = pictures.at_eye_height(scene.model, scene.data, scene.surfaces, scene.maps, (int(0.75 * wide), wide))
     standing.imshow(eye, interpolation="nearest")
-    standing.set_title(f"from {EYE_M:g} m, {math.degrees(EYE_VIEW_RAD):.0f} degrees wide", fontsize=10)
+    standing.set_title(
+        f"from {pictures.EYE_M:g} m, {math.degrees(pictures.EYE_VIEW_RAD):.0f} degrees wide", fontsize=10
+    )
     for axes in (slantwise, standing):
         axes.axis("off")
 
@@ -259,7 +243,13 @@ def draw(scene: _Scene, raw: RawScene | None) -> Figure:
             (panels.pop(0), np.arange(len(keep)), f"scan, {len(keep):,} triangles"),
             (panels.pop(0), np.flatnonzero(keep), f"cut, {int(keep.sum()):,} triangles left"),
         ):
-            _draw_from_above(axes, scene, [_scan_surface(scan, vertices_w, chosen)], title)
+            faces = scan.faces[chosen]
+            if scan.texture is not None and scan.corner_uv is not None:
+                surface = TexturedMesh(vertices_w, faces, scan.corner_uv[chosen], scan.texture)
+            else:
+                assert scan.vertex_colours is not None
+                surface = textured_by_face(vertices_w, faces, scan.vertex_colours[faces].mean(axis=1))
+            _draw_from_above(axes, scene, [surface], title)
         _draw_from_above(panels.pop(0), scene, [scene.surfaces["structure"]], "filled: the static structure")
     objects, hulls, boxes = panels
     _draw_objects(objects, scene)
@@ -289,14 +279,19 @@ def draw_object(folder: Path) -> Figure:
         raise SceneError(f"{folder}: is no readable object ({error}); convert it again") from error
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    mesh = world_surfaces(model, data)[name]
+    mesh = pictures.world_surfaces(model, data)[name]
     size_m = float(np.ptp(mesh.vertices, axis=0).max())
     figure, grid = plt.subplots(2, 3, figsize=(10.5, 7.4), dpi=100)
     for (title, axes_w), (surface, solid) in zip(VIEWS.items(), grid.T, strict=True):
         points = mesh.vertices @ axes_w[:2].T
         low, high = points.min(axis=0) - 0.1 * size_m, points.max(axis=0) + 0.1 * size_m
         extent = _draw_along(surface, axes_w, low, high, [mesh], sided=False)
-        _draw_solids(solid, model, data, body, axes_w)
+        for geom in np.flatnonzero(model.geom_bodyid == body):
+            box = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX
+            if box or model.geom_contype[geom]:  # else the surface
+                fill, line = ("none", "#b03020") if box else ("#3070c040", "none")
+                outline = geom_outline(model, data, int(geom), axes_w)
+                solid.fill(*outline.T, facecolor=fill, edgecolor=line, linewidth=0.8)
         for axes in (surface, solid):
             axes.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
             axes.axis("off")
@@ -313,17 +308,6 @@ def draw_object(folder: Path) -> Figure:
     )
     figure.tight_layout()
     return figure
-
-
-def _draw_solids(axes: Axes, model: mujoco.MjModel, data: mujoco.MjData, body: int, axes_w: np.ndarray) -> None:
-    """Draw outlines of hulls, filled, and boxes, as lines."""
-    for geom in np.flatnonzero(model.geom_bodyid == body):
-        box = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX
-        if not box and not model.geom_contype[geom]:
-            continue  # the surface
-        outline = geom_outline(model, data, int(geom), axes_w)
-        fill, line = ("none", "#b03020") if box else ("#3070c040", "none")
-        axes.fill(*outline.T, facecolor=fill, edgecolor=line, linewidth=0.8)
 
 
 def preview(folder: Path, target: Path, source: Path | None = None) -> None:
@@ -349,7 +333,7 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
     raw = read_source(source, manifest, maps.floor_height_m) if source is not None else None
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    _save(draw(_Scene(model, data, manifest, maps, world_surfaces(model, data)), raw), target, few=True)
+    _save(draw(_Scene(model, data, manifest, maps, pictures.world_surfaces(model, data)), raw), target, few=True)
 
 
 def _save(figure: Figure, target: Path, few: bool = False) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, KDTree
 
 from converters.geometry.faces import face_areas, sample_faces
-from converters.records.visual import TexturedMesh
+from converters.records.raw import TexturedMesh
 from scenes_mjcf.look import geom_image, geom_mesh, mesh_of
 
 SPACING_M = 0.04

@@ -181,14 +181,13 @@ def hull_volume(points: np.ndarray) -> float:
         return 0.0
 
 
-def box_volume(points: np.ndarray) -> float:
-    """Return the volume of the box along the axes."""
-    return float(np.ptp(points, axis=0).prod())
-
-
 def merge_pieces(points: list[np.ndarray], most: int, slack: float | None = None) -> list[np.ndarray]:
     """Join pairs of convex pieces, each time the pair whose common hull encloses least that neither does."""
-    pieces, size = list(points), hull_volume if slack is None else box_volume
+    pieces = list(points)
+
+    def size(of: np.ndarray) -> float:  # of the hull, or of the box along the axes
+        return hull_volume(of) if slack is None else float(np.ptp(of, axis=0).prod())
+
     volume = [size(p) for p in pieces]
 
     def cost(i: int, j: int) -> float:

@@ -49,7 +49,11 @@ def find_up(vertices: np.ndarray, faces: np.ndarray, where: str) -> np.ndarray:
     axes: list[np.ndarray] = []
     for k in np.argsort(-score, kind="stable"):
         if all(abs(drawn[k] @ axis) < 0.3 for axis in axes):
-            axes.append(_mean_direction(drawn[k], normal, area))
+            axis = drawn[k]
+            for _ in range(3):  # the principal direction of the normals near it
+                near = np.abs(normal @ axis) > ALONG
+                axis = np.linalg.eigh((normal[near] * area[near, None]).T @ normal[near])[1][:, 2]
+            axes.append(axis)
     if len(axes) == 2:
         axes.append(np.cross(axes[0], axes[1]))
     if len(axes) < 2:
@@ -82,14 +86,6 @@ def find_up(vertices: np.ndarray, faces: np.ndarray, where: str) -> np.ndarray:
         return up if right else -up
     up = area[floor] @ normal[floor]
     return up / np.linalg.norm(up)
-
-
-def _mean_direction(axis: np.ndarray, normal: np.ndarray, area: np.ndarray) -> np.ndarray:
-    """Refine the axis: the principal direction of the normals near it."""
-    for _ in range(3):
-        near = np.abs(normal @ axis) > ALONG
-        axis = np.linalg.eigh((normal[near] * area[near, None]).T @ normal[near])[1][:, 2]
-    return axis
 
 
 def turn_upright(up: np.ndarray) -> np.ndarray:

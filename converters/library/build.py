@@ -30,7 +30,7 @@ from converters.read.files import SourceFolder, as_number
 from converters.read.meshes import colours_of_faces, read_surface
 from converters.read.obj import join_meshes
 from converters.records.errors import SceneRejected, StageFailed
-from converters.records.visual import TexturedMesh
+from converters.records.raw import TexturedMesh
 from converters.write.texture import bake_object, textured_cloud
 from interactive_nav_common.errors import ConfigError, FileError, readable
 from interactive_nav_common.files import whole_file, whole_folder, write_text
@@ -118,14 +118,8 @@ def _piece(library: str, of: dict[str, str], where: str, names: set[str]) -> Cat
     turn = np.array([_number({"modelRotation": w}, "modelRotation", where) for w in words])
     if turn.shape != (9,) or not np.allclose(turn.reshape(3, 3) @ turn.reshape(3, 3).T, np.eye(3), atol=1e-3):
         raise SceneRejected(f"{where}: modelRotation is {of['modelRotation']!r}, expected the 9 numbers of a rotation")
-    return CatalogueModel(
-        library,
-        of.get("name", ""),
-        model,
-        (width, height, depth),
-        turn.reshape(3, 3),
-        of.get("creator", ""),
-    )
+    name, creator = (of.get(key, "") for key in ("name", "creator"))
+    return CatalogueModel(library, name, model, (width, height, depth), turn.reshape(3, 3), creator)
 
 
 def read_catalogue(path: Path) -> Catalogue:
@@ -231,11 +225,6 @@ def as_catalogued(surface: TexturedMesh, piece: CatalogueModel, where: str) -> T
     return dataclasses.replace(surface, vertices=vertices, faces=faces)
 
 
-def _standing(points: np.ndarray, foot_m: float) -> np.ndarray:
-    level = points[points[:, 1] < foot_m] * [1.0, 0.0, 1.0]
-    return np.vstack([points, level])
-
-
 def _surface(catalogue: Catalogue, piece: CatalogueModel) -> TexturedMesh:
     with tempfile.TemporaryDirectory(prefix="library-") as folder:
         path = unpack_model(catalogue, piece, Path(folder))
@@ -265,7 +254,8 @@ def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]
     result = decompose_all({chosen.key: solid}, HULLS, 1, cache or cache_folder(), strict=True)
     size_m = np.ptp(surface.vertices, axis=0)
     foot_m = FOOT_SHARE * size_m[1]
-    hulls = tuple(convex_hull(_standing(hull.vertices, foot_m)) for hull in result.hulls[chosen.key])
+    solids = (hull.vertices for hull in result.hulls[chosen.key])
+    hulls = tuple(convex_hull(np.vstack([v, v[v[:, 1] < foot_m] * [1.0, 0.0, 1.0]])) for v in solids)
     for most in (*LEAN_FACES, MOST_FACES):
         low = simplify_to(vertices, faces, most)
         kept, off_m = surface_loss(vertices, faces, *low)
@@ -282,20 +272,14 @@ def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]
         )
     spacing_m = max(float(size_m.max()) / TEXELS, 1e-3)
     visual, _ = bake_object(vertices, faces, colours, textured_cloud(surface, spacing_m), low, TEXELS)
-    credits = tuple(
-        Credit(of.name, of.creator, _licence(catalogue.licence), of.key)
-        for catalogue, of in ((chosen.catalogue, piece), *chosen.riders)
-    )
+    credits = []
+    for catalogue, of in ((chosen.catalogue, piece), *chosen.riders):
+        by = re.search(r"Attribution 3.0( United States)?", text := catalogue.licence)
+        named = "CC0 1.0" if text == "Public domain" else f"CC BY 3.0{' US' if by[1] else ''}" if by else text
+        credits.append(Credit(of.name, of.creator, named, of.key))
     sides = tuple(float(side) for side in np.round(size_m, 4))
-    model = Model(chosen.key, chosen.category, chosen.split, sides, len(visual.faces), len(hulls), credits)
+    model = Model(chosen.key, chosen.category, chosen.split, sides, len(visual.faces), len(hulls), tuple(credits))
     return model, Shape(visual, hulls)
-
-
-def _licence(text: str) -> str:
-    if text == "Public domain":
-        return "CC0 1.0"
-    match = re.search(r"Attribution 3.0( United States)?", text)
-    return f"CC BY 3.0{' US' if match[1] else ''}" if match else text
 
 
 def build(
@@ -334,7 +318,8 @@ def fetch(given: Path | None, target: Path, overwrite: bool = False) -> tuple[Pa
     """
     with whole_folder(target, overwrite) as folder, tempfile.TemporaryDirectory(prefix="library-") as scratch:
         place = given or _downloaded(Path(scratch))
-        libraries = _of_folder(place) if place.is_dir() else _of_package(place)
+        files = {path.stem: path for path in sorted(place.rglob("*.sh3f")) if path.stem in FILES}
+        libraries = {k: p.read_bytes() for k, p in files.items()} if place.is_dir() else _of_package(place)
         for name, digest in FILES.items():
             data = libraries.get(name)
             if data is None:
@@ -354,10 +339,6 @@ def _downloaded(folder: Path) -> Path:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
         raise FileError(f"{PACKAGE}: apt-get cannot download it ({last}); run apt-get update, or {REMEDY}")
     return packages[0]
-
-
-def _of_folder(folder: Path) -> dict[str, bytes]:
-    return {path.stem: path.read_bytes() for path in sorted(folder.rglob("*.sh3f")) if path.stem in FILES}
 
 
 def _of_package(path: Path) -> dict[str, bytes]:

@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image
 
 from converters.geometry.boxes import Hull
-from converters.records.visual import VisualMesh
+from converters.records.raw import VisualMesh
 from converters.write.texture import quantise
 from interactive_nav_common.errors import FileError
 
@@ -71,12 +71,6 @@ class Shape:
 
 def _packed(values: np.ndarray, low: np.ndarray | float, span: np.ndarray | float) -> np.ndarray:
     return np.rint((values - low) / span * STEPS).astype(np.uint16)
-
-
-def _webp(image: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "WEBP", quality=QUALITY, method=6)
-    return buffer.getvalue()
 
 
 def _planes(table: np.ndarray) -> np.ndarray:
@@ -136,7 +130,9 @@ def write_library(path: Path, models: Sequence[tuple[Model, Shape]]) -> None:
         put("index.json", json.dumps(index, indent=1, sort_keys=True).encode())
         for model, shape in models:
             put(f"{model.name}.arrays", _arrays(shape))
-            put(f"{model.name}.webp", _webp(shape.visual.image))
+            image = io.BytesIO()
+            Image.fromarray(shape.visual.image).save(image, "WEBP", quality=QUALITY, method=6)
+            put(f"{model.name}.webp", image.getvalue())
 
 
 def attribution(models: Sequence[Model]) -> str:

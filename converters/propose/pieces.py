@@ -83,18 +83,15 @@ def _footprint(voxels: np.ndarray) -> set[tuple[int, int]]:
     return set(map(tuple, (cells[:, None] + around).reshape(-1, 2).tolist()))
 
 
-def _join(pieces: list[Piece]) -> Piece:
-    labels = np.concatenate([np.full(len(p.voxels), p.label) for p in pieces])
-    voxels = np.unique(np.concatenate([p.voxels for p in pieces]), axis=0)
-    return Piece(int(np.bincount(labels).argmax()), np.concatenate([p.points for p in pieces]), voxels)
-
-
 def merge(pieces: list[Piece], same: Any) -> list[Piece]:
     """Join pieces for which `same` holds, the largest first, until none is left to join."""
     pieces = sorted(pieces, key=lambda p: (-len(p.voxels), p.voxels[0].tolist()))
     while pair := next((p for p in itertools.combinations(range(len(pieces)), 2) if same(*(pieces[k] for k in p))), ()):
         i, j = pair
-        pieces[i] = _join([pieces[i], pieces.pop(j)])
+        both = pieces[i], pieces.pop(j)
+        labels = np.repeat([p.label for p in both], [len(p.voxels) for p in both])
+        voxels = np.unique(np.concatenate([p.voxels for p in both]), axis=0)
+        pieces[i] = Piece(int(np.bincount(labels).argmax()), np.concatenate([p.points for p in both]), voxels)
     return pieces
 
 
@@ -241,19 +238,15 @@ class _Plan:
         return np.floor((xy @ self.axes - self.low) / self.cell_m).astype(np.int64)
 
 
-def _main_yaw(xy: np.ndarray) -> float:
-    """Return the direction along which most of the outline of (n, 2) points runs, rad, modulo 90 degrees."""
-    outline = xy[ConvexHull(xy).vertices]
+def _plan(points: np.ndarray, cell_m: float) -> _Plan:
+    # Along the direction, modulo 90 degrees, in which most of the outline runs.
+    outline = points[ConvexHull(points[:, :2]).vertices, :2]
     edges = np.roll(outline, -1, axis=0) - outline
     length = np.linalg.norm(edges, axis=1)
     turn = np.exp(4j * np.arctan2(edges[:, 1], edges[:, 0]))  # the same for every quarter turn
     alike = np.real(turn[:, None] * turn.conj()) > math.cos(4 * OUTLINE_RAD)
     best = alike[int(np.argmax(alike @ length))]
-    return float(np.angle((turn * length)[best].sum()) / 4)
-
-
-def _plan(points: np.ndarray, cell_m: float) -> _Plan:
-    axes = yaw_matrix(_main_yaw(points[:, :2]))[:2, :2]
+    axes = yaw_matrix(float(np.angle((turn * length)[best].sum()) / 4))[:2, :2]
     flat = points[:, :2] @ axes
     low = flat.min(axis=0)
     index = np.floor((flat - low) / cell_m).astype(np.int64)

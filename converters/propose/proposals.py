@@ -15,19 +15,7 @@ import numpy as np
 
 from converters.geometry.boxes import upright_box
 from converters.geometry.faces import face_labels, sample_faces
-from converters.propose.pieces import (
-    LABEL_CATEGORIES,
-    MIN_VOXELS,
-    SIZES_M,
-    Piece,
-    components,
-    merge,
-    same_box,
-    split_at_necks,
-    split_row,
-    split_tops,
-    stacked,
-)
+from converters.propose import pieces
 from converters.records.raw import FLOOR, SYNSETS, UNLABELLED, WALL, ScanMesh
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, yaw_matrix
 
@@ -67,7 +55,7 @@ def _confidence(category: str, extent: np.ndarray, purity: float, n_voxels: int,
     `purity` is the class's share of the box's furniture voxels. Surface counts as enough when the voxels cover
     half of one side and the top of the box.
     """
-    wide, high = SIZES_M[category]
+    wide, high = pieces.SIZES_M[category]
     size = _inside_range(float(max(extent[:2])), wide) * _inside_range(float(extent[2]), high)
     surface = extent[0] * extent[1] + max(extent[0], extent[1]) * extent[2]
     visible = min(1.0, n_voxels * voxel_m**2 / max(0.5 * surface, 1e-9))
@@ -80,20 +68,20 @@ def propose_instances(scan: ScanMesh, voxel_m: float = VOXEL_M) -> tuple[Proposa
     label = face_labels(scan.labels, scan.faces)[face]
     origin = scan.vertices.min(axis=0)
     floor_xy = points[label == FLOOR, :2]
-    pieces: list[Piece] = []
-    for wanted in LABEL_CATEGORIES:
+    instances: list[pieces.Piece] = []
+    for wanted in pieces.LABEL_CATEGORIES:
         if (label == wanted).any():
-            parts = merge(components(points[label == wanted], wanted, origin, voxel_m), stacked)
-            parts = [p for p in parts if len(p.voxels) >= MIN_VOXELS]
-            parts = [part for p in parts for part in split_at_necks(p, origin, voxel_m)]
-            parts = [part for p in parts for part in split_tops(p, floor_xy, origin, voxel_m)]
-            pieces += [part for p in parts for part in split_row(p, origin, voxel_m)]
-    pieces = merge(pieces, same_box)
+            parts = pieces.merge(pieces.components(points[label == wanted], wanted, origin, voxel_m), pieces.stacked)
+            parts = [p for p in parts if len(p.voxels) >= pieces.MIN_VOXELS]
+            parts = [part for p in parts for part in pieces.split_at_necks(p, origin, voxel_m)]
+            parts = [part for p in parts for part in pieces.split_tops(p, floor_xy, origin, voxel_m)]
+            instances += [part for p in parts for part in pieces.split_row(p, origin, voxel_m)]
+    instances = pieces.merge(instances, pieces.same_box)
     other = ~np.isin(label, (UNLABELLED, WALL, 2, 22))
     other_voxels = np.unique(np.floor((points[other] - origin) / voxel_m).astype(np.int64), axis=0)
     proposals = []
-    for piece in pieces:
-        category = LABEL_CATEGORIES[piece.label]
+    for piece in instances:
+        category = pieces.LABEL_CATEGORIES[piece.label]
         box = upright_box(piece.points)
         inside = (other_voxels >= piece.voxels.min(axis=0)) & (other_voxels <= piece.voxels.max(axis=0))
         purity = min(1.0, len(piece.voxels) / max(int(inside.all(axis=1).sum()), 1))

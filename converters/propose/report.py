@@ -10,18 +10,8 @@ import numpy as np
 from shapely import MultiPoint
 
 from converters.bodies.alignment import apply_alignment
+from converters.propose import retrieval
 from converters.propose.proposals import Proposal, as_scan2cad, bounds, box_corners, box_iou, propose_instances
-from converters.propose.retrieval import (
-    MIN_CONFIDENCE,
-    Comparison,
-    Retrieval,
-    annotated_vertices,
-    as_annotation,
-    auto_align,
-    compare_retrieval,
-    read_library,
-    without_annotation,
-)
 from converters.records.errors import SceneRejected
 from converters.records.raw import CEILING, CadModel, RawScene
 from converters.structure.floor import fit_floor
@@ -37,8 +27,8 @@ class Proposed:
     """Result of `propose`."""
 
     proposals: tuple[Proposal, ...]
-    retrieved: dict[int, Retrieval]
-    comparisons: tuple[Comparison, ...]
+    retrieved: dict[int, retrieval.Retrieval]
+    comparisons: tuple[retrieval.Comparison, ...]
     """Where the source has annotations and models were retrieved, one for each annotation that was proposed."""
 
 
@@ -50,12 +40,12 @@ def floor_of(raw: RawScene) -> float:
 
 def retrieve_sure(
     raw: RawScene, library_root: Path | None, progress: Callable[[float], None]
-) -> tuple[tuple[Proposal, ...], dict[int, Retrieval]]:
+) -> tuple[tuple[Proposal, ...], dict[int, retrieval.Retrieval]]:
     """Return the furniture without an annotation, and by its index the model of a library where that is sure."""
     new = propose_instances(raw.scan)
-    new = tuple(new[k] for k in without_annotation(new, raw.annotations, raw.cads))
-    retrieved = auto_align(new, read_library(library_root), floor_of(raw), progress) if new else {}
-    return new, {k: retrieved[k] for k in sorted(retrieved) if retrieved[k].confidence >= MIN_CONFIDENCE}
+    new = tuple(new[k] for k in retrieval.without_annotation(new, raw.annotations, raw.cads))
+    retrieved = retrieval.auto_align(new, retrieval.read_library(library_root), floor_of(raw), progress) if new else {}
+    return new, {k: retrieved[k] for k in sorted(retrieved) if retrieved[k].confidence >= retrieval.MIN_CONFIDENCE}
 
 
 def given_up(proposals: Sequence[Proposal], sure: Container[int]) -> tuple[str, ...]:
@@ -70,18 +60,10 @@ def with_retrieved(raw: RawScene, library_root: Path | None, progress: Callable[
     proposals, sure = retrieve_sure(raw, library_root, progress)
     return dataclasses.replace(
         raw,
-        annotations=raw.annotations + tuple(as_annotation(r) for r in sure.values()),
+        annotations=raw.annotations + tuple(retrieval.as_annotation(r) for r in sure.values()),
         cads=raw.cads | {r.cad.cad_id: r.cad for r in sure.values()},
         warnings=raw.warnings + given_up(proposals, sure),
     )
-
-
-def _nearest_proposal(raw: RawScene, proposals: tuple[Proposal, ...], k: int) -> int | None:
-    box = bounds(annotated_vertices(raw.annotations[k], raw.cads))
-    shares = [((p.points > box[0]) & (p.points < box[1])).all(axis=1).mean() for p in proposals]
-    overlap = [box_iou(box, bounds(p.points)) for p in proposals]
-    order = sorted(range(len(proposals)), key=lambda i: -overlap[i])
-    return order[0] if order and shares[order[0]] > SAME_OBJECT_SHARE else None
 
 
 def _draw(raw: RawScene, proposed: Proposed, target: Path) -> None:
@@ -115,7 +97,7 @@ def _draw(raw: RawScene, proposed: Proposed, target: Path) -> None:
         x, y = proposal.centre[:2].tolist()
         axes.text(x, y, text, ha="center", va="center", fontsize=8, bbox=box)
     for annotation in raw.annotations:
-        hull = MultiPoint(annotated_vertices(annotation, raw.cads)[:, :2]).convex_hull
+        hull = MultiPoint(retrieval.annotated_vertices(annotation, raw.cads)[:, :2]).convex_hull
         axes.plot(*np.asarray(hull.exterior.coords).T, "k:", linewidth=1)
     shown = sorted({p.category for p in proposed.proposals})
     handles = [Patch(facecolor="none", edgecolor=CATEGORIES[c].preview_colour, label=c) for c in shown]
@@ -143,15 +125,19 @@ def propose(
     proposals = propose_instances(raw.scan)
     if not proposals:
         raise SceneRejected(f"{raw.name}: no furniture label in the scan, expected NYU40 ids 5, 6, 7, 8, 14 or 39")
-    retrieved: dict[int, Retrieval] = {}
+    retrieved: dict[int, retrieval.Retrieval] = {}
     comparisons = []
     if library is not None:
         floor = floor_of(raw)
-        retrieved = auto_align(proposals, library, floor, lambda share: say("retrieve", 0.1 + 0.8 * share))
-        for k, annotation in enumerate(raw.annotations):
-            at = _nearest_proposal(raw, proposals, k)
-            if at is not None and at in retrieved:
-                comparisons.append(compare_retrieval(annotation, raw.cads, proposals[at], retrieved[at], floor))
+        retrieved = retrieval.auto_align(proposals, library, floor, lambda share: say("retrieve", 0.1 + 0.8 * share))
+        for annotation in raw.annotations:
+            low, high = box = bounds(retrieval.annotated_vertices(annotation, raw.cads))
+            at = max(range(len(proposals)), key=lambda i, box=box: box_iou(box, bounds(proposals[i].points)))
+            share = ((proposals[at].points > low) & (proposals[at].points < high)).all(axis=1).mean()
+            if share > SAME_OBJECT_SHARE and at in retrieved:
+                comparisons.append(
+                    retrieval.compare_retrieval(annotation, raw.cads, proposals[at], retrieved[at], floor)
+                )
     proposed = Proposed(proposals, retrieved, tuple(comparisons))
     say("draw", 0.95)
     text = json.dumps(as_scan2cad(raw.name, proposals, retrieved), indent=1, allow_nan=False) + "\n"

@@ -24,8 +24,7 @@ from converters.read.annotations import read_cad
 from converters.read.files import SourceFolder
 from converters.read.obj import texels
 from converters.records.errors import SceneRejected
-from converters.records.raw import CATEGORY_LABELS, SYNSETS, Annotation, CadModel
-from converters.records.visual import TexturedMesh
+from converters.records.raw import CATEGORY_LABELS, SYNSETS, Annotation, CadModel, TexturedMesh
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, transformed, wrap_angle, yaw_matrix
 
 N_YAWS = 24
@@ -229,11 +228,6 @@ def fit_model(proposal: Proposal, cad: CadModel, floor_m: float | None) -> _Fit:
     return dataclasses.replace(best, pose=dataclasses.replace(best.pose, yaw=wrap_angle(best.pose.yaw)))
 
 
-def fits_label(cad: CadModel, label: int) -> bool:
-    """Return whether scans label such a model so (a desk is often labelled a table)."""
-    return label in CATEGORY_LABELS[cad.category]
-
-
 def retrieve(
     proposal: Proposal, library: Mapping[str, CadModel], floor_m: float | None, any_category: bool = False
 ) -> Retrieval | None:
@@ -242,7 +236,7 @@ def retrieve(
     fits = {
         cad_id: fit_model(proposal, cad, floor)
         for cad_id, cad in sorted(library.items())
-        if any_category or fits_label(cad, proposal.label)
+        if any_category or proposal.label in CATEGORY_LABELS[cad.category]  # a desk is often labelled a table
     }
     if not fits:
         return None

@@ -14,7 +14,6 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from converters.geometry.boxes import convex_pieces
-from converters.geometry.faces import merge_vertices
 from converters.read.files import SourceFolder, read_json, read_mesh, read_obj
 from converters.read.meshes import clean_surface
 from converters.read.obj import GREY, TexturedMesh, join_textures, read_painted_obj, texels
@@ -177,8 +176,8 @@ def read_cad(source: SourceFolder, synset: str, cad_id: str) -> CadModel:
     # By material, the last first: decompositions depend on the order of the faces, and stored ones have this.
     order = np.argsort(-image, kind="stable")
     used, faces = np.unique(mesh.faces[order], return_inverse=True)
-    vertices, faces, keep = merge_vertices(mesh.vertices[used], faces.reshape(-1, 3))
-    vertices, faces, colours = clean_surface(source, relative, vertices, faces, colours[order][keep])
+    skin = mesh.vertices[used], faces.reshape(-1, 3), colours[order]
+    vertices, faces, colours = clean_surface(source, relative, *skin)
     pieces, collision = None, f"cad/{synset}/{cad_id}/models/{COLLISION}"
     if source.has(collision):
         hard = read_obj(source.use(collision, ""))

@@ -259,14 +259,16 @@ def read_obj(path: Path) -> ObjMesh:
         index_of, uv_index = _corner_indices(corners)
     except (ValueError, OverflowError) as error:
         raise SceneRejected(f"{path}: not readable as OBJ ({error}{_comma(str(error))}); export it again") from error
-    corner, face = _fans(np.array(sizes, np.int64))
+    count = np.array(sizes, np.int64)
+    face = np.repeat(np.arange(len(count)), count - 2)  # of each triangle around its polygon's first corner
+    step = np.arange(len(face)) - np.repeat(np.cumsum(count - 2) - (count - 2), count - 2)
+    corner = (np.cumsum(count) - count)[face][:, None] + np.stack([0 * step, step + 1, step + 2], axis=1)
     check_mesh(path, vertices, index_of[corner] - 1)
     _unfold(vertices, index_of - 1, corner, face)
     of = np.array(material, np.int64)[face].T
-    return ObjMesh(
-        vertices, index_of[corner] - 1, None if uv_index is None else _corner_uv(path, uv, uv_index, corner), of[0],
-        tuple(names), tuple(libraries), of[1], tuple(groups), _tinted(len(vertices), tints), dict(unused),
-    )  # fmt: skip
+    corner_uv = None if uv_index is None else _corner_uv(path, uv, uv_index, corner)
+    named = of[0], tuple(names), tuple(libraries), of[1], tuple(groups)
+    return ObjMesh(vertices, index_of[corner] - 1, corner_uv, *named, _tinted(len(vertices), tints), dict(unused))
 
 
 def _corner_uv(path: Path, uv: np.ndarray, index: np.ndarray, corner: np.ndarray) -> np.ndarray | None:
@@ -319,15 +321,6 @@ def _corner_indices(corners: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
     index = np.array([s[0] for s in split], np.int64)
     has_uv = any(s[1] for s in split)
     return index, np.array([s[1] or "1" for s in split], np.int64) if has_uv else None
-
-
-def _fans(sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (m, 3) corners of the triangles around each polygon's first corner, and the (m,) polygon of each."""
-    first = np.cumsum(sizes) - sizes
-    face = np.repeat(np.arange(len(sizes)), sizes - 2)
-    step = np.arange(len(face)) - np.repeat(np.cumsum(sizes - 2) - (sizes - 2), sizes - 2)
-    start = first[face]
-    return np.stack([start, start + step + 1, start + step + 2], axis=1).reshape(-1, 3), face
 
 
 def _unfold(vertices: np.ndarray, index: np.ndarray, corner: np.ndarray, face: np.ndarray) -> None:

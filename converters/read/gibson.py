@@ -55,8 +55,15 @@ def read_gibson(root: Path, strict: bool = False) -> RawScene:
     else:
         source.note(f"{ALIGNMENTS} is absent: structure only, all furniture stays part of it")
     raw = building(source, "gibson", mesh, labels, heights, cads, annotations)
-    furnished = not source.has(LABELS) or _furnished(root / LABELS)
-    scan = dataclasses.replace(raw.scan, furnished=furnished)
+    furnished = np.array(True)
+    if source.has(LABELS):  # the mesh shows what is annotated, unless the labels' file says otherwise
+        path, expected = root / LABELS, "expected labels as an NPZ, furnished as true or false"
+        with read_npz(path, SceneRejected, expected) as arrays:
+            furnished = np.asarray(arrays["furnished"]) if "furnished" in arrays.files else furnished
+        if furnished.dtype != bool or furnished.size != 1:
+            was = f"{furnished.dtype} of shape {furnished.shape}"
+            raise SceneRejected(f"{path}: furnished is {was}, expected one true or false")
+    scan = dataclasses.replace(raw.scan, furnished=bool(furnished.all()))
     return dataclasses.replace(raw, scan=scan, windows=read_windows(source))
 
 
@@ -75,15 +82,6 @@ def building(source: SourceFolder, layout: str, mesh: TexturedMesh, labels, heig
         attribution=read_attribution(source),
         storeys=tuple(Storey(h, m) for h, m in zip(heights, maps, strict=True)) if len(heights) > 1 else (),
     )
-
-
-def _furnished(path: Path) -> bool:
-    """Return whether the mesh shows what is annotated: it does unless the labels' file says otherwise."""
-    with read_npz(path, SceneRejected, "expected labels as an NPZ, furnished as true or false") as arrays:
-        value = np.asarray(arrays["furnished"]) if "furnished" in arrays.files else np.array(True)
-    if value.dtype != bool or value.size != 1:
-        raise SceneRejected(f"{path}: furnished is {value.dtype} of shape {value.shape}, expected one true or false")
-    return bool(value.all())
 
 
 def read_floors(source: SourceFolder) -> tuple[float, ...]:

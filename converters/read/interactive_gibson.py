@@ -6,14 +6,13 @@ whose orientation and scale are baked into its mesh, `pos_<i>_<synset>.txt` the 
 `floors.txt` as in `gibson`.
 """
 
-import dataclasses
 import math
 from pathlib import Path
 
 import numpy as np
 
 from converters.geometry.boxes import upright_box
-from converters.geometry.faces import merge_vertices, sample_faces
+from converters.geometry.faces import sample_faces
 from converters.read.annotations import inside_scan
 from converters.read.files import SourceFolder, read_numbers
 from converters.read.gibson import building, read_floors, read_traversable
@@ -27,7 +26,6 @@ from converters.records.raw import (
     SYNSETS,
     Annotation,
     CadModel,
-    GivenMap,
     RawScene,
     ScannedHinge,
     category_of_id,
@@ -48,11 +46,6 @@ NEAR_HINGE_M = 0.15
 PLANE_CELL_M = 0.1
 SAME_SHARE = 0.5
 """Two objects of one class that share this much of the smaller one's bounding box are one object."""
-
-
-def looks_like(root: Path) -> bool:
-    """Return True when the folder has the cleaned mesh and a furniture URDF."""
-    return (root / MESH).is_file() and any(root.glob(f"{PREFIX}*.urdf"))
 
 
 def read_interactive_gibson(root: Path, strict: bool = False) -> RawScene:
@@ -88,9 +81,8 @@ def _furniture(source: SourceFolder, path: Path, structure: np.ndarray) -> tuple
     if len(position) != 3 or not np.isfinite(position).all():
         raise SceneRejected(f"{place}: holds {len(position)} numbers, expected x y z in metres, all finite")
     item = read_urdf(source, path.name, "")
-    vertices, faces, keep = merge_vertices(item.surface.vertices, item.surface.faces)
-    colours = colours_of_faces(item.surface)[keep]
-    vertices, faces, colours = clean_surface(source, path.name, vertices, faces, colours)
+    surface = item.surface.vertices, item.surface.faces, colours_of_faces(item.surface)
+    vertices, faces, colours = clean_surface(source, path.name, *surface)
     turn, pieces = np.eye(3), item.pieces
     if category == "door":
         turn = leaf_turn(vertices)
@@ -169,7 +161,10 @@ def _without_doubles(
 def _with_plane(
     source: SourceFolder, number: int, height_m: float, mesh: TexturedMesh, labels: np.ndarray
 ) -> tuple[TexturedMesh, np.ndarray]:
-    """Return the scan with the release's floor plane where it shows no floor and the floor's map has some."""
+    """Return the scan with squares of 0.1 m of the release's floor plane, with its texture.
+
+    They lie inside the mesh and on the map, where the scan shows no floor.
+    """
     name = f"plane_z_up_{number}.obj"
     if not source.has(name):
         source.note(f"{name} is absent: the floor under the furniture is patched from the floor around it")
@@ -180,25 +175,8 @@ def _with_plane(
     shown = set()
     if near.any():
         shown = {tuple(c) for c in _cells(sample_faces(mesh.vertices, floor_faces[near], PLANE_CELL_M / 2)[0])}
-    floor_xy = mesh.vertices[labels == FLOOR, :2]
-    given = read_traversable(source, number, mesh.vertices[:, :2], floor_xy) if len(floor_xy) else None
-    patch = plane_patch(plane, height_m, shown, given, mesh.vertices[:, :2])
-    if patch is None:
-        return mesh, labels
-    return join_meshes(mesh, patch), np.concatenate([labels, np.full(len(patch.vertices), FLOOR, np.int64)])
-
-
-def _cells(points: np.ndarray) -> np.ndarray:
-    return np.floor(points[:, :2] / PLANE_CELL_M).astype(np.int64)
-
-
-def plane_patch(
-    plane: TexturedMesh, height_m: float, shown: set[tuple[int, ...]], given: GivenMap | None, mesh_xy: np.ndarray
-) -> TexturedMesh | None:
-    """Return squares of 0.1 m of a floor plane with its texture, or None where none is needed.
-
-    They lie inside the mesh and on the map, where the scan shows no floor.
-    """
+    mesh_xy, floor_xy = mesh.vertices[:, :2], mesh.vertices[labels == FLOOR, :2]
+    given = read_traversable(source, number, mesh_xy, floor_xy) if len(floor_xy) else None
     check_extent("a floor plane", plane.vertices)
     points, face = sample_faces(plane.vertices, plane.faces, PLANE_CELL_M / 2)
     cell, first = np.unique(_cells(points), axis=0, return_index=True)
@@ -212,17 +190,22 @@ def plane_patch(
         wanted = wanted[on[wanted] & given.traversable[index[wanted, 1], index[wanted, 0]]]
     cell, face = cell[wanted], face[first[wanted]]
     if not len(cell):
-        return None
+        return mesh, labels
     corner = (cell[:, None] + np.array([(0, 0), (1, 0), (1, 1), (0, 1)])) * PLANE_CELL_M
     vertices = np.column_stack([corner.reshape(-1, 2), np.full(4 * len(cell), height_m)])
     start = 4 * np.arange(len(cell))[:, None]
     faces = np.concatenate([start + [0, 1, 2], start + [0, 2, 3]])
-    if plane.corner_uv is None or plane.texture is None:
-        return TexturedMesh(vertices, faces, None, None)
-    a, b, c = (plane.vertices[plane.faces[face, k], :2] for k in range(3))
-    matrix = np.stack([b - a, c - a], axis=2)
-    weights = np.einsum("kij,knj->kni", np.linalg.pinv(matrix), corner - a[:, None])
-    uv = plane.corner_uv[face]
-    at = uv[:, None, 0] + weights @ (uv[:, 1:] - uv[:, :1])
-    corner_uv = np.concatenate([at[:, [0, 1, 2]], at[:, [0, 2, 3]]])
-    return dataclasses.replace(plane, vertices=vertices, faces=faces, corner_uv=np.clip(corner_uv, 0.0, 1.0))
+    patch = TexturedMesh(vertices, faces, None, None)
+    if plane.corner_uv is not None and plane.texture is not None:
+        a, b, c = (plane.vertices[plane.faces[face, k], :2] for k in range(3))
+        matrix = np.stack([b - a, c - a], axis=2)
+        weights = np.einsum("kij,knj->kni", np.linalg.pinv(matrix), corner - a[:, None])
+        uv = plane.corner_uv[face]
+        at = uv[:, None, 0] + weights @ (uv[:, 1:] - uv[:, :1])
+        corner_uv = np.clip(np.concatenate([at[:, [0, 1, 2]], at[:, [0, 2, 3]]]), 0.0, 1.0)
+        patch = TexturedMesh(vertices, faces, corner_uv, plane.texture)
+    return join_meshes(mesh, patch), np.concatenate([labels, np.full(len(vertices), FLOOR, np.int64)])
+
+
+def _cells(points: np.ndarray) -> np.ndarray:
+    return np.floor(points[:, :2] / PLANE_CELL_M).astype(np.int64)

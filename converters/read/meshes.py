@@ -18,19 +18,11 @@ import trimesh
 from PIL import Image
 from trimesh.visual import ColorVisuals
 
+from converters.geometry.faces import merge_vertices
 from converters.geometry.upright import AXES, UNITS_M, faces_away, find_unit, find_up, turn_upright
+from converters.read import obj
 from converters.read.files import SourceFolder, as_number, check_mesh, read_labels
 from converters.read.formats.gltf import read_gltf
-from converters.read.obj import (
-    TexturedMesh,
-    join_meshes,
-    read_scan_obj,
-    read_texture,
-    scan_of,
-    texels,
-    textured_by_face,
-    use_named,
-)
 from converters.read.surfaces import check_extent, floor_level, label_storeys, labelled, welded, with_split_corners
 from converters.records.errors import SceneRejected
 from converters.records.raw import RawScene
@@ -83,9 +75,9 @@ class SourceResolver:
         try:
             path = None
             if Path(key).suffix.lower() not in Image.registered_extensions() or (
-                read_texture(self.source, self.model, key) is not None
+                obj.read_texture(self.source, self.model, key) is not None
             ):
-                path = use_named(self.source, self.model.parent, key, self.model.name)
+                path = obj.use_named(self.source, self.model.parent, key, self.model.name)
         except SceneRejected as refusal:
             self.refusal = self.refusal or refusal
             raise
@@ -94,16 +86,16 @@ class SourceResolver:
         return path.read_bytes()
 
 
-def read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedMesh:
+def read_surface(source: SourceFolder, relative: str, remedy: str) -> obj.TexturedMesh:
     """Read a mesh file of any kind, with its textures or colours, once for every source."""
     if relative not in source.surfaces:
         source.surfaces[relative] = _read_surface(source, relative, remedy)
     return source.surfaces[relative]
 
 
-def _read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedMesh:
+def _read_surface(source: SourceFolder, relative: str, remedy: str) -> obj.TexturedMesh:
     if relative.lower().endswith(".obj"):
-        return read_scan_obj(source, relative, remedy)
+        return obj.read_scan_obj(source, relative, remedy)
     path = source.use(relative, remedy)
     resolver: Any = SourceResolver(source, path)
     try:
@@ -124,7 +116,7 @@ def _read_surface(source: SourceFolder, relative: str, remedy: str) -> TexturedM
     source.note_counts(f"{relative}: not used:", _unused(path), " ")
     if not parts:
         raise SceneRejected(f"{path}: holds no triangle mesh; export it as OBJ, PLY, STL or GLB")
-    return join_meshes(*parts)
+    return obj.join_meshes(*parts)
 
 
 def _unused(path: Path) -> dict[str, int]:
@@ -194,11 +186,11 @@ def read_single_mesh(
         labels = label_storeys(mesh.vertices, mesh.faces, (floor_m,))
         source.note(f"{path.name}: has no labels: floor, walls and ceiling are told by shape, all else is part of them")
     licence = "unknown: a mesh file says none"
-    raw = source.scene("mesh", scan_of(mesh, labels), floor_height_m=floor_m, licence=licence)
+    raw = source.scene("mesh", obj.scan_of(mesh, labels), floor_height_m=floor_m, licence=licence)
     return dataclasses.replace(raw, name=path.stem)
 
 
-def _painted(path: Path, part: trimesh.Trimesh, turn: np.ndarray) -> TexturedMesh:
+def _painted(path: Path, part: trimesh.Trimesh, turn: np.ndarray) -> obj.TexturedMesh:
     """Return a mesh of trimesh with its texture, or its colours of faces, vertices or material; grey without any."""
     vertices, faces = np.asarray(part.vertices, float), np.asarray(part.faces, np.int64)
     check_mesh(path, vertices, faces)
@@ -207,13 +199,13 @@ def _painted(path: Path, part: trimesh.Trimesh, turn: np.ndarray) -> TexturedMes
     image = _first(material, "image", "baseColorTexture")
     if image is not None and uv is not None and len(uv) == len(vertices):
         uv = np.where(np.isfinite(uv), uv, 0.0)
-        return TexturedMesh(vertices, faces, uv[faces], np.asarray(image.convert("RGB")))
+        return obj.TexturedMesh(vertices, faces, uv[faces], np.asarray(image.convert("RGB")))
     if isinstance(part.visual, ColorVisuals) and part.visual.defined:
         colours = np.asarray(part.visual.face_colors, np.uint8)[:, :3]
     else:
         plain = _first(material, "diffuse", "main_color")
         colours = np.tile(np.asarray((160, 160, 160) if plain is None else plain, np.uint8)[:3], (len(faces), 1))
-    return textured_by_face(vertices, faces, colours)
+    return obj.textured_by_face(vertices, faces, colours)
 
 
 def _first(item: Any, *names: str) -> Any:
@@ -240,25 +232,25 @@ def _collada_turn(path: Path) -> np.ndarray:
     return as_number(unit) * UP_AXES[axis]
 
 
-def colours_of_faces(mesh: TexturedMesh) -> np.ndarray:
+def colours_of_faces(mesh: obj.TexturedMesh) -> np.ndarray:
     """Return (m, 3) uint8: the texture at the middle of each face, grey without one."""
     if mesh.texture is None or mesh.corner_uv is None:
         return np.full((len(mesh.faces), 3), 170, np.uint8)
-    return texels(mesh.texture, mesh.corner_uv.mean(axis=1))
+    return obj.texels(mesh.texture, mesh.corner_uv.mean(axis=1))
 
 
 def clean_surface(
     source: SourceFolder, where: str, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Drop faces without area and report what else is wrong; open and non-manifold surfaces are left as they are.
+    """Join vertices, drop faces without area and report what else is wrong; open surfaces are left as they are.
 
     Decomposition rebuilds such surfaces as closed ones (coacd's manifold preprocessing), so that they need no repair
     here; their hulls are a voxel thicker.
 
-    `vertices`: (n, 3), equal positions joined.
-    `faces`: (m, 3).
     `colours`: (m, 3) of the faces.
     """
+    vertices, faces, keep = merge_vertices(vertices, faces)
+    colours = colours[keep]
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     extent = np.ptp(vertices, axis=0)
     longest = np.max([np.linalg.norm(b - a, axis=1), np.linalg.norm(c - b, axis=1), np.linalg.norm(a - c, axis=1)], 0)

@@ -20,8 +20,7 @@ from converters.geometry.faces import stacked
 from converters.read.files import ObjMesh, SourceFolder, as_number, read_image, read_obj, read_text
 from converters.records.errors import SceneRejected
 from converters.records.limits import PIXELS
-from converters.records.raw import ScanMesh
-from converters.records.visual import TexturedMesh
+from converters.records.raw import ScanMesh, TexturedMesh
 
 GREY = (170, 170, 170)
 """Colour of what has none."""

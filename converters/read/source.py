@@ -13,7 +13,12 @@ from converters.records.errors import SceneRejected
 from converters.records.raw import RawScene
 
 READERS = {
-    "interactive-gibson": (interactive_gibson.looks_like, interactive_gibson.read_interactive_gibson),
+    "interactive-gibson": (
+        lambda root: (
+            (root / interactive_gibson.MESH).is_file() and any(root.glob(f"{interactive_gibson.PREFIX}*.urdf"))
+        ),
+        interactive_gibson.read_interactive_gibson,
+    ),
     "gibson": (lambda root: (root / gibson.MESH).is_file(), gibson.read_gibson),
     "scan2cad": (lambda root: (root / annotations.ANNOTATION).is_file(), annotations.read_scan2cad),
     "sdf": (sdf.worlds_of, sdf.read_sdf),

@@ -228,7 +228,11 @@ def split_storeys(raw: RawScene) -> tuple[RawScene, ...]:
     base = [float((vertices @ pose[2, :3]).min() + pose[2, 3]) for vertices, pose in placed]
     of_object = storey_of(np.array(base), heights, STANDS_ABOVE_M)
     parts = [(scan.vertices, scan.faces), *raw.picture]
-    within = [_on_storeys(vertices, faces, heights) for vertices, faces in parts]
+    within, number = [], np.arange(len(heights))[:, None]
+    for vertices, faces in parts:
+        z = vertices[faces, 2]
+        low, of, high = (storey_of(some, heights) for some in (z.min(axis=1), z.mean(axis=1), z.max(axis=1)))
+        within.append((of == number) | (long_faces(vertices, faces) & (low <= number) & (number <= high)))
     scenes = []
     for k, storey in enumerate(raw.storeys):
         mine, *drawn = (np.flatnonzero(on[k]) for on in within)
@@ -261,10 +265,3 @@ def split_storeys(raw: RawScene) -> tuple[RawScene, ...]:
             )
         )
     return tuple(scenes)
-
-
-def _on_storeys(vertices: np.ndarray, faces: np.ndarray, heights_m: tuple[float, ...]) -> np.ndarray:
-    """Return [storey, m] bool: the faces that belong to each storey."""
-    z, number = vertices[faces, 2], np.arange(len(heights_m))[:, None]
-    low, of, high = (storey_of(some, heights_m) for some in (z.min(axis=1), z.mean(axis=1), z.max(axis=1)))
-    return (of == number) | (long_faces(vertices, faces) & (low <= number) & (number <= high))

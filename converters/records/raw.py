@@ -1,4 +1,4 @@
-"""Records that every reader fills and every stage takes: scan, CAD library, annotations.
+"""Hold what every reader fills and every stage takes: scan, CAD library, annotations, and what is drawn.
 
 Frames: *scan frame* = the scan's, z up, floor anywhere; *CAD frame* = the library's model turned to z
 up, not scaled; *world frame* (`_w`) = scan frame with the floor at z = 0; *body frame* (`_b`) = a placed
@@ -12,7 +12,6 @@ import numpy as np
 
 from converters.records.cache import NOT_HASHED
 from converters.records.errors import SceneRejected
-from converters.records.visual import TexturedMesh
 from interactive_nav_common.rotations import transform
 from scenes_mjcf.categories import TABLE
 
@@ -39,6 +38,55 @@ SMALL_LABELS = (UNLABELLED, 18, 20, 21, 23, 26, 27, 29, 35, 37, 40)
 """Unlabelled, pillow, mat, clothes, books, paper, towel, box, lamp, bag, otherprop: may lie on furniture."""
 CATEGORY_LABELS = {category.name: category.labels for category in TABLE if category.labels}
 """Category -> NYU40 ids."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ColourCloud:
+    """Coloured points of a surface."""
+
+    points: np.ndarray
+    """(n, 3) m."""
+    normals: np.ndarray
+    """(n, 3) unit, or zero where unknown."""
+    colours: np.ndarray
+    """(n, 3) float64, 0 to 255."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TexturedMesh:
+    """A mesh with at most one image."""
+
+    vertices: np.ndarray
+    """(n, 3) float64, m."""
+    faces: np.ndarray
+    """(m, 3) int64."""
+    corner_uv: np.ndarray | None
+    """(m, 3, 2) float64, origin at the lower left, or None without an image."""
+    texture: np.ndarray | None
+    """(h, w, 3) uint8, or None."""
+
+
+@dataclasses.dataclass(frozen=True)
+class VisualMesh:
+    """A mesh with separately indexed texture coordinates."""
+
+    vertices: np.ndarray
+    """(n, 3) m."""
+    faces: np.ndarray
+    """(m, 3) into `vertices`."""
+    uv: np.ndarray
+    """(k, 2) in [0, 1], origin at the lower left."""
+    uv_faces: np.ndarray
+    """(m, 3) into `uv`."""
+    image: np.ndarray
+    """(h, w, 3) uint8, first row at the top."""
+    exact: bool = False
+    """The image is the source's, and is written as it is."""
+
+
+def joined_clouds(*clouds: ColourCloud) -> ColourCloud:
+    """Join clouds into one."""
+    return ColourCloud(*(np.vstack([getattr(c, f.name) for c in clouds]) for f in dataclasses.fields(ColourCloud)))
 
 
 @dataclasses.dataclass(frozen=True)

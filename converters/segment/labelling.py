@@ -9,9 +9,9 @@ import numpy as np
 from converters.clock import Report
 from converters.generate import GenerationError
 from converters.propose.proposals import bounds, box_iou, propose_instances
-from converters.propose.report import annotated_vertices
+from converters.propose.retrieval import annotated_vertices
 from converters.read.surfaces import floor_level, storey_of
-from converters.records.raw import UNLABELLED, RawScene, ScanMesh
+from converters.records.raw import UNLABELLED, RawScene
 from converters.segment.network import WEIGHTS, Scores, load_network, make_scores, score_voxels
 from converters.segment.samples import TIERS, building_surface
 from converters.segment.voxels import (
@@ -60,22 +60,16 @@ def label_scan(raw: RawScene, scores: Scores, report: Report = lambda stage, sha
     return np.where(scored.any(axis=1), NYU40[scored.argmax(axis=1)], UNLABELLED)
 
 
-def objects_matched(raw: RawScene, scan: ScanMesh) -> int:
-    """Return how many of a source's annotated objects `propose` finds by a scan's labels: category, `MATCH_IOU`."""
-    proposals = propose_instances(scan)
-    boxes = [(a.category, bounds(annotated_vertices(a, raw.cads))) for a in raw.annotations]
-    return sum(
-        any(p.category == category and box_iou(box, bounds(p.points)) >= MATCH_IOU for p in proposals)
-        for category, box in boxes
-    )
-
-
 def score_source(raw: RawScene, scores: Scores, report: Report) -> dict[str, Any]:
     """Return IoU by class at the vertices of a labelled source, and how many annotated objects `propose` finds."""
     labels = label_scan(raw, scores, report)
     iou = intersection_over_union(classes_of(raw.scan.labels), classes_of(labels))
-    by_labels, by_truth = (objects_matched(raw, s) for s in (dataclasses.replace(raw.scan, labels=labels), raw.scan))
-    return {"iou": iou, "objects": len(raw.annotations), "matched": by_labels, "matched_true": by_truth}
+    boxes, matched = [(a.category, bounds(annotated_vertices(a, raw.cads))) for a in raw.annotations], []
+    for scan in (dataclasses.replace(raw.scan, labels=labels), raw.scan):
+        proposed = [(p.category, bounds(p.points)) for p in propose_instances(scan)]
+        hits = [any(c == of and box_iou(box, at) >= MATCH_IOU for c, at in proposed) for of, box in boxes]
+        matched.append(sum(hits))
+    return {"iou": iou, "objects": len(raw.annotations), "matched": matched[0], "matched_true": matched[1]}
 
 
 def score_homes(seed: int, count: int, scores: Scores, report: Report) -> dict[str, float]:

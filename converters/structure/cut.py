@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 
 from converters.bodies.objects import PlacedObject, to_world
 from converters.geometry.boxes import Hull
-from converters.geometry.faces import face_areas, face_labels, loose_parts
+from converters.geometry.faces import face_areas, face_labels, face_vectors, loose_parts
 from converters.records.raw import CATEGORY_LABELS, FLOOR, SMALL_LABELS, STRUCTURE_LABELS
 from interactive_nav_common.rotations import matrix_from_quat
 
@@ -40,8 +40,7 @@ def depth_in_hulls(points: np.ndarray, hulls: tuple[Hull, ...]) -> np.ndarray:
     """Return (n,) signed distance-like values: negative inside a hull (largest plane value, least over hulls), m."""
     best = np.full(len(points), np.inf)
     for hull in hulls:
-        a, b, c = (hull.vertices[hull.faces[:, k]] for k in range(3))
-        normal = np.cross(b - a, c - a)
+        a, normal = hull.vertices[hull.faces[:, 0]], face_vectors(hull.vertices, hull.faces)
         length = np.linalg.norm(normal, axis=1)
         normal, a = normal[length > 1e-12] / length[length > 1e-12, None], a[length > 1e-12]
         best = np.minimum(best, (points @ normal.T - (normal * a).sum(axis=1)).max(axis=1))
@@ -96,7 +95,16 @@ def cut_furniture(
         owner[_faces_of(centres, label, placed) & (owner < 0)] = k
     area = face_areas(vertices_w, faces)
     for category in sorted({o.category for o in objects}):
-        _take_rest_of_instances(owner, vertices_w, faces, label, centres, area, objects, category)
+        index = np.flatnonzero(np.isin(label, CATEGORY_LABELS.get(category, ())))
+        if not len(index):
+            continue
+        piece = loose_parts(vertices_w, faces[index])
+        total, gone = (np.bincount(piece, area[index] * share) for share in (1, owner[index] >= 0))
+        rest = index[(gone[piece] > INSTANCE_SHARE * total[piece]) & (owner[index] < 0)]
+        if len(rest):
+            members = [k for k, o in enumerate(objects) if o.category == category]
+            middles = np.array([to_world(objects[k], objects[k].vertices_b).mean(axis=0) for k in members])
+            owner[rest] = np.array(members)[KDTree(middles).query(centres[rest])[1]]
     keep = owner < 0
     kept = np.flatnonzero(keep)
     if len(kept) and not keep.all():
@@ -104,29 +112,3 @@ def cut_furniture(
         loses = np.bincount(part, ~keep)[part[kept]] > 0
         keep[kept[loses & (np.bincount(piece, area[kept])[piece] < DEBRIS_AREA_M2)]] = False
     return CutResult(keep, owner)
-
-
-def _take_rest_of_instances(
-    owner: np.ndarray,
-    vertices_w: np.ndarray,
-    faces: np.ndarray,
-    label: np.ndarray,
-    centres: np.ndarray,
-    area: np.ndarray,
-    objects: tuple[PlacedObject, ...],
-    category: str,
-) -> None:
-    """Extend `owner` in place: a connected piece of a category's label that is mostly cut goes entirely."""
-    index = np.flatnonzero(np.isin(label, CATEGORY_LABELS.get(category, ())))
-    if len(index) == 0:
-        return
-    piece = loose_parts(vertices_w, faces[index])
-    total = np.bincount(piece, area[index])
-    gone = np.bincount(piece, area[index] * (owner[index] >= 0))
-    rest = index[(gone[piece] > INSTANCE_SHARE * total[piece]) & (owner[index] < 0)]
-    if len(rest) == 0:
-        return
-    members = [k for k, o in enumerate(objects) if o.category == category]
-    middles = np.array([to_world(objects[k], objects[k].vertices_b).mean(axis=0) for k in members])
-    nearest = KDTree(middles).query(centres[rest])[1]
-    owner[rest] = np.array(members)[nearest]

@@ -26,8 +26,7 @@ from converters.geometry.faces import (
     unit_normals,
 )
 from converters.records.limits import CLOUD
-from converters.records.raw import CEILING, FLOOR, STRUCTURE_LABELS
-from converters.records.visual import ColourCloud
+from converters.records.raw import CEILING, FLOOR, STRUCTURE_LABELS, ColourCloud
 from converters.structure.floor import LIFT_M
 from converters.structure.maps import FloorPlan
 from interactive_nav_common.grids import label
@@ -59,6 +58,10 @@ OPENING, CORNER = 12, 6
 """Columns: wider stretches without wall are openings; so many may be hidden in a corner."""
 VISIBLE_BORDER_SHARE = 0.35
 """Least share of a wall patch's border (its foot apart) that runs along visible wall: else it may be an opening."""
+
+
+Mesh = tuple[np.ndarray, np.ndarray]
+"""Vertices (n, 3), m, and faces (m, 3)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,7 +177,7 @@ class Shown:
         np.minimum.at(depth_m, (row[inside], column[inside]), plane.distance(points[inside]))
         return cls(plane, low, cell_m, np.isfinite(depth_m), depth_m)
 
-    def patches(self, hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def patches(self, hidden: np.ndarray) -> Mesh:
         """Return vertices (k, 3) m and faces (j, 3) that cover hidden cells; they look along the normal."""
         rearmost = ndimage.minimum_filter(self.depth_m, OVERLAP)
         rearmost = np.where(np.isfinite(rearmost), rearmost, 0.0) - BEHIND_M
@@ -259,9 +262,8 @@ def hidden_wall(plan: FloorPlan, shown: Shown, objects: tuple[PlacedObject, ...]
 
 
 def fill_holes(
-    planes: list[Plane], plan: FloorPlan, objects: tuple[PlacedObject, ...], cloud: ColourCloud,
-    scan: tuple[np.ndarray, np.ndarray],
-) -> tuple[tuple[np.ndarray, np.ndarray], list[ColourCloud]]:  # fmt: skip
+    planes: list[Plane], plan: FloorPlan, objects: tuple[PlacedObject, ...], cloud: ColourCloud, scan: Mesh
+) -> tuple[Mesh, list[ColourCloud]]:
     """Patch what furniture hid of floor and walls; return vertices and faces of the patches, and coloured points there.
 
     `scan`: vertices (n, 3) m and faces (m, 3) that are drawn.
@@ -298,7 +300,7 @@ def fill_holes(
     return stacked(done), clouds
 
 
-def _coloured(patch: tuple[np.ndarray, np.ndarray], plane: Plane, visible: ColourCloud) -> ColourCloud:
+def _coloured(patch: Mesh, plane: Plane, visible: ColourCloud) -> ColourCloud:
     """Return points on a patch, coloured as what is visible of its plane around them."""
     spots, _ = sample_faces(*patch, SPACING_M)
     count = min(48, len(visible.points))

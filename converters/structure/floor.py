@@ -36,23 +36,9 @@ class FloorFit:
     support: float
     """Share of the floor-labelled area that lies within `TOLERANCE_M` of the plane."""
 
-    @property
-    def tilt_deg(self) -> float:
-        """Return the angle to the level."""
-        return math.degrees(math.atan(float(np.hypot(*self.slope))))
-
     def height_at(self, points: np.ndarray) -> np.ndarray:
         """Return (n,) z of the plane under (n, 2+) points."""
         return self.height_m + (points[:, :2] - self.centre) @ self.slope
-
-
-def _least_squares(points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
-    """Return centre, height and slope of the plane with the least weighted vertical residual."""
-    centre = weight @ points[:, :2] / weight.sum()
-    root = np.sqrt(weight)[:, None]
-    terms = np.column_stack([np.ones(len(points)), points[:, :2] - centre])
-    height, *slope = np.linalg.lstsq(terms * root, points[:, 2] * root[:, 0], rcond=None)[0]
-    return centre, float(height), np.array(slope)
 
 
 def fit_floor(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, near_m: float | None = None) -> FloorFit:
@@ -94,7 +80,12 @@ def fit_floor(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, near_
             "the level; check the labels and that z is up"
         )
     for _ in range(2):
-        centre, height, slope = _least_squares(middle[best], weight[best])
+        # The plane of the least weighted vertical residual.
+        points, share = middle[best], weight[best]
+        centre, root = share @ points[:, :2] / share.sum(), np.sqrt(share)[:, None]
+        terms = np.column_stack([np.ones(len(points)), points[:, :2] - centre])
+        height, *rise = np.linalg.lstsq(terms * root, points[:, 2] * root[:, 0], rcond=None)[0]
+        height, slope = float(height), np.array(rise)
         best = np.abs(middle[:, 2] - height - (middle[:, :2] - centre) @ slope) < TOLERANCE_M
     return FloorFit(centre, height, slope, float(weight[best].sum() / weight.sum()))
 

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 import shapely
 from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
 from shapely import MultiPoint, contains_xy
 
 from converters.bodies.objects import PlacedObject, to_world
-from converters.geometry.faces import beyond_block, face_labels, face_vectors, sampled, unit_normals
+from converters.geometry.faces import beyond_block, face_labels, sampled, unit_normals
 from converters.records.errors import SceneRejected
 from converters.records.raw import CEILING, DOOR, FLOOR, STRUCTURE_LABELS, UNLABELLED, GivenMap
-from converters.structure.enclosure import beyond_obstacles, floor_outside
 from interactive_nav_common.grids import label
 from interactive_nav_common.rotations import yaw_matrix
 
@@ -50,6 +50,17 @@ HEIGHT_STEP_M = 0.1
 """Heights of low static furniture are rounded up to this: few boxes."""
 LEAF_MARGIN_M, BOXED_M = 0.04, 0.01
 """Kept free around the space that a door's leaf sweeps; how far a leaf's box may stand out of its hulls."""
+BEYOND_M = 0.5
+"""Floor farther than this outside of the convex hull of all obstacles lies outside of the home."""
+LEAST_BEYOND_M2 = 1.0
+"""A home with less floor beyond its obstacles has no floor around it: scans end between walls."""
+OPENINGS_M = (1.3, 2.0, 2.8)
+"""Widths of discs that roll around a home and do not fit through its doorways, tried in order."""
+LEAST_INSIDE_M2 = 3.0
+"""Least floor of a home."""
+RIGHT_SHARE, HOME_SHARE = 0.5, 0.25
+"""Least share of the floor within the hull that lies inside: for a width to be right at once, and for a home without
+furniture."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,37 +127,6 @@ class FloorPlan:
     """Traversable floor that the scan does not show."""
     open_share: float = 0.0
     """Share of the traversable floor that lies beyond all obstacles: no walls enclose it."""
-
-
-def main_direction(vertices_w: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> float:
-    """Return the direction of the walls modulo 90 degrees, rad in [-pi/4, pi/4): mode of wall normals, by area.
-
-    Less than 1 degree counts as 0: the map then needs no turning."""
-    wall = np.isin(face_labels(labels, faces), [v for v in STRUCTURE_LABELS if v not in (FLOOR, CEILING)])
-    normal = face_vectors(vertices_w, faces[wall])
-    length = np.linalg.norm(normal, axis=1)
-    steep = (length > 0) & (np.abs(normal[:, 2]) < 0.2 * length)
-    if not steep.any():
-        return 0.0
-    angle = np.arctan2(normal[steep, 1], normal[steep, 0]) % (math.pi / 2)
-    bins = 180
-    histogram = np.bincount((angle / (math.pi / 2) * bins).astype(int) % bins, length[steep], bins)
-    smooth = ndimage.gaussian_filter1d(histogram, 2.0, mode="wrap")
-    peak = (np.argmax(smooth) + 0.5) / bins * math.pi / 2
-    # Mean of the angles near the peak, on the circle of period 90 degrees.
-    offset = (angle - peak + math.pi / 4) % (math.pi / 2) - math.pi / 4
-    near = np.abs(offset) < math.radians(5)
-    yaw = peak + float(np.average(offset[near], weights=length[steep][near]))
-    yaw = (yaw + math.pi / 4) % (math.pi / 2) - math.pi / 4
-    return 0.0 if abs(yaw) < math.radians(1.0) else yaw
-
-
-def _footprint(grid: Grid, placed: PlacedObject) -> np.ndarray:
-    """Return (rows, columns) bool: cells under the object's hulls."""
-    mask = np.zeros(grid.shape, bool)
-    for hull in placed.hulls_b:
-        grid.add_below(mask, to_world(placed, hull.vertices), grid.resolution_m / 2)
-    return mask
 
 
 def swept_by_door(grid: Grid, placed: PlacedObject, margin_m: float = LEAF_MARGIN_M) -> np.ndarray:
@@ -217,15 +197,6 @@ def _without_insides(free: np.ndarray, shown: _Shown, resolution_m: float) -> np
     return keep[pieces]
 
 
-def _grid_around(points_w: np.ndarray, yaw: float, resolution_m: float) -> Grid:
-    """Return the grid of whole cells over (n, 3) points, with a margin."""
-    used = points_w @ yaw_matrix(yaw)
-    low, high = used[:, :2].min(axis=0) - PAD_M, used[:, :2].max(axis=0) + PAD_M
-    low = np.floor(low / resolution_m) * resolution_m
-    columns, rows = np.ceil((high - low) / resolution_m).astype(int)
-    return Grid(yaw, (float(low[0]), float(low[1])), (int(rows), int(columns)), resolution_m)
-
-
 def make_floor_plan(
     vertices_w: np.ndarray,
     faces: np.ndarray,
@@ -240,7 +211,10 @@ def make_floor_plan(
 
     `given` is the source's traversable map; `yaw` of the grid is the building's `main_direction`, rad.
     """
-    grid = _grid_around(vertices_w[np.unique(faces)], yaw, resolution_m)
+    used = (vertices_w[np.unique(faces)] @ yaw_matrix(yaw))[:, :2]
+    low = np.floor((used.min(axis=0) - PAD_M) / resolution_m) * resolution_m
+    columns, rows = np.ceil((used.max(axis=0) + PAD_M - low) / resolution_m).astype(int)
+    grid = Grid(yaw, (float(low[0]), float(low[1])), (int(rows), int(columns)), resolution_m)
     shown = _shown(grid, vertices_w, faces, face_labels(labels, faces))
     floor_visible = shown.floor >= 2
     occupied = _drop_small(shown.solid >= 3, MIN_OBSTACLE_CELLS)
@@ -250,14 +224,17 @@ def make_floor_plan(
 
     under, swept = np.zeros((2, *grid.shape), bool)
     for placed in objects:
-        under |= _footprint(grid, placed)
+        for hull in placed.hulls_b:
+            grid.add_below(under, to_world(placed, hull.vertices), resolution_m / 2)
         if placed.hinge is not None:
             swept |= swept_by_door(grid, placed, LEAF_MARGIN_M + BOXED_M * exact)
     # What is left of the door's scan in its sweep goes, walls stay.
     occupied &= ~swept | (shown.solid_wall >= 3)
     closed = ndimage.binary_closing(floor_visible, iterations=CLOSE_CELLS) | under | floor_visible
     if given is not None:
-        closed |= _given_floor(grid, given)
+        shape: Any = given.traversable.shape
+        upright = Grid(0.0, given.origin, shape, given.resolution_m)
+        closed |= upright.values(given.traversable, grid.centres_w().reshape(-1, 2)).reshape(grid.shape)
     # What lies behind a line of obstacles (the inside of a wall, the far side of one that a chair's annotated
     # pose cuts) is no floor: it must connect to visible floor.
     floor = np.asarray(ndimage.binary_propagation(floor_visible & ~occupied, mask=closed & ~occupied), bool)
@@ -346,11 +323,52 @@ def _heights(shown: _Shown, occupied: np.ndarray, around: int) -> np.ndarray:
     return np.where(low, np.minimum(rounded, tall_m), tall_m).round(3)
 
 
-def _given_floor(grid: Grid, given: GivenMap) -> np.ndarray:
-    """Return (rows, columns) bool: cells whose middle is traversable in the source's map."""
-    shape: Any = given.traversable.shape
-    upright = Grid(0.0, given.origin, shape, given.resolution_m)
-    return upright.values(given.traversable, grid.centres_w().reshape(-1, 2)).reshape(grid.shape)
+def beyond_obstacles(occupied: np.ndarray, resolution_m: float) -> np.ndarray:
+    """Return (rows, columns) bool: cells over `BEYOND_M` outside of the convex hull of the occupied cells."""
+    cells = np.argwhere(occupied)
+    try:
+        sides = ConvexHull(cells).equations
+    except (QhullError, ValueError):  # all on one line, or none
+        return np.zeros(occupied.shape, bool)
+    rows, columns = np.indices(occupied.shape)
+    far = np.full(occupied.shape, -np.inf)
+    for row, column, offset in sides:
+        np.maximum(far, row * rows + column * columns + offset, out=far)
+    return far * resolution_m > BEYOND_M
+
+
+def floor_outside(floor: np.ndarray, occupied: np.ndarray, furniture: np.ndarray, resolution_m: float) -> np.ndarray:
+    """Return the part of a floor that lies outside of the walls of a home; all masks are (rows, columns) bool.
+
+    Outside is what a disc that comes from beyond all obstacles covers, if it does not fit through doorways. Nothing is
+    outside where no floor lies beyond the obstacles, or where the walls enclose no home: too little floor, or less
+    than half of the furniture, which is the footprints of movable objects.
+    """
+    cell_m2 = resolution_m**2
+    beyond = beyond_obstacles(occupied, resolution_m)
+    if (floor & beyond).sum() * cell_m2 < LEAST_BEYOND_M2:
+        return np.zeros_like(floor)
+    best, within = np.zeros_like(floor), (floor & ~beyond).sum()
+    for width_m in OPENINGS_M:
+        inside = _inside(floor, occupied, beyond, width_m / resolution_m)
+        best = max(best, inside, key=np.count_nonzero)
+        if inside.sum() >= RIGHT_SHARE * within:
+            break
+    under = floor & furniture
+    is_home = 2 * (under & best).sum() >= under.sum() if under.any() else best.sum() >= HOME_SHARE * within
+    return floor & ~best if is_home and best.sum() * cell_m2 >= LEAST_INSIDE_M2 else np.zeros_like(floor)
+
+
+def _inside(floor: np.ndarray, occupied: np.ndarray, beyond: np.ndarray, width: float) -> np.ndarray:
+    """Return the floor that a disc of `width` cells, which comes from beyond, does not cover nor cut off."""
+    pad, radius = int(width) + 2, width / 2
+    around = np.pad(beyond, pad, constant_values=True)
+    fits = np.asarray(ndimage.distance_transform_edt(~np.pad(occupied, pad))) > radius
+    middles = np.asarray(ndimage.binary_propagation(around & fits, mask=fits), bool)
+    outside = np.asarray(ndimage.distance_transform_edt(~middles)) <= radius
+    core = np.pad(floor, pad) & fits & ~outside & ~around
+    inside = np.asarray(ndimage.binary_propagation(core, mask=np.pad(floor, pad) & ~outside), bool)
+    return inside[pad:-pad, pad:-pad]
 
 
 def resample(grid: Grid, mask: np.ndarray, resolution_m: float) -> tuple[np.ndarray, tuple[float, float]]:

@@ -13,8 +13,7 @@ import numpy as np
 
 from converters.bodies.objects import Physical, PlacedObject
 from converters.geometry.boxes import OrientedBox, least_turned
-from converters.records.raw import Lamp, Window
-from converters.records.visual import VisualMesh
+from converters.records.raw import Lamp, VisualMesh, Window
 from converters.write.texture import as_png, quantise, share_plain
 from interactive_nav_common.rotations import yaw_matrix
 from scenes_mjcf.agreement import LIT_AMBIENT
@@ -70,21 +69,6 @@ class SceneParts:
     """World frame."""
 
 
-def _add_defaults(spec: mujoco.MjSpec) -> None:
-    for name, collides, group, rgba in (
-        ("visual", 0, 2, None),
-        ("hull", 1, 3, (0.3, 0.6, 0.9, 0.5)),
-        ("box", 0, 4, (0.9, 0.6, 0.3, 0.5)),
-        ("structure", 1, 3, (0.7, 0.7, 0.7, 0.5)),
-    ):
-        default = spec.add_default(name, spec.default)
-        default.geom.contype = default.geom.conaffinity = collides
-        default.geom.group = group
-        default.geom.mass = 0.0
-        if rgba is not None:
-            default.geom.rgba = rgba
-
-
 def _quaternion(rotation: np.ndarray) -> np.ndarray:
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation, float).reshape(9))
@@ -113,16 +97,9 @@ def _add_movable(
     if placed.hinge is None:
         body.add_freejoint(name=f"{placed.name}_free")
     else:
-        body.add_joint(
-            name=f"{placed.name}_hinge",
-            type=mujoco.mjtJoint.mjJNT_HINGE,
-            pos=_tidy(placed.hinge.origin_b),
-            axis=[0, 0, 1],
-            range=np.round(placed.hinge.range_rad, 6),
-            damping=np.array([DOOR_DAMPING, 0, 0]),
-            frictionloss=DOOR_FRICTION,
-            armature=0.01,
-        )
+        joint = body.add_joint(name=f"{placed.name}_hinge", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
+        joint.pos, joint.range = _tidy(placed.hinge.origin_b), np.round(placed.hinge.range_rad, 6)
+        joint.damping, joint.frictionloss, joint.armature = [DOOR_DAMPING, 0, 0], DOOR_FRICTION, 0.01
     friction = [physical.friction, 0.005, 0.0001]
     if look is not None:
         _add_look(spec, body, placed.name, look)
@@ -152,30 +129,14 @@ def _add_look(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, look: Appear
     """Add a textured visual geom; reuse meshes, textures and materials of other bodies."""
     mesh_name = f"{name}_visual" if look.scale != ONE else f"{look.mesh}_visual"
     if mesh_name == f"{name}_visual":
-        spec.add_mesh(
-            name=mesh_name, file=f"{look.mesh}_visual.obj", scale=look.scale,
-            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
-        )  # fmt: skip
+        mesh = spec.add_mesh(name=mesh_name, file=f"{look.mesh}_visual.obj", scale=look.scale)
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     if look.image == name:
         spec.add_texture(name=f"{name}_texture", file=f"{name}.png", type=mujoco.mjtTexture.mjTEXTURE_2D)
         material = spec.add_material(name=f"{name}_material", specular=0.1, shininess=0.1)
         material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = f"{name}_texture"
-    body.add_geom(
-        spec.find_default("visual"),
-        name=f"{name}_visual",
-        type=mujoco.mjtGeom.mjGEOM_MESH,
-        meshname=mesh_name,
-        material=f"{look.image}_material",
-    )
-
-
-def _scale_between(first: VisualMesh, other: VisualMesh) -> tuple[float, float, float] | None:
-    """Return what turns the first mesh into the other, for each axis; None where no scale does."""
-    size, wanted = (np.ptp(m.vertices, axis=0) for m in (first, other))
-    scale = np.round(np.where(size > 1e-6, wanted / np.maximum(size, 1e-6), 1.0), 6)
-    if np.abs(first.vertices * scale - other.vertices).max() > SAME_M:
-        return None
-    return float(scale[0]), float(scale[1]), float(scale[2])
+    kind, mesh_geom = spec.find_default("visual"), mujoco.mjtGeom.mjGEOM_MESH
+    body.add_geom(kind, name=f"{name}_visual", type=mesh_geom, meshname=mesh_name, material=f"{look.image}_material")
 
 
 def share_assets(parts: SceneParts) -> Assets:
@@ -186,8 +147,11 @@ def share_assets(parts: SceneParts) -> Assets:
         image = images.setdefault((visual.exact, visual.image.shape, visual.image.tobytes()), name)
         key = tuple(np.ascontiguousarray(v).tobytes() for v in (visual.faces, visual.uv, visual.uv_faces))
         first, mesh = meshes.setdefault(key, (name, visual))
-        scale = _scale_between(mesh, visual)
-        looks[name] = Appearance(name, ONE, image) if scale is None else Appearance(first, scale, image)
+        size, wanted = (np.ptp(m.vertices, axis=0) for m in (mesh, visual))
+        scale = np.round(np.where(size > 1e-6, wanted / np.maximum(size, 1e-6), 1.0), 6)
+        same = np.abs(mesh.vertices * scale - visual.vertices).max() <= SAME_M
+        x, y, z = scale.tolist()
+        looks[name] = Appearance(first, (x, y, z), image) if same else Appearance(name, ONE, image)
     for placed in parts.objects:
         for i, hull in enumerate(placed.hulls_b):
             key = (np.round(hull.vertices, HULL_DECIMALS) + 0.0).tobytes(), hull.faces.tobytes()
@@ -204,7 +168,15 @@ def build_spec(parts: SceneParts, assets: Assets | None = None) -> mujoco.MjSpec
     lit = parts.structure_visual is not None and parts.structure_visual.exact
     _add_surroundings(spec, parts.walls, lit, parts.lamps)
     assets = assets or Assets({}, {})
-    _add_structure(spec, parts, assets.looks.get("structure"))
+    structure = spec.worldbody.add_body(name="structure")
+    if (look := assets.looks.get("structure")) is not None:
+        _add_look(spec, structure, "structure", look)
+    for i, wall in enumerate(parts.walls):
+        _add_box(spec, structure, "structure", f"wall_{i}", wall, [0.6, 0.005, 0.0001])
+    for k, window in enumerate(parts.windows):  # of a group that viewers hide
+        quat = np.round(_quaternion(yaw_matrix(window.yaw)), 9)
+        place = {"pos": _tidy(window.middle), "size": _tidy(window.half), "quat": quat}
+        structure.add_site(name=f"window_{k}", type=mujoco.mjtGeom.mjGEOM_BOX, group=5, **place)
     # Semantic classes, for tools that read the MJCF alone: text `class_<body>` holds the category.
     for body, category in (("structure", "structure"), *((o.name, o.category) for o in parts.objects)):
         spec.add_text(name=f"class_{body}", data=category)
@@ -223,51 +195,39 @@ def _empty_spec(name: str) -> mujoco.MjSpec:
     spec.option.timestep = TIMESTEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-    _add_defaults(spec)
+    for name, collides, group, rgba in (
+        ("visual", 0, 2, None),
+        ("hull", 1, 3, (0.3, 0.6, 0.9, 0.5)),
+        ("box", 0, 4, (0.9, 0.6, 0.3, 0.5)),
+        ("structure", 1, 3, (0.7, 0.7, 0.7, 0.5)),
+    ):
+        default = spec.add_default(name, spec.default)
+        default.geom.contype = default.geom.conaffinity = collides
+        default.geom.group = group
+        default.geom.mass = 0.0
+        if rgba is not None:
+            default.geom.rgba = rgba
     return spec
 
 
 def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[OrientedBox, ...], lit: bool, lamps: tuple[Lamp, ...]) -> None:
     """Add floor, lamps, and a light above the walls' middle: an even one where the structure's image is `lit`."""
-    spec.worldbody.add_geom(
-        name="floor",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[0, 0, 0.1],
-        friction=[1.0, 0.005, 0.0001],
-        rgba=[0.6, 0.6, 0.6, 1.0],
-    )
+    floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1])
+    floor.friction, floor.rgba = [1.0, 0.005, 0.0001], [0.6, 0.6, 0.6, 1.0]
     middle = np.mean([b.centre for b in walls], axis=0) if walls else np.zeros(3)
-    spec.worldbody.add_light(
-        name="light",
-        pos=[round(float(middle[0]), 3), round(float(middle[1]), 3), 4.0],
-        dir=[0.25, 0.35, -0.9] if lit else [0, 0, -1],
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        castshadow=False,
-        diffuse=[0.25 if lit else 0.15 if lamps else 0.6] * 3,
-        ambient=[0.5 if lit else 0.35 if lamps else 0.4] * 3,
-    )
+    light = spec.worldbody.add_light(name="light", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False)
+    light.pos = [round(float(middle[0]), 3), round(float(middle[1]), 3), 4.0]
+    light.dir = [0.25, 0.35, -0.9] if lit else [0, 0, -1]
+    light.diffuse = [0.25 if lit else 0.15 if lamps else 0.6] * 3
+    light.ambient = [0.5 if lit else 0.35 if lamps else 0.4] * 3
     for k, lamp in enumerate(lamps):  # MuJoCo's renderer leaves out lights of type point
-        spec.worldbody.add_light(
-            name=f"lamp_{k}", pos=_tidy(lamp.at), castshadow=False, cutoff=180.0, exponent=0.0,
-            attenuation=LAMP_FALL, diffuse=np.round(LAMP * lamp.colour, 4), specular=[0.0] * 3,
-        )  # fmt: skip
+        light = spec.worldbody.add_light(name=f"lamp_{k}", pos=_tidy(lamp.at), castshadow=False, cutoff=180.0)
+        light.exponent, light.attenuation, light.specular = 0.0, LAMP_FALL, [0.0] * 3
+        light.diffuse = np.round(LAMP * lamp.colour, 4)
     if lit or lamps:
         spec.visual.headlight.diffuse = [0.15] * 3
     if lit:
         spec.visual.headlight.ambient = [LIT_AMBIENT] * 3
-
-
-def _add_structure(spec: mujoco.MjSpec, parts: SceneParts, look: Appearance | None) -> None:
-    """Add the cleaned scan as a picture, and the wall boxes."""
-    structure = spec.worldbody.add_body(name="structure")
-    if look is not None:
-        _add_look(spec, structure, "structure", look)
-    for i, wall in enumerate(parts.walls):
-        _add_box(spec, structure, "structure", f"wall_{i}", wall, [0.6, 0.005, 0.0001])
-    for k, window in enumerate(parts.windows):  # of a group that viewers hide
-        quat = np.round(_quaternion(yaw_matrix(window.yaw)), 9)
-        place = {"pos": _tidy(window.middle), "size": _tidy(window.half), "quat": quat}
-        structure.add_site(name=f"window_{k}", type=mujoco.mjtGeom.mjGEOM_BOX, group=5, **place)
 
 
 def paired(faces: np.ndarray, corners: np.ndarray) -> list[list[int]]:

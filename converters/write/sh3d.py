@@ -22,8 +22,7 @@ from converters.read.files import read_image, read_obj
 from converters.read.homes.sh3d import OURS
 from converters.read.homes.sh3d_models import GLASS, HULLS, PANE
 from converters.records.errors import SceneRejected
-from converters.records.raw import ATTRIBUTION
-from converters.records.visual import ColourCloud, TexturedMesh
+from converters.records.raw import ATTRIBUTION, ColourCloud, TexturedMesh
 from converters.write.sh3d_rooms import SIDE_M, Wall, gap_around, half_wall, merged_walls, rooms_of, wall_between
 from converters.write.texture import textured_cloud
 from interactive_nav_common.errors import FileError

@@ -15,8 +15,7 @@ from converters.geometry.faces import face_areas, sample_faces, unit_normals, ve
 from converters.geometry.simplify import simplify_to, surface_loss
 from converters.read.obj import texels
 from converters.records.limits import CLOUD
-from converters.records.raw import ScanMesh
-from converters.records.visual import ColourCloud, TexturedMesh, VisualMesh
+from converters.records.raw import ColourCloud, ScanMesh, TexturedMesh, VisualMesh
 from interactive_nav_common.grids import nearest_cell
 from interactive_nav_common.rotations import matrix_from_quat
 
@@ -32,16 +31,14 @@ PLAIN, MARGIN = 8, 4
 
 
 def colour_cloud(
-    scan: ScanMesh, vertices_w: np.ndarray, faces: np.ndarray, face_index: np.ndarray,
-    spacing_m: float = TEXTURE_SPACING_M,
-) -> ColourCloud:  # fmt: skip
+    scan: ScanMesh, vertices_w: np.ndarray, face_index: np.ndarray, spacing_m: float = TEXTURE_SPACING_M
+) -> ColourCloud:
     """Sample coloured points of some faces of the scan: their vertices, or a sampling of the texture.
 
     `vertices_w`: (n, 3) the scan's vertices in the world, m.
-    `faces`: (m, 3) the scan's faces.
-    `face_index`: (k,) which of them to take.
+    `face_index`: (k,) which faces to take.
     """
-    chosen = faces[face_index]
+    chosen = scan.faces[face_index]
     if scan.texture is None or scan.corner_uv is None:
         assert scan.vertex_colours is not None
         used = np.unique(chosen)
@@ -60,7 +57,7 @@ def textured_cloud(mesh: TexturedMesh, spacing_m: float) -> ColourCloud:
         return ColourCloud(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
     none = np.zeros(len(mesh.vertices), np.int64)
     scan = ScanMesh(mesh.vertices, mesh.faces, none, None, mesh.corner_uv, mesh.texture)
-    return colour_cloud(scan, mesh.vertices, mesh.faces, np.arange(len(mesh.faces)), spacing_m)
+    return colour_cloud(scan, mesh.vertices, np.arange(len(mesh.faces)), spacing_m)
 
 
 def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -77,6 +74,15 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarr
     return np.asarray(uv, float), np.asarray(uv_faces, np.int64)
 
 
+def box_pixels(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return for every pixel of boxes, from (m, 2) low to below (m, 2) high, the box (n,) and its place (n, 2)."""
+    count = (high - low).prod(axis=1)
+    box = np.repeat(np.arange(len(low)), count)
+    step = np.arange(len(box)) - np.repeat(np.cumsum(count) - count, count)
+    wide = (high - low)[box, 0]
+    return box, low[box] + np.stack([step % wide, step // wide], axis=1)
+
+
 def texel_surface(
     vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, uv_faces: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -88,12 +94,8 @@ def texel_surface(
     corners[..., 1] = size - corners[..., 1]  # image rows run downwards
     low = np.clip(np.floor(corners.min(axis=1)).astype(int), 0, size - 1)
     high = np.clip(np.ceil(corners.max(axis=1)).astype(int), low + 1, size)
-    extent = high - low
-    count = extent.prod(axis=1)
-    face = np.repeat(np.arange(len(faces)), count)
-    step = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
-    column = low[face, 0] + step % extent[face, 0]
-    row = low[face, 1] + step // extent[face, 0]
+    face, at = box_pixels(low, high)
+    column, row = at.T
     a, b, c = (corners[face, k] for k in range(3))
     middle = np.stack([column + 0.5, row + 0.5], axis=1)
     det = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
@@ -209,7 +211,7 @@ def bake_object(
     """Bake a simplified CAD model, retextured from the scan points that showed the object.
 
     A texel takes the mean of the near scan points whose normal agrees. One that no scan point shows is
-    in-painted from the nearest shown texels of the same CAD material, else of any; an object that the scan
+    in-painted from the eight nearest shown texels of the same CAD material, else of any; an object that the scan
     does not show at all keeps its CAD colours.
 
     `vertices`: (n, 3) CAD surface in the world, m.
@@ -241,26 +243,15 @@ def bake_object(
         visible = total > 0
         mixed = (cloud.colours[index] * weight[..., None]).sum(axis=1)
         colours[visible] = mixed[visible] / total[visible, None]
-    colours = _inpaint(point, colours, visible, material)
-    image = fill_image(texel, colours, size)
-    return VisualMesh(low_vertices, low_faces, uv, uv_faces, image), float(visible.mean()) if len(visible) else 0.0
-
-
-def _inpaint(point: np.ndarray, colours: np.ndarray, visible: np.ndarray, material: np.ndarray) -> np.ndarray:
-    """Colour hidden texels as the mean of their eight nearest visible ones of the same material, else of any."""
-    result = colours.copy()
-    if not visible.any():
-        return result
-    for m in np.unique(material):
-        wanted = (material == m) & ~visible
-        source = (material == m) & visible
-        if source.sum() < 8:
-            source = visible
+    for m in np.unique(material) if visible.any() else ():
+        wanted, source = (material == m) & ~visible, (material == m) & visible
+        source = visible if source.sum() < 8 else source
         if wanted.any():
             count = min(8, int(source.sum()))
             index = KDTree(point[source]).query(point[wanted], k=count)[1].reshape(-1, count)
-            result[wanted] = colours[source][index].mean(axis=1)
-    return result
+            colours[wanted] = colours[source][index].mean(axis=1)
+    image = fill_image(texel, colours, size)
+    return VisualMesh(low_vertices, low_faces, uv, uv_faces, image), float(visible.mean()) if len(visible) else 0.0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,6 +5,7 @@ and enough floor to drive into every room stay free; some chairs narrow a doorwa
 one aside pays.
 """
 
+import dataclasses
 import math
 from collections.abc import Iterable, Sequence
 
@@ -57,10 +58,10 @@ def door_leaf(
     origin = (float(model.bounds[0, 0]), float(model.bounds[0, 1]), face_z)
     swing = (-open_rad, most - open_rad) if sign > 0 else (-(most - open_rad), open_rad)
     closed_rad, joint = math.atan2(closed[1], closed[0]), LeafHinge((0.0, 1.0, 0.0), origin, swing)
-    leaf = stand_at(model, scale, closed_rad + sign * open_rad, np.array(origin), hinge, lift_m, joint)
+    leaf = stand_at(model, scale, closed_rad + sign * open_rad, np.array(origin), hinge, lift_m)
     angles = closed_rad + sign * np.linspace(0.0, most, 24)
     fan = hinge + (width + 0.04) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    return leaf, shapely.Polygon([hinge, *fan]).buffer(0.03)
+    return dataclasses.replace(leaf, hinge=joint), shapely.Polygon([hinge, *fan]).buffer(0.03)
 
 
 def wall_behind_m(doorway: Doorway, high_side: bool, high_jamb: bool, plan: Plan) -> float:

@@ -159,6 +159,8 @@ def snap(value: float) -> float:
 
 Wall = tuple[int, Rect]
 """The axis along which a stretch of wall is thin, and its footprint."""
+Weights = Sequence[float] | None
+"""Areas of rooms against each other; None: equal."""
 
 
 def _cut(rect: Rect, axis: int, at: float, thick: float) -> tuple[Rect, Wall, Rect]:
@@ -187,7 +189,7 @@ def _split(
 
 
 def _layout(
-    cfg: BuildingConfig, rng: np.random.Generator, weights: Sequence[float] | None, spread: float
+    cfg: BuildingConfig, rng: np.random.Generator, weights: Weights, spread: float
 ) -> tuple[Rect, list[Rect], list[Wall], int | None]:
     """Draw rooms and inner walls once; the caller checks the rooms."""
     weights = weights or (1.0,) * int(rng.integers(cfg.n_rooms[0], cfg.n_rooms[1] + 1))
@@ -331,10 +333,8 @@ def _windows(
     """Draw windows in outer walls, each before one room, none behind a cupboard."""
     wanted = int(rng.integers(cfg.n_windows[0], cfg.n_windows[1] + 1))
     outer_faces = {(axis, way): face for axis, way, face, *_ in inside.sides()}
-    sides = [
-        s for room in rooms for s in room.sides()
-        if abs(s[2] - outer_faces[s[0], s[1]]) < CM / 2 and s[4] - s[3] > 1.6
-    ]  # fmt: skip
+    sides = [side for room in rooms for side in room.sides() if side[4] - side[3] > 1.6]
+    sides = [side for side in sides if abs(side[2] - outer_faces[side[0], side[1]]) < CM / 2]
     boxes: list[PlanBox] = []
     for k in rng.permutation(len(sides)):
         if len(boxes) == wanted:
@@ -350,9 +350,8 @@ def _windows(
 
 
 def make_plan(
-    cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 2000,
-    weights: Sequence[float] | None = None, spread: float = 0.1,
-) -> Plan:  # fmt: skip
+    cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 2000, weights: Weights = None, spread: float = 0.1
+) -> Plan:
     """Draw a plan whose rooms are all joined by doorways.
 
     `weights` are the rooms' areas against each other, in the order in which they lie, the corridor's (if there is to be
@@ -372,17 +371,12 @@ def make_plan(
         thick = snap(cfg.wall_thickness_m[1])
         outer = Rect(*map(snap, dataclasses.astuple(inside.grown(thick, thick))))
         boxes = [b for w in walls for b in _wall_boxes(w, doorways, height)]
-        around = (
-            Rect(outer.x0, outer.y0, inside.x0, outer.y1), Rect(inside.x1, outer.y0, outer.x1, outer.y1),
-            Rect(inside.x0, outer.y0, inside.x1, inside.y0), Rect(inside.x0, inside.y1, inside.x1, outer.y1),
-        )  # fmt: skip
+        around = [Rect(x0, outer.y0, x1, outer.y1) for x0, x1 in ((outer.x0, inside.x0), (inside.x1, outer.x1))]
+        around += [Rect(inside.x0, y0, inside.x1, y1) for y0, y1 in ((outer.y0, inside.y0), (inside.y1, outer.y1))]
         boxes += [PlanBox.over(rect, 0.0, height) for rect in around]
         fixtures = _fixtures(rooms, doorways, cfg, rng)
-        windows = _windows(inside, plain, fixtures, thick, cfg, rng)
-        return Plan(
-            tuple(rooms), outer, tuple(boxes), tuple(doorways), tuple(windows), tuple(fixtures), corridor,
-            height,
-        )  # fmt: skip
+        panes, cut = tuple(_windows(inside, plain, fixtures, thick, cfg, rng)), tuple(doorways)
+        return Plan(tuple(rooms), outer, tuple(boxes), cut, panes, tuple(fixtures), corridor, height)
     raise GenerationError(
         f"no plan in {max_tries} tries for {cfg.n_rooms} rooms on {cfg.floor_area_m2} m2: "
         "fewer rooms, more area or a smaller min_room_side_m would make it possible"

@@ -5,6 +5,7 @@ Frame: scan x, y, height above the floor; metres. Faces are one-sided, counter-c
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -68,15 +69,14 @@ def plain(colour: Sequence[float] | np.ndarray) -> Colouring:
     return lambda p: np.broadcast_to(value, (len(p), 3))
 
 
-def polygon(points: Iterable[Iterable[float]], towards: Iterable[float], label: int, paint: Colouring,
-            texels_per_m: float = 80.0, glows: bool = False, lit_as: np.ndarray | None = None) -> Chart:  # fmt: skip
-    """Return a flat convex polygon that is visible from where `towards` (3,) points."""
+def polygon(points: Iterable[Iterable[float]], towards: Iterable[float], *about: Any, **more: Any) -> Chart:
+    """Return a flat convex polygon that is visible from where `towards` (3,) points; `about` it: `Chart`'s others."""
     corners = np.array([tuple(p) for p in points])
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[1])
     if normal @ np.array(tuple(towards)) < 0:
         corners = corners[::-1]
     fan = [(0, k, k + 1) for k in range(1, len(corners) - 1)]
-    return Chart(corners, np.array(fan), label, paint, texels_per_m, glows, lit_as=lit_as)
+    return Chart(corners, np.array(fan), *about, **more)
 
 
 def piece_charts(vertices: np.ndarray, faces: np.ndarray, label: int, paint: Colouring) -> list[Chart]:
@@ -130,21 +130,17 @@ def _texels(laid: _Laid, n: np.ndarray, density: np.ndarray, grid: np.ndarray | 
     colour = chart.paint(laid.grid(wide, 1 / density, 0.5 - MARGIN)).reshape(wide[1], wide[0], 3)
     if grid is None:
         return colour
-    columns, rows = (
-        (np.arange(wide[k]) + 0.5 - MARGIN) / density[k] / max(laid.size_m[k], 1e-9) for k in range(2)
-    )  # fmt: skip
-    return colour * _between(grid, rows, columns)
+    s, t = ((np.arange(wide[k]) + 0.5 - MARGIN) / density[k] / max(laid.size_m[k], 1e-9) for k in range(2))
+    return colour * _between(grid, t, s)
 
 
 def _packed(laid: list[_Laid]) -> tuple[int, float, list[np.ndarray], np.ndarray]:
     """Return side of the sheet, factor on the resolution, texels (columns, rows) and corner of each patch."""
-    finer = 1.0
+    finer, paints = 1.0, [q.chart.paint for q in laid]
+    images = [np.array(paint.shape[1::-1]) if isinstance(paint, np.ndarray) else None for paint in paints]
     while True:
-        sizes = [
-            np.array(q.chart.paint.shape[1::-1]) if isinstance(q.chart.paint, np.ndarray)
-            else np.maximum(np.ceil(np.round(q.size_m * q.chart.texels_per_m * finer, 6)).astype(int), 1)
-            for q in laid
-        ]  # fmt: skip
+        sizes = [np.ceil(np.round(q.size_m * q.chart.texels_per_m * finer, 6)).astype(int) for q in laid]
+        sizes = [np.maximum(n, 1) if image is None else image for n, image in zip(sizes, images, strict=True)]
         wide = np.array(sizes) + 2 * MARGIN
         for side in SHEETS:
             if wide.max() > side:

@@ -17,11 +17,9 @@ GLAZES = np.array([[0.90, 0.92, 0.92], [0.70, 0.82, 0.84], [0.84, 0.88, 0.80], [
 CARPETS = np.array([[0.62, 0.58, 0.52], [0.48, 0.50, 0.55], [0.66, 0.61, 0.58], [0.45, 0.50, 0.45]])
 RUGS = np.array([[0.55, 0.22, 0.20], [0.22, 0.32, 0.46], [0.72, 0.64, 0.50], [0.33, 0.40, 0.33]])
 FRAMES = np.array([[0.16, 0.15, 0.14], [0.45, 0.30, 0.19], [0.90, 0.90, 0.88]])
-PRINTS = np.array([
-    [[0.78, 0.84, 0.88], [0.32, 0.42, 0.34]], [[0.92, 0.83, 0.70], [0.52, 0.35, 0.26]],
-    [[0.86, 0.80, 0.82], [0.40, 0.34, 0.44]], [[0.70, 0.80, 0.82], [0.20, 0.32, 0.42]],
-    [[0.92, 0.90, 0.86], [0.28, 0.28, 0.31]],
-])  # fmt: skip
+SKIES = np.array([[0.78, 0.84, 0.88], [0.92, 0.83, 0.70], [0.86, 0.80, 0.82], [0.70, 0.80, 0.82], [0.92, 0.90, 0.86]])
+LANDS = np.array([[0.32, 0.42, 0.34], [0.52, 0.35, 0.26], [0.40, 0.34, 0.44], [0.20, 0.32, 0.42], [0.28, 0.28, 0.31]])
+PRINTS = np.stack([SKIES, LANDS], axis=1)
 """Sky and land of pictures."""
 SKIRTING_M = 0.09
 """Height of the white board along the foot of painted walls."""
@@ -60,8 +58,9 @@ def boards(p: np.ndarray, base: np.ndarray, along: int) -> np.ndarray:
     return base * (tone * grain * joint)[:, None]
 
 
-def tiles(u: np.ndarray, v: np.ndarray, base: np.ndarray, side_m: float, chequered: bool = False,
-          blur_m: float = 0.0) -> np.ndarray:  # fmt: skip
+def tiles(
+    u: np.ndarray, v: np.ndarray, base: np.ndarray, side_m: float, chequered: bool = False, blur_m: float = 0.0
+) -> np.ndarray:
     """Paint square tiles with grout, over a plane's two coordinates; a texel `blur_m` wide takes its share of grout."""
     i, j = np.floor(u / side_m), np.floor(v / side_m)
     if blur_m:

@@ -6,6 +6,7 @@ Frame: scan x, y, height above the floor; metres.
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import shapely
@@ -16,7 +17,7 @@ from converters.generate.models.cad import Instance
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface import sides as at_walls
 from converters.generate.surface.charts import Chart, assemble, piece_charts, plain, polygon
-from converters.generate.surface.finishes import FRAMES, Colouring, Finish, finishes, framed
+from converters.generate.surface.finishes import FRAMES, Finish, finishes, framed
 from converters.generate.surface.scan import NYU40, Scan, building_solids, fuse, solid_from_box
 from converters.generate.surface.sides import CLOTHS, ENTRANCES, FLOOR_M, PICTURE, Side
 from converters.generate.surface.texture import Atlas
@@ -29,6 +30,8 @@ AMBIENT, LAMP, DAY = (np.array(c) for c in ([0.65, 0.65, 0.66], [0.32, 0.30, 0.2
 """Brightness of each channel: of all around, of a lamp and of a window at one metre."""
 REACH_M = 7.0
 """How far a lamp or window shines."""
+Sides = list[list[Side]]
+"""Of each room its walls."""
 BRIGHT = 0.8
 """From here on more light makes things less and less brighter."""
 
@@ -126,13 +129,12 @@ PICTURES = {"living": 4, "bedroom": 2, "dining": 3, "office": 2, "hall": 2, "kit
 """Use of a room -> pictures on its walls, at most."""
 
 
-def _flat(rect: Rect, z: float, up: int, label: int, paint: Colouring, texels_per_m: float = 80.0,
-          glows: bool = False) -> Chart:  # fmt: skip
+def _flat(rect: Rect, z: float, up: int, *about: Any) -> Chart:
     corners = [(rect.x0, rect.y0, z), (rect.x1, rect.y0, z), (rect.x1, rect.y1, z), (rect.x0, rect.y1, z)]
-    return polygon(corners, (0, 0, up), label, paint, texels_per_m, glows)
+    return polygon(corners, (0, 0, up), *about)
 
 
-def _shell(plan: Plan, sides: list[list[Side]], finish: list[Finish]) -> list[Chart]:
+def _shell(plan: Plan, sides: Sides, finish: list[Finish]) -> list[Chart]:
     """Return floors, ceilings, walls with their boards, doorways; tops and outsides of the walls."""
     height, charts = plan.wall_height_m, []
     for room, walls, of in zip(plan.rooms, sides, finish, strict=True):
@@ -168,13 +170,11 @@ def _lamp(at: np.ndarray, radius: float) -> list[Chart]:
 
 def _standing(items: Sequence[Instance], above_m: float) -> shapely.Geometry:
     """Return the footprints of what is higher than that."""
-    return shapely.union_all([
-        i.footprint for i in items if i.position[2] + i.scale[1] * i.model.bounds[1, 1] > above_m
-    ])  # fmt: skip
+    tops_m = ((i, i.position[2] + i.scale[1] * i.model.bounds[1, 1]) for i in items)
+    return shapely.union_all([i.footprint for i, top_m in tops_m if top_m > above_m])
 
 
-def _windows(plan: Plan, uses: Sequence[str], sides: list[list[Side]], items: Sequence[Instance],
-             rng: np.random.Generator) -> list[Chart]:  # fmt: skip
+def _windows(uses: Sequence[str], sides: Sides, items: Sequence[Instance], rng: np.random.Generator) -> list[Chart]:
     """Return windows, and curtains where nothing is in their way."""
     charts, sky = [], np.array([0.52, 0.70, 0.92]) + rng.uniform(-0.06, 0.06, 3)
     low, tall = _standing(items, 0.1), _standing(items, 0.84)
@@ -221,8 +221,9 @@ def _pictures(side: Side, count: int, tall: shapely.Geometry, rng: np.random.Gen
     return charts
 
 
-def _fittings(plan: Plan, uses: Sequence[str], sides: list[list[Side]], items: Sequence[Instance],
-              rng: np.random.Generator) -> list[Chart]:  # fmt: skip
+def _fittings(
+    plan: Plan, uses: Sequence[str], sides: Sides, items: Sequence[Instance], rng: np.random.Generator
+) -> list[Chart]:
     """Return front door, pictures, switches and sockets."""
     charts: list[Chart] = []
     standing, tall = _standing(items, 0.05), _standing(items, 1.1)
@@ -272,26 +273,24 @@ def _built_in(items: Sequence[Instance]) -> list[Chart]:
     return charts
 
 
-def model_building(plan: Plan, items: Sequence[Instance], uses: Sequence[str],
-                   rng: np.random.Generator) -> tuple[Scan, Atlas]:  # fmt: skip
+def model_building(
+    plan: Plan, items: Sequence[Instance], uses: Sequence[str], rng: np.random.Generator
+) -> tuple[Scan, Atlas]:
     """Model and paint the structure; no vertex of the mesh is in faces of two labels."""
     finish = finishes(plan.rooms, uses, rng, pictures=False)
     sides = [at_walls.sides_of(room, plan.doorways, plan.windows) for room in plan.rooms]
     everything = [*plan.built_in, *items]
     lamps = np.array([[*np.round(r.centre, 3), plan.wall_height_m] for r in plan.rooms])
     charts = _shell(plan, sides, finish)
-    charts += _windows(plan, uses, sides, everything, rng)
+    charts += _windows(uses, sides, everything, rng)
     charts += _fittings(plan, uses, sides, everything, rng)
     for room, lamp in zip(plan.rooms, lamps, strict=True):
         charts += _lamp(lamp, min(0.22, 0.11 * min(room.size)))
     cabinet = np.array(MATERIALS["white"] if rng.random() < 0.6 else MATERIALS["oak"])
     charts += [c for box in plan.fixtures for c in at_walls.cupboard(box, cabinet)]
     charts += _built_in(plan.built_in)
-    panes = [
-        (side.at(low + (high - low) * share, 0.0, 1.5), side.inward)
-        for walls in sides for side in walls for low, high in map(side.along, (w.rect for w in side.windows))
-        for share in (0.25, 0.75)
-    ]  # fmt: skip
-    places, inwards = (np.array([p[k] for p in panes]).reshape(-1, 3) for k in range(2))
-    light = Daylight(space_of(plan), lamps - [0, 0, 0.3], places, inwards)
+    spans = [(side, *side.along(w.rect)) for walls in sides for side in walls for w in side.windows]
+    places = [side.at(low + (high - low) * share, 0.0, 1.5) for side, low, high in spans for share in (0.25, 0.75)]
+    inwards = np.repeat([side.inward for side, *_ in spans], 2, axis=0)
+    light = Daylight(space_of(plan), lamps - [0, 0, 0.3], np.reshape(places, (-1, 3)), inwards.reshape(-1, 3))
     return assemble(charts, light)

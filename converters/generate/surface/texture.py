@@ -19,7 +19,7 @@ from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.finishes import finishes
 from converters.generate.surface.scan import Scan, smooth_noise
 from converters.geometry.faces import face_vectors, unit_normals
-from converters.records.visual import TexturedMesh
+from converters.records.raw import TexturedMesh
 from converters.write.texture import textured_cloud
 from interactive_nav_common.grids import nearest_cell
 
@@ -111,17 +111,6 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, texels_per_m: float) -> tupl
     return uv, face_uv, side
 
 
-def face_image(uv: np.ndarray, face_uv: np.ndarray, side: int) -> np.ndarray:
-    """Return (side, side) int32: the face that each texel shows (row 0 at v = 0), nearest face where none does."""
-    image = Image.new("I", (side, side), 0)
-    draw = ImageDraw.Draw(image)
-    corners = (uv[face_uv] - 0.5).reshape(-1, 6)
-    for k, polygon in enumerate(corners.tolist()):
-        draw.polygon(polygon, fill=k + 1)
-    ids = np.array(image)
-    return ids[tuple(nearest_cell(ids != 0))] - 1
-
-
 def texel_positions(uv: np.ndarray, face_uv: np.ndarray, scan: Scan, ids: np.ndarray, texels: np.ndarray) -> np.ndarray:
     """Return the (n, 3) place in the building of each texel, by barycentric coordinates clamped to the face."""
     a, b, c = (uv[face_uv[ids, i]] for i in range(3))
@@ -156,23 +145,17 @@ def _coloured(name: str) -> tuple[cKDTree, np.ndarray]:
     return cKDTree(cloud.points), cloud.colours / 255
 
 
-def _paint_models(scan: Scan, solid: np.ndarray, points: np.ndarray, colour: np.ndarray) -> None:
-    """Give points whose solid is of a library model the colour of the model's nearest point, in place."""
-    items = {id(s.item): s.item for s in scan.solids if s.item is not None and s.item.model.surface is not None}
-    of = np.array([id(s.item) for s in scan.solids])[solid]
-    order = np.argsort(of, kind="stable")
-    for key, item in items.items():
-        here = order[np.searchsorted(of[order], key) : np.searchsorted(of[order], key, "right")]
-        tree, colours = _coloured(item.model.name)
-        in_cad = (points[here] - item.matrix[:3, 3]) @ np.linalg.inv(item.matrix[:3, :3]).T
-        colour[here] = colours[tree.query(in_cad)[1]]
-
-
-def paint(scan: Scan, rooms: Sequence[Rect], uses: Sequence[str], points: np.ndarray, ids: np.ndarray,
-          normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:  # fmt: skip
+def paint(
+    scan: Scan,
+    rooms: Sequence[Rect],
+    uses: Sequence[str],
+    points: np.ndarray,
+    ids: np.ndarray,
+    rng: np.random.Generator,
+) -> np.ndarray:
     """Return colours (n, 3) in 0..1 of points (n, 3) on faces `ids` (n,) of the scan, by the nearest solid's material.
 
-    Walls and floors differ by room; `normals` (m, 3) are those of faces.
+    Walls and floors differ by room.
     """
     corner = scan.solid[scan.faces[ids]]
     # Two of three corners decide, so that a border follows edges rather than zigzags.
@@ -202,21 +185,34 @@ def paint(scan: Scan, rooms: Sequence[Rect], uses: Sequence[str], points: np.nda
             weave = 1 + 0.05 * np.sin(90 * p[:, 0]) * np.sin(90 * p[:, 1] + 40 * p[:, 2])
             value = np.array(MATERIALS[name]) * weave[:, None]
         colour[here] = value
-    _paint_models(scan, solid, points, colour)
+    # What is of a library model has the colour of the model's nearest point.
+    items = {id(s.item): s.item for s in scan.solids if s.item is not None and s.item.model.surface is not None}
+    of = np.array([id(s.item) for s in scan.solids])[solid]
+    order = np.argsort(of, kind="stable")
+    for key, item in items.items():
+        here = order[np.searchsorted(of[order], key) : np.searchsorted(of[order], key, "right")]
+        tree, colours = _coloured(item.model.name)
+        in_cad = (points[here] - item.matrix[:3, 3]) @ np.linalg.inv(item.matrix[:3, :3]).T
+        colour[here] = colours[tree.query(in_cad)[1]]
     lamp = np.column_stack([centres, np.full(len(rooms), 2.2)])[room]
-    light = _light(points, normals[ids], lamp, rng)
+    light = _light(points, unit_normals(scan.vertices, scan.faces)[ids], lamp, rng)
     return np.clip(colour * light[:, None], 0, 1)
 
 
-def make_atlas(scan: Scan, rooms: Sequence[Rect], uses: Sequence[str], texels_per_m: float,
-               rng: np.random.Generator) -> Atlas:  # fmt: skip
+def make_atlas(
+    scan: Scan, rooms: Sequence[Rect], uses: Sequence[str], texels_per_m: float, rng: np.random.Generator
+) -> Atlas:
     """Unwrap and paint a scan; the rooms' `uses` are as `finishes` takes them."""
     uv, face_uv, side = unwrap(scan.vertices, scan.faces, texels_per_m)
-    faces_at = face_image(uv, face_uv, side).ravel()
-    normals = unit_normals(scan.vertices, scan.faces)
+    sheet = Image.new("I", (side, side), 0)
+    draw = ImageDraw.Draw(sheet)
+    for k, polygon in enumerate((uv[face_uv] - 0.5).reshape(-1, 6).tolist(), 1):
+        draw.polygon(polygon, fill=k)
+    ids = np.array(sheet)  # of the face that each texel shows, row 0 at v = 0; the nearest face where none does
+    faces_at = (ids[tuple(nearest_cell(ids != 0))] - 1).ravel()
     rows, columns = np.divmod(np.arange(side * side), side)
     points = texel_positions(uv, face_uv, scan, faces_at, np.stack([columns + 0.5, rows + 0.5], axis=1))
-    shade = paint(scan, rooms, uses, points, faces_at, normals, rng)
+    shade = paint(scan, rooms, uses, points, faces_at, rng)
     # Six bits a channel and no noise per texel: the PNG stays small.
     colour = np.round(np.round(shade * 63) * (255 / 63)).astype(np.uint8)
     return Atlas(uv / side, face_uv, colour.reshape(side, side, 3)[::-1])

@@ -47,21 +47,20 @@ def write_npz(path: Path, **arrays: np.ndarray) -> None:
             archive.writestr(zipfile.ZipInfo(f"{name}.npy"), buffer.getvalue(), zipfile.ZIP_DEFLATED)
 
 
-def _write_textured(path: Path, before: str, vertices: str, uv: np.ndarray, between: str, corners: np.ndarray,
-                    material: str) -> None:  # fmt: skip
-    """Write an OBJ file, with lines before its vertices and its faces, and its MTL beside it."""
+def _write_textured(path: Path, lines: str, corners: np.ndarray, material: str) -> None:
+    """Write an OBJ file of the lines before its faces and of their corners (m, 3, 2), and its MTL beside it."""
     faces = _rows("f %d/%d %d/%d %d/%d\n", (corners + 1).reshape(-1, 6))
-    head = f"mtllib {path.stem}.mtl\n{before}"
-    path.write_text(head + vertices + _rows("vt %.5f %.5f\n", uv) + between + faces, "ascii")
+    path.write_text(f"mtllib {path.stem}.mtl\n{lines}{faces}", "ascii")
     path.with_suffix(".mtl").write_text(material, "ascii")
 
 
 def write_scan(folder: Path, scan: Scan, atlas: Atlas, floor_height_m: float) -> None:
     """Write `mesh_z_up.obj`, its MTL, texture and labels; raise the mesh to the scan's floor height."""
-    vertices = _rows("v %.4f %.4f %.4f\n", scan.vertices + [0.0, 0.0, floor_height_m])
+    lines = _rows("v %.4f %.4f %.4f\n", scan.vertices + [0.0, 0.0, floor_height_m])
+    lines += _rows("vt %.5f %.5f\n", atlas.uv) + "usemtl scan\n"
     corners = np.stack([scan.faces, atlas.face_uv], axis=2)
     material = "newmtl scan\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd mesh_z_up_texture.png\n"
-    _write_textured(folder / "mesh_z_up.obj", "", vertices, atlas.uv, "usemtl scan\n", corners, material)
+    _write_textured(folder / "mesh_z_up.obj", lines, corners, material)
     write_png(folder / "mesh_z_up_texture.png", atlas.image)
     bare = {} if scan.solids else {"furnished": np.array(False)}
     write_npz(folder / "mesh_z_up.labels.npz", label=scan.labels, **bare)
@@ -73,12 +72,10 @@ def write_cad(library: Path, model: CadModel, pieces: bool = False) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     path, surface = folder / "model_normalized.obj", model.surface
     if surface is not None:
-        vertices, corners = (
-            _rows("v %.6f %.6f %.6f\n", surface.vertices),
-            np.stack([surface.faces, surface.uv_faces], 2),
-        )
+        lines = _rows("v %.6f %.6f %.6f\n", surface.vertices) + _rows("vt %.5f %.5f\n", surface.uv)
+        corners = np.stack([surface.faces, surface.uv_faces], 2)
         material = "newmtl surface\nKd 1 1 1\nd 1\nillum 1\nmap_Kd texture.png\n"
-        _write_textured(path, "usemtl surface\n", vertices, surface.uv, "", corners, material)
+        _write_textured(path, f"usemtl surface\n{lines}", corners, material)
         write_png(folder / "texture.png", surface.image)
     else:
         path.write_text("mtllib model_normalized.mtl\n" + _part_lines(model, drawn=True), "ascii")
@@ -150,8 +147,9 @@ def pick_keypoints(item: Instance, scanned: np.ndarray, n: int, rng: np.random.G
     return candidates[chosen]
 
 
-def annotate_items(items: list[Instance], scan: Scan, floor_height_m: float, cfg: BuildingConfig, seed: int,
-             rng: np.random.Generator) -> list[dict[str, Any]]:  # fmt: skip
+def annotate_items(
+    items: list[Instance], scan: Scan, floor_height_m: float, cfg: BuildingConfig, seed: int, rng: np.random.Generator
+) -> list[dict[str, Any]]:
     """Return the content of `alignments.json`, a list of one scan: noisy poses and keypoint pairs, as people give.
 
     A pose composes as in Scan2CAD: world = T * R * S * cad. `bbox` holds half extents and `center` the centre of the
@@ -191,10 +189,9 @@ def annotate_items(items: list[Instance], scan: Scan, floor_height_m: float, cfg
                 "range_rad": [float(v) for v in item.hinge.range_rad],
             }
         models.append(entry)
-    return [{
+    about = {
         "trs": _trs(to_world_m, SCAN_TO_WORLD, np.ones(3)),
         "n_aligned_models": len(models),
         "aligned_models": models,
-        "id_alignment": f"generated-{seed}",
-        "id_scan": f"generated_{seed:04d}",
-    }]  # fmt: skip
+    }
+    return [about | {"id_alignment": f"generated-{seed}", "id_scan": f"generated_{seed:04d}"}]

@@ -45,7 +45,7 @@ COLLECTIONS = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, Colle
 
 
 def read_scan(name: str, root: Path, strict: bool = False) -> RawScene:
-    """Reads the folder of one scene."""
+    """Read the folder of one scene."""
     source, about = SourceFolder(root, strict), COLLECTIONS[name]
     library = optional("scenezoo", missing(f"{root}: {name}", "scenezoo", "datasets"), SceneRejected)
     for path in sorted(p for mark in about.marks for p in root.glob(mark)):
@@ -56,34 +56,19 @@ def read_scan(name: str, root: Path, strict: bool = False) -> RawScene:
         mesh = dataset.get_mesh(scene.name)
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.triangles, np.int64)
         colours = np.asarray(mesh.vertex_colors, float) if mesh.has_vertex_colors() else None
-        found = _labels(source, dataset, scene.name, about)
+        given = _labels(source, dataset, scene.name, about)
     if not len(faces) or not np.isfinite(vertices).all():
         raise SceneRejected(f"{root}: its mesh has {len(faces)} faces or vertices that are no numbers; fetch it again")
-    return _record(source, name, vertices, faces, colours, found)
-
-
-def _labels(source: SourceFolder, dataset: Any, scene: str, about: Collection) -> Any:
-    """scenezoo's segmentation; None where the collection does not publish this scene's."""
-    try:
-        return dataset.get_segmentation(scene, **about.options)
-    except (FileNotFoundError, importlib.import_module("scenezoo").UnsupportedOperationError) as error:
-        source.note(f"{scene}: has no labels ({' '.join(str(error).split())[:200]}); structure is told by shape")
-        return None
-
-
-def _record(
-    source: SourceFolder, name: str, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None, found: Any
-) -> RawScene:
-    root = source.root.resolve()
+    root = scene
     turn = turn_upright(find_up(vertices, faces, str(root)))
     if not np.allclose(turn, np.eye(3), atol=0.02):
         vertices = vertices @ turn.T
         source.note(f"{root.name}: turned so that its floor is level")
     floor_m = floor_level(vertices, faces, str(root))
     labels = label_storeys(vertices, faces, (floor_m,))
-    if found is not None:
-        labels = _of_vertices(source, found, len(vertices), faces)
-        unknown = sorted({n for n in found.id_to_name.values() if label_of(n) == PROP and n.lower() not in NYU40})
+    if given is not None:
+        labels = _of_vertices(source, given, len(vertices), faces)
+        unknown = sorted({n for n in given.id_to_name.values() if label_of(n) == PROP and n.lower() not in NYU40})
         if unknown:
             more = f" and {len(unknown) - 8} more" if len(unknown) > 8 else ""
             source.note(f"classes that NYU40 has no name for, taken as otherprop: {', '.join(unknown[:8])}{more}")
@@ -94,25 +79,34 @@ def _record(
     return dataclasses.replace(source.scene(name, scan, floor_height_m=floor_m, licence=licence), name=root.name)
 
 
+def _labels(source: SourceFolder, dataset: Any, scene: str, about: Collection) -> Any:
+    """Return scenezoo's segmentation; None where the collection does not publish this scene's."""
+    try:
+        return dataset.get_segmentation(scene, **about.options)
+    except (FileNotFoundError, importlib.import_module("scenezoo").UnsupportedOperationError) as error:
+        source.note(f"{scene}: has no labels ({' '.join(str(error).split())[:200]}); structure is told by shape")
+        return None
+
+
 def label_of(name: str) -> int:
-    """NYU40 id of a class's name, by its last words: an office chair is a chair."""
+    """Return the NYU40 id of a class's name, by its last words: an office chair is a chair."""
     words = [w for w in re.findall(r"[a-z]+", name.lower()) if len(w) > 1]
     category = category_of(name)
     default = category.labels[0] if category is not None and category.labels else PROP
     return by_last_words(words, NYU40) or default
 
 
-def _of_vertices(source: SourceFolder, found: Any, count: int, faces: np.ndarray) -> np.ndarray:
-    """(n,) NYU40 id of each vertex."""
-    labels = np.asarray(found.labels)
+def _of_vertices(source: SourceFolder, given: Any, count: int, faces: np.ndarray) -> np.ndarray:
+    """Return the (n,) NYU40 id of each vertex."""
+    labels = np.asarray(given.labels)
     labels = labels if labels.ndim == 1 else labels[:, 0]
-    wanted = count if found.domain == "vertex" else len(faces)
-    if found.domain not in ("vertex", "face") or len(labels) != wanted:
-        raise SceneRejected(f"{source.root}: {len(labels)} labels a {found.domain}, expected {wanted}; fetch it again")
+    wanted = count if given.domain == "vertex" else len(faces)
+    if given.domain not in ("vertex", "face") or len(labels) != wanted:
+        raise SceneRejected(f"{source.root}: {len(labels)} labels a {given.domain}, expected {wanted}; fetch it again")
     ids, at = np.unique(labels, return_inverse=True)
-    known = [label_of(found.id_to_name[i]) if i in found.id_to_name else UNLABELLED for i in ids.tolist()]
-    nyu = np.array(known, np.int64)[at]
-    if found.domain == "vertex":
+    named = [label_of(given.id_to_name[i]) if i in given.id_to_name else UNLABELLED for i in ids.tolist()]
+    nyu = np.array(named, np.int64)[at]
+    if given.domain == "vertex":
         return nyu
     # A vertex takes the label of the structure that meets there, else of any face: furniture ends at its own faces.
     out = np.zeros(count, np.int64)

@@ -22,20 +22,14 @@ from converters.read.files import SourceFolder, check_mesh
 from converters.read.obj import join_textures, read_texture, textured_by_face, use_named, wrapped
 from converters.records.errors import SceneRejected
 from converters.records.limits import NUMBERS, PIXELS, check_count
-from converters.records.visual import TexturedMesh
+from converters.records.raw import TexturedMesh
 from interactive_nav_common.records import Reader
 from interactive_nav_common.rotations import transformed
 
-READ = {
-    "KHR_mesh_quantization", "KHR_texture_transform", "KHR_materials_pbrSpecularGlossiness", "KHR_materials_unlit",
-    "KHR_materials_emissive_strength", "EXT_texture_webp", "EXT_mesh_gpu_instancing",
-}  # fmt: skip
+READ = {f"KHR_materials_{name}" for name in ("pbrSpecularGlossiness", "unlit", "emissive_strength")}
+READ |= {"KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp", "EXT_mesh_gpu_instancing"}
 """Extensions; others are refused where a file requires them, and reported where it only uses them."""
-COMPRESSED = {
-    "KHR_draco_mesh_compression": "Draco",
-    "EXT_meshopt_compression": "meshopt",
-    "KHR_meshopt_compression": "meshopt",
-}
+COMPRESSED = {f"{by}_meshopt_compression": "meshopt" for by in ("EXT", "KHR")} | {"KHR_draco_mesh_compression": "Draco"}
 USED = ("POSITION", "NORMAL", "TANGENT", "COLOR_0", "TEXCOORD_0")
 """Attributes, besides the texture coordinates that a material names."""
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}

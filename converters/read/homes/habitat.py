@@ -107,7 +107,10 @@ class _Reader:
         name = _value(instance, "template_name", "", path)
         if not name:
             raise SceneRejected(f"{path}: an instance has no template_name, expected the name of a stage or an object")
-        asset = self._asset(name, kind, path)
+        if (name, kind) not in self._assets:
+            read = self._articulated if kind == ARTICULATED else self._rigid
+            self._assets[name, kind] = read(name, kind, path)
+        asset = self._assets[name, kind]  # with y up, at its centre of mass: the file's, or the middle of its box
         scale = _value(instance, "non_uniform_scale", (1.0, 1.0, 1.0), path)
         scale = scale * _value(instance, "uniform_scale", 1.0, path)
         quat = _value(instance, "rotation", (1.0, 0.0, 0.0, 0.0), path)
@@ -126,13 +129,6 @@ class _Reader:
         return dataclasses.replace(
             asset, pose=turn @ pose @ turn.T, surface=placed(asset.surface, upright), collision=solid, static=static
         )
-
-    def _asset(self, name: str, kind: str, path: Path) -> HomePart:
-        """Return a stage or an object with y up, at its centre of mass: the file's, or the middle of its box."""
-        if (name, kind) not in self._assets:
-            read = self._articulated if kind == ARTICULATED else self._rigid
-            self._assets[name, kind] = read(name, kind, path)
-        return self._assets[name, kind]
 
     def _rigid(self, name: str, kind: str, path: Path) -> HomePart:
         config = self._find(name, (kind,))
@@ -190,7 +186,13 @@ class _Reader:
                 raise SceneRejected(f"{config}: names '{name}', which is not in {self.source.root}; copy it there")
             target = elsewhere[0]
         mesh = read_surface(self.source, self.source.inside(target), "")
-        frame = _frame(about, config)
+        up = _value(about, "up", (0.0, 1.0, 0.0), config)
+        front = _value(about, "front", (0.0, 0.0, -1.0), config)
+        lengths = np.linalg.norm(up), np.linalg.norm(front)
+        if min(lengths) < 1e-6 or abs(up @ front) > 1e-3 * lengths[0] * lengths[1]:
+            raise SceneRejected(f"{config}: up {up.tolist()} and front {front.tolist()} are not at right angles")
+        up, front = up / lengths[0], front / lengths[1]
+        frame = np.stack([np.cross(front, up), up, -front])  # to y up, looking along -z
         size = _value(about, "scale", (1.0, 1.0, 1.0), config) * _value(about, "units_to_meters", 1.0, config)
         matrix = transform(frame @ np.diag(size))
         if abs(np.linalg.det(matrix)) < 1e-12:
@@ -221,17 +223,6 @@ class _Reader:
                 if isinstance(entry, dict) and isinstance(entry.get("id"), int) and isinstance(entry.get("name"), str):
                     names[entry["id"]] = entry["name"]
         return names
-
-
-def _frame(about: dict[str, Any], path: Path) -> np.ndarray:
-    """Return (3, 3) an asset's local frame -> y up, looking along -z."""
-    up = _value(about, "up", (0.0, 1.0, 0.0), path)
-    front = _value(about, "front", (0.0, 0.0, -1.0), path)
-    lengths = np.linalg.norm(up), np.linalg.norm(front)
-    if min(lengths) < 1e-6 or abs(up @ front) > 1e-3 * lengths[0] * lengths[1]:
-        raise SceneRejected(f"{path}: up {up.tolist()} and front {front.tolist()} are not at right angles")
-    up, front = up / lengths[0], front / lengths[1]
-    return np.stack([np.cross(front, up), up, -front])
 
 
 def _short(value: Any) -> str:

@@ -279,7 +279,14 @@ def _mesh(model: mujoco.MjModel, geom: int, span_m: float) -> TexturedMesh | Non
     size, kind = model.geom_size[geom], _GEOM(model.geom_type[geom])  # a NumPy integer is `in` no tuple of kinds
     rgba, data = _rgba(model, geom), int(model.geom_dataid[geom])
     if kind == _GEOM.mjGEOM_MESH:
-        return _of_mesh(model, geom, rgba)
+        vertices, faces, uv = mesh_of(model, data)
+        vertices, faces, image = vertices.astype(float), faces.astype(np.int64), geom_image(model, geom)
+        at = model.geom_matid[geom], mujoco.mjtTextureRole.mjTEXROLE_RGB
+        if image is None or uv is None or model.tex_type[model.mat_texid[at]] != mujoco.mjtTexture.mjTEXTURE_2D:
+            return in_colour(TexturedMesh(vertices, faces, None, None), rgba)
+        # MuJoCo keeps images with their first row at the top and texture coordinates from there.
+        image = np.clip(image[..., :3] * rgba[:3], 0, 255).astype(np.uint8)
+        return TexturedMesh(vertices, faces, uv.astype(float) * [1.0, -1.0] + [0.0, 1.0], image)
     if kind == _GEOM.mjGEOM_HFIELD:
         rows, columns, first = (int(v[data]) for v in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
         x, y, high, _ = model.hfield_size[data]
@@ -299,15 +306,3 @@ def _rgba(model: mujoco.MjModel, geom: int) -> np.ndarray:
     """Return a geom's colour, or else its material's."""
     rgba, material = model.geom_rgba[geom], int(model.geom_matid[geom])
     return rgba if material < 0 or not np.allclose(rgba, DEFAULT_RGBA) else model.mat_rgba[material]
-
-
-def _of_mesh(model: mujoco.MjModel, geom: int, rgba: np.ndarray) -> TexturedMesh:
-    """Return a compiled mesh, with its material's texture where both have coordinates."""
-    vertices, faces, uv = mesh_of(model, model.geom_dataid[geom])
-    vertices, faces, image = vertices.astype(float), faces.astype(np.int64), geom_image(model, geom)
-    at = model.geom_matid[geom], mujoco.mjtTextureRole.mjTEXROLE_RGB
-    if image is None or uv is None or model.tex_type[model.mat_texid[at]] != mujoco.mjtTexture.mjTEXTURE_2D:
-        return in_colour(TexturedMesh(vertices, faces, None, None), rgba)
-    # MuJoCo keeps images with their first row at the top and texture coordinates from there.
-    image = np.clip(image[..., :3] * rgba[:3], 0, 255).astype(np.uint8)
-    return TexturedMesh(vertices, faces, uv.astype(float) * [1.0, -1.0] + [0.0, 1.0], image)

@@ -21,8 +21,8 @@ from converters.geometry.faces import face_vectors, merge_vertices, sample_faces
 from converters.read.files import SourceFolder
 from converters.read.gibson import read_attribution, read_licence
 from converters.read.interactive_gibson import SHOWN_M, assume_hinge, leaf_turn
-from converters.read.meshes import clean_surface, colours_of_faces, textured_by_face
-from converters.read.obj import TexturedMesh, at_most, join_meshes, scan_of
+from converters.read.meshes import clean_surface, colours_of_faces
+from converters.read.obj import TexturedMesh, at_most, join_meshes, scan_of, textured_by_face
 from converters.read.surfaces import check_extent, floor_level, label_storeys, storey_of, with_split_corners
 from converters.read.urdf import joined, placed
 from converters.records.errors import SceneRejected
@@ -300,12 +300,9 @@ def _small(mesh: TexturedMesh) -> TexturedMesh:
 def _moves(part: HomePart, low: np.ndarray, high: np.ndarray, floor_m: float) -> bool:
     """Return True for furniture that stands on the floor."""
     category = part.category
-    if category is not None and category.name == "door" and max((high - low)[:2]) > DOOR_MOST_M:
-        return False
-    if part.held:
-        return False
     movable = not part.static if category is None else category.is_object
-    return movable and abs(low[2] - floor_m) < STANDS_M
+    folds = category is not None and category.name == "door" and max((high - low)[:2]) > DOOR_MOST_M
+    return movable and not part.held and not folds and abs(low[2] - floor_m) < STANDS_M
 
 
 def _carriers(
@@ -314,10 +311,8 @@ def _carriers(
     """Return for each part the number of the movable one that it stands on or in, if any; none for those `fast`."""
     carried: list[int | None] = [None] * len(bounds)
     movers = np.flatnonzero(moves)
-    base, top = np.array([bounds[k] for k in movers]).reshape(-1, 2, 3).transpose(1, 0, 2) + [
-        [[0.0] * 3],
-        [[0, 0, RESTS_M]],
-    ]
+    base, top = np.array([bounds[k] for k in movers]).reshape(-1, 2, 3).transpose(1, 0, 2)
+    top = top + [0.0, 0.0, RESTS_M]
     for i, (low, high) in enumerate(bounds):
         if fast[i] or low[2] - floor_m[i] < RAISED_M:
             continue
@@ -333,11 +328,14 @@ def _furniture(
     """Return the annotation and the model of one movable part with what stands on it."""
     members = [(part, np.eye(4)), *((rider, np.linalg.inv(part.pose) @ rider.pose) for rider in riders)]
     surface = join_meshes(*(placed(_small(p.surface), by) for p, by in members))
-    every = [_pieces(p, by) for p, by in members]
+    every = []
+    for p, by in members:  # the convex pieces of each collision mesh; None where it has none or is not convex in parts
+        solid = None if p.collision is None else placed(p.collision, by)
+        every.append(None if solid is None else convex_pieces(*merge_vertices(solid.vertices, solid.faces)[:2]))
     pieces = None if None in every else tuple(piece for some in every for piece in some or ())
     pieces = None if pieces is None or len(pieces) > MAX_PIECES else pieces
-    vertices, faces, keep = merge_vertices(surface.vertices, surface.faces)
-    vertices, faces, colours = clean_surface(source, part.name, vertices, faces, colours_of_faces(surface)[keep])
+    skin = surface.vertices, surface.faces, colours_of_faces(surface)
+    vertices, faces, colours = clean_surface(source, part.name, *skin)
     category = part.category
     name, pose, hinge = "other" if category is None else category.name, part.pose, None
     if name == "door":
@@ -353,25 +351,12 @@ def _furniture(
         else:
             hinge = ScannedHinge(part.swing[0] @ turn, 1.0, part.swing[1])
     cad_id = re.sub(r"[^A-Za-z0-9_-]", "_", "-".join(p.name for p in (part, *riders)))[:100]
-    cad = CadModel(name, cad_id, vertices, faces, colours, pieces, _mass(source, part, name), part.friction, surface)
-    return Annotation(name, cad_id, pose, hinge=hinge), cad
-
-
-def _pieces(part: HomePart, by: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], ...] | None:
-    """Return the convex pieces of a part's collision mesh, moved; None where it has none or is not convex in parts."""
-    if part.collision is None:
-        return None
-    solid = placed(part.collision, by)
-    vertices, faces, _ = merge_vertices(solid.vertices, solid.faces)
-    return convex_pieces(vertices, faces)
-
-
-def _mass(source: SourceFolder, part: HomePart, category: str) -> float | None:
-    """Return the part's mass where it is plausible; else None, and the category's density gives it."""
-    material = CATEGORIES[category].material
+    material, mass_kg = CATEGORIES[name].material, part.mass_kg
     assert material is not None
-    low, high = material.mass_range_kg
-    if part.mass_kg is None or low / MASS_FACTOR <= part.mass_kg <= high * MASS_FACTOR:
-        return part.mass_kg
-    source.note(f"{part.name}: {part.mass_kg:g} kg is a placeholder; a {category} weighs {low:g} to {high:g} kg")
-    return None
+    least, most = material.mass_range_kg
+    if mass_kg is not None and not least / MASS_FACTOR <= mass_kg <= most * MASS_FACTOR:
+        # The category's density gives it then.
+        source.note(f"{part.name}: {mass_kg:g} kg is a placeholder; a {name} weighs {least:g} to {most:g} kg")
+        mass_kg = None
+    cad = CadModel(name, cad_id, vertices, faces, colours, pieces, mass_kg, part.friction, surface)
+    return Annotation(name, cad_id, pose, hinge=hinge), cad

@@ -18,21 +18,11 @@ import numpy as np
 import trimesh
 
 from converters.geometry.faces import unit_normals
+from converters.read import urdf
 from converters.read.files import SourceFolder, only_file, read_image
 from converters.read.homes.parts import LEVEL, HomePart, home
 from converters.read.meshes import UP_AXES, collada_frame, read_surface
 from converters.read.obj import GREY, TexturedMesh, find_file, in_colour
-from converters.read.urdf import (
-    count_unread,
-    height_field,
-    joined,
-    numbers,
-    parse_xml,
-    placed,
-    primitive,
-    rectangle,
-    report_unread,
-)
 from converters.records.errors import SceneRejected
 from converters.records.limits import PARTS, check_count
 from converters.records.raw import RawScene
@@ -58,16 +48,13 @@ class SdfModel:
     )
     """Frame -> its (4, 4) pose in the frame of this one, once it is resolved."""
 
-    def add_frames(self) -> None:
-        """Add the frames of links, joints and `<frame>`; those stand for themselves unless their poses name others."""
+    def add(self, models: list[tuple["SdfModel", ElementTree.Element | None, str]]) -> None:
+        """Add the frames of links, joints and `<frame>`, and models, each posed by a frame in it or by itself."""
         for child in self.element:
             if child.tag in ("link", "frame", "joint"):
                 on = {"frame": child.get("attached_to"), "joint": child.findtext("child")}.get(child.tag) or ""
                 pose = child.find("pose")
                 self.given[child.get("name") or ""] = _frame(pose) or on.strip(), self.matrix(pose)
-
-    def add_models(self, models: list[tuple["SdfModel", ElementTree.Element | None, str]]) -> None:
-        """Add models within; each pose is that of a frame in the model, or of the model itself."""
         for model, pose, placement in models:
             self.given[model.name] = _frame(pose), self.matrix(pose) @ np.linalg.inv(model.frame(placement))
             self.models.append(model)
@@ -110,7 +97,7 @@ class SdfModel:
             return np.eye(4)
         quaternion = {"euler_rpy": False, "quat_xyzw": True}.get(pose.get("rotation_format", "euler_rpy"))
         try:
-            values = numbers(pose.text, (0.0,) * 6 + (1.0,) * bool(quaternion))
+            values = urdf.numbers(pose.text, (0.0,) * 6 + (1.0,) * bool(quaternion))
         except ValueError as error:
             raise SceneRejected(f"{self.path}: '{self.name}': {error}") from error
         length = float(np.linalg.norm(values[3:]))
@@ -162,14 +149,14 @@ def read_sdf(root: Path, strict: bool = False, chosen: Path | None = None, withi
     source = SourceFolder(within or root, strict)
     file = chosen or only_file(root, worlds_of(root), "worlds")
     reader = _Reader(source, root)
-    world = parse_xml(source.use(source.inside(file), "expected SDF"), "SDF").find("world")
+    world = urdf.parse_xml(source.use(source.inside(file), "expected SDF"), "SDF").find("world")
     if world is None:
         raise SceneRejected(f"{file}: has no <world>; give a world, not a model")
-    count_unread(world, TABLES["read"], reader.unread)
+    urdf.count_unread(world, TABLES["read"], reader.unread)
     saved = world.find("state")
     tree = reader.tree(SdfModel("world", world, file))
     parts = list(reader.parts(tree, np.eye(4), UNMOVED if saved is None else saved))
-    report_unread(source, file.name, reader.unread)
+    urdf.report_unread(source, file.name, reader.unread)
     return home(source, "sdf", parts)
 
 
@@ -189,7 +176,6 @@ class _Reader:
             raise SceneRejected(f"{model.path}: models lie {DEEPEST} deep in models; does one include itself?")
         self.read += 1
         check_count(model.path, self.read, PARTS, "models")
-        model.add_frames()
         within = []
         for child in [*model.element, *model.element.findall("state/insertions/*")]:
             item = (child, model.path) if child.tag == "model" else None
@@ -202,7 +188,7 @@ class _Reader:
                 pose = inner.find("pose") if child.find("pose") is None else child.find("pose")
                 filled = self.tree(SdfModel(name, inner, path, static or model.static), depth + 1)
                 within.append((filled, pose, (placement or inner.get("placement_frame") or "").strip()))
-        model.add_models(within)
+        model.add(within)
         return model
 
     def parts(self, model: SdfModel, pose: np.ndarray, state: ElementTree.Element) -> Iterator[HomePart]:
@@ -228,14 +214,14 @@ class _Reader:
         root = BUILTIN.get(_key(fuel[1] if fuel else uri.removeprefix("model://")))
         if root is None:
             path = self._model_file(self._find(uri, path))
-            root = parse_xml(self.source.use(self.source.inside(path), "expected SDF"), "SDF")
+            root = urdf.parse_xml(self.source.use(self.source.inside(path), "expected SDF"), "SDF")
         model = root.find("model")
         if model is None and root.find("light") is None:
             raise SceneRejected(f"{path}: has no <model>")
         if model is None:
             self.unread["<light> in <include>"] += 1
             return None
-        count_unread(model, TABLES["read"], self.unread)
+        urdf.count_unread(model, TABLES["read"], self.unread)
         return model, path
 
     def _model_file(self, folder: Path) -> Path:
@@ -247,7 +233,7 @@ class _Reader:
             folder = max(versions, key=lambda path: int(path.name))
         names = []
         if self.source.has(self.source.inside(folder / "model.config")):
-            config = parse_xml(self.source.use(self.source.inside(folder / "model.config"), ""), "SDF")
+            config = urdf.parse_xml(self.source.use(self.source.inside(folder / "model.config"), ""), "SDF")
             names = [e.text for e in config.findall("sdf") if e.text]
         return folder / (names[-1].strip() if names else "model.sdf")
 
@@ -256,7 +242,7 @@ class _Reader:
         for joint in model.element.findall("joint"):
             if joint.get("type") != "fixed":
                 self.unread[f"{joint.get('type')} joint (its links are one part)"] += 1
-        scale = numbers(state.findtext("scale"), (1.0, 1.0, 1.0))
+        scale = urdf.numbers(state.findtext("scale"), (1.0, 1.0, 1.0))
         if not (scale > 1e-6).all():
             raise ValueError(f"<state> scales it by {scale.tolist()}, expected numbers above 0")
         grow, links = np.diag([*scale, 1.0]), model.element.findall("link")
@@ -272,17 +258,17 @@ class _Reader:
                     level = element.find("geometry/plane") is not None and (
                         unit_normals(transformed(mesh.vertices, pose @ matrix), mesh.faces)[0, 2] > LEVEL
                     )
-                    meshes.append((placed(mesh, matrix), pose @ matrix if level else None))
+                    meshes.append((urdf.placed(mesh, matrix), pose @ matrix if level else None))
         planes = [at for _, at in shapes["collision"] if at is not None]
         for at in planes:
             look = next(mesh for mesh, at in shapes["visual"] + shapes["collision"] if at is not None)
             at[:3, :3] = np.eye(3)
             yield HomePart(model.name, at, look, None, True, held=True, endless=True)
-        visual = joined([mesh for mesh, at in shapes["visual"] if at is None or not planes])
-        solid = joined([mesh for mesh, at in shapes["collision"] if at is None])
-        masses = [float(numbers(text, (0.0,))[0]) for link in links if (text := link.findtext("inertial/mass"))]
+        visual = urdf.joined([mesh for mesh, at in shapes["visual"] if at is None or not planes])
+        solid = urdf.joined([mesh for mesh, at in shapes["collision"] if at is None])
+        masses = [float(urdf.numbers(text, (0.0,))[0]) for link in links if (text := link.findtext("inertial/mass"))]
         mus = [c.findtext("surface/friction/ode/mu") for link in links for c in link.findall("collision")]
-        friction = [mu for text in mus if text and 0 < (mu := float(numbers(text, (0.0,))[0])) <= 2]
+        friction = [mu for text in mus if text and 0 < (mu := float(urdf.numbers(text, (0.0,))[0])) <= 2]
         surface, mass = visual or solid, sum(masses) if masses else None
         if surface is not None:
             yield HomePart(model.name, pose, surface, solid, model.static, mass, max(friction, default=None))
@@ -295,7 +281,7 @@ class _Reader:
             shape = next((s for g in element.findall("geometry") for s in g), None)
             if shape is None:
                 self.unread[f"<{kind}> without a shape"] += 1
-            elif shape.tag != "empty" and numbers(element.findtext("transparency"), (0.0,))[0] < 1.0:
+            elif shape.tag != "empty" and urdf.numbers(element.findtext("transparency"), (0.0,))[0] < 1.0:
                 mesh = self._shape(shape, model.path)
                 if not np.isfinite(mesh.vertices).all() or not len(mesh.faces):
                     raise ValueError(f"a <{shape.tag}> of link '{link.get('name')}' has no usable size")
@@ -308,24 +294,24 @@ class _Reader:
         if shape.tag in ("mesh", "heightmap"):
             file = self.source.inside(self._find((shape.findtext("uri") or "").strip(), path))
             if shape.tag == "mesh":
-                matrix = np.diag([*numbers(shape.findtext("scale"), (1.0, 1.0, 1.0)), 1.0])
+                matrix = np.diag([*urdf.numbers(shape.findtext("scale"), (1.0, 1.0, 1.0)), 1.0])
                 mesh = read_surface(self.source, file, "")
                 if file.lower().endswith(".dae"):  # Gazebo does not read the axis that points up
                     matrix[:3, :3] @= UP_AXES[collada_frame(self.source.root / file)[0]].T
-                return placed(mesh, matrix)
-            at, size_m = numbers(shape.findtext("pos"), (0.0, 0.0, 0.0)), numbers(size, (1.0, 1.0, 1.0))
+                return urdf.placed(mesh, matrix)
+            at, size_m = urdf.numbers(shape.findtext("pos"), (0.0, 0.0, 0.0)), urdf.numbers(size, (1.0, 1.0, 1.0))
             grey = read_image(self.source.use(file, ""), "L")[::-1].astype(float)
             step = max(1, max(grey.shape) // HEIGHTS)
             height_m = grey[::step, ::step] / max(grey.max(), 1.0) * size_m[2]  # the brightest pixel is that high
-            vertices, faces = height_field(height_m, (size_m[0] / 2, size_m[1] / 2))
+            vertices, faces = urdf.height_field(height_m, (size_m[0] / 2, size_m[1] / 2))
             return TexturedMesh(vertices + at, faces, None, None)
         if shape.tag == "plane":
-            x, y = np.maximum(numbers(size, (1.0, 1.0)), 1e-3) / 2
-            a, b, c = numbers(shape.findtext("normal"), (0.0, 0.0, 1.0))
+            x, y = np.maximum(urdf.numbers(size, (1.0, 1.0)), 1e-3) / 2
+            a, b, c = urdf.numbers(shape.findtext("normal"), (0.0, 0.0, 1.0))
             axis, angle = (-b, a, 0.0) if a or b else (1.0, 0.0, 0.0), math.atan2(math.hypot(a, b), c)
             turn = trimesh.transformations.rotation_matrix(angle, axis)
-            return placed(rectangle(x, y), turn)
-        return primitive(path, shape.tag, shape.findtext)
+            return urdf.placed(urdf.rectangle(x, y), turn)
+        return urdf.primitive(path, shape.tag, shape.findtext)
 
     def _coloured(self, mesh: TexturedMesh, element: ElementTree.Element) -> TexturedMesh:
         """Return the mesh with the colours of its file, or else of its material."""
@@ -338,7 +324,7 @@ class _Reader:
         if script and diffuse is None and script not in TABLES["colours"]:
             self.unread["<script> in <material>, but for Gazebo's plain ones"] += 1
         text = diffuse or TABLES["colours"].get(script) or element.findtext("material/ambient") or ""
-        rgb = numbers(" ".join(text.split()[:3]), tuple(c / 255 for c in GREY))
+        rgb = urdf.numbers(" ".join(text.split()[:3]), tuple(c / 255 for c in GREY))
         return in_colour(mesh, rgb)
 
     def _find(self, uri: str, path: Path) -> Path:

@@ -22,19 +22,10 @@ import shapely
 from converters.geometry.boxes import convex_hull
 from converters.geometry.faces import compacted
 from converters.read.files import SourceFolder, only_file
+from converters.read.homes import sh3d_walls
 from converters.read.homes.parts import HomePart, category_of, home
 from converters.read.homes.sh3d_archive import called, colour, metres, number, point, read_xml, unpack
 from converters.read.homes.sh3d_models import LEAF, WHITE, DrawnModels, mean_colour, yaw_pose
-from converters.read.homes.sh3d_walls import (
-    HEIGHT_M,
-    LOW_M,
-    enclosed,
-    level_parts,
-    opening_of,
-    read_room,
-    read_walls,
-    wall_part,
-)
 from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh
 from converters.read.surfaces import check_extent, storey_of
@@ -128,9 +119,9 @@ class _Drawing:
         levels = root.findall("level")
         self.hidden = {e.get("id") for e in levels if "false" in (e.get("visible"), e.get("viewable"))}
         self.base_m: dict[str | None, float] = {e.get("id"): number(e, "elevation") / 100 for e in levels}
-        self.high_m = {e.get("id"): number(e, "height", 100 * HEIGHT_M) / 100 for e in levels}
+        self.high_m = {e.get("id"): number(e, "height", 100 * sh3d_walls.HEIGHT_M) / 100 for e in levels}
         self.base_m.setdefault(None, min(self.base_m.values(), default=0.0))
-        self.high_m.setdefault(None, number(root, "wallHeight", 100 * HEIGHT_M) / 100)
+        self.high_m.setdefault(None, number(root, "wallHeight", 100 * sh3d_walls.HEIGHT_M) / 100)
         for tag, what in DROPPED.items():
             self.dropped[what] += len(root.findall(tag))
         unread: collections.Counter[str] = collections.Counter()
@@ -139,14 +130,14 @@ class _Drawing:
 
     def scene(self) -> RawScene:
         """Return the whole home."""
-        walls = read_walls(list(self._visible("wall")), self.base_m, self.source.note)
+        walls = sh3d_walls.read_walls(list(self._visible("wall")), self.base_m, self.source.note)
         pieces = list(self._pieces())
         check_count(self.source.root, len(walls) + len(pieces), DRAWN, "walls and pieces of furniture")
         cutting = [e for e in pieces if e.tag == "doorOrWindow"]
-        openings = [opening_of(e, self._base(e)) for e in cutting]
-        windows = tuple(o.window() for e, o in zip(cutting, openings, strict=True)
-                        if number(e, "elevation", 0.0) / 100 > DOOR_M[0]
-                        and any(o.within(wall) is not None for wall in walls))  # fmt: skip
+        openings = [sh3d_walls.opening_of(e, self._base(e)) for e in cutting]
+        high = [number(e, "elevation", 0.0) / 100 > DOOR_M[0] for e in cutting]
+        cuts = [any(opening.within(wall) is not None for wall in walls) for opening in openings]
+        windows = tuple(o.window() for o, *of in zip(openings, high, cuts, strict=True) if all(of))
         parts = [part for e in pieces for part in self._piece(e)]
         for wall in walls:
             e = wall.element
@@ -158,31 +149,35 @@ class _Drawing:
                 if side in looks and (size := metres(board, "thickness", "height", default=1.0)).min() > 0:
                     paint = self.models.look(board, "color", "texture", looks[side][0][:1, :1])
                     boards[side] = (float(size[0]), float(size[1]), paint)
-            part = wall_part(wall, openings, looks, boards)
-            low = wall.height_m.max() < LOW_M
+            part = sh3d_walls.wall_part(wall, openings, looks, boards)
+            low = wall.height_m.max() < sh3d_walls.LOW_M
             parts += [] if part is None else [dataclasses.replace(part, low=low)]
         rooms, floors_m, bases = [], set(), sorted(set(self.base_m.values()))
         for e in self._visible("room"):
-            room = read_room(e, self.models.look)
+            room = sh3d_walls.read_room(e, self.models.look)
             if room is None:
                 self.source.note(f"{called(e)}: its outline encloses nothing; it is left out")
             else:
                 rooms.append(room)
-        shafts = {e: _footprint(e) for e in pieces if e.get("staircaseCutOutShape")}
+        shafts = []  # footprint, foot and top
+        for e in (e for e in pieces if e.get("staircaseCutOutShape")):
+            foot = self._base(e) + number(e, "elevation", 0.0) / 100
+            shafts.append((_footprint(e), foot, foot + number(e, "height") / 100))
         ground = min((self.base_m.get(r.level, 0.0) for r in rooms), default=bases[0])
         for base, above in zip(bases, [*bases[1:], math.inf], strict=True):
             mine = [w for w in walls if w.base_m == base]
             here = [r for r in rooms if self.base_m.get(r.level, 0.0) == base]
-            high = max([self.high_m[r.level] for r in here], default=HEIGHT_M)
+            high = max([self.high_m[r.level] for r in here], default=sh3d_walls.HEIGHT_M)
             if (here and base == ground) or (not here and above - base > STOREY_M):  # else open to below, or too low
-                bare = enclosed(mine, here)
+                bare = sh3d_walls.enclosed(mine, here)
                 if here and bare:
                     area = sum(shapely.area(room.plan) for room in bare)
                     self.source.note(f"{area:.1f} m2 within walls are in no room: taken for floor")
                 here = bare + here
             span = base, base + high
-            through = [shapely.union_all([p for e, p in shafts.items() if self._crosses(e, z)]) for z in span]
-            level = level_parts(here, mine, openings, span, through)
+            cut = [[p for p, foot, top in shafts if foot < z - 0.1 and top > z - 0.5] for z in span]
+            through = [shapely.union_all(plans) for plans in cut]
+            level = sh3d_walls.level_parts(here, mine, openings, span, through)
             parts += level
             if level and any(r.floor is not None for r in here):
                 floors_m.add(base)
@@ -239,10 +234,6 @@ class _Drawing:
 
     def _base(self, e: ElementTree.Element) -> float:
         return self.base_m.get(e.get("level"), self.base_m[None])
-
-    def _crosses(self, e: ElementTree.Element, z_m: float) -> bool:
-        foot = self._base(e) + number(e, "elevation", 0.0) / 100
-        return foot < z_m - 0.1 and foot + number(e, "height") / 100 > z_m - 0.5
 
     def _piece(self, e: ElementTree.Element) -> list[HomePart]:
         """Return the parts of one piece: furniture, or a door or window with its leaves apart."""

@@ -147,7 +147,12 @@ class DrawnModels:
         else:
             vertices, faces = self._deformed(element, model)
             (vertices, faces), group = compacted(vertices, faces), model.group
-            vertices = vertices @ _rotation(element).T
+            words = (element.get("modelRotation") or "1 0 0 0 1 0 0 0 1").split()
+            turn = np.array([parsed(element, "modelRotation", word) for word in words])
+            turn = turn.reshape(3, 3) if len(turn) == 9 else np.zeros((3, 3))
+            if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-2):
+                raise SceneRejected(f"{called(element)}: modelRotation is no rotation; mend the drawing")
+            vertices = vertices @ turn.T
             uv, numbers, images = self._painted(element, model)
         low, span = vertices.min(axis=0), np.ptp(vertices, axis=0)
         scale = np.where(span > 1e-9, size / np.maximum(span, 1e-12), 1.0)
@@ -236,16 +241,6 @@ def _by_place(model: DrawnModel, element: ElementTree.Element, faces: np.ndarray
     normal = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])).argmax(axis=1)
     pair = np.array([(2, 1), (0, 2), (0, 1)])[normal]
     return np.take_along_axis(corners, pair[:, None, :].repeat(3, axis=1), axis=2) / size
-
-
-def _rotation(element: ElementTree.Element) -> np.ndarray:
-    """Return (3, 3) that turns the model's axes upright; the identity where it is not given."""
-    words = (element.get("modelRotation") or "1 0 0 0 1 0 0 0 1").split()
-    turn = np.array([parsed(element, "modelRotation", word) for word in words])
-    turn = turn.reshape(3, 3) if len(turn) == 9 else np.zeros((3, 3))
-    if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-2):
-        raise SceneRejected(f"{called(element)}: modelRotation is no rotation; mend the drawing")
-    return turn
 
 
 def yaw_pose(at: np.ndarray, yaw: float) -> np.ndarray:

@@ -274,11 +274,9 @@ def enclosed(walls: list[Wall], rooms: list[Room]) -> list[Room]:
     stands = shapely.union_all([wall.polygon() for wall in walls])
     drawn = shapely.union_all([room.plan for room in rooms])
     inside = [shapely.Polygon(ring) for p in shapely.get_parts(stands) for ring in getattr(p, "interiors", ())]
-    return [
-        Room("room", None, plan, (WHITE, None), None) for plan in inside
-        if not shapely.is_empty(shapely.buffer(plan, -SHAFT_M / 2))
-        and shapely.area(shapely.intersection(plan, drawn)) < COVERED * shapely.area(plan)
-    ]  # fmt: skip
+    inside = [plan for plan in inside if not shapely.is_empty(shapely.buffer(plan, -SHAFT_M / 2))]
+    bare = [p for p in inside if shapely.area(shapely.intersection(p, drawn)) < COVERED * shapely.area(p)]
+    return [Room("room", None, plan, (WHITE, None), None) for plan in bare]
 
 
 def level_parts(

@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from converters.check.pictures import Picture, world_surfaces
 from converters.propose.proposals import bounds, box_iou
-from converters.records.visual import TexturedMesh
+from converters.records.raw import TexturedMesh
 from converters.segment.labelling import MATCH_IOU
 from scenes_mjcf.look import over
 from scenes_mjcf.schema import load_manifest

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from converters.check.pictures import Picture, at_eye_height, from_the_south, world_surfaces
-from converters.records.visual import TexturedMesh
+from converters.records.raw import TexturedMesh
 from scenes_mjcf.look import CameraPose, Lens, look_along, over
 from scenes_mjcf.schema import load_maps
 

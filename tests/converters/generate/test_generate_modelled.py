@@ -27,8 +27,7 @@ from converters.pipeline import ConvertConfig, _structure_visual
 from converters.read.gibson import read_gibson
 from converters.recipes import building_of
 from converters.records.errors import SceneRejected
-from converters.records.raw import CEILING, FLOOR, STRUCTURE_LABELS, WALL, WINDOW, RawScene
-from converters.records.visual import VisualMesh
+from converters.records.raw import CEILING, FLOOR, STRUCTURE_LABELS, WALL, WINDOW, RawScene, VisualMesh
 from scenes_mjcf.categories import CATEGORIES
 
 SEED = 5

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from converters.structure.enclosure import OPENINGS_M, beyond_obstacles, floor_outside
+from converters.structure.maps import OPENINGS_M, beyond_obstacles, floor_outside
 
 CELL_M = 0.05
 

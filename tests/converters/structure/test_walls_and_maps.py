@@ -15,8 +15,8 @@ from converters.bodies.objects import BodyHinge, PlacedObject
 from converters.geometry.boxes import convex_hull
 from converters.geometry.faces import sample_faces
 from converters.records.raw import CEILING, FLOOR, WALL, GivenMap
-from converters.structure.maps import Grid, main_direction, make_floor_plan, resample
-from converters.structure.walls import border_cells, cover_rectangles, wall_boxes
+from converters.structure.maps import Grid, make_floor_plan, resample
+from converters.structure.walls import border_cells, cover_rectangles, main_direction, wall_boxes
 from interactive_nav_common.rotations import yaw_matrix
 from tests.converters import tiny_raw
 

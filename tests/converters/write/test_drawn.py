@@ -13,7 +13,7 @@ from PIL import Image
 from converters.bodies.objects import PlacedObject
 from converters.geometry.faces import sample_faces
 from converters.geometry.simplify import Surface, simplify_to, surface_loss
-from converters.records.visual import ColourCloud, TexturedMesh
+from converters.records.raw import ColourCloud, TexturedMesh
 from converters.write.texture import as_it_is, as_png, draw_objects
 
 NOTHING = ColourCloud(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))

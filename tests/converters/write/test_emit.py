@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from converters.bodies.objects import PlacedObject, physical_properties
 from converters.check.surfaces import geom_surface
 from converters.geometry.boxes import convex_hull, fit_box
-from converters.records.visual import VisualMesh
+from converters.records.raw import VisualMesh
 from converters.write.emit import SceneParts, paired, write_obj, write_scene
 from scenes_mjcf.look import geom_mesh
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from converters.bodies.objects import PlacedObject
 from converters.geometry.boxes import convex_hull
 from converters.geometry.density import ROBOTS, Ways, must_push_shares
-from converters.records.visual import VisualMesh
+from converters.records.raw import VisualMesh
 from converters.write.emit import SceneParts
 from converters.write.manifest import measure_scene, navigation_complexity, shadow, specific_surface_1_m
 from interactive_nav_common.grids import clearance

@@ -9,8 +9,7 @@ import pytest
 import trimesh
 
 from converters.geometry.faces import simplify
-from converters.records.raw import ScanMesh
-from converters.records.visual import ColourCloud, VisualMesh
+from converters.records.raw import ColourCloud, ScanMesh, VisualMesh
 from converters.write.texture import (
     bake_object,
     bake_structure,
@@ -55,7 +54,7 @@ def test_texture_of_a_scan_is_sampled_where_it_lies():
     texture[1, 1] = (0, 0, 255)  # lower right
     uv = SQUARE[:, :2][TRIANGLES]
     scan = ScanMesh(SQUARE, TRIANGLES, np.zeros(4, int), None, uv, texture)
-    cloud = colour_cloud(scan, SQUARE, TRIANGLES, np.arange(2), 0.1)
+    cloud = colour_cloud(scan, SQUARE, np.arange(2), 0.1)
     upper_left = (cloud.points[:, 0] < 0.5) & (cloud.points[:, 1] > 0.5)
     lower_right = (cloud.points[:, 0] > 0.5) & (cloud.points[:, 1] < 0.5)
     assert (cloud.colours[upper_left] == (255, 0, 0)).all() and upper_left.sum() > 20
@@ -66,7 +65,7 @@ def test_texture_of_a_scan_is_sampled_where_it_lies():
 def test_vertex_colours_come_with_the_chosen_faces_only():
     colours = np.array([[1, 1, 1], [2, 2, 2], [3, 3, 3], [4, 4, 4]], np.uint8)
     scan = ScanMesh(SQUARE, TRIANGLES, np.zeros(4, int), colours)
-    cloud = colour_cloud(scan, SQUARE, TRIANGLES, np.array([1]))
+    cloud = colour_cloud(scan, SQUARE, np.array([1]))
     np.testing.assert_array_equal(cloud.colours[:, 0], [1, 3, 4])
 
 

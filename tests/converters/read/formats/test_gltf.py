@@ -17,7 +17,7 @@ from PIL import Image
 from converters.read.files import SourceFolder
 from converters.read.meshes import colours_of_faces, read_surface
 from converters.records.errors import SceneRejected
-from converters.records.visual import TexturedMesh
+from converters.records.raw import TexturedMesh
 
 TRIANGLE = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0)], np.float32)
 # Upper left, upper right, lower left and lower right of the image.
