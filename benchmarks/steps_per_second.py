@@ -10,7 +10,7 @@ logs, compiling and checkpoints apart. Rows carry device, versions and commit, a
 `benchmarks/results/steps_per_second.jsonl`.
 """
 
-import argparse
+import dataclasses
 import datetime
 import functools
 import json
@@ -21,7 +21,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -35,39 +35,17 @@ from interactive_nav.physics.nearness import widths_at
 from interactive_nav.physics.window import PhysicsWindow
 from interactive_nav.task.wrappers import AutoResetEnv, ShardedEnv
 from interactive_nav.types import FAILURES
+from interactive_nav_common.commands import Command, option, parse
+from interactive_nav_common.config import AtLeastOne
+from interactive_nav_common.errors import reports_errors
 from interactive_nav_common.versions import commit, package_versions
-from interactive_nav_common.words import Parser, add_words, read_commands
 from train import config_io
 from train.runs.run import train_run
 from train.sweep.scheduler import gpu_listing
 
 RESULTS = Path("benchmarks/results")
 SCENE = "scenes_mjcf/apartment_0"
-TABLE = read_commands(Path(__file__).with_name("words.yaml"))
-"""Words of the command lines."""
 PACKAGES = ("mujoco", "mujoco-mjx", "warp-lang", "jax", "brax")
-
-
-def command_line(description: str | None, rows: str = "", settings: bool = False) -> argparse.ArgumentParser:
-    """Return a parser with the options that benchmarks share; `rows` names a file in `RESULTS` to write.
-
-    With `settings`, `--set key=value` changes the environment.
-    """
-    made = Parser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    if settings:
-        add_words(made, TABLE["settings"].words)
-        made.add_argument(
-            "--set",
-            dest="settings",
-            type=lambda word: (word.partition("=")[0], json.loads(word.partition("=")[2])),
-            nargs="*",
-            default=[],
-            metavar="key=value",
-            help="environment settings",
-        )
-    if rows:
-        add_words(made, TABLE["rows"].words, rows=RESULTS / f"{rows}.jsonl")
-    return made
 
 
 def origin(commit_told: str | None = None, packages: Sequence[str] = PACKAGES) -> dict[str, Any]:
@@ -341,25 +319,54 @@ def training(
     }
 
 
-def main() -> None:
-    """Measures and appends rows."""
-    parser = command_line(__doc__, "steps_per_second", settings=True)
-    add_words(parser, TABLE["steps_per_second"].words, modes=MODES)
-    args = parser.parse_args()
-    settings = dict(args.settings)
+@dataclasses.dataclass(kw_only=True)
+class Bench(Command):
+    """Measure env steps a second, and append rows."""
+
+    scenes: tuple[str, ...] = (SCENE,)
+    """Scene folders."""
+    robot: str = "turtlebot"
+    """Name of the robot."""
+    environment: Annotated[tuple[str, ...], option(name="set", metavar="KEY=JSON")] = ()
+    """Environment settings."""
+    backend: str = "auto"
+    """Physics backend."""
+    devices: AtLeastOne = 1
+    """Spread the environments over this many."""
+    num_envs: tuple[AtLeastOne, ...] = (64,)
+    """Environments; a row each."""
+    steps: AtLeastOne = 200
+    """Control steps of every environment."""
+    mode: tuple[Literal["physics", "task", "observed", "simulation", "windows", "train"], ...] = ("simulation",)
+    """What to measure; a row each."""
+    preset: str = "turtlebot_ppo"
+    """Of `python -m train`, for train."""
+    learner: Annotated[tuple[str, ...], option(metavar="KEY=VALUE")] = ()
+    """Laid over the preset, for train."""
+    commit: Annotated[str | None, option()] = None
+    """Recorded in the row (default: git's HEAD)."""
+    out: Path = RESULTS / "steps_per_second.jsonl"
+    """Where rows are appended."""
+
+
+@reports_errors("benchmarks.steps_per_second")
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure and append rows."""
+    args = parse(Bench, "python -m benchmarks.steps_per_second", argv)
+    settings = {name: json.loads(value) for name, _, value in (word.partition("=") for word in args.environment)}
     for num_envs in args.num_envs:
         for mode in args.mode:
             row: dict[str, Any] = {
                 "mode": mode,
                 "backend": resolve_backend(args.backend),
                 "num_envs": num_envs,
-                "scenes": args.scenes,
+                "scenes": list(args.scenes),
                 "settings": settings,
                 **origin(args.commit),
             }
-            measure = (args.scenes, args.backend, num_envs, args.steps, settings)
+            measure = (list(args.scenes), args.backend, num_envs, args.steps, settings)
             if mode == "train":
-                row |= training(*measure, args.preset, args.learner)
+                row |= training(*measure, args.preset, list(args.learner))
             else:
                 row |= {"robot": args.robot, "devices": args.devices}
             if mode == "windows":
@@ -367,7 +374,8 @@ def main() -> None:
             elif mode != "train":
                 row |= simulation(args.robot, *measure, part=mode, devices=args.devices)
             append_row(args.out, row)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -6,43 +6,54 @@ Exit codes: 0 done, 1 a gate failed (`convert` has written the scene anyway), 2 
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
 import glob
-import math
 import os
 import signal
 import sys
-import threading
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from converters.generating import GENERATING
+from converters.generating import (
+    CORES,
+    Build,
+    Command,
+    Generate,
+    GenerateScenes,
+    Get,
+    ListModels,
+    ListScenes,
+    MakeScenes,
+    Models,
+    OnCluster,
+)
 from converters.records.errors import StageFailed
-from converters.segmenting import SEGMENTING, label_unlabelled, next_step, propose_unproposed
-from interactive_nav_common.config import read_words, refuse_unused
-from interactive_nav_common.errors import UserError, printable, reports_errors
+from converters.segmenting import (
+    Annotate,
+    MeshFile,
+    Propose,
+    Segment,
+    SegmentScore,
+    SegmentTrain,
+    WithLibrary,
+    label_unlabelled,
+    next_step,
+    propose_unproposed,
+)
+from interactive_nav_common.commands import Flag, Words, option, parse, word
+from interactive_nav_common.config import AtLeastOne, Positive, read_words, refuse_unused
+from interactive_nav_common.errors import ConfigError, UserError, printable, readable, reports_errors
 from interactive_nav_common.jobs.progress import SafeConsole, stage_progress, warn_once
 from interactive_nav_common.signals import STOPS, interrupts_heard, number_of
-from interactive_nav_common.words import Command, Commands, Parser, add_words, read_commands
-from scenes_mjcf.schema import CATEGORIES
 from scenes_mjcf.sets import installed
-
-FORMATS = (
-    *("gibson", "interactive-gibson", "scan2cad", "sdf", "habitat", "mjcf", "sh3d"),
-    *("scannet", "scannetpp", "arkitscenes", "3rscan", "multiscan", "matterport3d"),
-)
-"""`READERS` of `converters.read.source`, which need not be imported to say so."""
 
 if TYPE_CHECKING:
     from converters.pipeline import ConvertConfig
-    from converters.propose.report import Proposed
     from converters.records.limits import Gate
 
 
@@ -80,100 +91,125 @@ def alignment_table(rows: tuple[dict[str, Any], ...]) -> Table:
     return table
 
 
-def proposal_tables(proposed: Proposed) -> Iterator[Table]:
-    """Yield a table of the proposals; and with a library and annotations, how well."""
-    table = Table("class", "confidence", "x y z, m", "size, m", "model", "sure", title="Proposals")
-    for k, proposal in enumerate(proposed.proposals):
-        model = proposed.retrieved.get(k)
-        table.add_row(
-            proposal.category,
-            f"{proposal.confidence:.2f}",
-            " ".join(f"{v:.2f}" for v in proposal.centre),
-            " ".join(f"{v:.2f}" for v in proposal.extent_m),
-            model.cad.cad_id[:8] if model else "-",
-            f"{model.confidence:.2f}" if model else "-",
-        )
-    yield table
-    if not proposed.comparisons:
-        return
-    heads = ("class", "annotated", "chosen", "rank", "cm", "yaw °", "scale x y z", "IoU", "sure")
-    caption = "cm, yaw and scale: the annotated model's best fit against its annotated pose"
-    table = Table(*heads, title="Retrieved models against the annotation", caption=caption)
-    for row in proposed.comparisons:
-        table.add_row(
-            row.category,
-            row.true_cad[:6],
-            row.chosen_cad[:6],
-            f"{row.rank}/{row.n_tried}",
-            f"{100 * row.difference.translation_m:.1f}",
-            f"{math.degrees(row.difference.yaw_rad):.1f}",
-            " ".join(f"{v:.2f}" for v in row.difference.scale_ratio),
-            f"{row.iou:.2f}",
-            f"{row.confidence:.2f}",
-        )
-    yield table
+def _choices_of(config: type[Any], command: Command) -> dict[str, Any]:
+    """Return the fields of a dataclass of choices that the command has."""
+    return {f.name: getattr(command, f.name) for f in dataclasses.fields(config) if hasattr(command, f.name)}
 
 
-def _words_of(config: type[Any], arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the fields of a dataclass of choices that the command line has."""
-    return {f.name: getattr(arguments, f.name) for f in dataclasses.fields(config) if f.name in arguments}
+@dataclasses.dataclass(kw_only=True)
+class Decomposing(Command):
+    """Base of the commands that decompose models into hulls."""
+
+    seed: int = 0
+    """Of the decomposition's search."""
+    overwrite: Flag = False
+    """Replace OUT if it exists."""
+    strict: Flag = False
+    """Refuse what would be repaired with a warning."""
+    timeout_s: Annotated[Positive, option(name="timeout", metavar="S")] = 240.0
+    """Seconds for the decomposition of one model before its convex hull is taken."""
 
 
-def _convert(arguments: argparse.Namespace, console: Console) -> int:
-    from converters.pipeline import ConvertConfig, convert_building
-    from converters.recipes import check_conversion
+@dataclasses.dataclass(kw_only=True)
+class Convert(OnCluster, MeshFile, WithLibrary, Decomposing):
+    """Turn a raw scan with alignments into a scene folder: SRC OUT; or many: SRC... --into DIR, or @LIST --into DIR."""
 
-    check_conversion(settings := read_words(arguments.settings, "object_faces=3000"), "settings")
-    words = _words_of(ConvertConfig, arguments)
-    words["auto_align"] |= arguments.segment or bool(arguments.library and not arguments.annotations)
-    config = ConvertConfig(**words | settings)
-    if arguments.into:
-        refuse_unused(arguments, "--annotations", "with --into: a file is of one scan")
-        return _convert_many(arguments, config, console)
-    if arguments.segment:
-        label_unlabelled(arguments, console)
-        arguments.annotations = arguments.annotations or propose_unproposed(arguments, console)
-        config = dataclasses.replace(config, auto_align=arguments.annotations is None)
-    warn = warn_once(console)
-    with stage_progress(console) as report:
-        results = convert_building(
-            arguments.source, arguments.out, config, report, warn=warn, annotations=arguments.annotations
-        )
-    for result in results:
-        if any(row.get("n_keypoints") for row in result.manifest.alignment):
-            console.print(alignment_table(result.manifest.alignment))
-        console.print(gate_table(result.gates))
-        for warning in result.manifest.warnings:
-            warn(warning)
-    times = ", ".join(f"{k} {v:.1f}" for k, v in results[0].stage_s.items())
-    console.print(f"Seconds: {times}", soft_wrap=True)
-    for result in results:
-        for row in result.manifest.alignment:
-            if "note" in row:
-                console.print(f"{row['name']}: {row['note']}", soft_wrap=True)
-        failed = [g.name for g in result.gates if not g.passed]
-        console.print(
-            f"{result.folder}: {len(result.manifest.objects)} movable objects, {result.n_walls} wall boxes, "
-            f"{result.manifest.floor_area_m2:.1f} m² traversable; "
-            + (f"gates that fail: {', '.join(failed)}" if failed else "every gate passes"),
-            soft_wrap=True,
-        )
-    layout, moves = results[0].manifest.source["format"], any(result.manifest.objects for result in results)
-    if not moves and (word := next_step(arguments, layout)):
-        console.print(word, soft_wrap=True, highlight=False)
-    return 0 if all(g.passed for result in results for g in result.gates) else 1
+    places: Annotated[tuple[str, ...], *word("SRC OUT")] = ()
+    """Folder with the raw scan, or a mesh file, and the scene folder to write, whose name becomes the scene's; several
+    floors give OUT_0, OUT_1, ...; @LIST is a file of one SRC a line."""
+    settings: Words = ()
+    """structure_faces, object_faces (triangles drawn), structure_texture, object_texture (pixels)."""
+    into: Annotated[Path | None, option(metavar="DIR")] = None
+    """Convert every SRC into a folder here, each in a process of its own, with a row in conversions.parquet; those that
+    exist with the same options and inputs are kept."""
+    mirror: Flag = False
+    """Take -x for x in a mesh file."""
+    root: Annotated[Path | None, option(metavar="DIR")] = None
+    """Of an MJCF or Gazebo home that names files outside of its folder: the folder that may be read."""
+    split: Literal["train", "test"] = "train"
+    """Recorded in scene.json."""
+    jobs: Annotated[AtLeastOne, option(metavar="N")] = CORES
+    """Decompositions side by side; with --into, sources."""
+    auto_align: Flag = False
+    """Also fit library models to labelled furniture that has no annotation."""
+    segment: Flag = False
+    """First label an unlabelled mesh file or Gibson folder by the network of segment; implies --auto-align."""
+    annotations: Annotated[Path | None, option(metavar="JSON")] = None
+    """Alignments of annotate, in place of those of SRC; their models are of --library."""
+
+    @property
+    def source(self) -> Path:
+        """The only source."""
+        return Path(self.places[0])
+
+    @property
+    def out(self) -> Path | None:
+        """Where scenes go."""
+        return self.into or (Path(self.places[1]) if len(self.places) == 2 else None)
+
+    def writes(self) -> tuple[str, ...]:
+        """Return the patterns of the files that it may write."""
+        return ("{}/[!.]*",) if self.into else ("{}", "{}_[0-9]*")
+
+    def run(self, console: Console) -> int:
+        """Run the command."""
+        from converters.pipeline import ConvertConfig, convert_building
+        from converters.recipes import check_conversion
+
+        places = [line for place in self.places for line in _lines(place) if line.strip()]
+        check_conversion(settings := read_words(self.settings, "object_faces=3000"), "settings")
+        words = _choices_of(ConvertConfig, self)
+        words["auto_align"] |= self.segment or bool(self.library and not self.annotations)
+        config = ConvertConfig(**words | settings)
+        if self.into:
+            refuse_unused(self, "--annotations", "with --into: a file is of one scan")
+            return _convert_many(self, places, config, console)
+        if len(places) != 2:
+            raise ConfigError(f"convert: got {len(places)} folders, expected SRC OUT, or SRC... --into DIR")
+        assert self.out is not None
+        if self.segment:
+            label_unlabelled(self, console)
+            self.annotations = self.annotations or propose_unproposed(self, console)
+            config = dataclasses.replace(config, auto_align=self.annotations is None)
+        warn = warn_once(console)
+        with stage_progress(console) as report:
+            results = convert_building(self.source, self.out, config, report, warn=warn, annotations=self.annotations)
+        for result in results:
+            if any(row.get("n_keypoints") for row in result.manifest.alignment):
+                console.print(alignment_table(result.manifest.alignment))
+            console.print(gate_table(result.gates))
+            for warning in result.manifest.warnings:
+                warn(warning)
+        times = ", ".join(f"{k} {v:.1f}" for k, v in results[0].stage_s.items())
+        console.print(f"Seconds: {times}", soft_wrap=True)
+        for result in results:
+            for row in result.manifest.alignment:
+                if "note" in row:
+                    console.print(f"{row['name']}: {row['note']}", soft_wrap=True)
+            failed = [g.name for g in result.gates if not g.passed]
+            console.print(
+                f"{result.folder}: {len(result.manifest.objects)} movable objects, {result.n_walls} wall boxes, "
+                f"{result.manifest.floor_area_m2:.1f} m² traversable; "
+                + (f"gates that fail: {', '.join(failed)}" if failed else "every gate passes"),
+                soft_wrap=True,
+            )
+        layout, moves = results[0].manifest.source["format"], any(result.manifest.objects for result in results)
+        if not moves and (word := next_step(self, layout)):
+            console.print(word, soft_wrap=True, highlight=False)
+        return 0 if all(g.passed for result in results for g in result.gates) else 1
 
 
-def _convert_many(arguments: argparse.Namespace, config: ConvertConfig, console: Console) -> int:
+def _convert_many(arguments: Convert, places: list[str], config: ConvertConfig, console: Console) -> int:
     from converters.many import convert_many
     from converters.sets import make_launcher
 
     launcher, side_by_side = make_launcher(
-        arguments.launcher, arguments.ray_address, min(arguments.jobs, len(arguments.places)), len(arguments.places)
+        arguments.launcher, arguments.ray_address, min(arguments.jobs, len(places)), len(places)
     )
+    assert arguments.into is not None
     with stage_progress(console) as report:
         failed = convert_many(
-            [Path(place) for place in arguments.places], arguments.into, config, launcher, side_by_side, report,
+            [Path(place) for place in places], arguments.into, config, launcher, side_by_side, report,
             lambda line: console.print(line, soft_wrap=True, highlight=False),
         )  # fmt: skip
     if failed:
@@ -181,160 +217,139 @@ def _convert_many(arguments: argparse.Namespace, config: ConvertConfig, console:
     return 1 if failed else 0
 
 
-def _object(arguments: argparse.Namespace, console: Console) -> None:
-    from converters.single_object import ObjectConfig, convert_object
+@dataclasses.dataclass(kw_only=True)
+class Object(Decomposing):
+    """Turn one mesh or URDF into a folder with a MuJoCo body."""
 
-    config = ObjectConfig(**_words_of(ObjectConfig, arguments) | {"source": arguments.within})
-    warn = warn_once(console)
-    about = convert_object(arguments.source, arguments.out, config, warn=warn)
-    for warning in about["warnings"]:
-        warn(warning)
-    size = " x ".join(f"{100 * v:.1f}" for v in about["size_m"])
-    console.print(
-        f"{arguments.out}: {about['category']}, {about['mass_kg']:.3f} kg ({about['mass_source']}), {size} cm, "
-        f"{about['n_hulls']} hulls ({about['hull_source']}); at rest it drifts "
-        f"{1000 * about['rest']['drift_hulls_m']:.2f} mm with hulls, "
-        f"{1000 * about['rest']['drift_boxes_m']:.2f} mm with boxes",
-        soft_wrap=True,
-    )
+    source: Annotated[Path, *word("MESH_OR_URDF")]
+    """OBJ, PLY, STL, GLB, ... in metres, or a URDF."""
+    out: Annotated[Path, *word("OUT")]
+    """Folder to write; its name becomes the body's."""
+    category: Annotated[str | None, option(metavar="NAME")] = None
+    """Category, a row of scenes_mjcf/categories.yaml (default: by the file's name, else other)."""
+    mass_kg: Annotated[Positive | None, option(name="mass", metavar="KG")] = None
+    """Mass (default: the URDF's, else density x volume)."""
+    friction: Annotated[Positive | None, option(metavar="MU")] = None
+    """Friction (default: the URDF's, else the category's)."""
+    scale: Positive = 1.0
+    """Of a mesh that is not in metres."""
+    up: Literal["z", "y"] = "z"
+    """Axis of the mesh that points up; DAE files say it themselves."""
+    within: Annotated[Path | None, option(metavar="DIR")] = None
+    """Folder that textures are read from (default: the model's folder)."""
 
+    def run(self, console: Console) -> None:
+        """Run the command."""
+        from converters.single_object import ObjectConfig, convert_object
 
-def _check(arguments: argparse.Namespace, console: Console) -> int:
-    from converters.check.gates import check_folder
-
-    manifest, gates = check_folder(installed(arguments.scene))
-    for gate in gates:
-        verdict = "PASS" if gate.passed else "FAIL"
-        print(
-            f"{verdict}  {gate.name:<18} {gate.value:>10.5g} {gate.limit.unit:<6} limit {bounds(gate):<8} "
-            f"({gate.limit.meaning})"
+        config = ObjectConfig(**{**_choices_of(ObjectConfig, self), "source": self.within})
+        warn = warn_once(console)
+        about = convert_object(self.source, self.out, config, warn=warn)
+        for warning in about["warnings"]:
+            warn(warning)
+        size = " x ".join(f"{100 * v:.1f}" for v in about["size_m"])
+        console.print(
+            f"{self.out}: {about['category']}, {about['mass_kg']:.3f} kg ({about['mass_source']}), {size} cm, "
+            f"{about['n_hulls']} hulls ({about['hull_source']}); at rest it drifts "
+            f"{1000 * about['rest']['drift_hulls_m']:.2f} mm with hulls, "
+            f"{1000 * about['rest']['drift_boxes_m']:.2f} mm with boxes",
+            soft_wrap=True,
         )
-    for warning in (w for gate in gates for w in gate.warnings):
-        print(f"warning: {printable(warning)}")
-    failed = sum(not g.passed for g in gates)
-    print(f"{manifest.name}: {len(gates) - failed} of {len(gates)} gates pass")
-    return 1 if failed else 0
 
 
-def _preview(arguments: argparse.Namespace, console: Console) -> None:
-    from converters.check.preview import preview
+@dataclasses.dataclass(kw_only=True)
+class Check(Command):
+    """Run the acceptance gates on a scene folder; exit with 1 if one fails."""
 
-    preview(installed(arguments.scene), arguments.output, arguments.source)
-    console.print(f"{arguments.output}: picture of {arguments.scene}", soft_wrap=True)
+    scene: Annotated[Path, *word("SCENE_DIR")]
+    """Scene folder."""
 
+    def run(self, console: Console) -> int:
+        """Run the command."""
+        from converters.check.gates import check_folder
 
-def _export(arguments: argparse.Namespace, console: Console) -> None:
-    from converters.write.sh3d import export_sh3d
-
-    for line in export_sh3d(installed(arguments.scene), arguments.output):
-        console.print(f"{arguments.output}: {line}", soft_wrap=True, highlight=False)
-
-
-def _propose(arguments: argparse.Namespace, console: Console) -> None:
-    from converters.propose.report import propose
-    from converters.propose.retrieval import read_library
-    from converters.read.source import read_source
-
-    with stage_progress(console) as report:
-        raw, library = read_source(arguments.source, arguments.format), None
-        if arguments.auto_align or arguments.library:
-            library = read_library(arguments.library, arguments.source)
-        proposed = propose(raw, arguments.output, library, report)
-    for table in proposal_tables(proposed):
-        console.print(table)
-    console.print(f"{arguments.output}: proposals.json and proposals.png", soft_wrap=True)
+        manifest, gates = check_folder(installed(self.scene))
+        for gate in gates:
+            verdict = "PASS" if gate.passed else "FAIL"
+            print(
+                f"{verdict}  {gate.name:<18} {gate.value:>10.5g} {gate.limit.unit:<6} limit {bounds(gate):<8} "
+                f"({gate.limit.meaning})"
+            )
+        for warning in (w for gate in gates for w in gate.warnings):
+            print(f"warning: {printable(warning)}")
+        failed = sum(not g.passed for g in gates)
+        print(f"{manifest.name}: {len(gates) - failed} of {len(gates)} gates pass")
+        return 1 if failed else 0
 
 
-def _annotate(arguments: argparse.Namespace, console: Console) -> int:
-    from converters.annotate.browser import Page
-    from converters.annotate.session import Store, start
-    from converters.propose.proposals import propose_instances
-    from converters.propose.retrieval import read_library
-    from converters.read.source import read_source
-    from interactive_nav_common.files import alone_in
-    from interactive_nav_common.untrusted.guard import guarded_server
+@dataclasses.dataclass(kw_only=True)
+class Preview(Command):
+    """Draw a conversion's stages from above."""
 
-    with alone_in(arguments.output):
-        raw = read_source(arguments.source, arguments.format, up=arguments.up, unit=arguments.unit)
-        store = Store(arguments.output, read_library(arguments.library, arguments.source))
-        proposals = propose_instances(raw.scan)
-        session = store.save(store.open(raw, lambda: start(raw, proposals)))
-        server, address = guarded_server(arguments.host, arguments.port, raw.name, "annotate")
-        page = Page(server, store, session, raw, proposals)
-        console.print(f"{address} (Ctrl-C ends it; every action is saved)", soft_wrap=True, highlight=False)
-        try:
-            threading.Event().wait()
-        except KeyboardInterrupt as stop:
-            number = number_of(stop)  # Ctrl-C is how it ends
-        server.stop()
-    states = [item.state for item in page.session.items]
-    counts = ", ".join(f"{states.count(word)} {word}" for word in ("accepted", "skipped", "open"))
-    console.print(f"{arguments.output}: {counts}", soft_wrap=True)
-    return 0 if number == signal.SIGINT else 128 + number
+    scene: Annotated[Path, *word("SCENE_OR_OBJECT_DIR")]
+    """Folder of a scene or an object."""
+    output: Annotated[Path, option("-o", metavar="PNG")]
+    """The picture."""
+    source: Annotated[Path | None, option(metavar="SRC")] = None
+    """Raw folder or file: draws scan and cut too."""
+
+    def run(self, console: Console) -> None:
+        """Run the command."""
+        from converters.check.preview import preview
+
+        preview(installed(self.scene), self.output, self.source)
+        console.print(f"{self.output}: picture of {self.scene}", soft_wrap=True)
 
 
-RUNS: dict[str, Any] = {
-    "convert": _convert,
-    "propose": _propose,
-    "annotate": _annotate,
-    "object": _object,
-    "check": _check,
-    **GENERATING,
-    **SEGMENTING,
-    "preview": _preview,
-    "export": _export,
+@dataclasses.dataclass(kw_only=True)
+class Export(Command):
+    """Draw a scene for Sweet Home 3D, to edit it there and convert it again."""
+
+    scene: Annotated[Path, *word("SCENE_DIR")]
+    """Scene folder."""
+    output: Annotated[Path, *word("HOME.sh3d")]
+    """File to write."""
+
+    def run(self, console: Console) -> None:
+        """Run the command."""
+        from converters.write.sh3d import export_sh3d
+
+        for line in export_sh3d(installed(self.scene), self.output):
+            console.print(f"{self.output}: {line}", soft_wrap=True, highlight=False)
+
+
+def _lines(place: str) -> list[str]:
+    """Return the places that `@LIST` lists; another place as it is."""
+    if not place.startswith("@"):
+        return [place]
+    with readable(place[1:], ConfigError, "expected a file of one SRC a line"):
+        return Path(place[1:]).read_text().splitlines()
+
+
+COMMANDS: dict[str, Any] = {
+    "convert": Convert,
+    "segment": Segment,
+    "segment-train": SegmentTrain,
+    "segment-score": SegmentScore,
+    "propose": Propose,
+    "annotate": Annotate,
+    "object": Object,
+    "check": Check,
+    "generate": Generate,
+    "generate-scenes": GenerateScenes,
+    "scenes": {"list": ListScenes, "make": MakeScenes},
+    "models": Models,
+    "library": {"get": Get, "build": Build, "list": ListModels},
+    "preview": Preview,
+    "export": Export,
 }
-"""Command of words.yaml -> what runs it, or its actions' table; an exit code where it is not always 0."""
 
 
-def _add(commands: Commands, name: str, row: Command, run: Any) -> None:
-    command = commands.add_parser(name, help=row.help, usage=row.usage)
-    add_words(command, row.words, formats=("auto", *FORMATS), categories=CATEGORIES, cores=os.cpu_count() or 1)
-    if not row.actions:
-        command.set_defaults(run=run, writes=row.writes)
-        return
-    actions = command.add_subparsers(required=True, metavar="ACTION")
-    for action, inner in row.actions.items():
-        _add(actions, action, inner, run[action])
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = Parser(prog="python -m converters", description="Raw scans to MuJoCo scene folders.")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for name, row in read_commands(Path(__file__).with_name("words.yaml")).items():
-        _add(commands, name, row, RUNS[name])
-    convert = commands.choices["convert"]
-    convert.fromfile_prefix_chars = "@"
-    convert.convert_arg_line_to_args = lambda arg_line: [arg_line] if arg_line.strip() else []
-    return parser
-
-
-def _parse(argv: list[str] | None) -> argparse.Namespace:
-    """Parse the command line's words; those of `generate` and `convert` may stand before and after its options."""
-    parser = _parser()
-    arguments, rest = parser.parse_known_args(argv)
-    free = "settings" if "settings" in arguments else "places"
-    if rest and (free not in arguments or any(word.startswith("-") for word in rest)):
-        parser.error(f"unrecognized arguments: {' '.join(rest)}")
-    if rest:
-        setattr(arguments, free, [*getattr(arguments, free), *rest])
-    if "places" in arguments:
-        arguments.settings = [word for word in arguments.places if "=" in word and not Path(word).exists()]
-        arguments.places = [word for word in arguments.places if word not in arguments.settings]
-        if arguments.into:
-            arguments.out, arguments.writes = arguments.into, ("{}/[!.]*",)
-        elif len(arguments.places) == 2:
-            arguments.source, arguments.out = map(Path, arguments.places)
-        else:
-            parser.error(f"convert: got {len(arguments.places)} folders, expected SRC OUT, or SRC... --into DIR")
-    return arguments
-
-
-def _standing(arguments: argparse.Namespace) -> dict[str, int]:
+def _standing(command: Command) -> dict[str, int]:
     """Return the inode by path where the command writes: it changes once something else is put there."""
-    target = glob.escape(str(getattr(arguments, "out", None) or getattr(arguments, "output", "")))
+    target = glob.escape(str(getattr(command, "out", None) or getattr(command, "output", None) or ""))
     inodes = {}
-    for path in (p for pattern in arguments.writes for p in glob.glob(pattern.format(target))):
+    for path in (p for pattern in command.writes() for p in glob.glob(pattern.format(target))):
         with contextlib.suppress(OSError):
             inodes[path] = os.stat(path).st_ino
     return inodes
@@ -344,18 +359,16 @@ def _standing(arguments: argparse.Namespace) -> dict[str, int]:
 @interrupts_heard(*STOPS)
 def main(argv: list[str] | None = None) -> int:
     """Run one command and return its exit code."""
-    arguments = _parse(argv)
+    command = parse(COMMANDS, "python -m converters", argv)
     console = SafeConsole()
-    before = _standing(arguments)
+    before = _standing(command)
 
     def written() -> str:
-        new = sorted(path for path, inode in _standing(arguments).items() if before.get(path) != inode)
+        new = sorted(path for path, inode in _standing(command).items() if before.get(path) != inode)
         return f"written before: {', '.join(new)}" if new else "nothing was written"
 
     try:
-        if "launcher" in arguments and arguments.launcher != "ray":
-            refuse_unused(arguments, "--ray-address", "without --launcher ray")
-        return arguments.run(arguments, console) or 0
+        return command.run(console) or 0
     except KeyboardInterrupt as stop:
         number = number_of(stop)
         print(f"{'interrupted' if number == signal.SIGINT else 'terminated'}; {written()}", file=sys.stderr)
@@ -363,7 +376,7 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         if isinstance(error, BrokenPipeError):
             raise
-        where = error.filename or getattr(arguments, "out", None) or "file system"
+        where = error.filename or getattr(command, "out", None) or "file system"
         print(f"error: {where}: {error.strerror or error}; {written()}", file=sys.stderr)
         return 2
     except (UserError, StageFailed) as error:

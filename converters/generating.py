@@ -1,109 +1,237 @@
-"""Run the commands of `python -m converters` that generate scenes and prepare furniture; words.yaml has their words."""
+"""Run the commands of `python -m converters` that generate scenes and prepare furniture."""
 
-import argparse
 import dataclasses
 import functools
+import os
 import shlex
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
 
 from rich.console import Console
 
-from interactive_nav_common.config import read_words, refuse_unused
+from interactive_nav_common.commands import Command as AnyCommand
+from interactive_nav_common.commands import Flag, Words, option, word
+from interactive_nav_common.config import AtLeastOne, read_words, refuse_unused
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.jobs.progress import stage_progress
 from scenes_mjcf.sets import HERE, PACKAGED, in_cache, is_listed, packaged_set
 
-
-def _generate(arguments: argparse.Namespace, console: Console) -> None:
-    from converters.generate import generate_building
-    from converters.recipes import building_of
-
-    settings = read_words(arguments.settings, "floor_area_m2=80")
-    config = building_of(arguments.tier, settings, arguments.split, "settings")
-    with stage_progress(console) as report:
-        generate_building(arguments.out, arguments.seed, report, config)
-    console.print(
-        f"{arguments.out}: building of seed {arguments.seed}; convert it with "
-        f"'python -m converters convert {shlex.quote(str(arguments.out))} SCENE_DIR'",
-        soft_wrap=True,
-    )
+CORES = os.cpu_count() or 1
 
 
-def _generate_scenes(arguments: argparse.Namespace, console: Console) -> int:
-    from converters.sets import SEEDS, Wanted, generate_scenes
+class Command(AnyCommand):
+    """Base of the converters' commands."""
 
-    if arguments.tier:
-        refuse_unused(arguments, "--recipes", "with --tier, which writes them")
-        arguments.count, arguments.seed = arguments.count or 10, SEEDS if arguments.seed is None else arguments.seed
-    else:
-        refuse_unused(arguments, "--count --seed", "without --tier")
-    wanted = Wanted(**{f.name: getattr(arguments, f.name) for f in dataclasses.fields(Wanted)})
-    with stage_progress(console) as report:
-        failed = generate_scenes(wanted, report, lambda line: console.print(line, soft_wrap=True, highlight=False))
-    return 1 if failed else 0
+    WRITES: ClassVar[tuple[str, ...]] = ("{}",)
+    """What `writes` returns."""
 
+    def writes(self) -> tuple[str, ...]:
+        """Return the patterns of the files that it may write; {} stands for its field `out` or `output`."""
+        return self.WRITES
 
-def _make_scenes(arguments: argparse.Namespace, console: Console) -> int:
-    from converters.sets import make_packaged
-
-    with stage_progress(console) as report:
-        log = functools.partial(console.print, soft_wrap=True, highlight=False)
-        failed = make_packaged(arguments.names, arguments.jobs, report, log)
-    return 1 if failed else 0
+    def run(self, console: Console) -> int | None:
+        """Run the command; return its exit code, None for 0."""
+        raise NotImplementedError
 
 
-def _list_scenes(arguments: argparse.Namespace, console: Console) -> None:
-    listed = {f / scene: (name, m) for name, f in PACKAGED.items() for scene, m in packaged_set(name).scenes.items()}
-    for scene, (name, member) in listed.items():
-        place = next((p for p in (scene, in_cache(scene)) if p.exists()), None)
-        other = place and place == in_cache(scene) and not is_listed(place, member)
-        what = "in the cache is another scene of this name: make it again" if other else place or "not made"
-        print(f"{name:<10} {member.split:<6} {scene.name:<15} {what}")
-    for scene in sorted({path.parent for path in HERE.rglob("scene.json")} - set(listed)):
-        print(f"{'-':<10} {'-':<6} {scene.relative_to(HERE).as_posix():<15} {scene}")
+@dataclasses.dataclass(kw_only=True)
+class OnCluster(Command):
+    """Base of the commands that can run on a cluster."""
+
+    launcher: Literal["local", "ray"] = "local"
+    """This machine, or a Ray cluster."""
+    ray_address: Annotated[str | None, option(metavar="HOST:PORT")] = None
+    """Of the cluster's head (default: auto)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.launcher != "ray":
+            refuse_unused(self, "--ray-address", "without --launcher ray")
 
 
-def _models(arguments: argparse.Namespace, console: Console) -> None:
-    from converters.check.pictures import model_sheet
+@dataclasses.dataclass(kw_only=True)
+class Generate(Command):
+    """Write a synthetic building in the raw Gibson layout."""
 
-    count = model_sheet(arguments.output, arguments.names)
-    console.print(f"{arguments.output}: picture of {count} models", soft_wrap=True)
+    out: Annotated[Path, *word("OUT")]
+    """Folder to create."""
+    settings: Words = ()
+    """Settings of the tier's buildings, such as floor_area_m2=80."""
+    seed: Annotated[int, option(metavar="N")]
+    """Same seed, same building."""
+    tier: str = "sparse"
+    """sparse, furnished or cluttered."""
+    split: Literal["train", "test"] = "train"
+    """Whose CAD models."""
 
+    def run(self, console: Console) -> None:
+        """Run the command."""
+        from converters.generate import generate_building
+        from converters.recipes import building_of
 
-def _get(arguments: argparse.Namespace, console: Console) -> None:
-    from converters.library.build import fetch, library_folder
-
-    target = arguments.out or library_folder()
-    files = fetch(arguments.given, target, arguments.overwrite)
-    console.print(f"{target}: {len(files)} furniture libraries, checked by digest", soft_wrap=True)
-
-
-def _build(arguments: argparse.Namespace, console: Console) -> None:
-    from converters.library.build import FILES, build, library_folder
-
-    given = arguments.given or library_folder()
-    files = [given / f"{name}.sh3f" for name in FILES]
-    if not all(path.is_file() for path in files):
-        raise FileError(f"{given}: lacks furniture libraries; run 'python -m converters library get sweethome3d' first")
-    with stage_progress(console) as report:
-        count = build(files, arguments.out, arguments.jobs, report)
-    console.print(f"{arguments.out}: {count} models with their hulls, and ATTRIBUTION.md", soft_wrap=True)
-
-
-def _list(arguments: argparse.Namespace, console: Console) -> None:
-    from converters.library.store import read_index
-
-    for model in read_index().values():
-        width, height, depth = model.size_m
-        print(
-            f"{model.name:<40} {model.category:<15} {model.split:<6} {width:.2f} x {depth:.2f} x {height:.2f} m "
-            f"{model.faces:>5} faces {model.hulls:>3} hulls  "
-            + "; ".join(f"{c.creator}, {c.licence}" for c in model.credits)
+        settings = read_words(self.settings, "floor_area_m2=80")
+        config = building_of(self.tier, settings, self.split, "settings")
+        with stage_progress(console) as report:
+            generate_building(self.out, self.seed, report, config)
+        console.print(
+            f"{self.out}: building of seed {self.seed}; convert it with "
+            f"'python -m converters convert {shlex.quote(str(self.out))} SCENE_DIR'",
+            soft_wrap=True,
         )
 
 
-GENERATING = {
-    **{"generate": _generate, "generate-scenes": _generate_scenes, "models": _models},
-    "scenes": {"list": _list_scenes, "make": _make_scenes},
-    "library": {"get": _get, "build": _build, "list": _list},
-}
-"""Command -> what runs it, or its actions' table."""
+@dataclasses.dataclass(kw_only=True)
+class GenerateScenes(OnCluster):
+    """Generate, convert and draw the scenes of a recipe file, or homes of a tier; continue where it stopped."""
+
+    WRITES = ("{}/*",)
+    out: Annotated[Path, *word("OUT")]
+    """Folder of scene folders; those that exist are kept."""
+    recipes: Annotated[Path | None, option(metavar="YAML")] = None
+    """The recipe file (default: OUT/recipes.yaml)."""
+    tier: Annotated[str | None, option(metavar="TIER")] = None
+    """Write OUT/recipes.yaml: sparse, furnished or cluttered homes."""
+    count: Annotated[AtLeastOne | None, option(metavar="N")] = None
+    """How many of a tier (default: 10)."""
+    seed: Annotated[int | None, option(metavar="N")] = None
+    """Of a tier's first home (default: 100000)."""
+    only: Annotated[tuple[str, ...], option(metavar="NAME")] = ()
+    """Scenes to generate (default: all)."""
+    overwrite: Flag = False
+    """Generate those again that exist."""
+    jobs: Annotated[AtLeastOne, option(metavar="N")] = CORES
+    """Scenes side by side."""
+
+    def run(self, console: Console) -> int:
+        """Run the command."""
+        from converters.sets import SEEDS, Wanted, generate_scenes
+
+        if self.tier:
+            refuse_unused(self, "--recipes", "with --tier, which writes them")
+            self.count, self.seed = self.count or 10, SEEDS if self.seed is None else self.seed
+        else:
+            refuse_unused(self, "--count --seed", "without --tier")
+        wanted = Wanted(**{f.name: getattr(self, f.name) for f in dataclasses.fields(Wanted)})
+        with stage_progress(console) as report:
+            failed = generate_scenes(wanted, report, lambda line: console.print(line, soft_wrap=True, highlight=False))
+        return 1 if failed else 0
+
+
+@dataclasses.dataclass(kw_only=True)
+class MakeScenes(Command):
+    """Generate them in the cache folder, where every program looks for them, and compare their digests."""
+
+    names: Annotated[tuple[str, ...], *word("NAME")]
+    """Scenes (alder, cluttered_003), sets (cluttered) or splits of them (furnished/test)."""
+    jobs: Annotated[AtLeastOne, option(metavar="N")] = CORES
+    """Scenes side by side."""
+
+    def run(self, console: Console) -> int:
+        """Run the command."""
+        from converters.sets import make_packaged
+
+        with stage_progress(console) as report:
+            log = functools.partial(console.print, soft_wrap=True, highlight=False)
+            failed = make_packaged(self.names, self.jobs, report, log)
+        return 1 if failed else 0
+
+
+@dataclasses.dataclass(kw_only=True)
+class ListScenes(Command):
+    """List the scenes that are here, and those that can be generated: set, split, name, place."""
+
+    def run(self, console: Console) -> None:
+        """Run the command."""
+        listed = {
+            f / scene: (name, m) for name, f in PACKAGED.items() for scene, m in packaged_set(name).scenes.items()
+        }
+        for scene, (name, member) in listed.items():
+            place = next((p for p in (scene, in_cache(scene)) if p.exists()), None)
+            other = place and place == in_cache(scene) and not is_listed(place, member)
+            what = "in the cache is another scene of this name: make it again" if other else place or "not made"
+            print(f"{name:<10} {member.split:<6} {scene.name:<15} {what}")
+        for scene in sorted({path.parent for path in HERE.rglob("scene.json")} - set(listed)):
+            print(f"{'-':<10} {'-':<6} {scene.relative_to(HERE).as_posix():<15} {scene}")
+
+
+@dataclasses.dataclass(kw_only=True)
+class Models(Command):
+    """Draw the CAD models that generated buildings are furnished with."""
+
+    names: Annotated[tuple[str, ...], *word("NAME")] = ()
+    """Models or categories (default: all models)."""
+    output: Annotated[Path, option("-o", metavar="PNG")]
+    """The picture."""
+
+    def run(self, console: Console) -> None:
+        """Run the command."""
+        from converters.check.pictures import model_sheet
+
+        count = model_sheet(self.output, self.names)
+        console.print(f"{self.output}: picture of {count} models", soft_wrap=True)
+
+
+@dataclasses.dataclass(kw_only=True)
+class Get(Command):
+    """Fetch the furniture libraries of Sweet Home 3D."""
+
+    name: Annotated[Literal["sweethome3d"], *word("NAME")]
+    """Which libraries."""
+    given: Annotated[Path | None, option(name="from", metavar="FILE.deb|DIR")] = None
+    """Read them from here (default: apt-get downloads them)."""
+    out: Annotated[Path | None, option("-o", metavar="DIR")] = None
+    """Folder for them (default: the cache folder)."""
+    overwrite: Flag = False
+    """Replace what was fetched before."""
+
+    def run(self, console: Console) -> None:
+        """Run the command."""
+        from converters.library.build import fetch, library_folder
+
+        target = self.out or library_folder()
+        files = fetch(self.given, target, self.overwrite)
+        console.print(f"{target}: {len(files)} furniture libraries, checked by digest", soft_wrap=True)
+
+
+@dataclasses.dataclass(kw_only=True)
+class Build(Command):
+    """Rebuild the packaged selection: models.zip and ATTRIBUTION.md."""
+
+    WRITES = ("{}/*",)
+    out: Annotated[Path, *word("OUT")]
+    """Folder for both files."""
+    given: Annotated[Path | None, option(name="from", metavar="DIR")] = None
+    """Folder of the .sh3f files (default: as fetched)."""
+    jobs: Annotated[AtLeastOne, option(metavar="N")] = CORES
+    """Models side by side."""
+
+    def run(self, console: Console) -> None:
+        """Run the command."""
+        from converters.library.build import FILES, build, library_folder
+
+        given = self.given or library_folder()
+        files = [given / f"{name}.sh3f" for name in FILES]
+        if not all(path.is_file() for path in files):
+            raise FileError(
+                f"{given}: lacks furniture libraries; run 'python -m converters library get sweethome3d' first"
+            )
+        with stage_progress(console) as report:
+            count = build(files, self.out, self.jobs, report)
+        console.print(f"{self.out}: {count} models with their hulls, and ATTRIBUTION.md", soft_wrap=True)
+
+
+@dataclasses.dataclass(kw_only=True)
+class ListModels(Command):
+    """List the packaged models, with size and credit."""
+
+    def run(self, console: Console) -> None:
+        """Run the command."""
+        from converters.library.store import read_index
+
+        for model in read_index().values():
+            width, height, depth = model.size_m
+            print(
+                f"{model.name:<40} {model.category:<15} {model.split:<6} {width:.2f} x {depth:.2f} x {height:.2f} m "
+                f"{model.faces:>5} faces {model.hulls:>3} hulls  "
+                + "; ".join(f"{c.creator}, {c.licence}" for c in model.credits)
+            )

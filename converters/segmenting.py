@@ -1,20 +1,59 @@
-"""Run the commands of `python -m converters` that label scans; words.yaml has their words."""
+"""Run the commands of `python -m converters` that label and annotate scans."""
 
-import argparse
+import dataclasses
 import json
+import math
 import shlex
+import signal
+import threading
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from rich.console import Console
+from rich.table import Table
+from tyro.conf import Suppress
 
+from converters.generating import Command
 from converters.records.errors import SceneRejected
+from interactive_nav_common.commands import Flag, Words, option, word
+from interactive_nav_common.config import AtLeastOne
 from interactive_nav_common.files import write_arrays, write_text
 from interactive_nav_common.jobs.progress import stage_progress
+from interactive_nav_common.signals import number_of
+
+Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
+Unit = Literal["auto", "m", "cm", "mm", "ft", "in"]
+Format = Literal[
+    "auto", "gibson", "interactive-gibson", "scan2cad", "sdf", "habitat", "mjcf", "sh3d",
+    "scannet", "scannetpp", "arkitscenes", "3rscan", "multiscan", "matterport3d",
+]  # fmt: skip
+"""`READERS` of `converters.read.source`, which need not be imported to say so."""
+
 
 UNFIT = ("bed", "cabinet", "lamp")
 """Classes of furniture that `propose` does not look for."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class MeshFile(Command):
+    """Base of the commands that read mesh files."""
+
+    up: Up = "auto"
+    """Axis of a mesh file that points up."""
+    unit: Unit = "auto"
+    """Of a mesh file."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class WithLibrary(Command):
+    """Base of the commands that fit library models."""
+
+    format: Format = "auto"
+    """Layout of SRC; auto: by its files."""
+    library: Annotated[Path | None, option(metavar="DIR")] = None
+    """Folder with cad/ that models are from (default: SRC, else the packaged furniture)."""
 
 
 def _beside(source: Path, ending: str) -> Path:
@@ -28,21 +67,37 @@ def _beside(source: Path, ending: str) -> Path:
     return beside(source, ending) if source.is_file() else (source / MESH).with_suffix(f".{ending}")
 
 
-def _read(arguments: argparse.Namespace) -> Any:
+def _read(arguments: Any) -> Any:
     from converters.read.source import read_source
 
     words = {"layout": "format", "strict": "strict", "up": "up", "unit": "unit", "within": "root", "mirror": "mirror"}
-    return read_source(arguments.source, **{k: getattr(arguments, w) for k, w in words.items() if w in arguments})
+    return read_source(
+        arguments.source, **{k: getattr(arguments, w) for k, w in words.items() if hasattr(arguments, w)}
+    )
 
 
-def _segment(arguments: argparse.Namespace, console: Console) -> None:
-    arguments.output = target = _beside(arguments.source, "labels.npz")
-    if target.exists() and not arguments.overwrite:
-        raise SceneRejected(f"{target}: the scan has labels; give --overwrite to replace them")
-    _label(arguments, target, arguments.weights, console)
+@dataclasses.dataclass(kw_only=True)
+class Segment(MeshFile):
+    """Label an unlabelled scan by a network, for propose and convert."""
+
+    source: Annotated[Path, *word("SRC")]
+    """A mesh file, or a folder of layout gibson."""
+    weights: Annotated[Path | None, option(metavar="FILE")] = None
+    """weights.safetensors of a training (default: the packaged ones)."""
+    overwrite: Flag = False
+    """Replace labels that exist."""
+    output: Annotated[Path | None, Suppress] = None
+    """Where the labels go, once that is clear."""
+
+    def run(self, console: Console) -> None:
+        """Run the command."""
+        self.output = target = _beside(self.source, "labels.npz")
+        if target.exists() and not self.overwrite:
+            raise SceneRejected(f"{target}: the scan has labels; give --overwrite to replace them")
+        _label(self, target, self.weights, console)
 
 
-def label_unlabelled(arguments: argparse.Namespace, console: Console) -> None:
+def label_unlabelled(arguments: Any, console: Console) -> None:
     """Label the source of `convert --segment` beside it, unless it has labels, perhaps edited ones."""
     target = _beside(arguments.source, "labels.npz")
     if not target.exists():
@@ -50,7 +105,7 @@ def label_unlabelled(arguments: argparse.Namespace, console: Console) -> None:
     console.print(f"{target}: is there, kept", soft_wrap=True)
 
 
-def propose_unproposed(arguments: argparse.Namespace, console: Console) -> Path | None:
+def propose_unproposed(arguments: Any, console: Console) -> Path | None:
     """Write the models that fit beside the mesh, unless there are some; return their file, None if alignments exist."""
     from converters.propose.pieces import MIN_VOXELS
     from converters.propose.proposals import as_scan2cad
@@ -87,7 +142,7 @@ def _annotate(source: Path) -> str:
     return f"'python -m converters annotate {shlex.quote(str(source))} -o DIR'"
 
 
-def next_step(arguments: argparse.Namespace, layout: str) -> str:
+def next_step(arguments: Any, layout: str) -> str:
     """Return what else makes furniture of a scan move, or "" for homes and for scans that people annotated."""
     from converters.read.gibson import ALIGNMENTS
 
@@ -98,7 +153,7 @@ def next_step(arguments: argparse.Namespace, layout: str) -> str:
     return f"no movable object: {first}place models by hand with {_annotate(arguments.source)}"
 
 
-def _label(arguments: argparse.Namespace, target: Path, weights: Path | None, console: Console) -> None:
+def _label(arguments: Any, target: Path, weights: Path | None, console: Console) -> None:
     from converters.segment.labelling import label_scan, load_scores
 
     scores = load_scores(weights)
@@ -108,35 +163,57 @@ def _label(arguments: argparse.Namespace, target: Path, weights: Path | None, co
     console.print(f"{target}: labels of {len(labels)} vertices", soft_wrap=True)
 
 
-def _train(arguments: argparse.Namespace, console: Console) -> None:
-    from converters.segment.train import SegmentConfig, train
-    from interactive_nav_common.config import overridden
+@dataclasses.dataclass(kw_only=True)
+class SegmentTrain(Command):
+    """Train the network of segment on generated buildings."""
 
-    config = overridden(SegmentConfig(), arguments.settings)
-    with stage_progress(console) as report:
-        scores = train(arguments.out, config, report, lambda line: console.print(line, soft_wrap=True))
-    _table(console, "held-out crops", scores)
+    out: Annotated[Path, *word("OUT")]
+    """Folder of the run; one that exists is continued."""
+    settings: Words = ()
+    """Settings of the training, such as steps=1000; see SegmentConfig."""
+
+    def run(self, console: Console) -> None:
+        """Run the command."""
+        from converters.segment.train import SegmentConfig, train
+        from interactive_nav_common.config import overridden
+
+        config = overridden(SegmentConfig(), self.settings)
+        with stage_progress(console) as report:
+            scores = train(self.out, config, report, lambda line: console.print(line, soft_wrap=True))
+        _table(console, "held-out crops", scores)
 
 
-def _score(arguments: argparse.Namespace, console: Console) -> None:
-    from converters.read.source import read_source
-    from converters.segment.labelling import load_scores, score_homes, score_source
-    from converters.segment.train import HELD_OUT_SEED
+@dataclasses.dataclass(kw_only=True)
+class SegmentScore(Command):
+    """Score the network on labelled scans and generated buildings."""
 
-    scores = load_scores(arguments.weights)
-    with stage_progress(console) as report:
-        for source in arguments.sources:
-            score = score_source(read_source(source), scores, report)
-            _table(console, str(source), score["iou"])
-            console.print(
-                f"{source}: {score['matched']} of {score['objects']} annotated objects are recognised, "
-                f"{score['matched_true']} with the scan's labels",
-                soft_wrap=True,
-            )
-        if arguments.homes:
-            # Whole buildings of other seeds than those whose crops the training was watched by.
-            iou = score_homes(HELD_OUT_SEED + 50_000, arguments.homes, scores, report)
-            _table(console, f"{arguments.homes} held-out buildings", iou)
+    sources: Annotated[tuple[Path, ...], *word("SRC")] = ()
+    """Labelled scans."""
+    homes: Annotated[AtLeastOne | None, option(metavar="N")] = None
+    """Score whole generated buildings too, so many."""
+    weights: Annotated[Path | None, option(metavar="FILE")] = None
+    """weights.safetensors of a training (default: the packaged ones)."""
+
+    def run(self, console: Console) -> None:
+        """Run the command."""
+        from converters.read.source import read_source
+        from converters.segment.labelling import load_scores, score_homes, score_source
+        from converters.segment.train import HELD_OUT_SEED
+
+        scores = load_scores(self.weights)
+        with stage_progress(console) as report:
+            for source in self.sources:
+                score = score_source(read_source(source), scores, report)
+                _table(console, str(source), score["iou"])
+                console.print(
+                    f"{source}: {score['matched']} of {score['objects']} annotated objects are recognised, "
+                    f"{score['matched_true']} with the scan's labels",
+                    soft_wrap=True,
+                )
+            if self.homes:
+                # Whole buildings of other seeds than those whose crops the training was watched by.
+                iou = score_homes(HELD_OUT_SEED + 50_000, self.homes, scores, report)
+                _table(console, f"{self.homes} held-out buildings", iou)
 
 
 def _table(console: Console, what: str, iou: dict[str, float]) -> None:
@@ -145,5 +222,106 @@ def _table(console: Console, what: str, iou: dict[str, float]) -> None:
     console.print(f"{what}: mIoU {mean:.3f}; {row}", soft_wrap=True, highlight=False)
 
 
-SEGMENTING = {"segment": _segment, "segment-train": _train, "segment-score": _score}
-"""Command -> what runs it."""
+def proposal_tables(proposed: Any) -> Iterator[Table]:
+    """Yield a table of the proposals; and with a library and annotations, how well."""
+    table = Table("class", "confidence", "x y z, m", "size, m", "model", "sure", title="Proposals")
+    for k, proposal in enumerate(proposed.proposals):
+        model = proposed.retrieved.get(k)
+        table.add_row(
+            proposal.category,
+            f"{proposal.confidence:.2f}",
+            " ".join(f"{v:.2f}" for v in proposal.centre),
+            " ".join(f"{v:.2f}" for v in proposal.extent_m),
+            model.cad.cad_id[:8] if model else "-",
+            f"{model.confidence:.2f}" if model else "-",
+        )
+    yield table
+    if not proposed.comparisons:
+        return
+    heads = ("class", "annotated", "chosen", "rank", "cm", "yaw °", "scale x y z", "IoU", "sure")
+    caption = "cm, yaw and scale: the annotated model's best fit against its annotated pose"
+    table = Table(*heads, title="Retrieved models against the annotation", caption=caption)
+    for row in proposed.comparisons:
+        table.add_row(
+            row.category,
+            row.true_cad[:6],
+            row.chosen_cad[:6],
+            f"{row.rank}/{row.n_tried}",
+            f"{100 * row.difference.translation_m:.1f}",
+            f"{math.degrees(row.difference.yaw_rad):.1f}",
+            " ".join(f"{v:.2f}" for v in row.difference.scale_ratio),
+            f"{row.iou:.2f}",
+            f"{row.confidence:.2f}",
+        )
+    yield table
+
+
+@dataclasses.dataclass(kw_only=True)
+class Propose(WithLibrary):
+    """Find furniture in a labelled scan; JSON in Scan2CAD's shape and PNG."""
+
+    WRITES = ("{}/proposals.*",)
+    source: Annotated[Path, *word("SRC")]
+    """Folder with the raw scan, or a mesh file."""
+    output: Annotated[Path, option("-o", metavar="DIR")]
+    """Folder for the two files."""
+    auto_align: Flag = False
+    """Also pick model and pose, and compare with annotations."""
+
+    def run(self, console: Console) -> None:
+        """Run the command."""
+        from converters.propose.report import propose
+        from converters.propose.retrieval import read_library
+        from converters.read.source import read_source
+
+        with stage_progress(console) as report:
+            raw, library = read_source(self.source, self.format), None
+            if self.auto_align or self.library:
+                library = read_library(self.library, self.source)
+            proposed = propose(raw, self.output, library, report)
+        for table in proposal_tables(proposed):
+            console.print(table)
+        console.print(f"{self.output}: proposals.json and proposals.png", soft_wrap=True)
+
+
+@dataclasses.dataclass(kw_only=True)
+class Annotate(MeshFile, WithLibrary):
+    """Say in the browser which models stand where: proposals, models, pairs of points."""
+
+    WRITES = ("{}/*.json",)
+    source: Annotated[Path, *word("SRC")]
+    """Folder with the raw scan, or a mesh file."""
+    output: Annotated[Path, option("-o", metavar="DIR")]
+    """Folder of one person's work; one that exists is continued."""
+    host: Annotated[str, option(metavar="ADDRESS")] = "127.0.0.1"
+    """Address to listen on; any other than this machine's needs a token, which is printed."""
+    port: int = 8080
+    """0: any that is free."""
+
+    def run(self, console: Console) -> int:
+        """Run the command."""
+        from converters.annotate.browser import Page
+        from converters.annotate.session import Store, start
+        from converters.propose.proposals import propose_instances
+        from converters.propose.retrieval import read_library
+        from converters.read.source import read_source
+        from interactive_nav_common.files import alone_in
+        from interactive_nav_common.untrusted.guard import guarded_server
+
+        with alone_in(self.output):
+            raw = read_source(self.source, self.format, up=self.up, unit=self.unit)
+            store = Store(self.output, read_library(self.library, self.source))
+            proposals = propose_instances(raw.scan)
+            session = store.save(store.open(raw, lambda: start(raw, proposals)))
+            server, address = guarded_server(self.host, self.port, raw.name, "annotate")
+            page = Page(server, store, session, raw, proposals)
+            console.print(f"{address} (Ctrl-C ends it; every action is saved)", soft_wrap=True, highlight=False)
+            try:
+                threading.Event().wait()
+            except KeyboardInterrupt as stop:
+                number = number_of(stop)  # Ctrl-C is how it ends
+            server.stop()
+        states = [item.state for item in page.session.items]
+        counts = ", ".join(f"{states.count(word)} {word}" for word in ("accepted", "skipped", "open"))
+        console.print(f"{self.output}: {counts}", soft_wrap=True)
+        return 0 if number == signal.SIGINT else 128 + number

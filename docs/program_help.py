@@ -6,14 +6,13 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import importlib
 import importlib.util
-import inspect
 import io
 import os
-import sys
+from collections.abc import Iterator, Mapping
+from typing import Any
 from unittest import mock
 
 from docutils import nodes
@@ -24,38 +23,31 @@ COLUMNS = 100
 
 
 def help_of(module: str) -> dict[str, str]:
-    """What `python -m module --help` says, and its commands say, by the words that call them.
+    """Return the help of `python -m module`, and of its commands, by the words that call them.
 
     Raises:
         ValueError: the program ends without printing help.
     """
-    found = importlib.util.find_spec(module)
-    folder = found is not None and found.submodule_search_locations is not None
-    main = importlib.import_module(f"{module}.__main__" if folder else module).main
-    caught: list[argparse.ArgumentParser] = []
-    with (
-        mock.patch.object(argparse.ArgumentParser, "print_help", lambda self, file=None: caught.append(self)),
-        mock.patch.object(sys, "argv", [f"python -m {module}", "--help"]),
-        contextlib.redirect_stdout(io.StringIO()) as printed,
-        contextlib.suppress(SystemExit),
-    ):
-        main(*([["--help"]] if inspect.signature(main).parameters else []))
-    if caught:
-        return of_parser(caught[0])
-    if not printed.getvalue():
-        raise ValueError(f"{module}: no help; expected a program that prints it with --help")
-    return {f"python -m {module}": printed.getvalue()}
+    spec = importlib.util.find_spec(module)
+    folder = spec is not None and spec.submodule_search_locations is not None
+    program = importlib.import_module(f"{module}.__main__" if folder else module)
+    texts = {}
+    for words in ([], *_commands(getattr(program, "COMMANDS", {}))):
+        wide = mock.patch.dict(os.environ, {"COLUMNS": str(COLUMNS), "NO_COLOR": "1"})
+        with wide, contextlib.redirect_stdout(io.StringIO()) as printed, contextlib.suppress(SystemExit):
+            program.main([*words, "--help"])
+        if not printed.getvalue():
+            raise ValueError(f"{module}: no help; expected a program that prints it with --help")
+        texts[" ".join(["python -m", module, *words])] = printed.getvalue()
+    return texts
 
 
-def of_parser(parser: argparse.ArgumentParser) -> dict[str, str]:
-    """Help of a parser and of the commands below it, 100 columns wide."""
-    with mock.patch.dict(os.environ, {"COLUMNS": str(COLUMNS), "NO_COLOR": "1"}):
-        told = {parser.prog: parser.format_help()}
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for below in dict.fromkeys(action.choices.values()):
-                told |= of_parser(below)
-    return told
+def _commands(commands: Mapping[str, Any]) -> Iterator[list[str]]:
+    """Yield the words of every command and of the commands below it."""
+    for name, command in commands.items():
+        yield [name]
+        if isinstance(command, Mapping):
+            yield from ([name, *below] for below in _commands(command))
 
 
 class HelpOf(Directive):

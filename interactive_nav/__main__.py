@@ -4,14 +4,30 @@ import runpy
 import signal
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
+from interactive_nav_common.commands import TYPED, listing, version
 from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError, reports_errors
-from interactive_nav_common.records import read_packaged
-from interactive_nav_common.words import TYPED, version
 
-PROGRAMS = read_packaged(Path(__file__).with_name("programs.yaml"), dict[str, tuple[str, str]])
+PROGRAMS = {
+    "train": ("train", "a policy, from a preset or a file"),
+    "sweep": ("train.sweep", "trains and evaluates every run of a table"),
+    "evaluate": ("train.evaluate", "plays episodes, with scores"),
+    "figures": ("train.figures", "curves, tables and pictures of runs and sweeps"),
+    "record": ("train.record", "a film of an episode"),
+    "view": ("interactive_nav.view", "a scene and a robot, in a window or the browser"),
+    "robots": ("interactive_nav.robots", "those that come with it"),
+    "topological": ("topological_nav", "the navigator by images: map, train, evaluate"),
+    "bench": ("benchmarks.steps_per_second", "env steps a second"),
+    "convert": ("converters", "scans, drawings and other simulators' homes to scenes"),
+    "segment": ("converters", "labels an unlabelled scan, so that furniture in it can move"),
+    "annotate": ("converters", "says in the browser which model stands where in a scan"),
+    "generate": ("converters", "a scan of a furnished home"),
+    "generate-scenes": ("converters", "scenes of a recipe file or a tier"),
+    "scenes": ("converters", "lists the homes that have names, and makes those that recipes describe"),
+    "preview": ("converters", "a picture of a scene"),
+    "check": ("converters", "a scene's gates"),
+}
 """Command -> module that is run, and what it does."""
 
 
@@ -23,8 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(version())
         return 0
     if not words or words[0] in ("-h", "--help"):
-        print("usage: interactive-nav COMMAND ...   (interactive-nav COMMAND --help says more; --version)\n")
-        print("\n".join(f"  {name:<16} {about}" for name, (_, about) in PROGRAMS.items()))
+        print(listing("interactive-nav", {name: about for name, (_, about) in PROGRAMS.items()}))
         return 0 if words else 2
     if words[0] not in PROGRAMS:
         raise ConfigError(f"no command {words[0]!r}{nearest(words[0], list(PROGRAMS))}; --help lists them")

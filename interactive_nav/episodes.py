@@ -15,7 +15,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -27,13 +27,13 @@ from interactive_nav.navigation.ways import Ways
 from interactive_nav.scenes.scene import TASK_DIGEST
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav.types import EpisodeStart
+from interactive_nav_common.commands import Command, option, parse
 from interactive_nav_common.config import Natural, NotNegative, Seed
 from interactive_nav_common.errors import ConfigError, UserError, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.records import Reader
 from interactive_nav_common.signals import signals_wait
 from interactive_nav_common.untrusted.reading import read_bytes, unpack
-from interactive_nav_common.words import Parser, add_words, read_commands
 
 FORMAT = "interactive-nav-episodes"
 VERSION = 1
@@ -263,15 +263,33 @@ def load_episode_files(paths: Sequence[str | Path]) -> tuple[EpisodeFile, str]:
     return dataclasses.replace(first, scenes=scenes, episodes=tuple(rows)), hashlib.sha256(content).hexdigest()[:16]
 
 
+@dataclasses.dataclass(kw_only=True)
+class Make(Command):
+    """Draw episodes and write them to a file."""
+
+    scenes: Annotated[tuple[str, ...], option(metavar="SCENE_DIR")]
+    """Scene folders."""
+    out: Annotated[str, option("-o", metavar="FILE")]
+    """The file."""
+    robot: Annotated[str, option(metavar="NAME|FILE")] = "turtlebot"
+    """A name, a URDF or MJCF file, or path.py:function."""
+    episodes: int = 100
+    """How many."""
+    seed: int = 0
+    """Of the episodes."""
+    num_objects: int = 10
+    """Small objects."""
+    objects: Annotated[tuple[str, ...], option(metavar="OBJECT_DIR")] = ()
+    """Folders of small objects (default: the built-in ones)."""
+
+
+COMMANDS = {"make": Make}
+
+
 @reports_errors("interactive_nav.episodes")
 def main(argv: Sequence[str] | None = None) -> int:
     """Write a file; return 0 when done, 2 on a user's error."""
-    parser = Parser(prog="python -m interactive_nav.episodes", description="Fixed episodes.")
-    commands = parser.add_subparsers(dest="command", required=True)
-    row = read_commands(Path(__file__).with_name("words.yaml"))["episodes"]
-    make_parser = commands.add_parser("make", help=row.help)
-    add_words(make_parser, row.words)
-    arguments = parser.parse_args(argv)
+    arguments = parse(COMMANDS, "python -m interactive_nav.episodes", argv)
     env = interactive_nav.make(
         arguments.robot,
         arguments.scenes,

@@ -7,12 +7,12 @@ with its textures from where somebody would film it.
 Playing a policy is for `train` to do: `python -m train.record RUN` plays an episode of a run, and has it drawn here.
 """
 
-import argparse
+import dataclasses
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import imageio_ffmpeg
 import matplotlib
@@ -35,11 +35,12 @@ from interactive_nav.pictures.replay import Replay, ReplayError, load_replay, re
 from interactive_nav.pictures.scene_model import ROBOT, SCENE, clear_way
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav_common.commands import Command, option, parse, word
+from interactive_nav_common.config import AtLeastOne, Natural
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.jobs.progress import SafeConsole, progress_bar
 from interactive_nav_common.rotations import yaw_from_quat
-from interactive_nav_common.words import add_words, program, read_commands
 from scenes_mjcf.look import CameraPose, Lens, look_along, straight_down
 
 FORMATS = (".mp4", ".gif", ".webp")
@@ -254,7 +255,7 @@ def _write_frames(frames: Iterator[np.ndarray], path: Path, rate: float, hold_s:
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=shown_ms, loop=0, **words)
 
 
-def replay_of(run: Path, episode: int, policy: str, out: str) -> Path:
+def replay_of(run: Path, episode: int, policy: str, out: Path) -> Path:
     """Return where a run keeps the replay of an episode."""
     path = replay_path(run, policy, episode)
     if not path.is_file():
@@ -263,42 +264,54 @@ def replay_of(run: Path, episode: int, policy: str, out: str) -> Path:
     return path
 
 
-def add_picture_words(parser: argparse.ArgumentParser) -> None:
-    """Add the words that say what to draw, and where to."""
-    add_words(parser, read_commands(Path(__file__).with_name("words.yaml"))["picture"].words, views=VIEWS)
+@dataclasses.dataclass(kw_only=True)
+class Picture(Command):
+    """Make a video of an episode."""
+
+    episode: Natural = 0
+    """Which of the fixed episodes."""
+    policy: str = "learned"
+    """A policy of `train.evaluate`."""
+    out: Annotated[Path, option("-o", metavar="PATH")] = Path("episode.mp4")
+    """The video: .mp4, .gif or .webp."""
+    height: int = 360
+    """Rows of the view from behind."""
+    views: tuple[Literal["eye", "follow", "above"], ...] = ()
+    """Textured views, side by side, instead."""
+    every: AtLeastOne = 1
+    """Control steps from one frame to the next."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_format(self.out)
+        check_height(self.height)
+
+    def record(self, source: Path, console: Console) -> None:
+        """Draw a replay."""
+        replay = load_replay(source)
+        compositor = Compositor(replay, load_scene(replay.scene), self.height, self.views)
+        with progress_bar(console, "frames", -(-replay.num_steps // self.every) + 1, transient=True) as update:
+            frames = write_video(compositor, self.out, self.every, lambda n: update(completed=n))
+        console.print(f"{self.out}: {frames} frames of {replay.policy}, episode {replay.episode}; replay: {source}")
 
 
-def check_picture_words(arguments: argparse.Namespace) -> None:
-    """Refuse what cannot be drawn, before anything is played."""
-    check_format(Path(arguments.out))
-    check_height(arguments.height)
-    if arguments.every < 1 or arguments.episode < 0:
-        raise ReplayError(
-            f"--every is {arguments.every}, expected 1 or more; --episode is {arguments.episode}, expected 0 or more"
-        )
+@dataclasses.dataclass(kw_only=True)
+class Record(Picture):
+    """Make a video of an episode."""
 
-
-def record(source: Path, arguments: argparse.Namespace, console: Console) -> None:
-    """Draw a replay as the words of `add_picture_words` say."""
-    replay, out = load_replay(source), Path(arguments.out)
-    compositor = Compositor(replay, load_scene(replay.scene), arguments.height, arguments.views)
-    with progress_bar(console, "frames", -(-replay.num_steps // arguments.every) + 1, transient=True) as update:
-        frames = write_video(compositor, out, arguments.every, lambda n: update(completed=n))
-    console.print(f"{out}: {frames} frames of {replay.policy}, episode {replay.episode}; replay: {source}")
+    replay: Annotated[Path, *word("REPLAY")]
+    """A replay (.npz), or a run folder that holds the episode's."""
 
 
 @reports_errors("interactive_nav.record")
 def main(argv: Sequence[str] | None = None) -> int:
     """Record a video; return 0 when done, 2 on a user's error, 130 when interrupted."""
-    parser = program(Path(__file__).with_name("words.yaml"), "record")
-    add_picture_words(parser)
-    arguments = parser.parse_args(argv)
-    source = Path(arguments.replay)
+    arguments = parse(Record, "python -m interactive_nav.record", argv)
+    source = arguments.replay
     try:
-        check_picture_words(arguments)
         if source.suffix != ".npz":
             source = replay_of(source, arguments.episode, arguments.policy, arguments.out)
-        record(source, arguments, SafeConsole())
+        arguments.record(source, SafeConsole())
     except KeyboardInterrupt:
         print("interactive_nav.record: stopped; no video was written", file=sys.stderr)
         return 130

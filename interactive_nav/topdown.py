@@ -5,10 +5,11 @@ they stood at the start and filled where they stand at the end, an arrow from th
 robot's path coloured by time or by what it touched.
 """
 
+import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import shapely
@@ -27,10 +28,11 @@ from interactive_nav.record import check_replay_scene
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav.scenes.slots import bodies_by_name
+from interactive_nav_common.commands import Command, option, parse, word
+from interactive_nav_common.config import AtLeastOne
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.rotations import matrix_from_quat, yaw_from_quat
-from interactive_nav_common.words import program
 
 COLOUR_BY = ("time", "contact")
 TOUCH_COLOURS = {"nothing": "#0072b2", "an object": "#d55e00", "a wall": "#555555"}
@@ -174,13 +176,24 @@ def _files(sources: Sequence[str]) -> list[Path]:
     return files
 
 
+@dataclasses.dataclass(kw_only=True)
+class TopDown(Command):
+    """Draw episodes from above."""
+
+    replays: Annotated[tuple[Path, ...], *word("REPLAY")]
+    """Replay files, or run folders that hold replays."""
+    out: Annotated[Path, option("-o", metavar="PATH")] = Path("topdown.png")
+    """The picture."""
+    colour_by: Literal["time", "contact"] = "time"
+    """Colour of the path."""
+    columns: AtLeastOne = 3
+    """Panels in a row."""
+
+
 @reports_errors("interactive_nav.topdown")
 def main(argv: Sequence[str] | None = None) -> int:
     """Draw; return 0 when done, 2 on a user's error."""
-    parser = program(Path(__file__).with_name("words.yaml"), "topdown", colour_by=COLOUR_BY)
-    arguments = parser.parse_args(argv)
-    if arguments.columns < 1:
-        raise ReplayError(f"--columns is {arguments.columns}, expected at least 1")
+    arguments = parse(TopDown, "python -m interactive_nav.topdown", argv)
     replays = [load_replay(path) for path in _files(arguments.replays)]
     scenes = {path: load_scene(path) for path in dict.fromkeys(r.scene for r in replays)}
     figure = panels(replays, scenes, arguments.colour_by, arguments.columns)

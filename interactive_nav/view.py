@@ -4,6 +4,7 @@ A window where the machine has a screen, else a page in the browser (mjviser, an
 """
 
 import contextlib
+import dataclasses
 import functools
 import importlib
 import importlib.util
@@ -12,7 +13,7 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import mujoco
 import numpy as np
@@ -21,12 +22,12 @@ from interactive_nav.navigation.tables import furniture_map
 from interactive_nav.pictures.camera import BEHIND_M
 from interactive_nav.pictures.scene_model import furnished_spec
 from interactive_nav.robots import RobotSpec, get_robot, robot_names
-from interactive_nav.scenes.objects import SPLITS, VISUAL_GROUP, SmallObject, add_shapes, body_names, pick
+from interactive_nav.scenes.objects import VISUAL_GROUP, SmallObject, add_shapes, body_names, pick
 from interactive_nav.scenes.scene import Scene, load_scene
+from interactive_nav_common.commands import Command, option, parse, word
 from interactive_nav_common.errors import UserError, missing, reports_errors
 from interactive_nav_common.grids import cell_centres, clearance
 from interactive_nav_common.untrusted.guard import guarded_server
-from interactive_nav_common.words import program
 from scenes_mjcf.look import cast, look_along
 
 GAP_M = 0.03
@@ -184,12 +185,39 @@ def open_browser(model: mujoco.MjModel, data: mujoco.MjData, host: str, port: in
     viewer.run()
 
 
+@dataclasses.dataclass(kw_only=True)
+class View(Command):
+    """Look at a scene."""
+
+    scene: Annotated[Path, *word("SCENE")]
+    """Scene folder."""
+    robot: Annotated[str, option(metavar="NAME|FILE")] = "turtlebot"
+    """Robot to put in: a name, a URDF or MJCF file, path.py:function, or none."""
+    objects: int = 10
+    """Small objects."""
+    small_objects: Literal["train", "test"] = "train"
+    """Whose models they are."""
+    seed: int = 0
+    """Of their places."""
+    view: Literal["whole", "follow", "eye"] = "whole"
+    """Free, and first at the robot or the whole scene; or from behind the robot, 1.8 or 1.5 m up."""
+    viewer: Literal["auto", "window", "browser"] = "auto"
+    """auto: a window where there is a screen."""
+    host: Annotated[str, option(metavar="ADDRESS")] = "127.0.0.1"
+    """Address that the browser's viewer listens on; any other than this machine's needs a token, which is printed."""
+    port: int = 8080
+    """Of the browser's viewer."""
+
+    @classmethod
+    def epilog(cls) -> str:
+        """Return the names of robots."""
+        return f"robots: {', '.join(robot_names())}"
+
+
 @reports_errors("interactive_nav.view")
 def main(argv: Sequence[str] | None = None) -> int:
     """Open a viewer; return 0 when it was closed, 2 with one line on stderr when none can open."""
-    table = Path(__file__).with_name("words.yaml")
-    parser = program(table, "view", robots=", ".join(robot_names()), splits=SPLITS)
-    arguments = parser.parse_args(argv)
+    arguments = parse(View, "python -m interactive_nav.view", argv)
     robot = None if arguments.robot == "none" else get_robot(arguments.robot)
     small = pick(arguments.objects, arguments.small_objects)
     if arguments.view != "whole" and robot is None:

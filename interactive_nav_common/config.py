@@ -6,7 +6,6 @@ dataclass may be composed of others: in files and on the command line they are s
 
 from __future__ import annotations
 
-import argparse
 import ast
 import dataclasses
 import difflib
@@ -72,7 +71,7 @@ class Settings:
         for name, hint in _hints(type(self)).items():
             if isinstance(value := getattr(self, name), list):
                 object.__setattr__(self, name, tuple(value))
-            _check(name, getattr(self, name), hint)
+            check(name, getattr(self, name), hint)
         for names, needs, used in (row for cls in type(self).__mro__ for row in cls.__dict__.get("IDLE", ())):
             for name in () if used(self) else names.split():
                 if (value := getattr(self, name)) not in (0, getattr(type(self), name, 0)):
@@ -92,7 +91,7 @@ def _hints(config_type: type) -> dict[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(config_type)}
 
 
-def _check(name: str, value: Any, hint: Any) -> None:
+def check(name: str, value: Any, hint: Any) -> None:
     """Raise `ConfigError` for a value that its type does not allow; None is still to be chosen."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if value is None or origin is None:
@@ -104,11 +103,11 @@ def _check(name: str, value: Any, hint: Any) -> None:
             raise ConfigError(f"{name} is {value!r}, expected one of {', '.join(choices)}{near}")
     elif origin is tuple:
         for item in value:
-            _check(name, item, arguments[0])
+            check(name, item, arguments[0])
     else:  # `X | None`, Annotated[X, bounds]
-        _check(name, value, arguments[0])
+        check(name, value, arguments[0])
         for bounds in arguments[1:] if origin is Annotated else ():
-            if not Bounds(*bounds).hold(value):
+            if isinstance(bounds, tuple) and not Bounds(*bounds).hold(value):
                 raise ConfigError(f"{name} is {value!r}, expected {Bounds(*bounds)}")
 
 
@@ -234,11 +233,11 @@ def overridden(config: Config, words: Sequence[str]) -> Config:
     return overlay(config, read_words(words, "seed=1"), "setting")
 
 
-def refuse_unused(arguments: argparse.Namespace, names: str, why: str) -> None:
+def refuse_unused(arguments: Any, names: str, why: str) -> None:
     """Refuse options and settings that were given but would change nothing.
 
     Args:
-        arguments: of a command line, its `key=value` words in `settings`; what is None, False or empty was not given.
+        arguments: a `Command`; what is None, False or empty was not given.
         names: `--options` and settings.
         why: with what they change nothing.
     """

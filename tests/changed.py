@@ -11,7 +11,7 @@ HOURS = 4
 AT_MOST = 1
 """Heavy tests that `make test` takes on."""
 INSTALLED = {
-    "tests/test_wheel.py": {"pyproject.toml", "interactive_nav/__main__.py", "interactive_nav/programs.yaml"},
+    "tests/test_wheel.py": {"pyproject.toml", "interactive_nav/__main__.py"},
     "tests/converters/test_sample_scan.py": {"converters/pipeline.py", "converters/bodies/decompose.py"},
 }
 """Tests of the whole, and what of it concerns them."""

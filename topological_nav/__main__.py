@@ -3,67 +3,188 @@
 Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when stopped: the same command goes on.
 """
 
-import argparse
+import dataclasses
 import importlib
-import re
 import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar, Literal
 
+from interactive_nav_common.commands import Command, Flag, Words, option, parse, word
 from interactive_nav_common.config import settings_help
 from interactive_nav_common.errors import reports_errors
 from interactive_nav_common.jobs.progress import Stopped
-from interactive_nav_common.words import Parser, add_words, read_commands
 from topological_nav import config as configs
-from topological_nav.config import ADAPTED, DATASET, DRIVES, RUNS
+from topological_nav.config import DATASET, RUNS
 from topological_nav.data.domains import AdaptConfig
 
-SETTINGS: dict[str, dict[str, Any]] = {
-    "data": {"": configs.DataConfig(), " of drives": configs.DriveConfig()},
-    "train": {"": configs.TASKS["rooms"], " of policy": configs.PolicyConfig()},
-    "map": {"": configs.MapConfig()},
-    "navigate": {"": configs.EvaluationConfig()},
-    "evaluate": {"": configs.EvaluationConfig()},
-    "adapt": {"": AdaptConfig()},
-    "export": {"": configs.ExportConfig()},
-}
-"""Command -> its settings, and of what else it does."""
+
+class _Listed(Command):
+    """Base of the commands that list their settings."""
+
+    LISTED: ClassVar[dict[str, Any]]
+    """What settings are of -> their defaults."""
+
+    @classmethod
+    def epilog(cls) -> str:
+        """Return the settings."""
+        listed = cls.LISTED.items()
+        return "\n\n".join(f"settings{of or ' (key=default)'}:\n{settings_help(config)}" for of, config in listed)
 
 
-def parser() -> argparse.ArgumentParser:
-    """Build the command line's parser; its words are in words.yaml."""
-    root = Parser(
-        prog="python -m topological_nav",
-        description="Navigation by images and a graph. Words key=value change settings: COMMAND --help lists them.",
-    )
-    commands = root.add_subparsers(dest="command", required=True)
-    for name, row in read_commands(Path(__file__).with_name("words.yaml")).items():
-        listed = [
-            f"settings{of or ' (key=default)'}:\n{settings_help(config)}" for of, config in SETTINGS[name].items()
-        ]
-        command = commands.add_parser(
-            name,
-            help=row.help,
-            description=row.help,
-            epilog="\n\n".join(listed),
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        add_words(command, row.words, runs=RUNS, dataset=DATASET, drives=DRIVES, adapted=ADAPTED)
-    return root
+@dataclasses.dataclass(kw_only=True)
+class _Networks(_Listed):
+    """Base of the commands that use networks."""
+
+    settings: Words = ()
+    """Change settings, listed below."""
+    localiser: Annotated[Path | None, option(metavar="RUN")] = None
+    """Network that embeds images (default: a trained one, else the packaged)."""
+    detector: Annotated[Path | None, option(metavar="RUN")] = None
+    """Network that judges passages (default: as the localiser)."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class _Driving(_Networks):
+    """Base of the commands that drive through scenes."""
+
+    LISTED = {"": configs.EvaluationConfig()}
+    maps: Annotated[Path | None, option(metavar="DIR")] = None
+    """Folder of SCENE.npz (default: maps beside the networks, built where missing)."""
+    policy: Annotated[str | None, option(metavar="RUN")] = None
+    """Local policy (default: the networks', if none is named); passage: ahead while the detector agrees, else turn."""
+    domain: Annotated[str, option(metavar="NAME")] = "clean"
+    """Its camera, goals included: clean, lens, light, noise, blur or camera; maps of its images: `adapt map`."""
+    truth: Flag = False
+    """Take maps from the plan, and the truth instead of both networks."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Data(_Listed):
+    """Render room and passage images of scenes, or drives of the expert."""
+
+    LISTED = {"": configs.DataConfig(), " of drives": configs.DriveConfig()}
+    scenes: Annotated[tuple[str, ...], *word("SCENE")]
+    """Scene folders or sets of them."""
+    settings: Words = ()
+    """Change settings, listed below."""
+    drives: Flag = False
+    """Drive through the scenes, and render what the robot sees."""
+    out: Annotated[Path | None, option("-o", metavar="DIR")] = None
+    """The dataset."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Train(_Networks):
+    """Train the room classifier, the passage detector or the local policy."""
+
+    LISTED = {"": configs.TASKS["rooms"], " of policy": configs.PolicyConfig()}
+    task: Annotated[Literal["rooms", "passages", "policy"], *word("TASK")]
+    """What to train: rooms, passages (whose defaults differ: batch=32 epochs=20) or policy."""
+    data: Annotated[Path | None, option(metavar="DIR")] = None
+    """The dataset."""
+    grid: Flag = False
+    """policy: train with every alpha and lambda of the report."""
+    out: Annotated[Path | None, option("-o", metavar="DIR")] = None
+    """Run folder."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Map(_Networks):
+    """Build a scene's topological map and draw it."""
+
+    LISTED = {"": configs.MapConfig()}
+    scene: Annotated[Path, *word("SCENE")]
+    """Scene folder."""
+    out: Annotated[Path | None, option("-o", metavar="PATH")] = None
+    """The map."""
+    route: Annotated[tuple[int, int] | None, option(metavar="FROM TO")] = None
+    """Draw the route between two nodes."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Navigate(_Driving):
+    """Drive one episode of a scene and draw it."""
+
+    scene: Annotated[str, *word("SCENE")]
+    """Scene folder."""
+    episode: Annotated[int, option(metavar="N")] = 0
+    """Of the scene's."""
+    sparse: Flag = False
+    """Use the map thinned out."""
+    out: Annotated[Path | None, option("-o", metavar="PATH")] = None
+    """The picture."""
+    video: Annotated[Path | None, option(metavar="PATH")] = None
+    """Film it as well (.mp4), ten times as fast."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Evaluate(_Driving):
+    """Play fixed episodes of scenes and score them."""
+
+    scenes: Annotated[tuple[str, ...], *word("SCENE")]
+    """Scene folders or sets of them."""
+    contenders: Annotated[str | None, option(metavar="NAME,...")] = None
+    """dense, sparse (the navigator, on its map and on the map thinned out), expert, ppo (default: all that can)."""
+    ppo: Annotated[Path | None, option(metavar="RUN")] = None
+    """Run folder of `python -m train`, whose policy knows where the goal is."""
+    out: Annotated[Path, option("-o", metavar="DIR")] = RUNS / "evaluation"
+    """Rows and figures."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Adapt(_Networks):
+    """Take networks and maps to another domain."""
+
+    LISTED = {"": AdaptConfig()}
+    what: Annotated[Literal["features", "passages", "map"], *word("WHAT")]
+    """The embedding, adversarially; the passage detector, in configurations A to D; or a map of the domain's images."""
+    scene: Annotated[Path | None, *word("SCENE")] = None
+    """map: scene folder."""
+    data: Annotated[Path | None, option(metavar="DIR")] = None
+    """The source's dataset."""
+    target: Annotated[Path | None, option(metavar="DIR")] = None
+    """Dataset of the target (default: the source's)."""
+    out: Annotated[Path | None, option("-o", metavar="PATH")] = None
+    """Folder of the networks, or the map."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Export(_Listed):
+    """Write finished runs as a small folder of weights in half precision."""
+
+    LISTED = {"": configs.ExportConfig()}
+    settings: Words = ()
+    """Change settings, listed below."""
+    localiser: Annotated[Path, option(metavar="RUN")] = RUNS / "rooms"
+    """Network that embeds images."""
+    detector: Annotated[Path, option(metavar="RUN")] = RUNS / "passages"
+    """Network that judges passages."""
+    policy: Annotated[Path | None, option(metavar="RUN")] = None
+    """Local policy."""
+    maps: Annotated[Path | None, option(metavar="DIR")] = None
+    """Folder of SCENE.npz, all of which are exported."""
+    images: Annotated[Path, option(metavar="PATH")] = DATASET
+    """To compare by: a dataset, or a scene."""
+    out: Annotated[Path, option("-o", metavar="DIR")] = RUNS / "export"
+    """The folder."""
+    picture: Annotated[Path | None, option(metavar="PATH")] = None
+    """The picture (default: DIR.png)."""
+
+
+COMMANDS = {kind.__name__.lower(): kind for kind in (Data, Train, Map, Navigate, Evaluate, Adapt, Export)}
 
 
 @reports_errors("topological_nav")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command."""
-    words = list(sys.argv[1:] if argv is None else argv)
-    settings = [word for word in words if re.match(r"\w+=", word)]
-    arguments = parser().parse_args([word for word in words if word not in settings])
-    arguments.settings = settings
+    arguments = parse(COMMANDS, "python -m topological_nav", argv)
     try:
         # Imported once the command is clear: it is heavy.
-        getattr(importlib.import_module("topological_nav.commands"), f"run_{arguments.command}")(arguments)
+        getattr(importlib.import_module("topological_nav.commands"), f"run_{type(arguments).__name__.lower()}")(
+            arguments
+        )
     except (Stopped, KeyboardInterrupt) as stopped:  # the latter: before the work began, or at a second Ctrl-C
         print("topological_nav: stopped; the same command goes on", file=sys.stderr)
         return 128 + (stopped.args[0] if isinstance(stopped, Stopped) else signal.SIGINT)

@@ -1,12 +1,12 @@
 """Run the commands: make datasets, train and adapt networks, build maps, play and score episodes, export."""
 
-import argparse
 import dataclasses
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import Any
 
 from interactive_nav import load_scene
 from interactive_nav_common.config import field_docs, overridden, refuse_unused
@@ -72,7 +72,7 @@ def bar(signals: list[int] | None = None) -> Iterator[Progress]:
         yield report
 
 
-def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: Sequence[str], out: Path):
+def _contest(arguments: Any, scenes: Sequence[str], contenders: Sequence[str], out: Path):
     """Return the contest that is requested; choose networks and maps that are not named, and build missing maps."""
     contest = Contest(
         scenes=tuple(Path(scene) for scene in scene_folders(scenes)),
@@ -103,7 +103,7 @@ def _contest(arguments: argparse.Namespace, scenes: Sequence[str], contenders: S
     return dataclasses.replace(contest, maps=maps, map_files=files, **runs)
 
 
-def _refuse_unused(arguments: argparse.Namespace, contest: Contest) -> None:
+def _refuse_unused(arguments: Any, contest: Contest) -> None:
     """Refuse settings that change nothing for these contenders."""
     names = set(contest.contenders)
     who = f"without a contender that needs it (contenders: {', '.join(contest.contenders)})"
@@ -121,7 +121,7 @@ def _refuse_unused(arguments: argparse.Namespace, contest: Contest) -> None:
         refuse_unused(arguments, "watch_s", "with glance=false")
 
 
-def run_navigate(arguments: argparse.Namespace) -> None:
+def run_navigate(arguments: Any) -> None:
     """Drive one episode and draw it."""
     if arguments.video and arguments.video.suffix != ".mp4":
         raise ConfigError(f"--video {arguments.video}: expected a name that ends in .mp4")
@@ -144,7 +144,7 @@ def run_navigate(arguments: argparse.Namespace) -> None:
         print(f"{arguments.video}: {film(driven, arguments.video)} frames")
 
 
-def run_evaluate(arguments: argparse.Namespace) -> None:
+def run_evaluate(arguments: Any) -> None:
     """Play episodes and score them."""
     names = ("dense", "sparse", "expert", *(["ppo"] if arguments.ppo else []))
     names = arguments.contenders.split(",") if arguments.contenders else names
@@ -170,7 +170,7 @@ def run_evaluate(arguments: argparse.Namespace) -> None:
     print(f"{contest.out}: {len(rows)} episodes; tables in summary.md, a picture a scene")
 
 
-def run_map(arguments: argparse.Namespace) -> None:
+def run_map(arguments: Any) -> None:
     """Build a map and draw it."""
     config = overridden(MapConfig(), arguments.settings)
     chosen = choose(arguments.localiser, arguments.detector, PASSAGE_POLICY)
@@ -207,7 +207,7 @@ def keep_map(built: Built, out: Path, ends: Sequence[int] | None = None) -> None
     )
 
 
-def run_export(arguments: argparse.Namespace) -> None:
+def run_export(arguments: Any) -> None:
     """Write finished runs as a small folder."""
     config = overridden(configs.ExportConfig(), arguments.settings)
     with bar() as report:
@@ -220,7 +220,7 @@ def run_export(arguments: argparse.Namespace) -> None:
     print(f"{arguments.out}: {size_lines(sizes, config.limit_mib)}; drawn in {picture}")
 
 
-def run_data(arguments: argparse.Namespace) -> None:
+def run_data(arguments: Any) -> None:
     """Render a dataset, or drives of the expert."""
     if arguments.drives:
         return _drives(arguments)
@@ -243,7 +243,7 @@ def _size_line(out: Path, images: int, config: configs.CameraConfig) -> str:
     return f"{out}: {images:,} images of {config.width} x {config.height}, {folder_bytes(out) / 2**20:.1f} MiB"
 
 
-def _drives(arguments: argparse.Namespace) -> None:
+def _drives(arguments: Any) -> None:
     config = overridden(configs.DriveConfig(), arguments.settings)
     out, scenes = arguments.out or DRIVES, [Path(s) for s in scene_folders(arguments.scenes)]
     with stop_signals() as stops:
@@ -261,7 +261,7 @@ def _drives(arguments: argparse.Namespace) -> None:
     print(_size_line(out, int(drives.steps[drives.kept].sum()), config))
 
 
-def run_train(arguments: argparse.Namespace) -> None:
+def run_train(arguments: Any) -> None:
     """Train a network or a local policy."""
     if arguments.task == "policy":
         return _policy(arguments)
@@ -284,7 +284,7 @@ def run_train(arguments: argparse.Namespace) -> None:
     print(f"{out}: {results['parameters']:,} parameters")
 
 
-def _policy(arguments: argparse.Namespace) -> None:
+def _policy(arguments: Any) -> None:
     config = overridden(configs.PolicyConfig(), arguments.settings)
     if arguments.grid:
         refuse_unused(arguments, "alpha lam", "with --grid, which takes every pair of the report's")
@@ -314,7 +314,7 @@ def _policy(arguments: argparse.Namespace) -> None:
     )
 
 
-def run_adapt(arguments: argparse.Namespace) -> None:
+def run_adapt(arguments: Any) -> None:
     """Take networks, and a map, to another domain."""
     config = overridden(AdaptConfig(), arguments.settings)
     if (arguments.what == "map") != bool(arguments.scene):
@@ -330,7 +330,7 @@ def run_adapt(arguments: argparse.Namespace) -> None:
         ADAPTATIONS[arguments.what](arguments, config, host)
 
 
-def _refuse_unused_to_adapt(arguments: argparse.Namespace) -> None:
+def _refuse_unused_to_adapt(arguments: Any) -> None:
     """Refuse settings of other adaptations; the settings' docstrings say whose they are."""
     what = arguments.what
     why = f"in 'adapt {what}'"
@@ -347,7 +347,7 @@ def _refuse_unused_to_adapt(arguments: argparse.Namespace) -> None:
         refuse_unused(arguments, "--data", f"{why} with --target")
 
 
-def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, host: Host) -> None:
+def _adapt_features(arguments: Any, config: AdaptConfig, host: Host) -> None:
     out = arguments.out or ADAPTED / "features"
     results = adaptation.adapt_features(arguments.localiser, arguments.data, arguments.target, out, config, host)
     rendered, captured = load_rooms(arguments.target).images, adaptation.target_rooms(arguments.target, config).images
@@ -361,7 +361,7 @@ def _adapt_features(arguments: argparse.Namespace, config: AdaptConfig, host: Ho
     print(f"{out}: {results['target_images']:,} target images, {results['before']['queries']} queries")
 
 
-def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, host: Host) -> None:
+def _adapt_passages(arguments: Any, config: AdaptConfig, host: Host) -> None:
     out = arguments.out or ADAPTED / "passages"
     results = adaptation.passage_configurations(arguments.detector, arguments.target, out, config, host)
     images = load_passages(arguments.target).images
@@ -377,7 +377,7 @@ def _adapt_passages(arguments: argparse.Namespace, config: AdaptConfig, host: Ho
     print(f"{out}: fine-tuned on {results['fine_tuned_on']} images, tested on {results['tested_on']}")
 
 
-def _adapt_map(arguments: argparse.Namespace, config: AdaptConfig, host: Host) -> None:
+def _adapt_map(arguments: Any, config: AdaptConfig, host: Host) -> None:
     del host
     scene = Path(arguments.scene)
     out = arguments.out or ADAPTED / f"{scene.resolve().name}.npz"

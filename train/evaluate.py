@@ -1,25 +1,24 @@
 """Run `python -m train.evaluate`: evaluate run folders; write Parquet rows, recorded paths and tables of scores."""
 
-import argparse
 import dataclasses
 import json
 import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pyarrow as pa
 from rich.console import Console
 
 from interactive_nav.episodes import EpisodeFile, EpisodeFileError, load_episode_files
 from interactive_nav.types import FAILURES
-from interactive_nav_common.config import refuse_unused, replace
+from interactive_nav_common.commands import Command, Flag, Repeated, Words, option, parse, word
+from interactive_nav_common.config import AtLeastOne, Natural, refuse_unused, replace
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.rows import write_parquet
 from interactive_nav_common.signals import STOPS, interrupts_heard, number_of, raise_stop
-from interactive_nav_common.words import program
 from scenes_mjcf.sets import installed, scene_folders
 from train import config_io
 from train.config import EnvConfig, TrainConfig
@@ -47,18 +46,54 @@ def _read_episodes(paths: Sequence[str], most: int | None) -> tuple[EpisodeFile,
     return dataclasses.replace(file, episodes=file.episodes[:most]), digest
 
 
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    return program(
-        Path(__file__).with_name("words.yaml"), "evaluate", episodes=EPISODES, policies=",".join(POLICIES),
-        planners=",".join(PLANNERS), seed=SEED, rows=ROWS,
-        batches=", ".join(f"{backend} {size}" for backend, size in AUTO_BATCH.items()),
-    )  # fmt: skip
+@dataclasses.dataclass
+class Evaluate(Command):
+    """Play fixed episodes."""
+
+    runs: Annotated[tuple[str, ...], *word("RUN_DIR")] = ()
+    """Folders that `python -m train` wrote; several share what is compiled. Without one, --scenes, --out and --policies
+    say what to play."""
+    settings: Words = ()
+    """Environment settings to change: env.NAME=VALUE."""
+    robot: Annotated[str | None, option(metavar="NAME|FILE")] = None
+    """Sets env.robot: a name, a URDF or MJCF file, or path.py:function."""
+    episodes: Annotated[AtLeastOne | None, option(metavar="N")] = None
+    """Episodes of each policy (default: 200; of files, all)."""
+    episode_file: Annotated[Repeated, option(metavar="FILE")] = ()
+    """Play these (python -m interactive_nav.episodes make)."""
+    balanced: Flag = False
+    """Scenes take turns; otherwise each episode draws one."""
+    policies: Annotated[str | None, option(metavar="NAME,...")] = None
+    """Policies and planners to play (default: all policies; with --policy none)."""
+    policy: Annotated[Repeated, option(metavar="[NAME=]MODULE:FACTORY")] = ()
+    """Also play what this function of your module, or of path/to/file.py, returns."""
+    scenes: Annotated[tuple[str, ...], option(metavar="SCENE_DIR")] = ()
+    """Where to play (default: the scenes that the policy was trained on)."""
+    seed: Annotated[int | None, option()] = None
+    """Of the fixed episodes."""
+    checkpoint: Annotated[str, option(metavar="best|last|STEPS")] = "best"
+    """Which checkpoint plays."""
+    stochastic: bool = True
+    """Sample the learned policy's actions, as the original did, or take their mode."""
+    record: Natural = 8
+    """Episodes to record paths of."""
+    batch: Annotated[AtLeastOne | None, option(metavar="N")] = None
+    """Episodes played at a time (default: by the backend)."""
+    out: Annotated[Path | None, option(metavar="PATH")] = None
+    """Parquet file of rows (default: RUN_DIR/evaluation/episodes.parquet)."""
+    dataset: Annotated[Path | None, option(metavar="DIR")] = None
+    """Add a file for each run and evaluation to this folder instead."""
+
+    @classmethod
+    def epilog(cls) -> str:
+        """Return what --policies may name and the default sizes."""
+        batches = ", ".join(f"{backend} {size}" for backend, size in AUTO_BATCH.items())
+        return f"policies: {', '.join(POLICIES)}\nplanners: {', '.join(PLANNERS)}\nseed: {SEED}\nbatch: {batches}"
 
 
-def _policies(arguments: argparse.Namespace) -> tuple[str, ...]:
+def _policies(arguments: Evaluate) -> tuple[str, ...]:
     """Return what --policies names, then `name=module:factory` of each --policy."""
-    brought = [named(word) for word in arguments.policy]
+    brought = [named(given) for given in arguments.policy]
     given = arguments.policies
     if given is None:
         given = "" if brought else ",".join(POLICIES)
@@ -72,41 +107,33 @@ def _policies(arguments: argparse.Namespace) -> tuple[str, ...]:
     return (*policies, *brought)
 
 
-def _place(
-    arguments: argparse.Namespace, folder: RunFolder | None, config: TrainConfig, request: EvaluationRequest
-) -> Path:
+def _place(arguments: Evaluate, folder: RunFolder | None, config: TrainConfig, request: EvaluationRequest) -> Path:
     """Return where rows go; those without a run go where those of a run of their name would."""
     if arguments.dataset:
-        return Path(arguments.dataset) / request.file_name(config.run.name)
+        return arguments.dataset / request.file_name(config.run.name)
     home = folder.path if folder else Path(config.run.out_dir) / config.run.name
     return Path(arguments.out or home / ROWS)
 
 
-def _wanted(
-    folder: RunFolder | None, policies: Sequence[str], arguments: argparse.Namespace, console: Console
-) -> TrainConfig:
+def _wanted(folder: RunFolder | None, policies: Sequence[str], arguments: Evaluate, console: Console) -> TrainConfig:
     """Return a run's config with the environment that the command line requests."""
-    words = [word for word in arguments.words if "=" in word]
     if folder:
-        return config_to_play(folder, words, arguments.scenes, console)
+        return config_to_play(folder, arguments.settings, arguments.scenes, console)
     if LEARNED in policies or not arguments.scenes:
         raise ConfigError(
             "RUN_DIR is missing; without one, expected --scenes and --policies without learned, "
             "for example --policies random,follower,avoider,namo:0.5"
         )
     config = dataclasses.replace(TrainConfig(), run=dataclasses.replace(TrainConfig().run, name="baselines"))
-    config = config_io.apply_overrides(config, words)
+    config = config_io.apply_overrides(config, arguments.settings)
     return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=scene_folders(arguments.scenes)))
 
 
-def _checked_seed(arguments: argparse.Namespace) -> int:
+def _checked_seed(arguments: Evaluate) -> int:
     """Return the seed of drawn episodes, once numbers are in range and no word is without effect."""
-    for name, value in (("--episodes", arguments.episodes), ("--batch", arguments.batch)):
-        if value is not None and value < 1:
-            raise ConfigError(f"{name} is {value}, expected at least 1")
     seed = SEED if arguments.seed is None else arguments.seed
-    if arguments.record < 0 or not -(2**63) <= seed < 2**63:
-        raise ConfigError(f"--record {arguments.record} --seed {seed}: expected 0 or more and 64 bits")
+    if not -(2**63) <= seed < 2**63:
+        raise ConfigError(f"--seed is {seed}, expected a number of 64 bits")
     if arguments.episode_file:
         refuse_unused(arguments, "--balanced --seed", "with --episode-file, whose episodes are fixed")
     if arguments.dataset:
@@ -120,7 +147,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
     kept: dict[Path, str] = {}
     try:
         with interrupts_heard(*STOPS, at_once=False):  # progress raises it, between two chunks
-            code = _run(parser().parse_intermixed_args(argv), build_env, kept)
+            code = _run(parse(Evaluate, "python -m train.evaluate", argv), build_env, kept)
             raise_stop()
             return code
     except KeyboardInterrupt as stop:
@@ -130,16 +157,16 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         return 128 + number
 
 
-def _run(arguments: argparse.Namespace, build_env: Callable[[EnvConfig], Any], kept: dict[Path, str]) -> int:
+def _run(arguments: Evaluate, build_env: Callable[[EnvConfig], Any], kept: dict[Path, str]) -> int:
     """Fill `kept` with what has been written: a run's file of rows -> how to say it."""
     console = SafeConsole()
-    arguments.words = config_io.with_robot(arguments.words, arguments.robot)
+    arguments.settings = tuple(config_io.with_robot(arguments.settings, arguments.robot))
     seed = _checked_seed(arguments)
     policies = _policies(arguments)
-    for word in arguments.words:
-        if "=" in word and not word.startswith("env."):
-            raise ConfigError(f"override {word!r}: expected env.<setting>=value: the run decides the rest")
-    runs = [RunFolder(Path(word)) for word in arguments.words if "=" not in word]
+    for setting in arguments.settings:
+        if not setting.startswith("env."):
+            raise ConfigError(f"override {setting!r}: expected env.<setting>=value: the run decides the rest")
+    runs = [RunFolder(Path(run)) for run in arguments.runs]
     if len(runs) > 1 and arguments.out:
         raise ConfigError("--out is for one run; several write into a folder: --dataset DIR")
     folders = runs or [None]
@@ -162,7 +189,7 @@ def _run(arguments: argparse.Namespace, build_env: Callable[[EnvConfig], Any], k
             balanced=arguments.balanced and file is None,
             checkpoint=arguments.checkpoint,
             deterministic=not arguments.stochastic,
-            settings=tuple(sorted(word for word in arguments.words if "=" in word)),
+            settings=tuple(sorted(arguments.settings)),
             episode_file=digest,
         )
         out = _place(arguments, folder, config, request)

@@ -6,21 +6,21 @@ end otherwise; a replay carries its scores. Videos and maps are drawn from its f
 `python -m train.record`, `python -m interactive_nav.topdown`.
 """
 
-import argparse
+import dataclasses
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 
 from interactive_nav.episodes import load_episode_file, starts_of
 from interactive_nav.pictures import replay
 from interactive_nav.task.rollout import episode_keys
+from interactive_nav_common.commands import Command, Words, option, parse, word
 from interactive_nav_common.config import refuse_unused
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.jobs.progress import SafeConsole
-from interactive_nav_common.words import program
 from scenes_mjcf.sets import installed
 from train.config import EnvConfig
 from train.runs.run import build_env, config_to_play
@@ -28,21 +28,40 @@ from train.runs.run_folder import RunFolder, claim
 from train.scoring.evaluation import POLICIES, SEED, make_policies
 
 
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    return program(Path(__file__).with_name("words.yaml"), "replay", policies=",".join(POLICIES), seed=SEED)
+@dataclasses.dataclass(kw_only=True)
+class Replay(Command):
+    """Record episodes step by step."""
+
+    run: Annotated[Path, *word("RUN_DIR")]
+    """Folder that `python -m train` wrote."""
+    settings: Words = ()
+    """Environment settings to change: env.NAME=VALUE."""
+    episodes: Annotated[str, option(metavar="K,K,...")] = "0"
+    """Which of the fixed episodes."""
+    policies: Annotated[str, option(metavar="NAME,...")] = "learned"
+    """Which policies play."""
+    scenes: Annotated[tuple[str, ...], option(metavar="SCENE_DIR")] = ()
+    """Where to play (default: the scenes that the policy was trained on)."""
+    seed: Annotated[int | None, option()] = None
+    """Of the fixed episodes."""
+    episode_file: Annotated[str | None, option(metavar="FILE")] = None
+    """Play those of this one (python -m interactive_nav.episodes make)."""
+    checkpoint: Annotated[str, option(metavar="best|last|STEPS")] = "best"
+    """Which checkpoint plays."""
+    stochastic: bool = True
+    """Sample the learned policy's actions, as the original did, or take their mode."""
 
 
 @reports_errors("train.replay")
 def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = build_env) -> int:
     """Record; return 0 when done, 2 on a user's error."""
-    arguments = parser().parse_intermixed_args(argv)
+    arguments = parse(Replay, "python -m train.replay", argv)
     console = SafeConsole()
-    if not all(word.isdecimal() for word in arguments.episodes.split(",")):
+    if not all(number.isdecimal() for number in arguments.episodes.split(",")):
         raise ConfigError(f"--episodes is {arguments.episodes!r}, expected numbers from 0 on, such as 0,1,5")
-    episodes = [int(word) for word in arguments.episodes.split(",")]
-    folder = RunFolder(Path(arguments.run))
-    config = config_to_play(folder, arguments.overrides, arguments.scenes, console)
+    episodes = [int(number) for number in arguments.episodes.split(",")]
+    folder = RunFolder(arguments.run)
+    config = config_to_play(folder, arguments.settings, arguments.scenes, console)
     claim(folder.path / "replays")
     env = build_env(config.env)
     seed, starts = SEED if arguments.seed is None else arguments.seed, None

@@ -1,1 +1,28 @@
 """One-off studies behind numbers of the documentation: programs to run in a checkout, not part of the package."""
+
+import argparse
+import json
+from pathlib import Path
+
+RESULTS = Path("benchmarks/results")
+
+
+def command_line(description: str | None, rows: str = "", settings: bool = False) -> argparse.ArgumentParser:
+    """Return a parser with the options that studies share; `rows` names a file in `RESULTS` to write.
+
+    With `settings`, `--set key=value` changes the environment.
+    """
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+    def setting(word: str) -> tuple[str, object]:
+        name, _, value = word.partition("=")
+        return name, json.loads(value)
+
+    if settings:
+        parser.add_argument("--scenes", nargs="+", default=["scenes_mjcf/apartment_0"])
+        parser.add_argument("--robot", default="turtlebot")
+        parser.add_argument("--set", dest="settings", type=setting, nargs="*", default=[], metavar="key=value")
+    if rows:
+        parser.add_argument("--commit", help="recorded in the row; default: git's HEAD")
+        parser.add_argument("--out", type=Path, default=RESULTS / f"{rows}.jsonl", help="where rows are appended")
+    return parser

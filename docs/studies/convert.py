@@ -22,8 +22,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from benchmarks.steps_per_second import append_row, command_line, origin
+from benchmarks.steps_per_second import append_row, origin
 from converters.generate import BuildingConfig, generate_building
+from docs.studies import command_line
 
 PACKAGES = ("mujoco", "coacd", "trimesh", "numpy", "scipy", "xatlas")
 LIMITS = {"cold_s": 600.0, "warm_s": 30.0, "memory_mib": 6 * 1024.0}

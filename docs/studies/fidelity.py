@@ -25,7 +25,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.steps_per_second import SCENE, append_row, command_line, origin
+from benchmarks.steps_per_second import SCENE, append_row, origin
+from docs.studies import command_line
 from interactive_nav.config import NavConfig, PhysicsConfig
 from interactive_nav.physics import PhysicsState, make_physics, resolve_backend
 from interactive_nav.robots import get_robot

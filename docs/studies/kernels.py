@@ -22,7 +22,8 @@ from rich.console import Console
 from rich.table import Table
 
 import interactive_nav
-from benchmarks.steps_per_second import MODES, append_row, command_line, origin, random_driving, step_of
+from benchmarks.steps_per_second import MODES, append_row, origin, random_driving, step_of
+from docs.studies import command_line
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav_common.errors import ConfigError
 

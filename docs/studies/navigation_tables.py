@@ -16,7 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.steps_per_second import command_line, timed
+from benchmarks.steps_per_second import timed
+from docs.studies import command_line
 from interactive_nav.geodesic import CornerGraph, corner_graph, navigation_grid
 from interactive_nav.navigation import lookup
 from interactive_nav.navigation.tables import navigation_tables

@@ -21,7 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import interactive_nav
-from benchmarks.steps_per_second import SCENE, append_row, command_line, origin, random_driving, timed
+from benchmarks.steps_per_second import SCENE, append_row, origin, random_driving, timed
+from docs.studies import command_line
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, make_physics
 from interactive_nav.robots import get_robot

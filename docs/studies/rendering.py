@@ -23,7 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import interactive_nav
-from benchmarks.steps_per_second import SCENE, append_row, command_line, origin, timed
+from benchmarks.steps_per_second import SCENE, append_row, origin, timed
+from docs.studies import command_line
 from interactive_nav.sensing import build_boxes, make_renderer
 from scenes_mjcf.look import CameraPose, Lens
 

@@ -3,20 +3,33 @@
 Exit status: 0; 2 for a question that cannot be answered, with one line that says why.
 """
 
+import dataclasses
 import sys
-from pathlib import Path
+from typing import Annotated
 
 from rich.console import Console
 from rich.table import Table
 
 from interactive_nav.robots import get_robot, robot_names
+from interactive_nav_common.commands import Command, option, parse, word
 from interactive_nav_common.errors import reports_errors
 from interactive_nav_common.jobs.progress import SafeConsole
-from interactive_nav_common.words import program
 
 
-def _names(text: str | None) -> tuple[str, ...]:
-    return robot_names() if text == "all" else tuple(name.strip() for name in text.split(",")) if text else ()
+@dataclasses.dataclass
+class Robots(Command):
+    """Print the table of robots."""
+
+    files: Annotated[tuple[str, ...], *word("FILE")] = ()
+    """Your robots: URDF or MJCF files, or path.py:function."""
+    robots: Annotated[str | None, option(metavar="NAME,...")] = None
+    """Robots by name (default: all; with FILE none)."""
+
+    def names(self) -> tuple[str, ...]:
+        """Return the names and files of the table's rows."""
+        names = self.robots or ("" if self.files else "all")
+        listed = robot_names() if names == "all" else [name.strip() for name in names.split(",") if name]
+        return (*listed, *self.files)
 
 
 def _unit(label: str) -> str:
@@ -50,9 +63,9 @@ def _print_table(names: tuple[str, ...], console: Console) -> None:
 @reports_errors("interactive_nav.robots")
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit status."""
-    args = program(Path(__file__).parents[1] / "words.yaml", "robots").parse_args(argv)
+    arguments = parse(Robots, "python -m interactive_nav.robots", argv)
     console = SafeConsole(width=None if sys.stdout.isatty() else 220)
-    _print_table((*_names(args.robots or ("" if args.files else "all")), *args.files), console)
+    _print_table(arguments.names(), console)
     return 0
 
 

@@ -22,8 +22,8 @@ from interactive_nav.robots.repair import FLOOR_M, slip_torque_n_m, strip
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import write_text, writing
+from interactive_nav_common.imports import import_function
 from interactive_nav_common.records import Reader
-from interactive_nav_common.words import import_function
 
 _GEOM = mujoco.mjtGeom
 _MAPPINGS = dict.fromkeys(("joints", "home", "torque_limits"), dict[str, float] | None)

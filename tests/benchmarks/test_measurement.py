@@ -5,7 +5,8 @@ import json
 import jax
 import jax.numpy as jnp
 
-from benchmarks.steps_per_second import append_row, command_line, origin, random_driving, timed
+from benchmarks.steps_per_second import append_row, origin, random_driving, timed
+from docs.studies import command_line
 
 
 def test_rows_say_where_they_come_from(tmp_path, capsys):

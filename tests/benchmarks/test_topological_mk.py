@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from interactive_nav_common.commands import parse
 from interactive_nav_common.config import overridden
-from topological_nav.__main__ import parser
+from topological_nav.__main__ import COMMANDS
 from topological_nav.config import (
     TASKS,
     DataConfig,
@@ -34,13 +35,12 @@ def listed(*words: str) -> str:
 
 
 def settings_of(arguments):
-    if arguments.command == "data":
+    command = type(arguments).__name__.lower()
+    if command == "data":
         return DriveConfig() if arguments.drives else DataConfig()
-    if arguments.command == "train":
+    if command == "train":
         return {**TASKS, "policy": PolicyConfig()}[arguments.task]
-    return {"map": MapConfig, "evaluate": EvaluationConfig, "adapt": AdaptConfig, "export": ExportConfig}[
-        arguments.command
-    ]()
+    return {"map": MapConfig, "evaluate": EvaluationConfig, "adapt": AdaptConfig, "export": ExportConfig}[command]()
 
 
 def commands_of(shown: str) -> list[list[str]]:
@@ -51,13 +51,12 @@ def commands_of(shown: str) -> list[list[str]]:
 
 def understood(words: list[str], made: Collection[str]):
     """Arguments and settings of a command; what it reads in RUNS is made before."""
-    settings = [word for word in words if re.match(r"\w+=", word)]
-    arguments = parser().parse_args([word for word in words if word not in settings])
+    arguments = parse(COMMANDS, "tool", words)
     for name in ("localiser", "detector", "data", "target", "maps"):
         needed = getattr(arguments, name, None)
         if needed is not None and str(needed).startswith("/nowhere"):
             assert any(done == str(needed) or done.startswith(f"{needed}/") for done in made), (words, name)
-    return arguments, overridden(settings_of(arguments), settings)
+    return arguments, overridden(settings_of(arguments), arguments.settings)
 
 
 @pytest.mark.parametrize("size", ["full", "cpu"])
@@ -153,7 +152,7 @@ def test_a_scanned_room_is_a_target_where_it_is_given(size):
     targets = {name: str(done[name][0].target).removeprefix("/nowhere/") for name in adapted}
     assert targets == dict.fromkeys(adapted, "data-scan") | {"adapted-passages-scan": "data-scan-passages"}
     folders = [done[name][0].scenes for name in ("data-scan", "data-scan-passages")]
-    assert folders == [["/elsewhere/room"]] * 2 and {done[name][0].scene for name in maps} == {"/elsewhere/room"}
+    assert folders == [("/elsewhere/room",)] * 2 and {str(done[name][0].scene) for name in maps} == {"/elsewhere/room"}
     assert str(done[maps[1]][0].localiser) == "/nowhere/features-scan"
 
 

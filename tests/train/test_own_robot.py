@@ -12,6 +12,7 @@ from rich.console import Console
 
 from interactive_nav.pictures import replay
 from interactive_nav.robots import get_robot
+from interactive_nav_common.commands import parse
 from interactive_nav_common.config import replace
 from interactive_nav_common.errors import FileError
 from tests.interactive_nav.robots.urdf import cart
@@ -19,7 +20,7 @@ from tests.toys import write_room
 from tests.train.toy_run import UPDATE_STEPS, build_toy, toy_config
 from train import evaluate
 from train import replay as replay_program
-from train.__main__ import parser
+from train.__main__ import Train
 from train.config import EnvConfig, TrainConfig
 from train.config_io import apply_overrides, with_robot
 from train.runs.run import train_run
@@ -38,9 +39,9 @@ def train(config, **more):
 
 def test_both_spellings_of_the_option_name_a_robot(tmp_path):
     path = tmp_path / 'my "porter".urdf'
-    words = parser().parse_args(["--config", "demo", "--robot", str(path)])
+    words = parse(Train, "tool", ["--config", "demo", "--robot", str(path)])
     assert with_robot(["run.seed=1"], None) == ["run.seed=1"]
-    assert apply_overrides(TrainConfig(), with_robot(words.overrides, words.robot)).env.robot == str(path)
+    assert apply_overrides(TrainConfig(), with_robot(words.settings, words.robot)).env.robot == str(path)
     assert apply_overrides(TrainConfig(), ["env.robot=a/b.py:porter"]).env.robot == "a/b.py:porter"
 
 

@@ -56,7 +56,7 @@ def test_what_cannot_be_drawn_is_not_played(run, tmp_path, capsys):
         (["-o", str(out)], "holds no checkpoint"),
         (["-o", "x.avi"], "ends in '.avi', expected one of .mp4, .gif"),
         (["--height", "125"], "height is 125, expected a multiple of 12"),
-        (["--every", "0"], "--every is 0, expected 1 or more"),
+        (["--every", "0"], "--every is 0, expected at least 1"),
     ):
         assert record.main([str(run), *words]) == 2
         (line,) = capsys.readouterr().err.splitlines()

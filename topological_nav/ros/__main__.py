@@ -3,11 +3,10 @@
 Exit codes: 0 done, 2 on a user's error or a failed node of `all` (one line on stderr), 128 + signal when stopped.
 """
 
-import argparse
 import contextlib
+import dataclasses
 import json
 import os
-import re
 import shlex
 import signal
 import subprocess
@@ -15,15 +14,17 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+from tyro.conf import UseAppendAction
+
+from interactive_nav_common.commands import Command, Flag, Words, option, parse, word
 from interactive_nav_common.config import overridden, refuse_unused, settings_help
 from interactive_nav_common.errors import UserError, missing, optional, reports_errors
 from interactive_nav_common.jobs.processes import GUARD
 from interactive_nav_common.jobs.progress import say
 from interactive_nav_common.signals import stop_signals
-from interactive_nav_common.words import Parser, add_words, read_commands
-from topological_nav.config import RUNS, NavigatorConfig
+from topological_nav.config import NavigatorConfig
 from topological_nav.ros.config import HeadingConfig, SimulatorConfig
 
 DRIVERS = {"heading": HeadingConfig, "topological": NavigatorConfig}
@@ -32,58 +33,102 @@ _GRACE_S = 10.0
 """Time for a node of `all` to end after the other one has."""
 
 
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    program = Parser(
-        prog="python -m topological_nav.ros",
-        description="The simulator and the navigator as ROS 2 nodes. Words key=value change settings.",
-    )
-    commands = program.add_subparsers(dest="command", required=True)
+@dataclasses.dataclass(kw_only=True)
+class All(Command):
+    """Run one episode: the simulator and the navigator, each in a process."""
 
-    def command(name: str, text: str, *configs: Any) -> argparse.ArgumentParser:
-        epilog = "".join(f"settings of {what} (key=default):\n{settings_help(c)}\n" for what, c in configs)
-        return commands.add_parser(
-            name, help=text, description=text, epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter
-        )
+    scene: Annotated[Path, *word("SCENE")]
+    """Scene folder."""
+    sim: Annotated[str, option(metavar="WORDS")] = ""
+    """Further words of the simulator, such as '--lockstep width=64'."""
+    navigator: Annotated[str, option(metavar="WORDS")] = ""
+    """Words of the navigator, such as 'heading_rad=1.57'."""
+    bag: Annotated[Path | None, option(metavar="FOLDER")] = None
+    """Record all topics there (rosbag2)."""
 
-    sim, heading = ("the simulator", SimulatorConfig()), ("driver heading", HeadingConfig())
-    topological = ("driver topological", NavigatorConfig())
-    everything = command("all", "One episode: the simulator and the navigator, each in a process.")
-    alone = command("sim", "The simulator's node.", sim)
-    navigator = command("navigator", "The navigator's node, for a robot or a simulator.", heading, topological)
-    sets = read_commands(Path(__file__).with_name("words.yaml"))
-    add_words(everything, sets["all"].words)
-    add_words(alone, sets["sim"].words)
-    add_words(alone.add_mutually_exclusive_group(), sets["pace"].words)
-    add_words(navigator, sets["navigator"].words, drivers=tuple(DRIVERS))
-    add_words(navigator.add_argument_group("driver topological"), sets["topological"].words, runs=RUNS)
-    command("check", "Says whether ROS 2 can be used here.")
-    return program
+
+@dataclasses.dataclass(kw_only=True)
+class Sim(Command):
+    """Run the simulator's node."""
+
+    scene: Annotated[Path, *word("SCENE")]
+    """Scene folder."""
+    settings: Words = ()
+    """Change settings, listed below."""
+    limit: Annotated[float, option(metavar="S")] = 1800.0
+    """Simulated seconds of an episode."""
+    lockstep: Flag = False
+    """Each picture waits for its velocity command."""
+    factor: float = 1.0
+    """Simulated seconds a second; 0: no waiting."""
+    bag: Annotated[Path | None, option(metavar="FOLDER")] = None
+    """Record all topics there (rosbag2)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.lockstep and self.factor != 1.0:
+            raise UserError("--factor has no effect with --lockstep; leave it out")
+
+    @classmethod
+    def epilog(cls) -> str:
+        """Return the settings."""
+        return f"settings (key=default):\n{settings_help(SimulatorConfig())}"
+
+
+@dataclasses.dataclass(kw_only=True)
+class Navigator(Command):
+    """Run the navigator's node, for a robot or a simulator."""
+
+    settings: Words = ()
+    """Change settings of the driver, listed below."""
+    driver: Literal["heading", "topological"] = "heading"
+    """What decides on velocities."""
+    heading_from: Literal["imu", "odom"] = "imu"
+    """Topic of the heading."""
+    heading_offset: Annotated[float, option(metavar="RAD")] = 0.0
+    """Of that frame in the map's."""
+    map: Annotated[Path | None, option(metavar="PATH")] = None
+    """Of `python -m topological_nav map`."""
+    localiser: Annotated[Path | None, option(metavar="RUN")] = None
+    """Network that embeds images (default: a trained one, else the packaged)."""
+    detector: Annotated[Path | None, option(metavar="RUN")] = None
+    """Network that judges passages (default: as the localiser)."""
+    policy: Annotated[str | None, option(metavar="RUN")] = None
+    """Drives along edges; or passage (default: as the networks, if none is named)."""
+    goal: Annotated[UseAppendAction[tuple[Path, ...]], option(metavar="PICTURE")] = ()
+    """Taken at the goal."""
+    goal_heading: Annotated[float | None, option(metavar="RAD")] = None
+    """Along which the first was (default: 0)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.driver == "heading":
+            options = "--map --localiser --detector --policy --goal --goal-heading"
+            refuse_unused(self, options, "with --driver heading, only with --driver topological")
+
+    @classmethod
+    def epilog(cls) -> str:
+        """Return the settings of both drivers."""
+        drivers = DRIVERS.items()
+        return "\n".join(f"settings of driver {name} (key=default):\n{settings_help(of())}" for name, of in drivers)
+
+
+@dataclasses.dataclass
+class Check(Command):
+    """Report whether ROS 2 can be used here."""
+
+
+COMMANDS = {kind.__name__.lower(): kind for kind in (All, Sim, Navigator, Check)}
 
 
 @reports_errors("topological_nav.ros")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command."""
-    words = list(sys.argv[1:] if argv is None else argv)
-    # Words of `all` are those of the nodes, in quotes.
-    settings = [word for word in words if re.match(r"\w+=", word)] if words[:1] != ["all"] else []
-    arguments = parser().parse_args([word for word in words if word not in settings])
-    arguments.settings = settings
-    run = {"all": _all, "sim": _sim, "navigator": _navigator, "check": _check}
+    run = {All: _all, Sim: _sim, Navigator: _navigator, Check: _check}
     with stop_signals() as stops:
-        _refuse_unused(arguments)
-        run[arguments.command](arguments, stops)
+        arguments = parse(COMMANDS, "python -m topological_nav.ros", argv)
+        run[type(arguments)](arguments, stops)
         return 128 + stops[0] if stops else 0
-
-
-def _refuse_unused(arguments: argparse.Namespace) -> None:
-    """Refuse what the chosen driver, or the command, does not read."""
-    if arguments.command == "check":
-        named = " ".join(word.partition("=")[0] for word in arguments.settings)
-        refuse_unused(arguments, named, "in 'check', which has no settings")
-    elif arguments.command == "navigator" and arguments.driver == "heading":
-        options = "--map --localiser --detector --policy --goal --goal-heading"
-        refuse_unused(arguments, options, "with --driver heading, only with --driver topological")
 
 
 def need_ros() -> Any:
@@ -94,7 +139,7 @@ def need_ros() -> Any:
     return optional("rclpy", line)
 
 
-def _networks(arguments: argparse.Namespace) -> Any:
+def _networks(arguments: Navigator) -> Any:
     from topological_nav.weights.export import choose
 
     if arguments.map is None:
@@ -104,7 +149,7 @@ def _networks(arguments: argparse.Namespace) -> Any:
     return chosen
 
 
-def _all(arguments: argparse.Namespace, stops: list[int]) -> None:
+def _all(arguments: All, stops: list[int]) -> None:
     """Run both nodes until one ends; the other may then take `_GRACE_S` to end by itself."""
     need_ros()
     program = [sys.executable, "-c", GUARD, sys.executable, "-m", "topological_nav.ros"]
@@ -138,7 +183,7 @@ def _all(arguments: argparse.Namespace, stops: list[int]) -> None:
         raise UserError(f"{', '.join(failed)}; its message is above")
 
 
-def _sim(arguments: argparse.Namespace, stops: list[int]) -> None:
+def _sim(arguments: Sim, stops: list[int]) -> None:
     config = overridden(SimulatorConfig(), arguments.settings)
     need_ros()
     from topological_nav.ros.nodes import SimulatorNode, recording, ros_node
@@ -155,7 +200,7 @@ def _sim(arguments: argparse.Namespace, stops: list[int]) -> None:
         print(json.dumps(tally.row()), flush=True)
 
 
-def _navigator(arguments: argparse.Namespace, stops: list[int]) -> None:
+def _navigator(arguments: Navigator, stops: list[int]) -> None:
     config = overridden(DRIVERS[arguments.driver](), arguments.settings)
     chosen = _networks(arguments) if arguments.driver == "topological" else None
     need_ros()
@@ -165,7 +210,8 @@ def _navigator(arguments: argparse.Namespace, stops: list[int]) -> None:
     if chosen is None:
         driver: drivers.Driver = drivers.HeadingDriver(config)
     else:
-        goal = tuple(arguments.goal), arguments.goal_heading or 0.0
+        assert arguments.map is not None
+        goal = arguments.goal, arguments.goal_heading or 0.0
         driver = drivers.topological_driver(arguments.map, chosen, *goal, config)
     with ros_node("navigator") as node:
         navigator = NavigatorNode(node, driver, arguments.heading_from, arguments.heading_offset, say)
@@ -173,7 +219,7 @@ def _navigator(arguments: argparse.Namespace, stops: list[int]) -> None:
         say(f"navigator: {'done' if done else 'stopped'}")
 
 
-def _check(arguments: argparse.Namespace, stops: list[int]) -> None:
+def _check(arguments: Check, stops: list[int]) -> None:
     del arguments, stops
     print(f"rclpy: {need_ros().__file__}")
 

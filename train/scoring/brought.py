@@ -12,7 +12,7 @@ import numpy as np
 
 from interactive_nav.task.rollout import HostPolicy
 from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.words import first_line, import_function
+from interactive_nav_common.imports import first_line, import_function
 from train.errors import PolicyError
 
 TAKEN = ("learned", "random", "follower", "avoider", "namo")

@@ -1,15 +1,16 @@
 """Run `python -m train.sweep`: train the runs of one YAML file and write rows of their evaluation."""
 
-import argparse
+import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated, Literal
 
-from interactive_nav_common.config import refuse_unused, settings_help
+from interactive_nav_common.commands import Command, Flag, Repeated, option, parse, word
+from interactive_nav_common.config import Bounds, Positive, refuse_unused, settings_help
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.signals import stop_signals
-from interactive_nav_common.words import program
 from train.config_io import preset_names
 from train.runs.checkpoint import STEP
 from train.runs.run_folder import claim
@@ -19,34 +20,66 @@ from train.sweep.scheduler import PROGRAMS, STAGES, Machine, Programs, Scheduler
 from train.sweep.spec import SweepConfig
 
 
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    epilog = (
-        f"keys of the file (default):\n{settings_help(SweepConfig(), equals=': ')}\n\n"
-        "exit codes: 0 all done (or in another sweep's hands), "
-        "1 runs were given up or are not done, 2 the file is wrong, 3 stopped by the time limit, 128 + signal"
-    )
-    table, sweeps = Path(__file__).parents[1] / "words.yaml", ", ".join(preset_names(spec.SWEEP_DIR))
-    return program(table, "sweep", epilog, sweeps=sweeps, step=STEP, stages=STAGES)
+@dataclasses.dataclass
+class Sweep(Command):
+    """Train and evaluate every run of a sweep. The same command continues what was stopped or killed, and leaves out
+    what is done."""
+
+    sweep: Annotated[str | None, *word("NAME|PATH")] = None
+    """A sweep, or a YAML file."""
+    config: Annotated[str | None, option(metavar="NAME|PATH")] = None
+    """The same, as `python -m train` takes it."""
+    status: Flag = False
+    """Print how far every run is, and do nothing."""
+    export: Annotated[Path | None, option(metavar="DIR")] = None
+    """Copy rows, curves and the best run's checkpoint of each cell there."""
+    policy_step: Annotated[float, Bounds(0, 4, open=True)] = STEP
+    """With --export: round the checkpoint's weights to so many standard deviations."""
+    resume: Flag = False
+    """Only continue: refuse a sweep that was never begun."""
+    only: Annotated[Literal["train", "evaluate"] | None, option()] = None
+    """Train without evaluating, or evaluate what is trained."""
+    redo: Flag = False
+    """Evaluate again what is evaluated."""
+    unfinished: Flag = False
+    """Evaluate unfinished runs too, as far as they are."""
+    time_limit: Annotated[Positive | None, option(metavar="SECONDS")] = None
+    """Then stop all runs, with their checkpoints."""
+    where: Annotated[Repeated, option(metavar="KEY=VALUE[,VALUE]")] = ()
+    """Only these runs."""
+    shard: Annotated[str | None, option(metavar="I/N")] = None
+    """Only every N-th run, from the I-th: one machine's part."""
+    launcher: Literal["local", "ray"] = "local"
+    """This machine, or a Ray cluster."""
+    ray_address: Annotated[str | None, option(metavar="ADDRESS")] = None
+    """Of the cluster (default: auto)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.sweep is None) == (self.config is None):
+            raise ConfigError("expected one sweep, by name or path (--help lists them)")
+        if self.launcher != "ray":
+            refuse_unused(self, "--ray-address", "without --launcher ray")
+        if self.unfinished and self.only != "evaluate":
+            raise ConfigError("--unfinished evaluates without training on; expected --only evaluate with it")
+
+    @classmethod
+    def epilog(cls) -> str:
+        """Return the sweeps, the keys of their files and the exit codes."""
+        return (
+            f"sweeps: {', '.join(preset_names(spec.SWEEP_DIR))}\n\n"
+            f"keys of the file (default):\n{settings_help(SweepConfig(), equals=': ')}\n\n"
+            "exit codes: 0 all done (or in another sweep's hands), "
+            "1 runs were given up or are not done, 2 the file is wrong, 3 stopped by the time limit, 128 + signal"
+        )
 
 
 @reports_errors("train.sweep")
 def main(argv: Sequence[str] | None = None, programs: Programs = PROGRAMS) -> int:
     """Run a sweep; see `Outcome.exit_code`."""
-    arguments = parser().parse_args(argv)
+    arguments = parse(Sweep, "python -m train.sweep", argv)
     console = SafeConsole()
-    chosen = [name for name in (arguments.sweep, arguments.config) if name]
-    if len(chosen) != 1:
-        raise ConfigError(f"expected one sweep, by name or path, got {len(chosen)}; see --help")
-    if arguments.time_limit is not None and not arguments.time_limit > 0:
-        raise ConfigError(f"--time-limit is {arguments.time_limit}, expected a positive number of seconds")
-    if not 0 < arguments.policy_step <= 4:
-        raise ConfigError(f"--policy-step is {arguments.policy_step:g}, expected above 0 and at most 4")
-    if arguments.launcher != "ray":
-        refuse_unused(arguments, "--ray-address", "without --launcher ray")
-    if arguments.unfinished and arguments.only != "evaluate":
-        raise ConfigError("--unfinished evaluates without training on; expected --only evaluate with it")
-    sweep = spec.select(spec.load_sweep(chosen[0]), arguments.where, arguments.shard)
+    sweep = spec.select(spec.load_sweep(arguments.sweep or arguments.config), arguments.where, arguments.shard)
     folder = SweepFolder(sweep)
     if arguments.status:
         states = [folder.state(run) for run in sweep.runs]
@@ -56,7 +89,7 @@ def main(argv: Sequence[str] | None = None, programs: Programs = PROGRAMS) -> in
     if arguments.export:
         from train.sweep.export import export
 
-        size, best = export(folder, Path(arguments.export), arguments.policy_step)
+        size, best = export(folder, arguments.export, arguments.policy_step)
         for name in best.values():
             console.print(f"checkpoint of {name}", highlight=False)
         console.print(f"{arguments.export}: {size / 2**20:.1f} MiB", highlight=False, soft_wrap=True)

@@ -187,8 +187,7 @@ def test_a_scan_shows_a_library_model_in_the_colours_of_its_texture():
     faces = np.arange(3 * len(points)).reshape(-1, 3)
     scan = Scan(item.to_floor(surface.vertices[surface.faces].reshape(-1, 3)), faces, np.zeros(faces.size, np.uint8),
                 np.full(faces.size, own), tuple(solids))  # fmt: skip
-    up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    got = paint(scan, plan.rooms, (), points, np.arange(len(points)), up, np.random.default_rng(0))
+    got = paint(scan, plan.rooms, (), points, np.arange(len(points)), np.random.default_rng(0))
     uv = surface.uv[surface.uv_faces].mean(axis=1)
     height, width = surface.image.shape[:2]
     at = np.clip([(1 - uv[:, 1]) * height, uv[:, 0] * width], 0, [[height - 1], [width - 1]]).astype(int)

@@ -62,4 +62,6 @@ def test_stopped_epochs_go_on_with_the_same_keys(tmp_path):
     losses = [[line["loss"] for line in read_metrics(tmp_path / name / METRICS)] for name in ("whole", "part")]
     assert losses[0] == losses[1] and len(losses[0]) == 5
     with pytest.raises(FileError, match="the loss of epoch 1 is nan; try a smaller learning_rate"):
-        run_epochs(tmp_path / "bad", "count", jnp.zeros(1), lambda s, n, k: (s, {"loss": jnp.nan}), 1, key, ALONE)
+        run_epochs(
+            tmp_path / "bad", "count", jnp.zeros(1), lambda s, n, k: (s, {"loss": jnp.array(jnp.nan)}), 1, key, ALONE
+        )

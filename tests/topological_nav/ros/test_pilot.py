@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from interactive_nav_common.commands import parse
 from interactive_nav_common.errors import ConfigError
 from topological_nav.config import NavigatorConfig
 from topological_nav.data.dataset import load_rooms
 from topological_nav.learn.training import load_trained
 from topological_nav.maps.graph import load_map
-from topological_nav.ros.__main__ import _networks, main, parser
+from topological_nav.ros.__main__ import COMMANDS, _networks, main
 from topological_nav.ros.drivers import topological_driver
 from topological_nav.weights.export import choose
 
@@ -50,7 +51,7 @@ def test_out_of_time_it_is_done(made, goal):
 
 def test_networks_are_read_from_words(made):
     words = ["--map", str(made.map), "--localiser", str(made.rooms), "--detector", str(made.passages)]
-    chosen = _networks(parser().parse_args(["navigator", "--driver", "topological", *words, "--policy", "passage"]))
+    chosen = _networks(parse(COMMANDS, "", ["navigator", "--driver", "topological", *words, "--policy", "passage"]))
     assert (chosen.localiser, chosen.detector, chosen.policy) == (made.rooms, made.passages, "passage")
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from interactive_nav_common.commands import parse
 from interactive_nav_common.errors import ConfigError
 from scenes_mjcf import sets
 from train import evaluate
@@ -161,7 +162,7 @@ def test_fixed_episodes_of_each_run_s_robot_are_played(monkeypatch):
     words = words_of_evaluation(folder, [fetch.name], ("-m", "train.evaluate"))
     given = [word for flag, word in itertools.pairwise(words) if flag == "--episode-file"]
     assert given == [name.replace("{robot}", "fetch") for name in files]
-    understood = evaluate.parser().parse_intermixed_args(words[3:])
+    understood = parse(evaluate.Evaluate, "tool", words[3:])
     played, digest = evaluate._read_episodes(understood.episode_file, understood.episodes)
     assert (len(played.episodes), digest) == (asked["fetch"].episodes, asked["fetch"].episode_file)
 
@@ -170,7 +171,7 @@ def test_a_wrong_file_is_one_line_and_exit_2(tmp_path, capsys):
     for words, message in (
         (["kitn"], "no sweep 'kitn', did you mean 'kint'?"),
         ([str(tmp_path / "no.yaml")], "cannot read"),
-        ([], "expected one sweep, by name or path, got 0"),
+        ([], "expected one sweep, by name or path"),
         (["kint", "--unfinished"], "expected --only evaluate with it"),
         (["kint", "--time-limit", "0"], "--time-limit is 0.0, expected a positive number"),
     ):

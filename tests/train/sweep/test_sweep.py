@@ -444,7 +444,7 @@ def test_status_prints_every_run_and_does_nothing(tmp_path, capsys):
 def test_impossible_words_are_one_line(tmp_path, capsys):
     path = str(write_sweep(tmp_path))
     for words, message in (
-        (["--time-limit", "nan"], "--time-limit is nan, expected a positive number of seconds"),
+        (["--time-limit", "nan"], "--time-limit is nan, expected a positive number"),
         (["--where", "env.k_int=["], "--where 'env.k_int=[': not readable"),
     ):
         assert main([path, *words], FAKE) == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import typing
 from pathlib import Path
 
 import numpy as np
@@ -428,6 +429,6 @@ def test_damaged_worlds_end_in_one_line_or_a_scene(tmp_path_factory, data):
 
 
 def test_the_command_offers_every_reader():
-    from converters.__main__ import FORMATS
+    from converters.segmenting import Format
 
-    assert set(FORMATS) == set(READERS)
+    assert set(typing.get_args(Format)) == {"auto", *READERS}
