@@ -215,7 +215,6 @@ class LocalPolicy(Protocol):
 
     def start(self, batch: int) -> Any:
         """Return the hidden state of `batch` fresh runs."""
-        ...
 
     def act(self, state: Any, images: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
         """Map level images [B, H, W, 3] u8 straight ahead to the new state, linear [B] m/s and angular [B] rad/s."""

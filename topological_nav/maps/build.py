@@ -195,15 +195,9 @@ def build_map(
     progress: Progress = lambda *_: None,
     parts: Path | None = None,
 ) -> Built:
-    """Build a scene's map.
+    """Build a scene's map by the run folders of a network whose embedding localises and of a passage detector.
 
-    Args:
-        scene_folder: the scene.
-        localiser_run: run folder of a network whose embedding localises.
-        detector_run: run folder of a passage detector.
-        config: of the map.
-        progress: called with what is drawn, images done and images in all; may raise to stop.
-        parts: folder that drawn images are kept in, so that a map that was stopped goes on; None: they are not.
+    Drawn images are kept in the folder `parts`, if any, so that a map that was stopped goes on.
     """
     networks = load_networks(localiser_run, detector_run)
     data = drawn_for(networks.camera, config.supersample)

@@ -199,12 +199,7 @@ def save_map(nav_map: TopologicalMap, path: Path) -> None:
 
 
 def load_map(path: Path, digest: str | None = None) -> TopologicalMap:
-    """Read a map.
-
-    Args:
-        path: of the file.
-        digest: of the scene that it is to be used in; None: not checked.
-    """
+    """Read a map, and check that it is of the scene with this digest; None: not checked."""
     with read_npz(path, FileError, "build the map: python -m topological_nav map SCENE") as stored:
         header = json.loads(stored["header"].tobytes())
         arrays = {name: stored[name] for name in _ARRAYS}

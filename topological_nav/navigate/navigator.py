@@ -55,13 +55,9 @@ class Navigator:
     """Navigate by a map, eyes and a local policy."""
 
     def __init__(self, nav_map: TopologicalMap, sight: Sight, policy: LocalPolicy, config: NavigatorConfig):
-        """Take what is needed.
+        """Take a map, whose nodes' positions are not used, what judges images, and what drives along edges.
 
-        Args:
-            nav_map: the map; positions of its nodes are not used.
-            sight: judges images.
-            policy: drives along an edge. A member `period` says that it looks at every so manieth image only.
-            config: settings.
+        A policy's `period`, if it has one, says that it looks at every so manieth image only.
         """
         around = nav_map.embeddings.shape[1]
         if config.match == "aligned" and around % config.images:
@@ -111,16 +107,11 @@ class Navigator:
     def step(
         self, state: State, images: np.ndarray, heading_rad: np.ndarray, time_s: np.ndarray | float
     ) -> tuple[State, np.ndarray, np.ndarray, Events]:
-        """Take one control step.
+        """Take one control step from a state of `start` or `step`.
 
-        Args:
-            state: of `start` or `step`.
-            images: [B, ...] what the robots see now; those that `looks` leaves out may be anything.
-            heading_rad: [B] absolute, world frame, as by a compass.
-            time_s: [B] or one for all; must not go back.
-
-        Returns:
-            The new state, linear [B] (m/s) and angular [B] (rad/s) velocity to command, and what happened.
+        Images [B, ...] that `looks` leaves out may be anything; headings [B] are those of a compass, world frame; times,
+        [B] or one for all, must not go back. Return the new state, linear [B] (m/s) and angular [B] (rad/s)
+        velocity to command, and what happened.
         """
         batch = len(state.phase)
         heading = np.asarray(heading_rad, float)

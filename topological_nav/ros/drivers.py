@@ -47,7 +47,6 @@ class Driver(Protocol):
     @property
     def lens(self) -> Lens | None:
         """Return the lens that its pictures must have; None: any."""
-        ...
 
     def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> VelocityCommand:
         """Return the next command, by a level image [H, W, 3] u8 straight ahead and the yaw in the map's frame."""

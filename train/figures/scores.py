@@ -69,13 +69,9 @@ def equal_ins(axis: Axes, step: float = 0.1) -> None:
         axis.plot(p, 2 * level - p, color="0.85", linewidth=0.7, zorder=0)
 
 
-def _robots_runs(rows: pa.Table, robot: str, split: str | None) -> list[RunMean]:
-    return [run for run in run_means(rows, split) if run.robot == robot]
-
-
 def ins_over_alpha(rows: pa.Table, robot: str, split: str | None) -> Figure:
     """Draw INS_alpha over alpha (paper, figures 5 and 12): above a panel an algorithm, below a panel a k_int."""
-    by_cell = cells(_robots_runs(rows, robot, split))
+    by_cell = cells(run_means(where(rows, robot=robot), split))
     looks = style.Looks(by_cell)
     wide = max(len(looks.algorithms), len(looks.k_ints))
     figure, grid = panels((2.9 * wide, 6.0), 2, wide, sharex=True, sharey=True)
@@ -104,7 +100,7 @@ def ins_over_alpha(rows: pa.Table, robot: str, split: str | None) -> Figure:
 
 def efficiency_plane(rows: pa.Table, robot: str, split: str | None) -> Figure:
     """Draw path against effort efficiency of each cell (paper, figures 6 and 11), before those who never learned."""
-    means = _robots_runs(rows, robot, split)
+    means = run_means(where(rows, robot=robot), split)
     looks = style.Looks(cells(means))
     figure, ((axis,),) = panels((5.6, 4.9))
     for algorithm in looks.algorithms:
@@ -235,7 +231,10 @@ def _baselines(axis: Axes, rows: pa.Table, robot: str, split: str | None) -> Non
         part = where(rows, policy=name)
         places[name] = tuple(float(part[x].to_numpy().mean()) for x in ("path_efficiency", "effort_efficiency"))
     line = [(float(name.partition(":")[2]), *place) for name, place in places.items() if name.startswith("namo:")]
-    low, high = _drawn(axis, [place[1:] for place in line])
+    drawn = [*(np.asarray(line.get_xydata(), float) for line in axis.lines), np.reshape([p[1:] for p in line], (-1, 2))]
+    drawn = np.concatenate(drawn)
+    drawn = drawn[np.isfinite(drawn).all(1)]
+    low, high = drawn.min(0), drawn.max(0)
     reach = np.maximum(high - low, 0.1)
     far, named = [], []
     for name, place in places.items():
@@ -271,15 +270,6 @@ def _gathered(
         else:
             groups.append([(label, place)])
     return [(", ".join(sorted(label for label, _ in g)), min((p for _, p in g), key=lambda p: p[1])) for g in groups]
-
-
-def _drawn(axis: Axes, places: Sequence[tuple[float, ...]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and the greatest corner of what an axis shows, with some more places."""
-    drawn = np.concatenate(
-        [*(np.asarray(line.get_xydata(), float) for line in axis.lines), np.reshape(places, (-1, 2))]
-    )
-    drawn = drawn[np.isfinite(drawn).all(1)]
-    return drawn.min(0), drawn.max(0)
 
 
 def _finish_plane(*axes: Axes) -> float:

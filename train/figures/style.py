@@ -24,8 +24,7 @@ Cell = tuple[str, str, float]
 def look(kind: dict[str, tuple[str, str]], name: str, among: list[str]) -> dict[str, Any]:
     """Return the colour and marker of an algorithm or robot; one that has none gets a spare one."""
     others = [other for other in among if other not in kind]
-    colour, marker = kind[name] if name in kind else SPARE[others.index(name) % len(SPARE)]
-    return {"color": colour, "marker": marker}
+    return dict(zip(("color", "marker"), kind.get(name) or SPARE[others.index(name) % len(SPARE)], strict=True))
 
 
 def in_order(algorithms: set[str]) -> list[str]:

@@ -15,8 +15,6 @@ from train.scoring.statistics import Finding, cells, claims, learned_rows, objec
 SPLITS = {"train": "seen", "test": "unseen"}
 COLUMNS = ("success", "P_eff = SPL = INS_1", "E_eff = INS_0", "INS_0.5")
 NAMES = ("success", "path_efficiency", "effort_efficiency", "ins_0.5")
-MOVED = ("touched", "displacement_m")
-"""Of `by_category`, the sums that are shown per object."""
 
 
 def score_cells(rows: pa.Table) -> str:
@@ -100,13 +98,11 @@ def category_lines(rows: pa.Table, split: str | None) -> str:
     policies = sorted({of for _, of, _ in moved}, key=lambda of: (not of.startswith("k_int"), of))
     lines = []
     for robot, category in sorted({key[::2] for key in moved}):
-        shown = []
-        for of in policies:
-            if sums := moved.get((robot, of, category)):
-                share, moved_m = (sums[name] / sums["objects"] for name in MOVED)
-                shown.append(f"{share:.1%}, {100 * moved_m:.1f}")
-            else:
-                shown.append("-")
+        each = (moved.get((robot, of, category)) for of in policies)
+        shown = (
+            f"{s['touched'] / s['objects']:.1%}, {100 * s['displacement_m'] / s['objects']:.1f}" if s else "-"
+            for s in each
+        )
         lines.append((style.robot_name(robot), category.replace("_", " "), *shown))
     return markdown(("robot", "category", *policies), lines) if lines else ""
 

@@ -1,4 +1,16 @@
-"""Share what actor-critic learners have in common: networks, first parameters, and a step down both losses."""
+"""Define the off-policy actor-critics: what they share, SAC with Brax's losses, and DDPG in the same shape.
+
+Soft actor-critic (Haarnoja et al. 2018, arXiv:1812.05905) has Brax's losses, optimisers and order of steps: a test
+compares the parameters after a gradient step with Brax's arithmetic. What differs is in `train.learners.offpolicy`: one
+device, a compact replay, images, resuming.
+
+Deep deterministic policy gradient (Lillicrap et al. 2016, arXiv:1509.02971) is as the original benchmark has it: Huber
+loss, target networks of policy and critic, Ornstein-Uhlenbeck noise (reference benchmark, section 8.2). Several
+critics with the least of them as target (Fujimoto et al. 2018, arXiv:1802.09477) are an option.
+
+Time limits: the critics' losses leave out a step with `truncation` = 1, because its next state is unknown (the
+environment shows a new episode's observation); it says nothing about the step's value, so nothing is learned from it.
+"""
 
 import abc
 import dataclasses
@@ -9,12 +21,13 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import optax
-from brax.training import gradients, types
+from brax.training import distribution, gradients, types
 from brax.training import networks as brax_networks
 from brax.training.acme import running_statistics
+from brax.training.agents.sac import losses as sac_losses
 from brax.training.agents.sac import networks as sac_networks
 
-from train.config import OffPolicyConfig, TrainConfig
+from train.config import DDPGConfig, OffPolicyConfig, SACConfig, TrainConfig
 from train.learners import networks
 from train.learners.networks import ObservationSize
 
@@ -51,15 +64,15 @@ class ActorCritic(abc.ABC):
     def of(cls, env: Any, config: TrainConfig) -> Self:
         """Build networks for an environment's observations and actions; with images the critics share an encoder."""
         c, network, size = getattr(config, config.algorithm), config.network, env.observation_size
-        distribution = cls.distribution(env.action_size)
-        outputs, critics = distribution.param_size if distribution else env.action_size, getattr(c, "num_critics", 2)
+        actions = cls.distribution(env.action_size)
+        outputs, critics = actions.param_size if actions else env.action_size, getattr(c, "num_critics", 2)
         prepare: Any = networks.preprocess(c.normalize_observations)
         layers, q_layers, norm = c.policy_hidden_layer_sizes, c.q_hidden_layer_sizes, c.q_layer_norm
         if isinstance(size, Mapping):
             images, head = network.critic_inputs == "all", networks.Head(layers, outputs)
             q_head = networks.TwinHead(q_layers, network.action_features, critics, norm)
-            policy = networks.make_split(network, size, True, prepare, head).whole()
-            q = networks.make_split(network, size, images, prepare, q_head, env.action_size).whole()
+            policy = networks.make_split(network, size, True, prepare, head)
+            q = networks.make_split(network, size, images, prepare, q_head, env.action_size)
         else:
             policy = brax_networks.make_policy_network(
                 outputs, size, preprocess_observations_fn=prepare, hidden_layer_sizes=layers
@@ -67,7 +80,7 @@ class ActorCritic(abc.ABC):
             q = brax_networks.make_q_network(
                 size, env.action_size, prepare, hidden_layer_sizes=q_layers, n_critics=critics, layer_norm=norm
             )
-        both = sac_networks.SACNetworks(policy, q, distribution)  # type: ignore[call-arg]
+        both = sac_networks.SACNetworks(policy, q, actions)  # type: ignore[call-arg]
         shared = network.share_encoder and isinstance(size, Mapping)
         return cls(config.algorithm, c, both, size, env.action_size, shared)
 
@@ -140,11 +153,7 @@ class ActorCritic(abc.ABC):
         """Step critics and policy, each from the other's parameters before the step.
 
         The actor's loss is (whole policy's parameters, normalizer_params, q_params, *actor_inputs) -> (); a shared
-        encoder does not move with it.
-
-        Returns:
-            The learner's fields that change, without its targets; scalar metrics, with the mean value of the
-            transitions' actions.
+        encoder does not move with it. Return the learner's fields that change, without its targets, and scalar metrics.
         """
 
         def policy_loss(policy_params: Any, q_params: Any, *rest: Any) -> jax.Array:
@@ -187,3 +196,199 @@ def descend(loss: Callable[..., jax.Array], optimizer: optax.GradientTransformat
 def soft_update(target: Any, online: Any, tau: float | jax.Array) -> Any:
     """Move targets by `tau` towards the networks they follow, written as Brax writes it."""
     return jax.tree.map(lambda x, y: x * (1 - tau) + y * tau, target, online)
+
+
+@flax.struct.dataclass
+class SACState(ActorCriticState):
+    """Adds the temperature."""
+
+    alpha_optimizer_state: optax.OptState
+    alpha_params: jax.Array
+    """() logarithm of the temperature."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SAC(ActorCritic):
+    """Holds all that learning does not change."""
+
+    config: SACConfig
+
+    @staticmethod
+    def distribution(action_size: int) -> Any:
+        return distribution.NormalTanhDistribution(event_size=action_size)
+
+    @property
+    def optimizers(self) -> tuple[optax.GradientTransformation, ...]:
+        """Return the optimizers of policy, critics and temperature."""
+        c = self.config
+        return tuple(map(optax.adam, (c.actor_learning_rate, c.critic_learning_rate, c.alpha_learning_rate)))
+
+    def init(self, key_networks: jax.Array, key: jax.Array) -> SACState:
+        """Return a new learner."""
+        log_alpha = jnp.log(jnp.float32(self.config.initial_alpha))
+        return SACState(
+            **self.first_fields(key_networks),
+            alpha_optimizer_state=self.optimizers[2].init(log_alpha),
+            alpha_params=log_alpha,
+            key=key,
+        )
+
+    def policy(self, learner: SACState, deterministic: bool) -> types.Policy:
+        """Return (observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
+        params = self.whole_policy(learner.policy_params, learner.q_params)
+        return sac_networks.make_inference_fn(self.networks)((learner.normalizer_params, params), deterministic)
+
+    def init_noise(self) -> tuple[()]:
+        """Return nothing: the policy is random itself."""
+        return ()
+
+    def explore(
+        self, learner: SACState, observation: Any, noise: tuple[()], key: jax.Array
+    ) -> tuple[jax.Array, tuple[()]]:
+        """Return actions drawn from the policy."""
+        return self.policy(learner, deterministic=False)(observation, key)[0], noise
+
+    def gradient_step(
+        self, learner: SACState, transitions: types.Transition, key: jax.Array
+    ) -> tuple[SACState, dict[str, jax.Array]]:
+        """Step temperature, critics, policy and targets, as Brax does, with keys split in the same places."""
+        alpha_loss, critic_loss, actor_loss = self.losses()
+        _, key_alpha, key_critic, key_actor = jax.random.split(key, 4)
+        acting_policy = self.whole_policy(learner.policy_params, learner.q_params)
+        normalizer, alpha = learner.normalizer_params, jnp.exp(learner.alpha_params)
+        inputs = acting_policy, normalizer, transitions, key_alpha
+        alpha_loss_value, alpha_params, alpha_optimizer_state = descend(alpha_loss, self.optimizers[2])(
+            learner.alpha_params, *inputs, optimizer_state=learner.alpha_optimizer_state
+        )
+        changed, metrics = self.descended(
+            learner,
+            critic_loss,
+            (acting_policy, normalizer, learner.target_q_params, alpha, transitions, key_critic),
+            actor_loss,
+            (alpha, transitions, key_actor),
+            transitions,
+        )
+        return learner.replace(  # type: ignore[attr-defined]
+            **changed,
+            target_q_params=soft_update(learner.target_q_params, changed["q_params"], self.config.tau),
+            alpha_optimizer_state=alpha_optimizer_state,
+            alpha_params=alpha_params,
+        ), {**metrics, "alpha_loss": alpha_loss_value, "alpha": jnp.exp(alpha_params)}
+
+    def losses(self) -> tuple[Any, Any, Any]:
+        """Return Brax's losses of temperature, critics and policy."""
+        c = self.config
+        # Brax aims at the entropy -0.5 * action_size and reads action_size for nothing else.
+        stand_in: Any = -2.0 * c.target_entropy_per_action * self.action_size
+        return sac_losses.make_losses(self.networks, c.reward_scaling, c.discounting, action_size=stand_in)
+
+
+def action_of(
+    both: sac_networks.SACNetworks, normalizer_params: Any, policy_params: Any, observation: Any
+) -> jax.Array:
+    """Return the policy's actions [..., A] in [-1, 1]."""
+    return jnp.tanh(both.policy_network.apply(normalizer_params, policy_params, observation))
+
+
+@flax.struct.dataclass
+class DDPGState(ActorCriticState):
+    """Adds a target of the policy."""
+
+    target_policy_params: Any
+
+
+def ddpg_losses(both: sac_networks.SACNetworks, reward_scaling: float, discounting: float) -> tuple[Any, Any]:
+    """Return the losses of critic and policy, with arguments in Brax's order."""
+
+    def critic_loss(
+        q_params: Any,
+        target_policy_params: Any,
+        normalizer_params: Any,
+        target_q_params: Any,
+        transitions: types.Transition,
+    ) -> jax.Array:
+        q_old_action = both.q_network.apply(normalizer_params, q_params, transitions.observation, transitions.action)
+        next_action = action_of(both, normalizer_params, target_policy_params, transitions.next_observation)
+        next_q = both.q_network.apply(normalizer_params, target_q_params, transitions.next_observation, next_action)
+        target_q = jax.lax.stop_gradient(
+            transitions.reward * reward_scaling + transitions.discount * discounting * jnp.min(next_q, axis=-1)
+        )
+        extras: Any = transitions.extras
+        truncation = extras["state_extras"]["truncation"]
+        q_error = (q_old_action - target_q[..., None]) * (1.0 - truncation)[..., None]
+        return jnp.mean(optax.losses.huber_loss(q_error))
+
+    def actor_loss(
+        policy_params: Any, normalizer_params: Any, q_params: Any, transitions: types.Transition
+    ) -> jax.Array:
+        action = action_of(both, normalizer_params, policy_params, transitions.observation)
+        q = both.q_network.apply(normalizer_params, q_params, transitions.observation, action)
+        return -jnp.mean(q[..., 0])
+
+    return critic_loss, actor_loss
+
+
+@dataclasses.dataclass(frozen=True)
+class DDPG(ActorCritic):
+    """Holds all that learning does not change."""
+
+    config: DDPGConfig
+
+    @property
+    def optimizers(self) -> tuple[optax.GradientTransformation, ...]:
+        """Return the optimizers of policy and critic."""
+        return optax.adam(self.config.actor_learning_rate), optax.adam(self.config.critic_learning_rate)
+
+    def init(self, key_networks: jax.Array, key: jax.Array) -> DDPGState:
+        """Return a new learner."""
+        common = self.first_fields(key_networks)
+        return DDPGState(**common, target_policy_params=common["policy_params"], key=key)
+
+    def policy(self, learner: DDPGState, deterministic: bool = True) -> types.Policy:
+        """Return (observation [N, ...], key) -> (action [N, A] in [-1, 1], extras), which is never random."""
+        del deterministic
+        params = self.whole_policy(learner.policy_params, learner.q_params)
+
+        def act(observation: Any, key: jax.Array) -> tuple[jax.Array, dict[str, Any]]:
+            del key
+            return action_of(self.networks, learner.normalizer_params, params, observation), {}
+
+        return act
+
+    def init_noise(self) -> jax.Array:
+        """Return zeros [envs, A]."""
+        return jnp.zeros((self.config.num_envs or 1, self.action_size))
+
+    def explore(
+        self, learner: DDPGState, observation: Any, noise: jax.Array, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return the policy's actions with noise added, clipped to [-1, 1]."""
+        c = self.config
+        sd = jnp.linspace(c.noise_sd[0], c.noise_sd[-1], noise.shape[0])[:, None]
+        kept = 1.0 - c.noise_damping if c.noise == "ou" else 0.0
+        noise = kept * noise + sd * jax.random.normal(key, noise.shape)
+        action, _ = self.policy(learner)(observation, key)
+        return jnp.clip(action + noise, -1.0, 1.0), noise
+
+    def gradient_step(
+        self, learner: DDPGState, transitions: types.Transition, key: jax.Array
+    ) -> tuple[DDPGState, dict[str, jax.Array]]:
+        """Step critic and policy, and the targets when they are due."""
+        del key  # nothing is drawn
+        c = self.config
+        critic_loss, actor_loss = ddpg_losses(self.networks, c.reward_scaling, c.discounting)
+        acting = self.whole_policy(learner.target_policy_params, learner.target_q_params)
+        changed, metrics = self.descended(
+            learner,
+            critic_loss,
+            (acting, learner.normalizer_params, learner.target_q_params, transitions),
+            actor_loss,
+            (transitions,),
+            transitions,
+        )
+        tau = jnp.where(changed["gradient_steps"] % c.target_update_period == 0, c.tau, 0.0)
+        return learner.replace(  # type: ignore[attr-defined]
+            **changed,
+            target_policy_params=soft_update(learner.target_policy_params, changed["policy_params"], tau),
+            target_q_params=soft_update(learner.target_q_params, changed["q_params"], tau),
+        ), metrics

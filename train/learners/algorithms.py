@@ -10,7 +10,8 @@ from brax.envs import Env
 from brax.training import types
 
 from train.config import TrainConfig
-from train.learners import actor_critic, ddpg, offpolicy, ppo, sac
+from train.learners import offpolicy, ppo
+from train.learners.actor_critic import DDPG, SAC, policy_part
 from train.learners.learner import Callbacks, Snapshot, TrainResult, Update, reset_envs, run_loop
 
 
@@ -54,6 +55,6 @@ class Algorithm:
 
 ALGORITHMS = {
     "ppo": Algorithm(ppo.make_agent, ppo.start, ppo.update, ppo.policy_part),
-    "sac": Algorithm(sac.SAC.of, offpolicy.start, offpolicy.update, actor_critic.policy_part),
-    "ddpg": Algorithm(ddpg.DDPG.of, offpolicy.start, offpolicy.update, actor_critic.policy_part),
+    "sac": Algorithm(SAC.of, offpolicy.start, offpolicy.update, policy_part),
+    "ddpg": Algorithm(DDPG.of, offpolicy.start, offpolicy.update, policy_part),
 }

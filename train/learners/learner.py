@@ -55,7 +55,6 @@ class Callbacks(Protocol):
 
     def restore(self, template: Snapshot) -> Snapshot | None:
         """Return the snapshot to continue from, shaped like `template`; None to begin."""
-        ...
 
     def should_stop(self) -> bool:
         """Return whether to stop, between updates: True saves a checkpoint and ends the loop."""
@@ -63,19 +62,15 @@ class Callbacks(Protocol):
 
     def on_start(self, snapshot: Snapshot, total_steps: int) -> None:
         """Receive the state to begin from and the steps to reach, before anything is compiled."""
-        ...
 
     def on_update(self, env_steps: int) -> None:
         """Receive the steps after each update; must be cheap."""
-        ...
 
     def on_log(self, env_steps: int, metrics: dict[str, float]) -> None:
         """Receive the means of a log interval."""
-        ...
 
     def on_checkpoint(self, snapshot: Snapshot) -> None:
         """Receive a snapshot to keep; its arrays may be overwritten once this returns."""
-        ...
 
     def on_diverged(self, before: Snapshot, update: Update) -> str:
         """Save the state before the update that blew up, and that update; return where they were saved."""
@@ -175,14 +170,9 @@ def interval_metrics(updates: list[Update]) -> dict[str, float]:
 
 
 def episode_sums(info: dict[str, Any]) -> dict[str, jax.Array]:
-    """Return sums over the episodes that ended, from an auto-resetting environment's `info`.
+    """Return scalar sums over the episodes that ended, and `episodes`, their number, from an environment's `info`.
 
-    Args:
-        info: `episode_done` [...] and `episode_metrics` {name: [...]}; scores count where an episode ended,
-            and what stands elsewhere (even NaN) does not.
-
-    Returns:
-        name -> scalar sum, and `episodes` -> number of episodes.
+    Of `episode_metrics` {name: [...]} those values count where `episode_done` [...] is set, not even NaN elsewhere.
     """
     ended = info["episode_done"] > 0
     sums = {name: jnp.sum(jnp.where(ended, value, 0.0)) for name, value in info["episode_metrics"].items()}

@@ -46,12 +46,9 @@ def vector_part(observation: Any) -> Any:
 
 def init_normalizer(size: ObservationSize) -> running_statistics.RunningStatisticsState:
     """Return the running mean and deviation of the vector part before any observation."""
-    shapes: Any = {name: tuple(shape) for name, shape in size.items()} if isinstance(size, Mapping) else (size,)
-    if isinstance(shapes, dict):
-        arrays: Any = {name: specs.Array(shape, jnp.dtype("float32")) for name, shape in vector_part(shapes).items()}
-    else:
-        arrays = specs.Array(shapes, jnp.dtype("float32"))
-    return running_statistics.init_state(arrays)
+    sizes = vector_part(size) if isinstance(size, Mapping) else {"": (size,)}
+    arrays: Any = {name: specs.Array(tuple(shape), jnp.dtype("float32")) for name, shape in sizes.items()}
+    return running_statistics.init_state(arrays if isinstance(size, Mapping) else arrays[""])
 
 
 def update_normalizer(
@@ -197,44 +194,14 @@ def check_image_size(config: NetworkConfig, size: ObservationSize) -> None:
             )
 
 
-def make_encoder(
-    config: NetworkConfig, size: ObservationSize, images: bool, prepare: Callable[[Any, Any], Any]
-) -> FeedForwardNetwork:
-    """Build what comes before a head: init(key), apply(normalizer, params, observation) -> features [..., F]."""
-    assert isinstance(size, Mapping)
-    check_image_size(config, size)
-    if not images and "state" not in size:
-        raise ConfigError(
-            "network.critic_inputs is 'state', but the observation holds images only; expected 'all', or "
-            "observations with a vector (env.observations=waypoints,goal,velocity,depth,...)"
-        )
-    module, zeros = Encoder(config, images), {name: jnp.zeros((1, *shape)) for name, shape in size.items()}
-    return FeedForwardNetwork(
-        init=jax.jit(lambda key: module.init(key, zeros)),  # as one program, not one for each operation
-        apply=lambda statistics, params, observation: module.apply(params, prepare(observation, statistics)),
-    )
-
-
-@dataclasses.dataclass(frozen=True)
-class Split:
-    """Build a network in two parts: parameters `{"encoder": ..., "head": ...}`."""
+@dataclasses.dataclass
+class Split(FeedForwardNetwork):
+    """A network in two parts, with parameters `{"encoder": ..., "head": ...}`."""
 
     encoder: FeedForwardNetwork
+    """init(key), apply(normalizer, params, observation) -> features [..., F]."""
     head: FeedForwardNetwork
     """init(key), apply(None, params, features, *action)."""
-
-    def whole(self) -> FeedForwardNetwork:
-        """Return both parts as one network of observations."""
-
-        def init(key: jax.Array) -> dict[str, Any]:
-            key_encoder, key_head = jax.random.split(key)
-            return {"encoder": self.encoder.init(key_encoder), "head": self.head.init(key_head)}
-
-        def apply(statistics: Any, params: Any, observation: Any, *action: jax.Array) -> jax.Array:
-            features = self.encoder.apply(statistics, params["encoder"], observation)
-            return self.head.apply(None, params["head"], features, *action)
-
-        return FeedForwardNetwork(init=init, apply=apply)
 
 
 def make_split(
@@ -248,26 +215,35 @@ def make_split(
 ) -> Split:
     """Build an encoder with a head behind it."""
     assert isinstance(size, Mapping)
-    encoder = make_encoder(config, size, images, prepare)
+    check_image_size(config, size)
+    if not images and "state" not in size:
+        raise ConfigError(
+            "network.critic_inputs is 'state', but the observation holds images only; expected 'all', or "
+            "observations with a vector (env.observations=waypoints,goal,velocity,depth,...)"
+        )
+    module, zeros = Encoder(config, images), {name: jnp.zeros((1, *shape)) for name, shape in size.items()}
     features = jnp.zeros((1, images * config.image_features + ("state" in size) * config.state_features))
-    action = (jnp.zeros((1, action_size)),) if action_size else ()
+    inputs = (features, jnp.zeros((1, action_size))) if action_size else (features,)
 
-    def apply(_: Any, params: Any, features: jax.Array, *action: jax.Array) -> jax.Array:
+    def encode(statistics: Any, params: Any, observation: Any) -> Any:
+        return module.apply(params, prepare(observation, statistics))
+
+    def decide(_: Any, params: Any, features: jax.Array, *action: jax.Array) -> jax.Array:
         out = head.apply(params, features, *action)
         assert isinstance(out, jax.Array)
         return out[..., 0] if squeeze else out
 
-    return Split(encoder, FeedForwardNetwork(init=jax.jit(lambda key: head.init(key, features, *action)), apply=apply))
+    # Each init as one program, not one for each operation.
+    init_encoder, init_head = jax.jit(lambda key: module.init(key, zeros)), jax.jit(lambda key: head.init(key, *inputs))
 
+    def init(key: jax.Array) -> dict[str, Any]:
+        key_encoder, key_head = jax.random.split(key)
+        return {"encoder": init_encoder(key_encoder), "head": init_head(key_head)}
 
-@dataclasses.dataclass(frozen=True)
-class PpoNetworks:
-    """A policy and a value network, and their parts where there are any."""
+    def apply(statistics: Any, params: Any, observation: Any, *action: jax.Array) -> jax.Array:
+        return decide(None, params["head"], encode(statistics, params["encoder"], observation), *action)
 
-    networks: ppo_networks.PPONetworks
-    """As Brax takes them."""
-    policy: Split | None = None
-    value: Split | None = None
+    return Split(init, apply, FeedForwardNetwork(init_encoder, encode), FeedForwardNetwork(init_head, decide))
 
 
 def make_ppo_networks(
@@ -277,23 +253,19 @@ def make_ppo_networks(
     policy_sizes: Sequence[int],
     value_sizes: Sequence[int],
     normalize_observations: bool,
-) -> PpoNetworks:
-    """Build the policy (mean and deviation of a Gaussian before tanh) and the value network."""
+) -> ppo_networks.PPONetworks:
+    """Build the policy (mean and deviation of a Gaussian before tanh) and the value network, of images as `Split`s."""
     prepare = preprocess(normalize_observations)
     if not isinstance(size, Mapping):
-        plain = ppo_networks.make_ppo_networks(
+        return ppo_networks.make_ppo_networks(
             size,
             action_size,
             preprocess_observations_fn=prepare,  # type: ignore[arg-type]
             policy_hidden_layer_sizes=policy_sizes,
             value_hidden_layer_sizes=value_sizes,
         )
-        return PpoNetworks(plain)
     actions = distribution.NormalTanhDistribution(event_size=action_size)
     policy = make_split(config, size, True, prepare, Head(policy_sizes, actions.param_size))
-    critic_sees = config.critic_inputs == "all"
-    value = make_split(
-        config, size, critic_sees, prepare, Head(value_sizes, 1, output_init=critic_output_init), squeeze=True
-    )
-    networks = ppo_networks.PPONetworks(policy.whole(), value.whole(), actions)  # type: ignore[call-arg]
-    return PpoNetworks(networks, policy, value)
+    value_head, images = Head(value_sizes, 1, output_init=critic_output_init), config.critic_inputs == "all"
+    value = make_split(config, size, images, prepare, value_head, squeeze=True)
+    return ppo_networks.PPONetworks(policy, value, actions)  # type: ignore[call-arg]

@@ -19,7 +19,6 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 from brax.envs import Env
-from brax.training import types
 
 from interactive_nav_common.errors import ConfigError
 from train.config import OffPolicyConfig
@@ -52,11 +51,10 @@ class OffPolicyData:
 def collect(
     agent: ActorCritic, env: Env, learner: Any, data: OffPolicyData, key: jax.Array
 ) -> tuple[OffPolicyData, Any]:
-    """Act for one update.
+    """Act for one update: take `steps_per_update` steps of every environment into the replay.
 
-    Returns:
-        The data with `steps_per_update` more steps of every environment in the replay; and those steps without their
-        images, leaves [steps, envs, ...], with `sums` over ended episodes.
+    Return the data after them, and those steps without their images, leaves [steps, envs, ...], with `sums` over ended
+    episodes.
     """
     assert agent.config.steps_per_update, "the config must be resolved"
     at_random = learner.gradient_steps == 0
@@ -92,17 +90,14 @@ def learn(
 ) -> tuple[Any, dict[str, jax.Array], Any]:
     """Take gradient steps, if the replay is full enough.
 
-    Returns:
-        The learner; means of its metrics, 0 where no step was taken; and one batch learned from, the first that
-        metrics were not finite on if there is such a one.
+    Return the learner; means of its metrics, 0 where no step was taken; and one batch learned from, the first that
+    metrics were not finite on if there is one.
     """
     c = agent.config
     assert c.grad_steps_per_update and c.batch_size and c.min_replay_size, "the config must be resolved"
     keys = jax.random.split(key, c.grad_steps_per_update)
-
-    def draw(key: jax.Array) -> types.Transition:
-        assert c.batch_size
-        return replay_buffer.sample(replay, key, c.batch_size, c.n_steps, c.discounting)
+    settings = {"batch_size": c.batch_size, "n_steps": c.n_steps, "discounting": c.discounting}
+    draw = functools.partial(replay_buffer.sample, replay, **settings)
 
     def one(learner: Any, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
         key_draw, key_step = jax.random.split(key)

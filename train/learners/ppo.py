@@ -61,7 +61,7 @@ class PPOParts:
     """Holds all that learning does not change."""
 
     config: PPOConfig
-    nets: nets.PpoNetworks
+    nets: ppo_networks.PPONetworks
     optimizer: optax.GradientTransformation
     observation_size: ObservationSize
     shared: bool = False
@@ -77,8 +77,8 @@ class PPOParts:
     def init(self, key_networks: jax.Array, key: jax.Array) -> PPOState:
         """Return a new learner; `key` is what its updates will draw from."""
         key_policy, key_value = jax.random.split(key_networks)
-        policy = self.nets.networks.policy_network.init(key_policy)  # type: ignore[call-arg]
-        value = self.nets.networks.value_network.init(key_value)  # type: ignore[call-arg]
+        policy = self.nets.policy_network.init(key_policy)  # type: ignore[call-arg]
+        value = self.nets.value_network.init(key_value)  # type: ignore[call-arg]
         if self.shared:
             params: Any = SharedParams(encoder=policy["encoder"], policy=policy["head"], value=value["head"])
         else:
@@ -92,26 +92,20 @@ class PPOParts:
 
     def policy(self, learner: PPOState, deterministic: bool) -> types.Policy:
         """Return (observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
-        make = ppo_networks.make_inference_fn(self.nets.networks)
+        make = ppo_networks.make_inference_fn(self.nets)
         return make((learner.normalizer_params, *whole_params(learner.params)), deterministic)
 
 
 def make_agent(env: Any, config: TrainConfig) -> PPOParts:
     """Build networks and optimiser for an environment's observations and actions."""
     network, size, c = config.network, env.observation_size, config.ppo
-    built = nets.make_ppo_networks(
-        network,
-        size,
-        env.action_size,
-        c.policy_hidden_layer_sizes,
-        c.value_hidden_layer_sizes,
-        c.normalize_observations,
-    )
+    layers = c.policy_hidden_layer_sizes, c.value_hidden_layer_sizes
+    built = nets.make_ppo_networks(network, size, env.action_size, *layers, c.normalize_observations)
     adam = optax.adam(c.learning_rate)
     if c.learning_rate_schedule == "adaptive_kl":
         adam = optax.inject_hyperparams(optax.adam)(learning_rate=c.learning_rate)
     optimizer = optax.chain(optax.clip_by_global_norm(c.max_grad_norm), adam)
-    return PPOParts(c, built, optimizer, size, network.share_encoder and built.policy is not None)
+    return PPOParts(c, built, optimizer, size, network.share_encoder and isinstance(size, Mapping))
 
 
 def policy_part(learner: Mapping[str, Any]) -> dict[str, Any]:
@@ -123,10 +117,7 @@ def policy_part(learner: Mapping[str, Any]) -> dict[str, Any]:
 def whole_params(params: ppo_losses.PPONetworkParams | SharedParams) -> tuple[Any, Any]:
     """Return the parameters of the policy and the value network as `PPOParts.networks` take them."""
     if isinstance(params, SharedParams):
-        return (
-            {"encoder": params.encoder, "head": params.policy},
-            {"encoder": params.encoder, "head": params.value},
-        )
+        return {"encoder": params.encoder, "head": params.policy}, {"encoder": params.encoder, "head": params.value}
     return params.policy, params.value
 
 
@@ -135,8 +126,7 @@ def collect(
 ) -> tuple[Any, types.Transition, dict[str, jax.Array]]:
     """Act for one update.
 
-    Returns:
-        The environments' new state; transitions with leaves [sequences, time, ...]; sums over ended episodes.
+    Return the environments' new state, transitions with leaves [sequences, time, ...], and sums over ended episodes.
     """
     act, config = parts.policy(state, deterministic=False), parts.config
     assert config.batch_size and config.num_minibatches and config.num_envs
@@ -155,10 +145,7 @@ def collect(
         extras: Any = data.extras["state_extras"]  # type: ignore[call-overload,index]
         sums = episode_sums(extras)
         data = data._replace(
-            extras={
-                "policy_extras": data.extras["policy_extras"],
-                "state_extras": {"truncation": extras["truncation"]},
-            },
+            extras={**data.extras, "state_extras": {"truncation": extras["truncation"]}},  # type: ignore[dict-item]
             next_observation=jax.tree.map(lambda x: x[-1:], data.next_observation),
         )
         return (env_state, next_key), (data, sums)
@@ -170,27 +157,20 @@ def collect(
     return env_state, data, jax.tree.map(jnp.sum, sums)
 
 
-def _heads(parts: PPOParts) -> ppo_networks.PPONetworks:
-    assert parts.nets.policy and parts.nets.value
-    return parts.nets.networks.replace(policy_network=parts.nets.policy.head, value_network=parts.nets.value.head)
-
-
 def shared_loss(
+    both: ppo_networks.PPONetworks,
     params: SharedParams,
     normalizer_params: Any,
     data: types.Transition,
     key: jax.Array,
-    *,
-    encode: Any,
     **settings: Any,
 ) -> tuple[jax.Array, types.Metrics]:
     """Return Brax's loss of the two heads, on features that are computed once."""
-    data = data._replace(
-        observation=encode(normalizer_params, params.encoder, data.observation),
-        next_observation=encode(normalizer_params, params.encoder, data.next_observation),
-    )
+    encode = functools.partial(both.policy_network.encoder.apply, normalizer_params, params.encoder)  # type: ignore
+    data = data._replace(observation=encode(data.observation), next_observation=encode(data.next_observation))
     heads = ppo_losses.PPONetworkParams(policy=params.policy, value=params.value)  # type: ignore[call-arg]
-    return ppo_losses.compute_ppo_loss(heads, None, data, key, **settings)
+    of_heads: Any = both.replace(policy_network=both.policy_network.head, value_network=both.value_network.head)
+    return ppo_losses.compute_ppo_loss(heads, None, data, key, ppo_network=of_heads, **settings)
 
 
 def minibatch_step(
@@ -200,10 +180,9 @@ def minibatch_step(
     optimizer_state, params, key = carry
     key, key_loss = jax.random.split(key)
     config = parts.config
+    whole_loss = functools.partial(ppo_losses.compute_ppo_loss, ppo_network=parts.nets)
     loss_fn = functools.partial(
-        shared_loss if parts.shared else ppo_losses.compute_ppo_loss,
-        ppo_network=_heads(parts) if parts.shared else parts.nets.networks,
-        **({"encode": parts.nets.policy.encoder.apply} if parts.shared and parts.nets.policy else {}),
+        functools.partial(shared_loss, parts.nets) if parts.shared else whole_loss,
         entropy_cost=config.entropy_cost,
         discounting=config.discounting,
         reward_scaling=config.reward_scaling,
@@ -222,11 +201,7 @@ def minibatch_step(
         rate = jnp.asarray(config.learning_rate)
     updates, optimizer_state = parts.optimizer.update(grads, optimizer_state)
     params = optax.apply_updates(params, updates)
-    return (optimizer_state, params, key), {
-        **losses,
-        "learning_rate": rate,
-        "grad_norm": optax.tree.norm(grads),
-    }
+    return (optimizer_state, params, key), {**losses, "learning_rate": rate, "grad_norm": optax.tree.norm(grads)}
 
 
 def sgd_pass(

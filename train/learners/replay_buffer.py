@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from brax.training import types
 
-from train.learners.networks import PIXELS
+from train.learners.networks import vector_part
 
 
 @flax.struct.dataclass
@@ -40,23 +40,10 @@ class ReplayBuffer:
 
 
 def init(slots: int, observation: Any, action_size: int, vector_dtype: str = "float32") -> ReplayBuffer:
-    """Return an empty ring.
-
-    Args:
-        observation: a batch of observations [envs, ...]; only shapes and types are read.
-        vector_dtype: how vectors are stored, float32 or float16.
-    """
-
-    def ring(name: str, x: jax.Array) -> jax.Array:
-        return jnp.zeros((slots, *x.shape), x.dtype if name.startswith(PIXELS) else vector_dtype)
-
-    if isinstance(observation, Mapping):
-        rings: Any = {name: ring(name, x) for name, x in observation.items()}
-    else:
-        rings = ring("", observation)
+    """Return an empty ring for observations shaped as [envs, ...], with vectors in float32 or float16."""
     envs = jax.tree.leaves(observation)[0].shape[0]
     return ReplayBuffer(
-        observation=rings,
+        observation=_cast(jax.tree.map(lambda x: jnp.zeros((slots, *x.shape), x.dtype), observation), vector_dtype),
         action=jnp.zeros((slots, envs, action_size)),
         reward=jnp.zeros((slots, envs)),
         done=jnp.zeros((slots, envs), bool),
@@ -86,15 +73,10 @@ def insert(
 ) -> ReplayBuffer:
     """Return the ring with one step of every environment in place of its oldest.
 
-    Args:
-        observation: [envs, ...] before the step.
-        action: [envs, A].
-        reward: [envs].
-        done: [envs], not 0 where the step ended an episode.
-        truncated: [envs], not 0 where the time limit did.
+    The observation [envs, ...] is that before the step, action is [envs, A], the others are [envs]: `done` is not 0
+    where the step ended an episode, `truncated` where the time limit did.
     """
-    at = replay.position
-    slots = replay.reward.shape[0]
+    at, slots = replay.position, replay.reward.shape[0]
 
     def write(ring: jax.Array, x: jax.Array) -> jax.Array:
         if ring.dtype == jnp.float16:  # beyond its range: its largest number, not infinity
@@ -118,19 +100,14 @@ def size(replay: ReplayBuffer) -> jax.Array:
 
 
 def sample(replay: ReplayBuffer, key: jax.Array, batch_size: int, n_steps: int, discounting: float) -> types.Transition:
-    """Draw transitions uniformly, with replacement, from all that have `n_steps` younger slots.
+    """Draw transitions [batch, ...] uniformly, with replacement, from all that have `n_steps` >= 1 younger slots.
 
     A transition covers `n_steps` steps, or fewer where the episode ends. For m steps of discount g it holds
     reward r_1 + g r_2 + ... + g^(m-1) r_m and discount g^(m-1), or 0 where the last one is a failure or success:
     Brax's losses multiply by the last g themselves. At a time limit there is no observation of what comes after
     (the next slot shows a new episode): a window that meets one ends before that step and bootstraps from the
-    observation there; a window that begins with it has truncation 1, and the losses leave it out, as Brax's do.
-
-    Args:
-        n_steps: at least 1.
-
-    Returns:
-        Leaves [batch, ...]; vectors f32, images as stored; `extras["state_extras"]["truncation"]`.
+    observation there; a window that begins with it has truncation 1, and the losses leave it out, as Brax's do. Vectors
+    are f32, images as stored.
     """
     slots, envs = replay.reward.shape
     key_age, key_env = jax.random.split(key)
@@ -148,7 +125,7 @@ def sample(replay: ReplayBuffer, key: jax.Array, batch_size: int, n_steps: int, 
     alive = ~jnp.any(counts & done, 1)
 
     def at(slot: jax.Array) -> Any:
-        return _as_learned_from(jax.tree.map(lambda ring: ring[slot % slots, env], replay.observation))
+        return _cast(jax.tree.map(lambda ring: ring[slot % slots, env], replay.observation), "float32")
 
     return types.Transition(  # type: ignore[call-arg]
         observation=at(first),
@@ -156,15 +133,11 @@ def sample(replay: ReplayBuffer, key: jax.Array, batch_size: int, n_steps: int, 
         reward=reward,
         discount=alive * jnp.float32(discounting) ** (length - 1),
         next_observation=at(first + length),
-        extras={
-            "policy_extras": {},
-            "state_extras": {"truncation": truncated[:, 0].astype(jnp.float32)},
-        },  # type: ignore[arg-type]
+        extras={"policy_extras": {}, "state_extras": {"truncation": truncated[:, 0].astype(jnp.float32)}},  # type: ignore
     )
 
 
-def _as_learned_from(observation: Any) -> Any:
-    """Return the observation with its vectors in f32 again."""
-    if not isinstance(observation, Mapping):
-        return observation.astype(jnp.float32)
-    return {name: x if name.startswith(PIXELS) else x.astype(jnp.float32) for name, x in observation.items()}
+def _cast(observation: Any, dtype: str) -> Any:
+    """Return the observation with its vectors in another type; images pass."""
+    vectors = jax.tree.map(lambda x: x.astype(dtype), vector_part(observation))
+    return {**observation, **vectors} if isinstance(observation, Mapping) else vectors

@@ -95,11 +95,7 @@ def list_checkpoints(root: Path) -> list[CheckpointMeta]:
 
 
 def verify(folder: Path) -> CheckpointMeta:
-    """Return what a checkpoint is of, if its files are those that were written.
-
-    Raises:
-        CheckpointError: a file is missing or differs from the digest in `meta.json`.
-    """
+    """Return what a checkpoint is of; raise where a file is missing or differs from the digest in `meta.json`."""
     meta = read_meta(folder)
     for name, digest in meta.sha256.items():
         path = folder / check_name(name, f"{folder / META}: a file", CheckpointError)
@@ -119,10 +115,7 @@ def best_checkpoint(checkpoints: list[CheckpointMeta]) -> CheckpointMeta | None:
 def find(root: Path, which: str) -> tuple[Path, CheckpointMeta]:
     """Return a checkpoint's folder by `best`, `last` or its env steps; while none has a score, the last is the best.
 
-    `best` and `last` pass over damaged checkpoints with a warning.
-
-    Raises:
-        CheckpointError: there is none, none is intact, or the one named by its steps is damaged.
+    `best` and `last` pass over damaged checkpoints with a warning; one named by its steps must be intact.
     """
     paths = [path for path in sorted(root.glob("[0-9]*")) if path.name.isdigit() and (path / META).exists()]
     if not paths:

@@ -22,7 +22,7 @@ from interactive_nav_common.config import flatten, replace
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import locked, write_json, writing
 from interactive_nav_common.records import mean_over_episodes
-from interactive_nav_common.runs.folder import GOES_ON, append_metrics, write_state
+from interactive_nav_common.runs.folder import append_metrics, write_state
 from interactive_nav_common.signals import stop_signals
 from interactive_nav_common.versions import versions
 from scenes_mjcf.sets import scene_folders
@@ -51,10 +51,8 @@ def config_to_play(
 ) -> TrainConfig:
     """Return a run's config with the environment to play in: the trained one, but for what a command line changes.
 
-    What a run learned on a GPU can be played without one: where its backend is not here, another one is taken.
-
-    Args:
-        scenes: folders or sets of scenes; None: those that it was trained on.
+    What a run learned on a GPU can be played without one: where its backend is not here, another one is taken. Scenes
+    are folders or sets; None: those that it was trained on.
     """
     if "env.backend=native" in words:
         # It simulates everything, and takes no sizes of windows; those that the run learned with do no harm.
@@ -91,8 +89,7 @@ class FolderCallbacks:
         self._wall_before_s = 0.0
         self._began_together = 0
         self._began = time.perf_counter()
-        self._events: tracking.Events | None = None
-        self._tracker: tracking.Tracker | None = None
+        self._logs: list[tracking.Events | tracking.Tracker] = []
 
     def _wall_s(self) -> float:
         return self._wall_before_s + time.perf_counter() - self._began
@@ -137,21 +134,18 @@ class FolderCallbacks:
             raise ConfigError(
                 f"run.best_metric is {self._config.run.best_metric!r}, expected one of {', '.join(sorted(available))}"
             )
-        one_mb = checkpoint.megabytes(snapshot.learner)
-        env_mb = checkpoint.megabytes(snapshot.env_state)
+        one_mb, env_mb = map(checkpoint.megabytes, (snapshot.learner, snapshot.env_state))
         env_mb = 2 * env_mb if env_mb <= self._config.run.env_state_limit_mb else 0.0
         claim(self._folder.path, one_mb * (self._config.run.keep_checkpoints + 2) + env_mb)
         self._folder.cut_metrics(snapshot.env_steps)
         if snapshot.env_steps < total_steps:
             self._folder.summary.unlink(missing_ok=True)  # of a shorter run, which this one goes on from
         if self._config.run.tensorboard:
-            with writing(self._folder.tensorboard, GOES_ON):
-                self._events = tracking.Events(self._folder.tensorboard, snapshot.env_steps)
-        note = getattr(snapshot.env_state, "note", "")
-        if note:
+            self._logs.append(tracking.Events(self._folder.tensorboard, snapshot.env_steps))
+        if note := getattr(snapshot.env_state, "note", ""):
             self._display.console.print(note, highlight=False, soft_wrap=True)
         if self._config.run.wandb:
-            self._tracker = tracking.Tracker(self._folder.path, self._config, versions())
+            self._logs.append(tracking.Tracker(self._folder.path, self._config, versions()))
         self._display.begin(snapshot.env_steps, total_steps)
 
     def on_update(self, env_steps: int) -> None:
@@ -161,11 +155,8 @@ class FolderCallbacks:
     def on_log(self, env_steps: int, metrics: dict[str, float]) -> None:
         """Write a line of metrics.jsonl and a TensorBoard point for each value; show a status on the console."""
         append_metrics(self._folder.path, {"env_steps": env_steps, "wall_s": round(self._wall_s(), 3), **metrics})
-        if self._events:
-            with writing(self._folder.tensorboard, GOES_ON):
-                self._events.log(env_steps, metrics)
-        if self._tracker:
-            self._tracker.log(env_steps, metrics)
+        for log in self._logs:
+            log.log(env_steps, metrics)
         self._display.log(env_steps, metrics)
 
     def on_checkpoint(self, snapshot: Snapshot) -> None:
@@ -205,11 +196,9 @@ class FolderCallbacks:
         return str(path)
 
     def close(self) -> None:
-        """Finish the event file."""
-        if self._events:
-            self._events.close()
-        if self._tracker:
-            self._tracker.close()
+        """Finish TensorBoard's event file and the run of Weights & Biases."""
+        for log in self._logs:
+            log.close()
 
 
 def check_fits(meta: CheckpointMeta, path: Path, config: EnvConfig, env: Any) -> None:
@@ -280,12 +269,10 @@ def _train_in(
         note = f"{each:,} steps for each environment, and an episode has up to {limit:,}: none that fails comes to its"
         console.print(f"{note} end; lower env.episode_steps or train longer", style="yellow", soft_wrap=True)
     with stop_signals() as stops, TrainingDisplay(console) as display:
-        callbacks = FolderCallbacks(folder, config, env, display, stops, resume_from)
-        try:
+        with contextlib.closing(FolderCallbacks(folder, config, env, display, stops, resume_from)) as callbacks:
             result = ALGORITHMS[config.algorithm].train(AutoResetEnv(env), config, callbacks)
-        finally:
-            callbacks.close()
-        metrics = result.metrics or last_metrics(folder)
+        last = (folder.read_metrics() or [{}])[-1]
+        metrics = result.metrics or {k: v for k, v in last.items() if k not in ("env_steps", "wall_s")}
         write_json(folder.summary, summary(config, folder, result, metrics))
     best = checkpoint.best_checkpoint(checkpoint.list_checkpoints(folder.checkpoints))
     console.print(
@@ -296,8 +283,7 @@ def _train_in(
         highlight=False,
         soft_wrap=True,
     )
-    lost = failures(folder)
-    if lost:
+    if lost := failures(folder):
         note = ", ".join(f"{name} {count:,.0f}" for name, count in lost.items())
         console.print(f"what physics lost, summed over ended episodes: {note}", style="yellow", soft_wrap=True)
     return result, folder, stops[0] if stops else None
@@ -308,18 +294,10 @@ def num_envs(config: TrainConfig) -> int:
     return getattr(config, config.algorithm).num_envs
 
 
-def last_metrics(folder: RunFolder) -> dict[str, Any]:
-    """Return the last logged line, without its step; empty if there is none."""
-    lines = folder.read_metrics()
-    return {k: v for k, v in lines[-1].items() if k not in ("env_steps", "wall_s")} if lines else {}
-
-
 def failures(folder: RunFolder) -> dict[str, float]:
     """Return the steps (episodes for `nonfinite`) in which physics failed, over all logged episodes, where not 0."""
-    lines = folder.read_metrics()
-    totals = {
-        name: sum(line.get(f"episode/{name}", 0.0) * line.get("episodes", 0) for line in lines) for name in FAILURES
-    }
+    lines, each = folder.read_metrics(), "episode/{}".format
+    totals = {name: sum(line.get(each(name), 0.0) * line.get("episodes", 0) for line in lines) for name in FAILURES}
     return {name: round(total, 3) for name, total in totals.items() if total > 0}
 
 

@@ -83,11 +83,7 @@ class RunFolder:
         return recorded_robot(self.robot)
 
     def open(self, config: TrainConfig) -> bool:
-        """Write config and versions of a new run, or check that an existing one is continued as it began.
-
-        Returns:
-            True where the run exists already.
-        """
+        """Write config and versions of a new run, or check that one that exists (True) is continued as it began."""
         from interactive_nav.robots.reference import identity, record_robot
 
         exists = self.config.is_file()

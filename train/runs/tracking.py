@@ -20,8 +20,9 @@ from tensorboardX.summary import scalar
 from interactive_nav.robots import robot_name
 from interactive_nav_common.config import flatten
 from interactive_nav_common.errors import ConfigError, missing, optional
-from interactive_nav_common.files import write_text
+from interactive_nav_common.files import write_text, writing
 from interactive_nav_common.jobs.progress import progress_bar
+from interactive_nav_common.runs.folder import GOES_ON
 from train.config import TrainConfig
 
 ID_FILE = "wandb_id"
@@ -39,19 +40,22 @@ class Events:
     """
 
     def __init__(self, folder: Path, env_steps: int):
-        folder.mkdir(parents=True, exist_ok=True)
-        self._file = RecordWriter(str(folder / f"events.out.tfevents.{time.time():.6f}"))
-        self._add(file_version="brain.Event:2")
-        self._add(step=env_steps + 1, session_log=SessionLog(status=SessionLog.START))
+        self._folder = folder
+        with writing(folder, GOES_ON):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._file = RecordWriter(str(folder / f"events.out.tfevents.{time.time():.6f}"))
+            self._add(file_version="brain.Event:2")
+            self._add(step=env_steps + 1, session_log=SessionLog(status=SessionLog.START))
 
     def _add(self, **content: Any) -> None:
         self._file.write(Event(wall_time=time.time(), **content).SerializeToString())
 
     def log(self, env_steps: int, metrics: dict[str, float]) -> None:
         """Write the means of a log interval, on disk afterwards."""
-        for name, value in metrics.items():
-            self._add(step=env_steps, summary=scalar(name if "/" in name else f"run/{name}", value))
-        self._file.flush()
+        with writing(self._folder, GOES_ON):
+            for name, value in metrics.items():
+                self._add(step=env_steps, summary=scalar(name if "/" in name else f"run/{name}", value))
+            self._file.flush()
 
     def close(self) -> None:
         """Close the file, full disk or not."""
@@ -60,11 +64,7 @@ class Events:
 
 
 class Tracker:
-    """One run there; a continued run goes on with the same one.
-
-    Args:
-        folder: of the run; remembers the run's id, and holds its files.
-    """
+    """One run of Weights & Biases, whose id the run's folder keeps; a continued run goes on with the same one."""
 
     def __init__(self, folder: Path, config: TrainConfig, versions: dict[str, Any]):
         wandb = import_wandb()

@@ -124,7 +124,7 @@ def make_policies(
     deterministic: bool,
     cached: dict[Any, Any] | None = None,
 ) -> dict[str, tuple[Any, CheckpointMeta | None]]:
-    """Build policies by name; return them with the checkpoints of those that learned.
+    """Build policies by name, with the checkpoints of those that learned.
 
     See `load_policy`, `make_baseline`, and `BroughtPolicy` for `name=module:factory`.
     """

@@ -18,16 +18,6 @@ from interactive_nav_common.statistics import RESAMPLES, over_episodes
 SCORES = {"success": "success", "path_efficiency": "P_eff", "effort_efficiency": "E_eff", "ins_0.5": "INS_0.5"}
 
 
-TYPES: dict[str, pa.DataType] = {
-    **dict.fromkeys(("run", "robot", "algorithm", "policy", "backend", "device", "commit", "versions"), pa.string()),
-    **dict.fromkeys(("train_device", "train_commit"), pa.string()),
-    **dict.fromkeys(("seed", "checkpoint_steps", "evaluation_seed", "train_env_steps"), pa.int64()),
-    **dict.fromkeys(("k_int", "evaluation_wall_s", "train_wall_s"), pa.float64()),
-    "deterministic": pa.bool_(),
-}
-"""Of the constant columns, which are empty where they mean nothing (a baseline has no seed)."""
-
-
 _OF_TRAINING = ("train_device", "train_commit", "train_env_steps", "checkpoint_steps", "train_wall_s")
 COLUMNS = Columns(
     text=("run", "robot", "policy", "scene", "split", "algorithm", "device", *_OF_TRAINING[:2]),
@@ -36,19 +26,16 @@ COLUMNS = Columns(
     may_be_empty=("algorithm", "seed", "k_int", *_OF_TRAINING),
     may_be_missing=("device", "evaluation_seed", "structure_steps", *_OF_TRAINING),
 )
-
-
+TYPES: dict[str, pa.DataType] = {
+    **dict.fromkeys((*COLUMNS.text, "backend", "commit", "versions"), pa.string()),
+    **dict.fromkeys(COLUMNS.whole, pa.int64()),
+    **dict.fromkeys((*COLUMNS.numbers, "evaluation_wall_s"), pa.float64()),
+    "deterministic": pa.bool_(),
+}
+"""Of the constant columns, which are empty where they mean nothing (a baseline has no seed)."""
+_COUNTS, _SUMS = ("objects", "touched", "contact_steps"), ("displacement_m", "force_sum_n")
 BY_CATEGORY = pa.list_(
-    pa.struct(
-        {
-            "category": pa.string(),
-            "objects": pa.int32(),
-            "touched": pa.int32(),
-            "contact_steps": pa.int32(),
-            "displacement_m": pa.float32(),
-            "force_sum_n": pa.float32(),
-        }
-    )
+    pa.struct({"category": pa.string(), **dict.fromkeys(_COUNTS, pa.int32()), **dict.fromkeys(_SUMS, pa.float32())})
 )
 """Of the column `by_category`: how many objects of each category that a scene has were there and were touched, and,
 summed over them, control steps in contact, path lengths of their centres of mass, and largest net forces of the
@@ -109,13 +96,10 @@ def episode_table(
         constants: columns that are the same in every row; they come first.
     """
     count = len(episodes.scene_index)
-    columns: dict[str, Any] = {
-        name: pa.array([value] * count, type=TYPES.get(name)) for name, value in constants.items()
-    }
+    columns: dict[str, Any] = {name: pa.array([value] * count, TYPES.get(name)) for name, value in constants.items()}
     columns["scene"] = [scenes[i].name for i in episodes.scene_index]
     columns["split"] = [scenes[i].split for i in episodes.scene_index]
-    columns["episode"] = np.arange(count, dtype=np.int32)
-    columns |= episodes.metrics
+    columns |= {"episode": np.arange(count, dtype=np.int32), **episodes.metrics}
     entries = [_by_category(episodes, i, categories[int(scene)]) for i, scene in enumerate(episodes.scene_index)]
     return pa.table({**columns, "by_category": pa.array(entries, BY_CATEGORY)})
 
@@ -126,16 +110,9 @@ def _by_category(episodes: PlayedEpisodes, episode: int, categories: Sequence[st
     rows = []
     for category in sorted(set(categories) - {""}):
         of = np.array([other == category for other in categories])
-        rows.append(
-            {
-                "category": category,
-                "objects": int(of.sum()),
-                "touched": int((steps[of] > 0).sum()),
-                "contact_steps": int(steps[of].sum()),
-                "displacement_m": float(path_m[of].sum()),
-                "force_sum_n": float(force_n[of].sum()),
-            }
-        )
+        counts = (int(x.sum()) for x in (of, steps[of] > 0, steps[of]))
+        sums = (float(x[of].sum()) for x in (path_m, force_n))
+        rows.append(dict(zip(("category", *_COUNTS, *_SUMS), (category, *counts, *sums), strict=True)))
     return rows
 
 

@@ -103,10 +103,7 @@ Cells = dict[tuple[str, str, float], list[RunMean]]
 
 def cells(means: Sequence[RunMean]) -> Cells:
     """Group runs by robot, algorithm and k_int."""
-    groups: Cells = {}
-    for run in means:
-        groups.setdefault(run.cell, []).append(run)
-    return groups
+    return {cell: [run for run in means if run.cell == cell] for cell in dict.fromkeys(run.cell for run in means)}
 
 
 def contrast(
@@ -116,26 +113,20 @@ def contrast(
 
     Each seed counts once: its score is the mean over the settings of the other axes that both sides have.
     """
-    chosen = [run for run in means if all(getattr(run, name) == value for name, value in fixed.items())]
     others = [name for name in ("robot", "algorithm", "k_int") if name != axis]
-
-    def by_setting(value: Any) -> dict[tuple[Any, ...], dict[int, float]]:
-        by_others: dict[tuple[Any, ...], dict[int, float]] = {}
-        for run in chosen:
-            if getattr(run, axis) == value:
-                by_others.setdefault(tuple(getattr(run, name) for name in others), {})[run.seed] = score(run)
-        return by_others
-
-    sides = [by_setting(left), by_setting(right)]
-    common = set(sides[0]) & set(sides[1])
+    by_setting = collections.defaultdict(dict)
+    for run in means:
+        if all(getattr(run, name) == value for name, value in fixed.items()):
+            by_setting[getattr(run, axis), *(getattr(run, name) for name in others)][run.seed] = score(run)
+    common = [setting for side, *setting in by_setting if side == left and (right, *setting) in by_setting]
     if not common:
         return None
 
-    def per_seed(side: dict[tuple[Any, ...], dict[int, float]]) -> np.ndarray:
-        seeds = set.intersection(*(set(side[setting]) for setting in common))
-        return np.array([np.mean([side[setting][seed] for setting in common]) for seed in sorted(seeds)])
+    def per_seed(side: Any) -> np.ndarray:
+        each = [by_setting[side, *setting] for setting in common]
+        return np.array([np.mean([of[seed] for of in each]) for seed in sorted(set.intersection(*map(set, each)))])
 
-    a, b = map(per_seed, sides)
+    a, b = per_seed(left), per_seed(right)
     return welch(a, b) if len(a) and len(b) else None
 
 
@@ -159,20 +150,14 @@ class Finding:
     verdict: str
 
 
-def _verdict(test: Contrast, expected: str) -> str:
-    """Return what a contrast says to a claim that expects higher, lower or same."""
-    if math.isnan(test.p_value):
-        return "too few runs to test"
-    return {expected: "holds", "undecided": "undecided"}.get(test.verdict, f"does not hold: {test.verdict}")
-
-
 def _tested(
     claim: str, what: str, expected: str, test: Contrast | None, missing: str = "no runs to compare"
 ) -> Finding:
-    """Judge a claim by a test; None: there are no runs."""
+    """Judge a claim that expects higher, lower or same by a test; None: there are no runs."""
     if test is None or math.isnan(test.difference):
         return Finding(claim, what, "-", missing)
-    return Finding(claim, what, str(test), _verdict(test, expected))
+    verdict = {expected: "holds", "undecided": "undecided"}.get(test.verdict, f"does not hold: {test.verdict}")
+    return Finding(claim, what, str(test), "too few runs to test" if math.isnan(test.p_value) else verdict)
 
 
 def _compared(
@@ -262,20 +247,6 @@ def _of_penalties(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
             yield _compared(means, claim, what, expected, alpha, "k_int", k, 0.0, robot=robot)
 
 
-def _of_splits(rows: pa.Table) -> Finding:
-    """Compare train with test scenes."""
-    pairs, test = train_test_contrast(rows)
-    what = f"INS_0.5, unseen minus seen scenes, one-sample t test over {len(pairs)} runs"
-    claim, missing = "Seen and unseen scenes do not differ", "no runs with rows of train and of test scenes"
-    return _tested(claim, what, "same", test, missing)
-
-
-def _of_whole_cells(means: Sequence[RunMean]) -> list[RunMean]:
-    """Return runs of the cells that have the most: a seed counts only with all settings, and few would be left."""
-    most = max(map(len, cells(means).values()), default=0)
-    return [run for runs in cells(means).values() if len(runs) == most for run in runs]
-
-
 def claims(rows: pa.Table, split: str | None) -> list[Finding]:
     """Return the paper's claims, one comparison a line; those whose runs are missing say so.
 
@@ -283,7 +254,8 @@ def claims(rows: pa.Table, split: str | None) -> list[Finding]:
     about train and test scenes are about one `split` of the scenes; None: all.
     """
     runs = run_means(rows, split)
-    means = _of_whole_cells(runs)
+    most = max(map(len, cells(runs).values()), default=0)  # a seed counts only with all settings
+    means = [run for whole in cells(runs).values() if len(whole) == most for run in whole]
     robots = sorted({run.robot for run in means})
     findings: list[Finding] = []
     for robot in robots:
@@ -300,4 +272,7 @@ def claims(rows: pa.Table, split: str | None) -> list[Finding]:
         r = correlation((s["kinematic_effort"] for s in chosen), (s["dynamic_effort"] for s in chosen))
         what = f"{robot}: Pearson's r over runs"
         findings.append(Finding("The two terms of E_eff are correlated", what, str(r), r.verdict))
-    return [*findings, _of_splits(rows)]
+    pairs, test = train_test_contrast(rows)
+    what = f"INS_0.5, unseen minus seen scenes, one-sample t test over {len(pairs)} runs"
+    claim, missing = "Seen and unseen scenes do not differ", "no runs with rows of train and of test scenes"
+    return [*findings, _tested(claim, what, "same", test, missing)]

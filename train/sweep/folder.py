@@ -29,7 +29,7 @@ from rich.text import Text
 from interactive_nav_common.errors import FileError, regular
 from interactive_nav_common.files import is_locked, remove_partial, write_text
 from interactive_nav_common.records import RUNS
-from interactive_nav_common.rows import read_notes
+from interactive_nav_common.rows import console_table, read_notes
 from train.config_io import to_yaml
 from train.runs.run_folder import PATHS, EvaluationRequest, RunFolder, files_of_run, lonely_paths, paths_beside
 from train.sweep.spec import EvaluateConfig, RunSpec, Sweep
@@ -166,9 +166,8 @@ class SweepFolder:
 
     def give_up(self, run: str, reason: str, attempts: int) -> None:
         """Note why a run was given up."""
-        write_text(
-            self.root / "failed" / f"{run}.json", json.dumps(dataclasses.asdict(_Failure(reason, attempts))) + "\n"
-        )
+        kept = json.dumps(dataclasses.asdict(_Failure(reason, attempts)))
+        write_text(self.root / "failed" / f"{run}.json", kept + "\n")
 
     def try_again(self, run: str) -> None:
         """Forget that a run was given up."""
@@ -238,44 +237,31 @@ def totals(states: Sequence[RunState]) -> str:
 
 def status_table(states: Sequence[RunState], where: dict[str, str] | None = None) -> Table:
     """Return a table with one line for each run."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("run")
-    table.add_column("state")
-    for label in ("env steps", "", "steps/s", "success", "INS"):
-        table.add_column(label, justify="right")
-    table.add_column("", overflow="fold")
+    header, lines = ("run", "state", "env steps", "", "steps/s", "success", "INS", ""), []
     for s in states:
-        share = f"{100 * s.env_steps / max(s.total_steps, 1):.0f} %"
-        speed = s.metrics.get("env_steps_per_s")
-        table.add_row(
-            s.name,
-            Text(s.state, STYLES[s.state]),
-            f"{s.env_steps:,}",
-            share,
-            f"{speed:,.0f}" if speed else "-",
-            _score(s, "episode/success"),
-            _score(s, "episode/ins_0.5"),
-            (where or {}).get(s.name, s.reason),
-        )
+        share, speed = s.env_steps / max(s.total_steps, 1), s.metrics.get("env_steps_per_s")
+        numbers = f"{s.env_steps:,}", f"{100 * share:.0f} %", f"{speed:,.0f}" if speed else "-"
+        scores = (s.metrics.get(name) for name in ("episode/success", "episode/ins_0.5"))
+        shown = ("-" if score is None else f"{score:.2f}" for score in scores)
+        lines.append((s.name, Text(s.state, STYLES[s.state]), *numbers, *shown, (where or {}).get(s.name, s.reason)))
+    table = console_table(header, lines, left=2, box=None, pad_edge=False, header_style="bold")
+    table.columns[-1].justify, table.columns[-1].overflow = "left", "fold"
     return table
 
 
-class SweepDisplay:
+class SweepDisplay(contextlib.ExitStack):
     """A live table under the events on a terminal; elsewhere the events, and a line now and then."""
 
     def __init__(self, console: Console):
+        super().__init__()
         self._console = console
         self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
         self._shown_at = float("-inf")
 
     def __enter__(self) -> Self:
         if self._live:
-            self._live.start()
+            self.enter_context(self._live)
         return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._live:
-            self._live.stop()
 
     def event(self, text: str, style: str = "") -> None:
         """Print a line."""
@@ -292,11 +278,6 @@ class SweepDisplay:
             self._live.update(Group(status_table(ordered, where), Text(totals(states))), refresh=True)
         else:
             self._console.print(Text(f"{time.strftime('%H:%M:%S')} {totals(states)}"), soft_wrap=True)
-
-
-def _score(state: RunState, name: str) -> str:
-    value = state.metrics.get(name)
-    return "-" if value is None else f"{value:.2f}"
 
 
 def _hours(seconds: float) -> str:

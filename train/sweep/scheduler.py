@@ -8,17 +8,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from interactive_nav_common.config import replace
 from interactive_nav_common.jobs.processes import LOCKED, LOST, Job, Launcher, LocalLauncher, Share
-from train.sweep.folder import (
-    RunState,
-    SweepDisplay,
-    SweepFolder,
-    log_tail,
-    words_of_evaluation,
-)
+from train.sweep.folder import RunState, SweepDisplay, SweepFolder, log_tail, words_of_evaluation
 from train.sweep.spec import LaunchConfig
 
 STAGES = ("train", "evaluate")
@@ -41,8 +35,7 @@ USABLE = 0.95
 """Part of a GPU's memory that runs may fill: the driver takes some."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Gpu:
+class Gpu(NamedTuple):
     """One GPU."""
 
     name: str
@@ -71,9 +64,7 @@ def parse_gpus(listing: str, visible: str | None) -> list[Gpu]:
     for line in listing.splitlines():
         fields = [field.strip() for field in line.split(",")]
         if len(fields) == 3 and fields[2].isdecimal():
-            memory_gb = int(fields[2]) * 2**20 / 1e9
-            gpus[fields[0]] = Gpu(fields[0], memory_gb)
-            gpus[fields[1]] = Gpu(fields[1], memory_gb)
+            gpus |= {name: Gpu(name, int(fields[2]) * 2**20 / 1e9) for name in fields[:2]}
     names = [n for n in gpus if n.isdecimal()] if visible is None else [n.strip() for n in visible.split(",")]
     return [gpus[name] for name in names if name in gpus]
 
@@ -177,8 +168,7 @@ class Scheduler:
 
         After the time limit, if any, all runs are stopped, with their checkpoints.
         """
-        began, deadline, killed = self._clock(), None, False
-        timed_out = False
+        began, deadline, killed, timed_out = self._clock(), None, False, False
         while True:
             for job, code in self._launcher.ended():
                 self._over(job, code)
@@ -186,8 +176,7 @@ class Scheduler:
             timed_out = timed_out or (time_limit_s is not None and elapsed >= time_limit_s)
             if (stops or timed_out) and not self._stopping:
                 self._stopping = True
-                grace_s = self._folder.sweep.config.launch.grace_s
-                deadline = self._clock() + grace_s
+                deadline = self._clock() + self._folder.sweep.config.launch.grace_s
                 if self._busy:
                     why = f"time limit of {time_limit_s:.0f} s" if timed_out else signal.Signals(stops[0]).name
                     self._display.event(
@@ -251,10 +240,10 @@ class Scheduler:
 
     def _begin(self, kind: str, names: list[str], command: list[str]) -> bool:
         log = self._folder.log(names[0])
-        launch, (first, *others) = self._runs[names[0]].launch, names
+        launch, others = self._runs[names[0]].launch, len(names) - 1
         factor = max(self._factor.get((kind, name), 1.0) for name in names)
         job = RunJob(
-            name=f"{kind} {first}" + (f" and {len(others)} more" if others else ""),
+            name=f"{kind} {names[0]}" + (f" and {others} more" if others else ""),
             kind=kind,
             runs=tuple(names),
             command=tuple(command),
@@ -310,20 +299,17 @@ class Scheduler:
         shown = tail[-6:] or ["(nothing was printed)"]
         reason = f"{job.kind}: {_how(code)}: {shown[-1][:300]}"
         attempts = self._attempts[key] = self._attempts.get(key, 0) + 1
-        hungry = any(word in line.lower() for line in tail for word in OUT_OF_MEMORY)
-        if code == REFUSED or attempts > job.launch.retries:
+        over = code == REFUSED or attempts > job.launch.retries
+        if over:
             self._given_up.add(key)
             self._folder.give_up(name, reason, attempts)
-            more = "another try cannot mend it" if code == REFUSED else f"given up after {attempts} tries"
-            self._display.event(f"{job.name}: {_how(code)}, {more}; the end of {job.log}:", "red")
+            what = "another try cannot mend it" if code == REFUSED else f"given up after {attempts} tries"
         else:
+            hungry = any(word in line.lower() for line in tail for word in OUT_OF_MEMORY)
             self._factor[key] = job.factor * 2.0 if hungry else job.factor
             more = " with twice the memory" if hungry else ""
-            self._display.event(
-                f"{job.name}: {_how(code)}, tried again{more} ({attempts} of {job.launch.retries}); "
-                f"the end of {job.log}:",
-                "yellow",
-            )
+            what = f"tried again{more} ({attempts} of {job.launch.retries})"
+        self._display.event(f"{job.name}: {_how(code)}, {what}; the end of {job.log}:", "red" if over else "yellow")
         for line in shown:
             self._display.event(f"    {line}")
 

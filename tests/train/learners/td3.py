@@ -12,9 +12,8 @@ from brax.training import types
 from interactive_nav_common.config import AtLeastOne, NotNegative, Positive, Share
 from train.config import OffPolicyConfig, TrainConfig
 from train.learners import offpolicy
-from train.learners.actor_critic import ActorCritic, ActorCriticState, policy_part, soft_update
+from train.learners.actor_critic import ActorCritic, ActorCriticState, action_of, policy_part, soft_update
 from train.learners.algorithms import Algorithm
-from train.learners.ddpg import action_of
 
 
 @dataclasses.dataclass(frozen=True)

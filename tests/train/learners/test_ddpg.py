@@ -18,14 +18,14 @@ from tests.train.learners.test_sac import KEY, LEARNING, SIZES, transitions
 from tests.train.toy_env import ToyEnv, batched
 from tests.train.toy_pixels import SMALL, ToyPixels
 from train.config import DDPGConfig, EnvConfig, NetworkConfig, RunConfig, TrainConfig
-from train.learners import ddpg
+from train.learners.actor_critic import DDPG, ddpg_losses
 from train.learners.algorithms import ALGORITHMS
 
 
-def make(env: ToyEnv, network: NetworkConfig = SMALL, **settings: Any) -> ddpg.DDPG:
+def make(env: ToyEnv, network: NetworkConfig = SMALL, **settings: Any) -> DDPG:
     section = DDPGConfig(**{**SIZES, **settings})
     config = TrainConfig(env=EnvConfig(scenes=("toy",)), algorithm="ddpg", network=network, ddpg=section)
-    return ddpg.DDPG.of(batched(env), config)
+    return DDPG.of(batched(env), config)
 
 
 # One number each: policy p * o before tanh, critics (q * o + a, q * o - a).
@@ -57,7 +57,7 @@ def test_critic_loss_by_hand():
     First transition: target 2 * 1 + 0.5 (6 - a); critics of 1 say 1.5 and 0.5, so both errors exceed 1 and count
     |e| - 0.5. Second, ended: target 2 * 0.25 = 0.5; critics say 0, errors 0.5 count 0.125 each.
     """
-    critic_loss, _ = ddpg.make_losses(BY_HAND, reward_scaling=2.0, discounting=0.5)
+    critic_loss, _ = ddpg_losses(BY_HAND, reward_scaling=2.0, discounting=0.5)
     target = 2.0 + 0.5 * (6.0 - np.tanh(0.5))
     expected = ((target - 1.5 - 0.5) + (target - 0.5 - 0.5) + 2 * 0.125) / 4
     np.testing.assert_allclose(critic_loss(1.0, 0.25, None, 3.0, by_hand()), expected, rtol=1e-6)
@@ -73,7 +73,7 @@ def test_critic_loss_by_hand():
 
 def test_actor_loss_by_hand():
     """-mean of the first critic: observations 1 and 0 give 2 + tanh(0.5) and 0; its slope is -(1 - a^2) / 2."""
-    _, actor_loss = ddpg.make_losses(BY_HAND, 1.0, 0.5)
+    _, actor_loss = ddpg_losses(BY_HAND, 1.0, 0.5)
     a = np.tanh(0.5)
     np.testing.assert_allclose(actor_loss(0.5, None, 2.0, by_hand()), -(2 + a) / 2, rtol=1e-6)
     np.testing.assert_allclose(jax.grad(actor_loss)(0.5, None, 2.0, by_hand()), -(1 - a**2) / 2, rtol=1e-5)

@@ -41,7 +41,7 @@ def make(config=SMALL, size=TINY, normalize=True):
 def test_sizes_are_those_of_the_original():
     """Reference benchmark 8.1: 68 -> 16 -> 7 -> 5 pixels, 1,600 features, 0.62 million weights with the trunk."""
     made = networks.make_ppo_networks(NetworkConfig(), FULL, 2, (256,), (256,), True)
-    policy = made.networks.policy_network.init(KEY)  # type: ignore[call-arg]
+    policy = made.policy_network.init(KEY)  # type: ignore[call-arg]
     image = policy["encoder"]["params"]["image"]
     assert image["Conv_0"]["kernel"].shape == (8, 8, 2, 32)
     assert image["Conv_2"]["kernel"].shape == (3, 3, 64, 64)
@@ -50,29 +50,29 @@ def test_sizes_are_those_of_the_original():
     encoder = conv + 1600 * 256 + 256 + 29 * 256 + 256
     assert count(policy["encoder"]) == encoder
     assert count(policy["head"]) == 512 * 256 + 256 + 256 * 4 + 4  # mean and deviation of two actions
-    value = made.networks.value_network.init(KEY)  # type: ignore[call-arg]
+    value = made.value_network.init(KEY)  # type: ignore[call-arg]
     assert count(value["head"]) == 512 * 256 + 256 + 256 * 1 + 1
     assert float(jnp.abs(value["head"]["params"]["output"]["kernel"]).max()) <= 0.003
 
 
 def test_bytes_and_floats_of_one_image_give_the_same_features():
     made = make()
-    params = made.networks.policy_network.init(KEY)  # type: ignore[call-arg]
+    params = made.policy_network.init(KEY)  # type: ignore[call-arg]
     seen = observation()
     floats = {k: v.astype(jnp.float32) / 255 if v.dtype == jnp.uint8 else v for k, v in seen.items()}
     statistics = networks.init_normalizer(TINY)
-    apply = made.networks.policy_network.apply
+    apply = made.policy_network.apply
     np.testing.assert_allclose(apply(statistics, params, seen), apply(statistics, params, floats), rtol=1e-5, atol=1e-6)
 
 
 def test_bytes_beside_signed_floats_are_each_taken_as_they_are():
     size = {"pixels/rgb": (SIDE, SIDE, 3), "pixels/normals": (SIDE, SIDE, 3)}
     made = networks.make_ppo_networks(SMALL, size, 2, (8,), (8,), True)
-    params = made.networks.policy_network.init(KEY)  # type: ignore[call-arg]
+    params = made.policy_network.init(KEY)  # type: ignore[call-arg]
     rng = np.random.default_rng(0)
     rgb = jnp.asarray(rng.integers(0, 256, (4, SIDE, SIDE, 3)), jnp.uint8)
     seen = {"pixels/rgb": rgb, "pixels/normals": jnp.asarray(rng.uniform(-1, 1, rgb.shape), jnp.float32)}
-    statistics, apply = networks.init_normalizer(size), made.networks.policy_network.apply
+    statistics, apply = networks.init_normalizer(size), made.policy_network.apply
     floats = {**seen, "pixels/rgb": rgb.astype(jnp.float32) / 255}
     np.testing.assert_allclose(apply(statistics, params, seen), apply(statistics, params, floats), rtol=1e-5, atol=1e-6)
 
@@ -91,11 +91,11 @@ def test_only_the_vector_is_normalised():
 
 def test_a_critic_of_the_vector_does_not_see_the_images():
     made = make(dataclasses.replace(SMALL, critic_inputs="state"))
-    value = made.networks.value_network
+    value = made.value_network
     params, statistics = value.init(KEY), networks.init_normalizer(TINY)  # type: ignore[call-arg]
     one, other = observation(), {**observation(seed=1), "state": observation()["state"]}
     np.testing.assert_array_equal(value.apply(statistics, params, one), value.apply(statistics, params, other))
-    policy = made.networks.policy_network
+    policy = made.policy_network
     params = policy.init(KEY)  # type: ignore[call-arg]
     assert float(jnp.abs(policy.apply(statistics, params, one) - policy.apply(statistics, params, other)).max()) > 0
 
@@ -103,9 +103,8 @@ def test_a_critic_of_the_vector_does_not_see_the_images():
 def test_an_action_reaches_both_critics():
     head = networks.TwinHead((8,), action_features=4)
     split = networks.make_split(SMALL, TINY, True, networks.preprocess(True), head, action_size=2)
-    whole = split.whole()
-    params, statistics = whole.init(KEY), networks.init_normalizer(TINY)
-    values = [whole.apply(statistics, params, observation(), jnp.full((3, 2), a)) for a in (0.0, 1.0)]
+    params, statistics = split.init(KEY), networks.init_normalizer(TINY)
+    values = [split.apply(statistics, params, observation(), jnp.full((3, 2), a)) for a in (0.0, 1.0)]
     assert values[0].shape == (3, 2)
     assert (np.asarray(values[0]) != np.asarray(values[1])).all()
     assert (np.asarray(values[0])[:, 0] != np.asarray(values[0])[:, 1]).all()  # independent critics
@@ -137,10 +136,10 @@ def test_images_too_small_for_the_kernels_are_refused():
 def test_images_alone_are_enough():
     images = {name: shape for name, shape in TINY.items() if name != "state"}
     made = make(size=images)
-    params, statistics = made.networks.policy_network.init(KEY), networks.init_normalizer(images)  # type: ignore[call-arg]
+    params, statistics = made.policy_network.init(KEY), networks.init_normalizer(images)  # type: ignore[call-arg]
     seen = {name: value for name, value in observation().items() if name != "state"}
     statistics = networks.update_normalizer(statistics, seen)
-    assert made.networks.policy_network.apply(statistics, params, seen).shape == (3, 4)
+    assert made.policy_network.apply(statistics, params, seen).shape == (3, 4)
 
 
 def test_shared_and_separate_encoders_give_the_same_loss_and_gradient():
@@ -159,16 +158,11 @@ def test_shared_and_separate_encoders_give_the_same_loss_and_gradient():
     settings = {"entropy_cost": 0.01, "normalize_advantage": False, "discounting": 0.9}
 
     def loss_shared(params):
-        heads = ppo._heads(shared)
-        assert shared.nets.policy
-        encode = shared.nets.policy.encoder.apply
-        return ppo.shared_loss(params, one.normalizer_params, data, KEY, encode=encode, ppo_network=heads, **settings)[
-            0
-        ]
+        return ppo.shared_loss(shared.nets, params, one.normalizer_params, data, KEY, **settings)[0]
 
     def loss_apart(params):
         return ppo_losses.compute_ppo_loss(
-            params, one.normalizer_params, data, KEY, ppo_network=apart.nets.networks, **settings
+            params, one.normalizer_params, data, KEY, ppo_network=apart.nets, **settings
         )[0]
 
     both = ppo_losses.PPONetworkParams(policy=policy, value=value)  # type: ignore[call-arg]
@@ -229,10 +223,10 @@ def test_convolutions_for_a_cpu_are_xlas_in_value_and_gradients(size: int, k: in
 def test_on_a_cpu_acting_has_xlas_convolutions_and_learning_none():
     """Its gradients within a loop take 20 to 30 times as long there, see `docs/studies/policies/cpu_programs.py`."""
     made = make()
-    params = made.networks.policy_network.init(KEY)  # type: ignore[call-arg]
+    params = made.policy_network.init(KEY)  # type: ignore[call-arg]
 
     def acted(params):
-        return made.networks.policy_network.apply(networks.init_normalizer(TINY), params, observation())
+        return made.policy_network.apply(networks.init_normalizer(TINY), params, observation())
 
     acting, learning = (jax.make_jaxpr(f)(params) for f in (acted, jax.grad(lambda params: acted(params).sum())))
     assert "conv_general_dilated" in str(acting)

@@ -20,10 +20,9 @@ from tests.train.toy_pixels import SMALL, ToyPixels
 from train.config import DDPGConfig, EnvConfig, OffPolicyConfig, RunConfig, SACConfig, TrainConfig
 from train.errors import DivergedError
 from train.learners import offpolicy, replay_buffer
+from train.learners.actor_critic import DDPG, SAC
 from train.learners.algorithms import ALGORITHMS
-from train.learners.ddpg import DDPG
 from train.learners.learner import Snapshot, Update
-from train.learners.sac import SAC
 
 STEPS = 16 * 4
 """Environment steps in an update of `tiny`."""

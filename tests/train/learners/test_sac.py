@@ -17,17 +17,18 @@ from tests.train.learners.test_ppo import Recorder
 from tests.train.toy_env import ToyEnv, batched
 from tests.train.toy_pixels import SMALL, ToyPixels
 from train.config import EnvConfig, NetworkConfig, RunConfig, SACConfig, TrainConfig
-from train.learners import networks, sac
+from train.learners import networks
+from train.learners.actor_critic import SAC, SACState
 from train.learners.algorithms import ALGORITHMS
 
 SIZES: dict[str, Any] = {"policy_hidden_layer_sizes": (16,), "q_hidden_layer_sizes": (16,)}
 KEY = jax.random.PRNGKey(5)
 
 
-def make(env: ToyEnv, network: NetworkConfig = SMALL, **settings: Any) -> sac.SAC:
+def make(env: ToyEnv, network: NetworkConfig = SMALL, **settings: Any) -> SAC:
     section = SACConfig(**{**SIZES, **settings})
     config = TrainConfig(env=EnvConfig(scenes=("toy",)), algorithm="sac", network=network, sac=section)
-    return sac.SAC.of(batched(env), config)
+    return SAC.of(batched(env), config)
 
 
 def transitions(size: networks.ObservationSize, count: int = 12) -> types.Transition:
@@ -56,7 +57,7 @@ def transitions(size: networks.ObservationSize, count: int = 12) -> types.Transi
     )
 
 
-def learner_of(agent: sac.SAC) -> sac.SACState:
+def learner_of(agent: SAC) -> SACState:
     """A new learner whose normaliser has seen something and whose targets lag."""
     learner = jax.jit(agent.init)(KEY, KEY)
     seen = jax.tree.map(lambda x: 3.0 * x + 1.0, networks.vector_part(transitions(agent.size).observation))
@@ -143,7 +144,7 @@ def test_target_entropy_is_what_is_asked_for():
     data, losses = transitions(29), []
     for each in (-0.5, -1.0):
         agent = make(ToyEnv(), target_entropy_per_action=each)
-        alpha_loss, _, _ = sac.make_losses(agent)
+        alpha_loss, _, _ = agent.losses()
         learner = learner_of(agent)
         losses.append(alpha_loss(jnp.log(0.25), learner.policy_params, learner.normalizer_params, data, KEY))
     np.testing.assert_allclose(losses[1] - losses[0], 0.25, rtol=1e-4)
