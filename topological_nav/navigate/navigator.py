@@ -109,8 +109,8 @@ class Navigator:
     ) -> tuple[State, np.ndarray, np.ndarray, Events]:
         """Take one control step from a state of `start` or `step`.
 
-        Images [B, ...] that `looks` leaves out may be anything; headings [B] are those of a compass, world frame; times,
-        [B] or one for all, must not go back. Return the new state, linear [B] (m/s) and angular [B] (rad/s)
+        Images [B, ...] that `looks` leaves out may be anything; headings [B] are those of a compass, world frame;
+        times, [B] or one for all, must not go back. Return the new state, linear [B] (m/s) and angular [B] (rad/s)
         velocity to command, and what happened.
         """
         batch = len(state.phase)
