@@ -2,24 +2,16 @@
 
 from collections.abc import Callable
 
+from interactive_nav.robots.build import WHEELED
 from interactive_nav.robots.factory import from_file
-from interactive_nav.robots.models.ant import ant
-from interactive_nav.robots.models.humanoid import humanoid
-from interactive_nav.robots.models.minitaur import minitaur
+from interactive_nav.robots.models.legged import LEGGED
 from interactive_nav.robots.models.quadrotor import quadrotor
-from interactive_nav.robots.models.wheeled import WHEELED
 from interactive_nav.robots.reference import A_FILE, is_reference, load_reference
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError
 
-_FACTORIES: dict[str, Callable[[str], RobotSpec]] = {
-    "ant": ant,
-    "humanoid": humanoid,
-    "minitaur": minitaur,
-    "quadrotor": quadrotor,
-    **WHEELED,
-}
+_FACTORIES: dict[str, Callable[[str], RobotSpec]] = {**LEGGED, "quadrotor": quadrotor, **WHEELED}
 """Name -> control mode -> spec."""
 
 

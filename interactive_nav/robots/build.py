@@ -1,5 +1,10 @@
 """Build one `RobotSpec` per control mode from a robot's MJCF file and a table of its driven joints.
 
+`WHEELED` are the robots of `models/wheeled.yaml`. Control modes: `native`, velocities of the wheels, left then right,
+front before rear (Husky: their torques), an arm folded; `whole_body`, of a robot with an arm, its velocities too, and a
+gripper's opening; `twist`, linear and angular velocity of the base, an arm folded; `velocity`, `position` or `torque`
+of all joints.
+
 Files are written without the robot's name in front of theirs; the loader adds it (`wheel_left` becomes
 `fetch_wheel_left`) and attaches the file to the world. Collision geoms are in group 3. A group-3 geom
 without contype and conaffinity rolls: it is paired with the world's floor and meets nothing else, so that
@@ -7,6 +12,7 @@ a sphere can stand for a thin wheel without standing out at its sides.
 """
 
 import dataclasses
+import functools
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,8 +21,9 @@ import mujoco
 import numpy as np
 
 from interactive_nav.robots.files import read_file
-from interactive_nav.robots.spec import ControlLaw, RobotCamera, RobotSpec, TwistMap, check_mode, set_servo
+from interactive_nav.robots.spec import ControlLaw, Figures, RobotCamera, RobotSpec, TwistMap, check_mode, set_servo
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.records import read_packaged
 
 FOLDER = Path(__file__).parent / "mjcf"
 _OPTIONS = ("timestep", "integrator", "cone", "solver", "iterations", "ls_iterations", "gravity")
@@ -43,11 +50,6 @@ class Joint:
     """Of a wheel: -1 left, +1 right; 0: no wheel."""
     unit: str = "rad"
     """'m' for a slide."""
-
-    @property
-    def label(self) -> str:
-        """Return its name in words."""
-        return self.name.replace("_", " ")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,6 +132,11 @@ def stand(robot: RobotSpec, world: mujoco.MjSpec) -> tuple[mujoco.MjModel, mujoc
     return model, data
 
 
+def solid_geoms(model: mujoco.MjModel, body: int) -> list[int]:
+    """Return the geoms of a body that collide."""
+    return np.flatnonzero((model.geom_bodyid == body) & (model.geom_group == 3)).tolist()
+
+
 def half_extents(model: mujoco.MjModel, geom: int) -> np.ndarray:
     """Return (3,) half sizes of a box about the geom's origin that holds it, in its frame, m."""
     return np.abs(model.geom_aabb[geom, :3]) + model.geom_aabb[geom, 3:]
@@ -195,7 +202,7 @@ def _mode(base: WheeledBase, mode: str, limits: list[tuple[Any, float]]) -> tupl
             "position": place,
         }[kind]
         servos[i], (low, high) = kind, native or (low, high)
-        actions.append(_Action(f"{joint.label} {unit}", low, high, alone[i]))
+        actions.append(_Action(f"{joint.name.replace('_', ' ')} {unit}", low, high, alone[i]))
 
     if mode == "twist":
         gains, least = np.zeros((len(joints), 2)), base.min_linear_m_s
@@ -285,3 +292,15 @@ def wheeled_robot(
         twist=_twist_map(base, control_mode, len(actions)),
         **{"spawn_height_m": 0.0, **figures},
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class Row(Figures):
+    """A robot of `models/wheeled.yaml`."""
+
+    base: WheeledBase
+
+
+_ROWS = read_packaged(FOLDER.parent / "models" / "wheeled.yaml", tuple[Row, ...])
+WHEELED = {row.base.name: functools.partial(wheeled_robot, **vars(row)) for row in _ROWS}
+"""Name -> control mode -> spec."""

@@ -13,9 +13,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from interactive_nav.robots.build import FLOOR, Joint, WheeledBase, half_extents, stand, wheeled_robot
+from interactive_nav.robots.build import FLOOR, Joint, WheeledBase, half_extents, solid_geoms, stand, wheeled_robot
 from interactive_nav.robots.files import compiled, read_file
-from interactive_nav.robots.repair import Facts, Wheel, complete, find, strip
+from interactive_nav.robots.repair import Wheel, complete, find, strip
 from interactive_nav.robots.spec import RobotCamera, RobotSpec
 from interactive_nav_common.errors import ConfigError
 
@@ -26,7 +26,7 @@ _LARGEST_WHEEL_M = 2.0
 """Radius above which a file is taken to be in other units than metres."""
 
 
-def _read_facts(child: mujoco.MjSpec, path: Path, base_body: str, wheels: Mapping[str, int]) -> Facts:
+def _read_wheels(child: mujoco.MjSpec, path: Path, base_body: str, wheels: Mapping[str, int]) -> list[Wheel]:
     model = compiled(child, path)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -41,7 +41,7 @@ def _read_facts(child: mujoco.MjSpec, path: Path, base_body: str, wheels: Mappin
                 f"robot file {path}: wheel joint '{name}' turns about {np.round(axis, 2).tolist()} of the base, "
                 "expected its y axis (x forward, y left, z up)"
             )
-        geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body and model.geom_group[g] == 3]
+        geoms = solid_geoms(model, body)
         if not geoms:
             raise ConfigError(f"robot file {path}: wheel body '{model.body(body).name}' has no collision geom")
         geom = geoms[0]
@@ -57,7 +57,7 @@ def _read_facts(child: mujoco.MjSpec, path: Path, base_body: str, wheels: Mappin
         half_width = float(model.geom_size[geom, 1]) if thin else _SPHERE_WIDTH * radius
         pos = data.geom_xpos[geom] - data.xpos[model.body(base_body).id]
         read.append(Wheel(name, side, model.body(body).name, pos, radius, half_width, bool(axis[1] < 0)))
-    return Facts(tuple(read), min(float(w.pos_m[2] - w.radius_m) for w in read))
+    return read
 
 
 def _outline(robot: RobotSpec) -> tuple[np.ndarray, np.ndarray, float, float]:
@@ -93,7 +93,7 @@ def _sides(left_wheels: tuple[str, ...], right_wheels: tuple[str, ...]) -> dict[
 def _base(
     name: str,
     path: Path,
-    facts: Facts,
+    wheels: list[Wheel],
     wheel_speed_rad_s: float,
     others: tuple[Joint, ...],
     track_m: float | None,
@@ -101,7 +101,7 @@ def _base(
     max_angular_rad_s: float | None,
 ) -> WheeledBase:
     """Return the driven joints and commands; what is None follows from the wheels."""
-    radii = [w.radius_m for w in facts.wheels]
+    radii = [w.radius_m for w in wheels]
     if max(radii) - min(radii) > 1e-3:
         raise ConfigError(f"robot file {path}: its driven wheels differ in radius, expected one radius")
     if radii[0] > _LARGEST_WHEEL_M:
@@ -109,66 +109,28 @@ def _base(
             f"robot file {path}: its wheels have a radius of {radii[0]:g} m, expected at most {_LARGEST_WHEEL_M:g}; "
             "is the file in millimetres? Give lengths in metres"
         )
-    left, right = (float(np.mean([w.pos_m[1] for w in facts.wheels if w.side == side])) for side in (-1, 1))
+    left, right = (float(np.mean([w.pos_m[1] for w in wheels if w.side == side])) for side in (-1, 1))
     if left <= right:
         raise ConfigError(
             f"robot file {path}: the left wheels lie at y = {left:.3g} m, the right ones at {right:.3g} m, expected "
             "the left ones at the larger y (x forward, y left); swap left_wheels and right_wheels, or turn the robot"
         )
     if track_m is None:
-        across = float(np.ptp([w.pos_m[1] for w in facts.wheels]))
-        along = float(np.ptp([w.pos_m[0] for w in facts.wheels]))
+        across = float(np.ptp([w.pos_m[1] for w in wheels]))
+        along = float(np.ptp([w.pos_m[0] for w in wheels]))
         track_m = across + along**2 / across
     fastest = wheel_speed_rad_s * radii[0]
     return WheeledBase(
         name=name,
-        joints=(*(Joint(w.joint, wheel_speed_rad_s, side=w.side) for w in facts.wheels), *others),
+        joints=(*(Joint(w.joint, wheel_speed_rad_s, side=w.side) for w in wheels), *others),
         wheel_radius_m=radii[0],
         track_m=track_m,
         native=(-wheel_speed_rad_s, wheel_speed_rad_s),
         max_linear_m_s=max_linear_m_s or fastest,
         max_angular_rad_s=max_angular_rad_s or 2 * fastest / track_m,
-        yaw_gain=1.0 if len(facts.wheels) > 2 else 0.0,
+        yaw_gain=1.0 if len(wheels) > 2 else 0.0,
         whole_body=tuple(joint.name for joint in others),
     )
-
-
-def _factory(
-    base: WheeledBase,
-    child: mujoco.MjSpec,
-    facts: Facts,
-    base_body: str,
-    casters: tuple[str, ...],
-    source: str,
-    camera: RobotCamera | None,
-    body_width_m: float | None,
-) -> Callable[[str], RobotSpec]:
-    """Return control mode -> spec, with the figures that its outline gives."""
-    build = functools.partial(
-        wheeled_robot,
-        base=base,
-        parsed=child,
-        base_body=base_body,
-        rolling=(*(w.body for w in facts.wheels), *casters),
-        spawn_height_m=-facts.bottom_m,
-        camera=RobotCamera(base_body, (0, 0, 0)),
-        **dict.fromkeys(("body_width_m", "footprint_radius_m", "height_m"), 0.0),
-    )
-    low, high, reach, mass = _outline(build("native"))
-    size = (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2]))
-    build = functools.partial(
-        build,
-        camera=camera or RobotCamera(base_body, (0.0, 0.0, float(high[2]) + facts.bottom_m + 0.02)),
-        body_width_m=body_width_m or size[1],
-        footprint_radius_m=reach,
-        height_m=size[2],
-        mass_kg=mass,
-        size_m=size,
-        drive_type="skid steer" if base.yaw_gain else "differential",
-        source=source,
-    )
-    build("native")
-    return build
 
 
 def _check(name: str, wheel_rad_s: float, optional: Mapping[str, float | None]) -> None:
@@ -222,10 +184,30 @@ def from_file(
     for joint in (*sides, *driven, *(home or {}), *limits):
         find(child, path, "joint", joint)
     strip(child, path, base_body)
-    facts = _read_facts(child, path, base_body, sides)
+    wheels = _read_wheels(child, path, base_body, sides)
+    bottom_m = min(float(w.pos_m[2] - w.radius_m) for w in wheels)
     units = {j.name: "m" if j.type == mujoco.mjtJoint.mjJNT_SLIDE else "rad" for j in child.joints}
     others = tuple(Joint(j, speed, dict(home or {}).get(j, 0.0), unit=units[j]) for j, speed in driven.items())
-    base = _base(name, path, facts, max_wheel_speed_rad_s, others, track_m, max_linear_m_s, max_angular_rad_s)
+    base = _base(name, path, wheels, max_wheel_speed_rad_s, others, track_m, max_linear_m_s, max_angular_rad_s)
     child = read_file(path, base_body)
-    complete(path, facts, base, base_body, casters, limits, dict(home or {}), child)
-    return _factory(base, child, facts, base_body, casters, path.name, camera, body_width_m)
+    complete(path, wheels, bottom_m, base, base_body, casters, limits, dict(home or {}), child)
+    rolling = (*(w.body for w in wheels), *casters)
+    build = functools.partial(wheeled_robot, base=base, parsed=child, base_body=base_body, rolling=rolling)
+    unknown = dict.fromkeys(("body_width_m", "footprint_radius_m", "height_m"), 0.0)
+    plain = build("native", spawn_height_m=-bottom_m, camera=RobotCamera(base_body, (0, 0, 0)), **unknown)
+    low, high, reach_m, mass_kg = _outline(plain)
+    length_m, width_m, height_m = float(high[0] - low[0]), float(high[1] - low[1]), float(high[2])
+    build = functools.partial(
+        build,
+        spawn_height_m=-bottom_m,
+        camera=camera or RobotCamera(base_body, (0.0, 0.0, height_m + bottom_m + 0.02)),
+        body_width_m=body_width_m or width_m,
+        footprint_radius_m=reach_m,
+        height_m=height_m,
+        mass_kg=mass_kg,
+        size_m=(length_m, width_m, height_m),
+        drive_type="skid steer" if base.yaw_gain else "differential",
+        source=path.name,
+    )
+    build("native")
+    return build

@@ -16,6 +16,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
+from interactive_nav.robots.build import solid_geoms
 from interactive_nav.robots.factory import from_file
 from interactive_nav.robots.files import compiled, read_file, warn
 from interactive_nav.robots.repair import FLOOR_M, slip_torque_n_m, strip
@@ -124,7 +125,7 @@ def _on_floor(spec: mujoco.MjSpec, model: mujoco.MjModel, base: str) -> list[_Ro
     kinds = [int(k) for k in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CYLINDER)]
     links: list[tuple[float, _Round]] = []
     for body in range(1, model.nbody):
-        geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body and model.geom_group[g] == 3]
+        geoms = solid_geoms(model, body)
         if len(geoms) != 1 or model.geom_type[geoms[0]] not in kinds or model.body(body).name == base:
             continue
         (x, y, z), radius = data.geom_xpos[geoms[0]], float(model.geom_size[geoms[0], 0])

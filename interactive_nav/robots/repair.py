@@ -7,7 +7,7 @@ sensors and options of the file go.
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -29,7 +29,7 @@ FLOOR_M = 0.02
 
 @dataclasses.dataclass(frozen=True)
 class Wheel:
-    """A driven wheel, as the file has it."""
+    """A driven wheel, as the file has it at its zero pose."""
 
     joint: str
     side: int
@@ -40,15 +40,6 @@ class Wheel:
     half_width_m: float
     backwards: bool
     """The joint's axis points right: its positive speed rolls backwards."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Facts:
-    """What the file itself says, at its zero pose, in the base's frame."""
-
-    wheels: tuple[Wheel, ...]
-    bottom_m: float
-    """Lowest point of the wheels."""
 
 
 def _solid(geom) -> bool:
@@ -266,7 +257,8 @@ def add_servo(child: mujoco.MjSpec, path: Path, joint: Joint) -> None:
 
 def complete(
     path: Path,
-    facts: Facts,
+    wheels: Sequence[Wheel],
+    bottom_m: float,
     base: WheeledBase,
     base_body: str,
     casters: tuple[str, ...],
@@ -274,13 +266,13 @@ def complete(
     home: Mapping[str, float],
     child: mujoco.MjSpec,
 ) -> None:
-    """Apply every change to the file, in order; warn of each."""
+    """Apply every change to the file, in order; warn of each. `bottom_m` is the wheels' lowest point."""
     for name, limit in torque_limits.items():
         child.joint(name).actfrcrange = [-limit, limit]
     strip(child, path, base_body)
     _fix_masses(child, path, base_body)
-    hold(child, path, facts.bottom_m, {joint.name for joint in base.joints}, casters, home)
-    for wheel in facts.wheels:
+    hold(child, path, bottom_m, {joint.name for joint in base.joints}, casters, home)
+    for wheel in wheels:
         warn(
             path,
             f"wheel '{wheel.body}' now rolls on the floor as a sphere of radius {wheel.radius_m:g} m and "

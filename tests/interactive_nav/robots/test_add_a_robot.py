@@ -16,7 +16,6 @@ from docs.studies.robots import evidence
 from docs.studies.robots.pictures import stage
 from interactive_nav import robots
 from interactive_nav.robots import build
-from interactive_nav.robots.models import wheeled
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.records import read_packaged
 from tests.toys import write_room
@@ -77,13 +76,13 @@ def test_the_documents_code_runs(tmp_path, monkeypatch, registry, capsys):
 
 def test_a_model_and_a_row_add_a_wheeled_robot(tmp_path, monkeypatch, registry):
     """The steps of docs/extend.md, on copies of the package's files."""
-    model, table = build.FOLDER / "turtlebot.xml", Path(wheeled.__file__).with_suffix(".yaml")
+    model, table = build.FOLDER / "turtlebot.xml", build.FOLDER.parent / "models" / "wheeled.yaml"
     _write(tmp_path, model.read_text().replace('model="turtlebot"', 'model="puck"'), "puck.xml")
     monkeypatch.setattr(build, "FOLDER", tmp_path)
     rows = yaml.safe_load(table.read_text())
     (row,) = [row for row in rows if row["base"]["name"] == "turtlebot"]
     row["base"] |= {"name": "puck", "max_linear_m_s": 0.5}
-    (row,) = read_packaged(_write(tmp_path, yaml.safe_dump([row]), "wheeled.yaml"), tuple[wheeled._Row, ...])
+    (row,) = read_packaged(_write(tmp_path, yaml.safe_dump([row]), "wheeled.yaml"), tuple[build.Row, ...])
     robots._FACTORIES["puck"] = functools.partial(build.wheeled_robot, **vars(row))
     assert "puck" in robots.robot_names()
     scene = write_room(tmp_path / "room", (4.0, 3.0), ())

@@ -1,6 +1,5 @@
 """Ant, Humanoid and Minitaur: figures against the table, limits, closed chains, gaits that go where they are told."""
 
-import importlib
 import math
 
 import jax.numpy as jnp
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 
 from interactive_nav.robots import get_robot
-from interactive_nav.robots.gait import Legged, base_motion, gait_law
+from interactive_nav.robots.models.legged import ROWS, Legged, base_motion, gait_law
 from interactive_nav.robots.spec import RobotState
 from interactive_nav_common.errors import UserError
 from tests.interactive_nav.robots.motion import extents, hall_world, home_data, move, plain_model, schedule
@@ -21,7 +20,7 @@ NOTHING = RobotState(None, None, None)
 
 
 def legs_of(name: str) -> Legged:
-    return importlib.import_module(f"interactive_nav.robots.models.{name}").LEGS
+    return ROWS[name].legs
 
 
 @pytest.fixture(scope="module")
