@@ -22,8 +22,7 @@ from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import PhysicsState
 from interactive_nav.physics.nearness import REACH_M, Measured, Nearness, widths_at
 from interactive_nav.scenes.slots import Layout
-from interactive_nav.scenes.spec import FEET, build_empty_spec
-from interactive_nav.scenes.world import World
+from interactive_nav.scenes.world import FEET, World, build_empty_spec
 
 _MOVING_BONUS_M = 2.0
 """Moving objects rank as if they were this much nearer."""

@@ -19,14 +19,7 @@ SLOTS = 32
 """Contacts listed between the robot, or one of its wheels, and one body; more than a robot's few boxes make."""
 _FIELDS = 7
 """whether there is one (1), force in the contact's frame (3), normal in the world frame (3)."""
-_DATA = sum(
-    1 << int(bit)
-    for bit in (
-        mujoco.mjtConDataField.mjCONDATA_FOUND,
-        mujoco.mjtConDataField.mjCONDATA_FORCE,
-        mujoco.mjtConDataField.mjCONDATA_NORMAL,
-    )
-)
+_DATA = sum(1 << int(mujoco.mjtConDataField[f"mjCONDATA_{name}"]) for name in ("FOUND", "FORCE", "NORMAL"))
 _ALL = "contacts_of_robot"
 _ROLLING = "contacts_of_rolling"
 
@@ -48,22 +41,14 @@ def add_sensor(
 
 def add_contact_sensors(spec: mujoco.MjSpec, robot: RobotSpec, bodies: list[str]) -> None:
     """List the robot's and its rolling parts' contacts with each of the bodies."""
-
-    casters = [
-        geom.name
-        for geom in spec.body(robot.base_body).find_all("geom")
-        if geom.condim == 1 and geom.parent.name not in robot.rolling_bodies
-    ]
-
-    def add(name: str, objtype: mujoco.mjtObj, objname: str, body: str) -> None:
-        add_sensor(spec, name, objtype, objname, body, (_DATA, 0, SLOTS))
-
+    geoms, data = spec.body(robot.base_body).find_all("geom"), (_DATA, 0, SLOTS)
+    casters = [g.name for g in geoms if g.condim == 1 and g.parent.name not in robot.rolling_bodies]
+    rolling = [(mujoco.mjtObj.mjOBJ_BODY, wheel) for wheel in robot.rolling_bodies]
+    rolling += [(mujoco.mjtObj.mjOBJ_GEOM, caster) for caster in casters]
     for i, body in enumerate(bodies):
-        add(f"{_ALL}_{i}", mujoco.mjtObj.mjOBJ_XBODY, robot.base_body, body)
-        for wheel in robot.rolling_bodies:
-            add(f"{_ROLLING}_{i}_{wheel}", mujoco.mjtObj.mjOBJ_BODY, wheel, body)
-        for caster in casters:
-            add(f"{_ROLLING}_{i}_{caster}", mujoco.mjtObj.mjOBJ_GEOM, caster, body)
+        add_sensor(spec, f"{_ALL}_{i}", mujoco.mjtObj.mjOBJ_XBODY, robot.base_body, body, data)
+        for kind, part in rolling:
+            add_sensor(spec, f"{_ROLLING}_{i}_{part}", kind, part, body, data)
 
 
 def rolling_geoms(model: mujoco.MjModel, robot: RobotSpec, robot_bodies: np.ndarray) -> np.ndarray:

@@ -28,13 +28,14 @@ from scenes_mjcf.categories import MaskClasses, class_id
 from scenes_mjcf.schema import CATEGORIES, SceneError
 
 Rgba = tuple[float, float, float, float]
+Size = tuple[float, float, float]
 SPLITS = ("train", "test")
 KINDS = ("basket", "shoe", "pot", "toy", "shoe", "basket", "toy", "pot")
 """Kinds in the order in which `pick` deals them: ten are 3 baskets, 3 shoes, 2 pots, 2 toys."""
 VISUAL_GROUP = 2
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 """Quaternion w x y z of what is not turned."""
-_GREY = (0.6, 0.6, 0.6, 1.0)
+_GREY, _GLASS = (0.6, 0.6, 0.6, 1.0), (0.75, 0.85, 0.92, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +75,10 @@ class Shape:
     rgba: Rgba
     axis: str = "z"
     """Axis of a cylinder or capsule: x, y or z."""
+
+
+Parts = tuple[tuple[Box, ...], list[Shape]]
+"""What of an object collides, and what it looks like."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,16 +122,11 @@ class SmallObject:
         return np.asarray([[*b.centre_m, *b.quat, *b.half_m] for b in self.boxes], float)
 
 
-def _rgba(red: float, green: float, blue: float) -> Rgba:
-    return red, green, blue, 1.0
-
-
 def _darker(colour: Rgba, factor: float = 0.65) -> Rgba:
     return colour[0] * factor, colour[1] * factor, colour[2] * factor, 1.0
 
 
-def _basket(name: str, segmentation_id: int, width: float, depth: float, height: float, mass: float,
-            colour: Rgba, bands: int = 0) -> SmallObject:  # fmt: skip
+def _basket(colour: Rgba, width: float, depth: float, height: float, bands: int = 0) -> Parts:
     wall = 0.012
     w, d, h = width / 2, depth / 2, height / 2
     boxes = (
@@ -145,32 +145,28 @@ def _basket(name: str, segmentation_id: int, width: float, depth: float, height:
             shapes.append(Shape("capsule", (0, side * (d - 0.005), z), (radius, w - 0.01), dark, "x"))
     for side in (-1, 1):
         shapes.append(Shape("capsule", (side * (w - 0.008), 0, height + 0.02), (0.008, 0.35 * d), dark, "y"))
-    return SmallObject(name, "basket", segmentation_id, mass, 0.5, boxes, colour, tuple(shapes))
+    return boxes, shapes
 
 
-def _shoe(name: str, length: float, width: float, mass: float, colour: Rgba, upper: float = 0.05,
-          sole: Rgba = (0.9, 0.9, 0.88, 1.0)) -> SmallObject:  # fmt: skip
+def _shoe(colour: Rgba, length: float, width: float, upper: float = 0.05, sole: Rgba = (0.9, 0.9, 0.88, 1.0)) -> Parts:
     boxes = (
         Box((0, 0, 0.025), (length / 2, width / 2, 0.025)),
         Box((-0.22 * length, 0, round(0.05 + upper / 2, 4)), (0.28 * length, 0.42 * width, upper / 2)),
     )
-    top = 0.05 + upper
-    shapes = (
+    top, inside = 0.05 + upper, _darker(colour, 0.3)
+    return boxes, [
         Shape("box", (0, 0, 0.010), (0.40 * length, 0.46 * width, 0.010), sole),
         Shape("cylinder", (0.36 * length, 0, 0.010), (0.46 * width, 0.010), sole),
         Shape("cylinder", (-0.38 * length, 0, 0.010), (0.42 * width, 0.010), sole),
         Shape("ellipsoid", (0.20 * length, 0, 0.034), (0.29 * length, 0.46 * width, 0.032), colour),
         Shape("ellipsoid", (-0.22 * length, 0, 0.5 * top), (0.27 * length, 0.43 * width, 0.5 * top), colour),
-        Shape(
-            "ellipsoid", (-0.25 * length, 0, top - 0.012), (0.17 * length, 0.27 * width, 0.014), _darker(colour, 0.3)
-        ),
+        Shape("ellipsoid", (-0.25 * length, 0, top - 0.012), (0.17 * length, 0.27 * width, 0.014), inside),
         Shape("capsule", (0.06 * length, 0, 0.058), (0.004, 0.22 * width), sole, "y"),
         Shape("capsule", (0.12 * length, 0, 0.054), (0.004, 0.24 * width), sole, "y"),
-    )
-    return SmallObject(name, "shoe", 10, mass, 0.7, boxes, colour, shapes)
+    ]
 
 
-def _pot(name: str, width: float, height: float, mass: float, colour: Rgba, planted: bool = False) -> SmallObject:
+def _pot(colour: Rgba, width: float, height: float, planted: bool = False) -> Parts:
     # An octagonal prism from two boxes turned against each other would need a quaternion; a plus of two
     # boxes keeps the frame and is 8 % smaller in area than the disc.
     r = width / 2
@@ -178,58 +174,58 @@ def _pot(name: str, width: float, height: float, mass: float, colour: Rgba, plan
         Box((0, 0, height / 2), (r * 0.92, r * 0.55, height / 2)),
         Box((0, 0, height / 2), (r * 0.55, r * 0.92, height / 2)),
     )
-    dark = _darker(colour)
-    shapes = [Shape("cylinder", (0, 0, height / 2), (0.92 * r, height / 2), colour)]
+    dark, green = _darker(colour), (0.25, 0.50, 0.20, 1.0)
+    body = Shape("cylinder", (0, 0, height / 2), (0.92 * r, height / 2), colour)
     if planted:
-        green = _rgba(0.25, 0.50, 0.20)
-        shapes += [
+        return boxes, [
+            body,
             Shape("cylinder", (0, 0, height - 0.012), (0.97 * r, 0.012), dark),
             Shape("ellipsoid", (0, 0, height + 0.05), (0.75 * r, 0.75 * r, 0.07), green),
             Shape("ellipsoid", (0.3 * r, 0.2 * r, height + 0.10), (0.4 * r, 0.4 * r, 0.06), _darker(green, 1.2)),
         ]
-    else:
-        shapes += [
-            Shape("cylinder", (0, 0, height + 0.004), (0.95 * r, 0.006), dark),
-            Shape("ellipsoid", (0, 0, height + 0.022), (0.016, 0.016, 0.014), dark),
-            Shape("capsule", (0.96 * r, 0, 0.8 * height), (0.009, 0.25 * r), dark, "y"),
-            Shape("capsule", (-0.96 * r, 0, 0.8 * height), (0.009, 0.25 * r), dark, "y"),
-        ]
-    return SmallObject(name, "pot", 7, mass, 0.45, boxes, colour, tuple(shapes))
+    return boxes, [
+        body,
+        Shape("cylinder", (0, 0, height + 0.004), (0.95 * r, 0.006), dark),
+        Shape("ellipsoid", (0, 0, height + 0.022), (0.016, 0.016, 0.014), dark),
+        Shape("capsule", (0.96 * r, 0, 0.8 * height), (0.009, 0.25 * r), dark, "y"),
+        Shape("capsule", (-0.96 * r, 0, 0.8 * height), (0.009, 0.25 * r), dark, "y"),
+    ]
 
 
-def _toy(name: str, length: float, width: float, mass: float, colour: Rgba, cab: tuple[float, float, float] = (
-         0.05, 0.20, 0.035), accent: Rgba = (0.75, 0.85, 0.92, 1.0)) -> SmallObject:  # fmt: skip
+def _toy(colour: Rgba, length: float, width: float, cab: Size = (0.05, 0.20, 0.035), accent: Rgba = _GLASS) -> Parts:
     """Build a vehicle; `cab` is the cab's centre and half length as shares of the length, and its half height in m."""
     boxes = (
         Box((0, 0, 0.04), (length / 2, width / 2, 0.04)),
         Box((cab[0] * length, 0, round(0.08 + cab[2], 4)), (cab[1] * length, 0.4 * width, cab[2])),
     )
-    tyre = _rgba(0.10, 0.10, 0.11)
+    roof_m = cab[0] * length, 0, 0.08 + 2 * cab[2] - 0.006
     shapes = [
         Shape("box", (0, 0, 0.052), (length / 2, 0.42 * width, 0.028), colour),
         Shape("box", boxes[1].centre_m, boxes[1].half_m, accent),
-        Shape(
-            "box",
-            (cab[0] * length, 0, 0.08 + 2 * cab[2] - 0.006),
-            (cab[1] * length + 0.004, 0.41 * width, 0.007),
-            colour,
-        ),
+        Shape("box", roof_m, (cab[1] * length + 0.004, 0.41 * width, 0.007), colour),
     ]
-    for x in (-0.30, 0.30):
-        for side in (-1, 1):
-            shapes.append(Shape("cylinder", (x * length, side * 0.43 * width, 0.030), (0.030, 0.07 * width), tyre, "y"))
-    return SmallObject(name, "toy", 9, mass, 0.4, boxes, colour, tuple(shapes))
+    for x, side in itertools.product((-0.30, 0.30), (-1, 1)):
+        wheel_m, tyre = (x * length, side * 0.43 * width, 0.030), (0.10, 0.10, 0.11, 1.0)
+        shapes.append(Shape("cylinder", wheel_m, (0.030, 0.07 * width), tyre, "y"))
+    return boxes, shapes
 
 
-def _model(kind: str, about: dict[str, Any]) -> SmallObject:
+_BUILT = {"basket": (_basket, 0, 0.5), "shoe": (_shoe, 10, 0.7), "pot": (_pot, 7, 0.45), "toy": (_toy, 9, 0.4)}
+"""Kind -> builder, segmentation id, friction."""
+
+
+def _model(kind: str, name: str, mass: float, segmentation_id: int | None = None, **about: Any) -> SmallObject:
     """Build a model of the file."""
-    colours = {name: _rgba(*about[name]) for name in ("colour", "sole", "accent") if name in about}
-    return {"basket": _basket, "shoe": _shoe, "pot": _pot, "toy": _toy}[kind](**{**about, **colours})
+    build, number, friction = _BUILT[kind]
+    about |= {key: (*about[key], 1.0) for key in ("colour", "sole", "accent") if key in about}
+    boxes, shapes = build(**about)
+    number = segmentation_id or number
+    return SmallObject(name, kind, number, mass, friction, boxes, about["colour"], tuple(shapes))
 
 
 _ROWS = yaml.safe_load((Path(__file__).parent / "small_objects.yaml").read_text())
 MODELS: dict[str, dict[str, tuple[SmallObject, ...]]] = {
-    split: {kind: tuple(_model(kind, row) for row in rows) for kind, rows in kinds.items()}
+    split: {kind: tuple(_model(kind, **row) for row in rows) for kind, rows in kinds.items()}
     for split, kinds in _ROWS.items()
 }
 """Split -> kind -> models; no model is in both splits."""
@@ -265,20 +261,22 @@ def body_names(objects: Sequence[SmallObject]) -> tuple[str, ...]:
     return tuple(f"{o.category}_small_{i}" for i, o in enumerate(objects))
 
 
+def solid(friction: float, group: int = 3, **weight: float) -> dict[str, Any]:
+    """Return what geoms that collide are alike in; without a mass or density they weigh nothing."""
+    return {"friction": [friction, 0.005, 0.0001], "group": group, **(weight or {"mass": 0.0})}
+
+
+def add_box(body: mujoco.MjsBody, row: np.ndarray, name: str, friction: float, **weight: float) -> None:
+    """Add a box that collides to a body: its centre (3), quaternion (4) and half sizes (3)."""
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    body.add_geom(name=name, type=box, pos=row[:3], quat=row[3:7], size=row[7:10], **solid(friction, **weight))
+
+
 def add_boxes(body: mujoco.MjsBody, obj: SmallObject, name: str) -> None:
     """Add an object's boxes to its body, origin on the floor: they collide, and share its mass by volume."""
     volume = sum(8 * b.half_m[0] * b.half_m[1] * b.half_m[2] for b in obj.boxes)
-    for i, box in enumerate(obj.boxes):
-        body.add_geom(
-            name=f"{name}_box_{i}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=box.centre_m,
-            quat=box.quat,
-            size=box.half_m,
-            density=obj.mass_kg / volume,
-            friction=[obj.friction, 0.005, 0.0001],
-            group=3,
-        )
+    for i, row in enumerate(obj.rows):
+        add_box(body, row, f"{name}_box_{i}", obj.friction, density=obj.mass_kg / volume)
 
 
 def add_shapes(body: mujoco.MjsBody, obj: SmallObject, name: str) -> None:

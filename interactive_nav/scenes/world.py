@@ -7,20 +7,42 @@ slot is a body without a place: it waits at its parking spot and never counts.
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 
 from interactive_nav.config import NavConfig
 from interactive_nav.robots import RobotSpec
-from interactive_nav.scenes.objects import SmallObject, small_objects
-from interactive_nav.scenes.scene import Scene
-from interactive_nav.scenes.slots import Layout, SlotTables, build_slot_tables, find_layout, find_slots, parking_spot
-from interactive_nav.scenes.spec import build_spec
+from interactive_nav.scenes.contacts import add_contact_sensors, add_sensor
+from interactive_nav.scenes.objects import ConvertedObject, SmallObject, add_box, add_boxes, small_objects, solid
+from interactive_nav.scenes.scene import Hinge, Movable, Scene
+from interactive_nav.scenes.slots import (
+    Layout,
+    Slot,
+    SlotTables,
+    build_slot_tables,
+    find_layout,
+    find_slots,
+    parking_spot,
+)
 from interactive_nav_common.errors import ConfigError
 from scenes_mjcf.schema import SceneError
 
 _SETTLE_TIME_S = 3.0
+_EMPTY_BOX = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1e-3, 1e-3, 1e-3])
+_TILTED = np.array([0.8, 0.36, 0.48, 0.0])
+_FLOATS = 1.0
+"""Share of its weight that an empty slot's body is relieved of."""
+FEET = 12
+"""Points of each movable object that can touch the floor."""
+_FOOT_RADIUS_M = 2e-3
+_SOLID, _FLOOR, _CEILING = 1, 2, 4
+"""Collision bits: bodies against each other, what can touch the floor, and flying robots against the ceiling."""
+CEILING_M = 1.2
+"""Height of the ceiling that flying robots meet: just below the tops of walls, which are cut above ground robots."""
+FLOOR_FRICTION = 0.05
+"""Below every object's: MuJoCo takes the larger of two friction coefficients, so the object's holds."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +62,204 @@ class World:
     robot_mass_kg: float
     slots: SlotTables
     """The movable bodies of each scene."""
+
+
+def foot_points(boxes: np.ndarray, count: int = FEET) -> np.ndarray:
+    """Return [at most count, 3] points, m, at which a body of boxes can rest on a plane, its outermost corners.
+
+    A rigid body touches a plane at vertices of its convex hull only. Boxes against the floor would make four
+    contacts each (a chair of twelve boxes has 16 where 4 carry it), and the solver's cost grows with them. Those of the
+    bottom come first, then those of the top.
+    """
+    corners = []
+    for row in boxes:
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, row[3:7])
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        corners.append(row[:3] + (signs * row[7:10]) @ rotation.reshape(3, 3).T)
+    points = np.concatenate(corners)
+    azimuth = np.arange(8) * math.pi / 4 + math.pi / 4
+    # Slightly more than level: of corners at (nearly) one height the outermost wins.
+    level = np.stack([0.05 * np.cos(azimuth), 0.05 * np.sin(azimuth), np.ones(8)], -1)
+    kept: list[np.ndarray] = []
+    for direction in [*(level * [1, 1, -1])[::2], *(level * [1, 1, -1])[1::2], *level[::2], *level[1::2]]:
+        point = points[np.argmax(points @ direction)]
+        if len(kept) < count and all(np.linalg.norm(point - k) > 0.02 for k in kept):
+            kept.append(point)
+    return np.stack(kept)
+
+
+def _add_feet(body: mujoco.MjsBody, name: str, boxes: np.ndarray, hidden_m: np.ndarray, friction: float) -> None:
+    """Add `FEET` small spheres that alone touch the floor; those not needed hide inside the body."""
+    points = foot_points(boxes) if len(boxes) else np.zeros((0, 3))
+    if len(points):
+        centre = 0.5 * (points.min(0) + points.max(0))
+        points = points - _FOOT_RADIUS_M * np.sign(points - centre)
+    for i in range(FEET):
+        body.add_geom(
+            name=f"{name}_foot_{i}",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            pos=points[i] if i < len(points) else hidden_m,
+            size=[_FOOT_RADIUS_M, 0, 0],
+            contype=_FLOOR,
+            conaffinity=0,
+            **solid(friction, 4),
+        )
+
+
+def _nothing(slot: int, kind: str) -> Movable:
+    """Return what stands in an empty slot, at its parking spot.
+
+    It is off-centre and turned: MuJoCo gives a body whose frame is its inertia's a sparser mass matrix, and the models'
+    structure must be equal.
+    """
+    # The friction is not 0: MJX-JAX makes a row of constraints only for joints whose model has friction.
+    hinge = Hinge(np.array([0, 0, 1]), np.zeros(3), None, damping=0.1, frictionloss=1e-6) if kind == "hinge" else None
+    inertia, pos, level = np.array([0.01, 0.012, 0.014]), np.array([*parking_spot(slot), 2.0]), np.array([1, 0, 0, 0])
+    return Movable("", "", 1.0, inertia, np.full(3, 1e-3), _TILTED, pos, level, 0.5, np.zeros((0, 10)), (), hinge)
+
+
+def _add_movable(
+    spec: mujoco.MjSpec, name: str, movable: Movable, n_boxes: int, collision: str, gravcomp: float = 0.0
+) -> None:
+    body = spec.worldbody.add_body(name=name, pos=movable.pos_w, quat=movable.quat_w, gravcomp=gravcomp)
+    boxes, friction, com = movable.boxes, movable.friction, movable.com_m
+    if np.abs(com).max() < 1e-6:
+        com = com + 1e-6
+    body.explicitinertial = True
+    body.mass, body.inertia, body.ipos, body.iquat = movable.mass_kg, movable.inertia, com, movable.inertia_quat
+    if hinge := movable.hinge:
+        joint = body.add_joint(name=f"{name}_joint", type=mujoco.mjtJoint.mjJNT_HINGE)
+        joint.axis, joint.pos, joint.frictionloss = hinge.axis, hinge.anchor_m, hinge.frictionloss
+        joint.limited, joint.range = True, hinge.range_rad or (-math.pi, math.pi)
+        joint.damping = [hinge.damping, 0, 0]
+    else:
+        body.add_freejoint(name=f"{name}_joint")
+    if collision == "hulls" and movable.hulls:
+        for i, vertices in enumerate(movable.hulls):
+            spec.add_mesh(name=f"{name}_mesh_{i}", uservert=np.asarray(vertices, float).ravel())
+            body.add_geom(
+                name=f"{name}_hull_{i}",
+                type=mujoco.mjtGeom.mjGEOM_MESH,
+                meshname=f"{name}_mesh_{i}",
+                contype=_SOLID | _FLOOR,
+                **solid(friction),
+            )
+        return
+    # A padding box hides at the centre of mass, inside the body, and is too small to be met first.
+    hidden = _EMPTY_BOX.copy()
+    hidden[:3] = com
+    for i in range(n_boxes):
+        add_box(body, boxes[i] if i < len(boxes) else hidden, f"{name}_box_{i}", friction)
+    _add_feet(body, name, boxes, com, friction)
+
+
+def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject, park: int, collision: str) -> None:
+    x, y = parking_spot(park)
+    if isinstance(obj, ConvertedObject):
+        parked = dataclasses.replace(obj.movable, pos_w=np.array([x, y, 0.0]))
+        _add_movable(spec, name, parked, len(obj.boxes), collision)
+        return
+    body = spec.worldbody.add_body(name=name, pos=[x, y, 0.0])
+    body.add_freejoint(name=f"{name}_joint")
+    add_boxes(body, obj, name)
+    _add_feet(body, name, obj.rows, obj.rows[:, :3].mean(0), obj.friction)
+
+
+def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
+    """Return a spec of physics options, the floor and the robot."""
+    spec = mujoco.MjSpec()
+    spec.modelname = "interactive_nav"
+    spec.compiler.degree = False
+    option = spec.option
+    option.timestep = config.sim_dt_s
+    option.gravity = [0, 0, -9.81]
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = getattr(mujoco.mjtCone, f"mjCONE_{config.cone.upper()}")
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.iterations = config.solver_iterations
+    option.ls_iterations = 20
+    plane = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [0, 0, 0.1], "friction": [FLOOR_FRICTION, 0.005, 0.0001]}
+    spec.worldbody.add_geom(name="floor", contype=0, conaffinity=_FLOOR, **plane)
+    robot.add_to(spec)
+    if config.symmetric_actions:
+        for actuator in spec.actuators:
+            low, high = actuator.ctrlrange
+            if actuator.ctrllimited and low < 0 < high:
+                actuator.ctrlrange = [-max(-low, high), max(-low, high)]
+    for geom in spec.geoms:
+        if geom.name != "floor" and (geom.contype or geom.conaffinity):
+            geom.contype |= _FLOOR | (_CEILING if robot.kind == "flying" else 0)
+    if robot.kind == "flying":
+        above = {"pos": [0, 0, CEILING_M], "quat": [0, 1, 0, 0], "group": 4}
+        spec.worldbody.add_geom(name="ceiling", contype=0, conaffinity=_CEILING, **plane, **above)
+    return spec
+
+
+def build_empty_spec(
+    robot: RobotSpec, slots: tuple[tuple[str, int], ...], n_walls: int, config: NavConfig
+) -> tuple[mujoco.MjSpec, mujoco.MjModel, Layout]:
+    """Return a model whose movable slots and walls are all empty: its numbers are filled in per environment.
+
+    `slots` are (kind, number of boxes) each. Returns spec, compiled model and layout, with sensors as `build_world`'s.
+    """
+    spec = _empty_spec(robot, config)
+    named = [(f"{kind}_{i}", kind) for i, (kind, _) in enumerate(slots)]
+    for i, ((name, kind), (_, n_boxes)) in enumerate(zip(named, slots, strict=True)):
+        _add_movable(spec, name, _nothing(i, kind), n_boxes, "boxes", _FLOATS)
+    _finish(spec, robot, np.zeros((0, 10)), n_walls, named, config)
+    model = spec.compile()
+    return spec, model, find_layout(model, robot, named)
+
+
+def build_spec(
+    robot: RobotSpec, scene_index: int, scenes: tuple[Scene, ...], slots: Sequence[Slot], config: NavConfig
+) -> mujoco.MjSpec:
+    """Return the padded spec of one scene."""
+    spec, collision = _empty_spec(robot, config), config.collision
+    for i, slot in enumerate(slots):
+        body = slot.bodies[scene_index]
+        if isinstance(body, SmallObject):
+            _add_small(spec, slot.name, body, i, collision)
+            continue
+        n_boxes = max(len(m.boxes) for m in slot.bodies if m is not None)
+        # The tiny value keeps the models' structure equal.
+        gravcomp = _FLOATS if body is None else 1e-9 if None in slot.bodies else 0.0
+        _add_movable(spec, slot.name, body or _nothing(i, slot.kind), n_boxes, collision, gravcomp)
+    named, most = [(slot.name, slot.kind) for slot in slots], max(len(s.walls) for s in scenes)
+    _finish(spec, robot, scenes[scene_index].walls, most, named, config)
+    return spec
+
+
+def _finish(
+    spec: mujoco.MjSpec,
+    robot: RobotSpec,
+    walls: np.ndarray,
+    count: int,
+    slots: list[tuple[str, str]],
+    config: NavConfig,
+) -> None:
+    """Add `count` walls and the sensors of slots (name, kind), and make all contacts as soft as the settings say."""
+    structure = spec.worldbody.add_body(name="structure")
+    for i in range(count):
+        row = walls[i] if i < len(walls) else _EMPTY_BOX + np.array([0, 0, -5.0 - 0.01 * i, 0, 0, 0, 0, 0, 0, 0])
+        add_box(structure, row, f"wall_{i}", 0.5)
+    # Net force of the robot's subtree on a body: 3 numbers, world frame.
+    numbers, subtree = (1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1), mujoco.mjtObj.mjOBJ_XBODY
+    for i, (name, kind) in enumerate(slots):
+        add_sensor(spec, f"force_{i}", subtree, robot.base_body, name, numbers)
+        if kind == "hinge":
+            # A door leaf hangs in its frame: they touch by design.
+            spec.add_exclude(bodyname1=name, bodyname2="structure")
+    add_sensor(spec, "force_structure", subtree, robot.base_body, "structure", numbers)
+    if config.needs_contacts:
+        add_contact_sensors(spec, robot, [*(name for name, _ in slots), "structure"])
+    for geom in spec.geoms:
+        geom.solref = [config.contact_time_constant_s, 1.0]
+    if robot.contact_time_constant_s is not None:
+        for geom in spec.body(robot.base_body).find_all("geom"):
+            geom.solref = [robot.contact_time_constant_s, 1.0]
+            geom.solmix = 1e6  # a contact's is the mean of both geoms', weighted by this: the robot's holds
 
 
 def _settle(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> np.ndarray:

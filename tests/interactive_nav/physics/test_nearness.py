@@ -14,8 +14,7 @@ from interactive_nav.physics import PhysicsState
 from interactive_nav.physics.nearness import FAR_M, TOUCH_M, Boxes, Nearness, widths_at
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
-from interactive_nav.scenes.spec import FEET
-from interactive_nav.scenes.world import build_world
+from interactive_nav.scenes.world import FEET, build_world
 from interactive_nav_common.rotations import matrix_from_quat
 from tests.toys import write_room
 

@@ -14,8 +14,7 @@ from interactive_nav.physics import PhysicsState, make_physics, mjx_batch
 from interactive_nav.physics.window import FIELDS, PhysicsWindow
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
-from interactive_nav.scenes.spec import FEET
-from interactive_nav.scenes.world import build_world
+from interactive_nav.scenes.world import FEET, build_world
 from tests.toys import write_room
 
 # Chairs at x = 0.7 and 1.4 m in front of the robot, tables to the left and far behind.

@@ -9,7 +9,7 @@ import pytest
 import interactive_nav
 from interactive_nav.robots import get_robot
 from interactive_nav.robots.spec import RobotState
-from interactive_nav.scenes.spec import CEILING_M
+from interactive_nav.scenes.world import CEILING_M
 from interactive_nav.types import EpisodeStart
 from tests.interactive_nav.robots.motion import extents, hall_world, home_data, move, plain_model, schedule
 from tests.toys import write_room

@@ -12,8 +12,7 @@ from interactive_nav.navigation.tables import build_tables, furniture_map
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes import objects
 from interactive_nav.scenes.scene import load_scene
-from interactive_nav.scenes.spec import FEET, foot_points
-from interactive_nav.scenes.world import build_world
+from interactive_nav.scenes.world import FEET, build_world, foot_points
 from interactive_nav_common.errors import UserError
 from scenes_mjcf.schema import SceneError, load_maps, save_maps
 from tests.toys import write_room
