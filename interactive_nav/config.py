@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -198,12 +198,11 @@ class PhysicsConfig(Settings):
     """Native backend: threads; 0: all cores."""
 
     IDLE = (
-        (" ".join(WINDOW), "backend auto, jax or warp, or 0 (all)",
-         lambda c: c.backend != "native"),
+        (" ".join(WINDOW), "backend auto, jax or warp, or 0 (all)", lambda c: c.backend != "native"),
         ("windows", "backend auto, jax or warp, or ()", lambda c: c.backend != "native"),
         ("contacts_per_env constraints_per_env", "backend auto or warp", lambda c: c.backend in ("auto", "warp")),
         ("threads", "backend auto or native", lambda c: c.backend in ("auto", "native")),
-    )  # fmt: skip
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -226,6 +225,15 @@ _NOISE = {
     }.items()
 }
 """Image -> the settings that act on it alone."""
+
+
+_OF_IMAGES = "cameras robot_visible image_size image_fov_deg image_dtype image_geometry renderer frame_dropout"
+
+
+def _only_with(settings: str, *parts: str) -> tuple[str, str, Callable[[Any], bool]]:
+    """Return an entry of `IDLE`: settings without effect unless one of these parts is observed."""
+    which = parts[0] if len(parts) == 1 else f"one of {', '.join(parts)}"
+    return settings, f"{which} among observations", lambda c: any(part in c.observations for part in parts)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -279,15 +287,12 @@ class SensorConfig(CameraNoise):
     """Standard deviation of each step's distance and angle in odometry, as a share of them."""
 
     IDLE = (
-        ("cameras robot_visible image_size image_fov_deg image_dtype image_geometry renderer frame_dropout",
-         f"one of {', '.join(IMAGES)} among observations",
-         lambda c: any(name in c.observations for name in IMAGES)),
-        (_NOISE["depth"], "depth among observations", lambda c: "depth" in c.observations),
-        (_NOISE["rgb"], "rgb among observations", lambda c: "rgb" in c.observations),
-        ("lidar_rays lidar_fov_deg lidar_range_m lidar_pos_m lidar_dropout lidar_noise", "lidar among observations",
-         lambda c: "lidar" in c.observations),
-        ("odometry_noise", "odometry among observations", lambda c: "odometry" in c.observations),
-    )  # fmt: skip
+        _only_with(_OF_IMAGES, *IMAGES),
+        _only_with(_NOISE["depth"], "depth"),
+        _only_with(_NOISE["rgb"], "rgb"),
+        _only_with("lidar_rays lidar_fov_deg lidar_range_m lidar_pos_m lidar_dropout lidar_noise", "lidar"),
+        _only_with("odometry_noise", "odometry"),
+    )
 
     def __post_init__(self) -> None:
         allowed = (*SIGNALS, *IMAGES)

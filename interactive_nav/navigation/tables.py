@@ -169,15 +169,13 @@ def _farthest(starts: np.ndarray, goals: np.ndarray) -> np.ndarray:
     return np.linalg.norm(goals[:, None] - outermost[None], axis=-1).max(1)
 
 
-def _pad(arrays: list[np.ndarray], axes: int, fill: float = 0) -> np.ndarray:
-    """Stack arrays padded at the end of their first `axes` axes to common sizes."""
-    sizes = [max(a.shape[i] for a in arrays) for i in range(axes)]
-    padded = [
-        np.pad(a, [(0, s - n) for s, n in zip(sizes, a.shape, strict=False)] + [(0, 0)] * (a.ndim - axes),
-               constant_values=fill)
-        for a in arrays
-    ]  # fmt: skip
-    return np.stack(padded)
+def _pad(arrays: list[np.ndarray], axes: int, fill: float = 0, least: int = 0) -> np.ndarray:
+    """Stack arrays padded at the end of their first `axes` axes to common sizes, each at least `least`."""
+    sizes = [max(least, *(a.shape[i] for a in arrays)) for i in range(axes)]
+    out = np.full((len(arrays), *sizes, *arrays[0].shape[axes:]), fill, arrays[0].dtype)
+    for row, array in zip(out, arrays, strict=True):
+        row[tuple(map(slice, array.shape))] = array
+    return out
 
 
 def navigation_tables(graphs: list[CornerGraph]) -> dict[str, Any]:
@@ -186,21 +184,16 @@ def navigation_tables(graphs: list[CornerGraph]) -> dict[str, Any]:
     # The tables are large: the smallest type that numbers every corner.
     index = np.uint16 if count < 2**16 else np.int32
 
-    def squared(table: np.ndarray, fill: float) -> np.ndarray:
-        missing = count + 1 - len(table)
-        return np.pad(table, [(0, missing), (0, missing)], constant_values=fill)
-
     visible = [np.where(g.visible < len(g.corner_xy_w), g.visible, count) for g in graphs]
     extent = max(math.hypot(*g.free.shape) * g.fine_m for g in graphs)
-    corners = [np.pad(g.corner_xy_w, [(0, count + 1 - len(g.corner_xy_w)), (0, 0)]) for g in graphs]
     arrays = {
         "node_of_cell": np.int32(_pad([g.node_of_cell for g in graphs], 2)),
         "grid_origin_w": np.asarray([g.origin_w for g in graphs], np.float32),
         "node_xy_w": np.float32(_pad([g.node_xy_w for g in graphs], 1)),
         "visible": _pad(visible, 2, fill=count).astype(index),
-        "corner_xy_w": np.stack(corners),
-        "corner_distance_m": np.asarray([squared(g.distance_m, np.inf) for g in graphs], np.float32),
-        "next_corner": np.stack([squared(g.next_corner, count) for g in graphs]).astype(index),
+        "corner_xy_w": _pad([g.corner_xy_w for g in graphs], 1, least=count + 1),
+        "corner_distance_m": _pad([g.distance_m for g in graphs], 2, np.inf, count + 1),
+        "next_corner": _pad([g.next_corner for g in graphs], 2, count, count + 1).astype(index),
         "free": _pad([g.free for g in graphs], 2),
     }
     return jax.device_put(arrays) | {
@@ -229,7 +222,7 @@ def build_tables(world: World, rules: TaskRules) -> SceneTables:
         num_starts=i32([len(p[1]) for p in places]),
         goal_xy_w=f32(_pad([p[2] for p in places], 1)),
         num_goals=i32([len(p[2]) for p in places]),
-        clutter_xy_w=f32(_pad([p[3].reshape(-1, 2) if len(p[3]) else np.zeros((1, 2)) for p in places], 1)),
+        clutter_xy_w=f32(_pad([p[3] for p in places], 1, least=1)),
         num_clutter=i32([len(p[3]) for p in places]),
         fallback_pairs_xy_w=f32(np.zeros((len(places), 1, 2, 2))),
     )

@@ -19,7 +19,7 @@ SLOTS = 32
 """Contacts listed between the robot, or one of its wheels, and one body; more than a robot's few boxes make."""
 _FIELDS = 7
 """whether there is one (1), force in the contact's frame (3), normal in the world frame (3)."""
-_DATA = sum(1 << int(mujoco.mjtConDataField[f"mjCONDATA_{name}"]) for name in ("FOUND", "FORCE", "NORMAL"))
+_DATA = sum(1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{name}")) for name in ("FOUND", "FORCE", "NORMAL"))
 _ALL = "contacts_of_robot"
 _ROLLING = "contacts_of_rolling"
 

@@ -6,6 +6,7 @@ slot is a body without a place: it waits at its parking spot and never counts.
 """
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -64,18 +65,16 @@ class World:
     """The movable bodies of each scene."""
 
 
-def foot_points(boxes: np.ndarray, count: int = FEET) -> np.ndarray:
-    """Return [at most count, 3] points, m, at which a body of boxes can rest on a plane, its outermost corners.
+def foot_points(boxes: np.ndarray) -> np.ndarray:
+    """Return [at most `FEET`, 3] points, m, at which a body of boxes can rest on a plane, its outermost corners.
 
     A rigid body touches a plane at vertices of its convex hull only. Boxes against the floor would make four
     contacts each (a chair of twelve boxes has 16 where 4 carry it), and the solver's cost grows with them. Those of the
     bottom come first, then those of the top.
     """
-    corners = []
+    corners, rotation, signs = [], np.zeros(9), np.array(list(itertools.product((-1, 1), repeat=3)))
     for row in boxes:
-        rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, row[3:7])
-        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
         corners.append(row[:3] + (signs * row[7:10]) @ rotation.reshape(3, 3).T)
     points = np.concatenate(corners)
     azimuth = np.arange(8) * math.pi / 4 + math.pi / 4
@@ -84,7 +83,7 @@ def foot_points(boxes: np.ndarray, count: int = FEET) -> np.ndarray:
     kept: list[np.ndarray] = []
     for direction in [*(level * [1, 1, -1])[::2], *(level * [1, 1, -1])[1::2], *level[::2], *level[1::2]]:
         point = points[np.argmax(points @ direction)]
-        if len(kept) < count and all(np.linalg.norm(point - k) > 0.02 for k in kept):
+        if len(kept) < FEET and all(np.linalg.norm(point - k) > 0.02 for k in kept):
             kept.append(point)
     return np.stack(kept)
 

@@ -39,8 +39,8 @@ from scenes_mjcf.look import SKY_COLOUR, Lens, geom_colour, geom_image, mesh_of
 NEAR, FAR = wp.constant(NEAR_M), wp.constant(FAR_M)
 SKY, FLOOR = wp.constant(wp.vec3(*SKY_COLOUR)), wp.constant(wp.vec3(*FLOOR_COLOUR))
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-_SIDES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-                   [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])  # fmt: skip
+_SIDES = np.array(list("013032467475045051237276026064157173"), int).reshape(-1, 3)
+"""Triangles of a box: rows of `_CORNERS`."""
 
 
 @dataclasses.dataclass
@@ -345,9 +345,7 @@ class MeshRenderer(Renderer):
         sphere = jnp.concatenate([pos + apply_axes(axes, sphere[..., :3]), sphere[..., 3:]], -1)
         columns, rows = jnp.asarray(self.lens.columns), jnp.asarray(self.lens.rows)
         size = (len(scene), self.lens.height, self.lens.width)
-        handle = held(self._handle, self._mesh)
-        depth, ids, kind, normal, base = self._draw(
-            handle, scene, pos, axes, sphere, camera.pos_w, camera.axes_w, columns, rows, *self._constants,
-            launch_dims=(size[0], -(-size[1] // 8), -(-size[2] // 4), 32), output_dims=size,
-        )  # fmt: skip
+        shown = scene, pos, axes, sphere, camera.pos_w, camera.axes_w, columns, rows, *self._constants
+        handle, tiles = held(self._handle, self._mesh), (size[0], -(-size[1] // 8), -(-size[2] // 4), 32)
+        depth, ids, kind, normal, base = self._draw(handle, *shown, launch_dims=tiles, output_dims=size)
         return {"depth": depth, "segmentation": ids, **lit_images(base, normal, camera, kind == 1, ids, look)}

@@ -174,9 +174,12 @@ class InteractiveNav(Env):
     def _at_start(self, scene: jax.Array, physics: PhysicsState, geodesic_m: jax.Array) -> dict[str, Any]:
         """Return the fields of `NavInfo` that change within an episode, as they are at its start."""
         pos_w, rotation = self._robot_pose(physics)
-        objects = self._object_positions(scene, physics)
-        return {"robot_pos_w": pos_w, "yaw_rad": _yaw(rotation), "object_pos_w": objects, "geodesic_m": geodesic_m,
-                "step_count": jnp.zeros((), jnp.int32), "memory": {}}  # fmt: skip
+        poses = {
+            "robot_pos_w": pos_w,
+            "yaw_rad": _yaw(rotation),
+            "object_pos_w": self._object_positions(scene, physics),
+        }
+        return poses | {"geodesic_m": geodesic_m, "step_count": jnp.zeros((), jnp.int32), "memory": {}}
 
     def _remember(self, nav: NavInfo) -> NavInfo:
         return nav.replace(memory={t.key: t.start(nav) for t in self.terms if t.start})
@@ -267,14 +270,12 @@ class InteractiveNav(Env):
         flies = self.robot.kind == "flying"
         goal_w = jnp.concatenate([nav.goal_xy_w, jnp.full(1, self.robot.spawn_height_m if flies else 0.0)])
         away = (goal_w - pos_w)[: 3 if self.config.success_in_3d or flies else 2]
-        near = jnp.linalg.norm(away) < self.success_distance_m
-        return Step(
-            *self._constants, nav, physics, rotation, last, signals, rng,
-            touches=(self.tables.mass_kg[scene, 1:] > 0) & (signals.slot_force_n > TOUCH_FORCE_N),
-            hits_structure=signals.structure_force_n > TOUCH_FORCE_N,
-            lifted=pos_w[2] - self.robot.spawn_height_m > LIFT_M,
-            broken=broken, success=near & ~broken & (signals.overflow == 0),
-        )  # fmt: skip
+        success = (jnp.linalg.norm(away) < self.success_distance_m) & ~broken & (signals.overflow == 0)
+        touches = (self.tables.mass_kg[scene, 1:] > 0) & (signals.slot_force_n > TOUCH_FORCE_N)
+        hits_structure = signals.structure_force_n > TOUCH_FORCE_N
+        lifted = pos_w[2] - self.robot.spawn_height_m > LIFT_M
+        moment = nav, physics, rotation, last, signals, rng
+        return Step(*self._constants, *moment, touches, hits_structure, lifted, broken, success)
 
     def initial_physics(self, start: EpisodeStart) -> PhysicsState:
         """Return the physics' state that a given episode starts with."""

@@ -133,10 +133,7 @@ def _moved_m(delta: jax.Array) -> jax.Array:
 
 def _count(name: str, doc: str, of: Callable[[Step], jax.Array]) -> Term:
     """Build a metric that counts control steps."""
-    return Term(
-        name, doc, "metric", lambda count, step: count, lambda nav: jnp.zeros((), jnp.int32),
-        lambda count, step: count + of(step),
-    )  # fmt: skip
+    return Term(name, doc, "metric", lambda n, step: n, lambda nav: jnp.int32(0), lambda n, step: n + of(step))
 
 
 def _whole(step: Step, flag: jax.Array) -> jax.Array:
@@ -241,7 +238,7 @@ TERMS = (
     Term("off_distance", "1 where start and goal are nearer or farther than the settings ask.", "metric",
          _off_distance),
     Term("lifted", "1 where the base was `LIFT_M` above its standing height.", "metric",
-         lambda count, step: count > 0, lambda nav: jnp.zeros((), jnp.int32),
+         lambda count, step: count > 0, lambda nav: jnp.int32(0),
          lambda count, step: count + _whole(step, step.lifted)),
     Term("object_path_m", "(M,) l_i, m.", "memory", None,
          lambda nav: jnp.zeros(len(nav.object_pos_w)), _object_path),
