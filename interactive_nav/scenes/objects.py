@@ -261,15 +261,16 @@ def body_names(objects: Sequence[SmallObject]) -> tuple[str, ...]:
     return tuple(f"{o.category}_small_{i}" for i, o in enumerate(objects))
 
 
-def solid(friction: float, group: int = 3, **weight: float) -> dict[str, Any]:
-    """Return what geoms that collide are alike in; without a mass or density they weigh nothing."""
-    return {"friction": [friction, 0.005, 0.0001], "group": group, **(weight or {"mass": 0.0})}
+def solid(friction: float, group: int = 3, density: float | None = None) -> dict[str, Any]:
+    """Return what geoms that collide are alike in; without a density, kg/m3, they weigh nothing."""
+    weight = {"mass": 0.0} if density is None else {"density": density}
+    return {"friction": [friction, 0.005, 0.0001], "group": group, **weight}
 
 
-def add_box(body: mujoco.MjsBody, row: np.ndarray, name: str, friction: float, **weight: float) -> None:
+def add_box(body: mujoco.MjsBody, row: np.ndarray, name: str, friction: float, density: float | None = None) -> None:
     """Add a box that collides to a body: its centre (3), quaternion (4) and half sizes (3)."""
     box = mujoco.mjtGeom.mjGEOM_BOX
-    body.add_geom(name=name, type=box, pos=row[:3], quat=row[3:7], size=row[7:10], **solid(friction, **weight))
+    body.add_geom(name=name, type=box, pos=row[:3], quat=row[3:7], size=row[7:10], **solid(friction, density=density))
 
 
 def add_boxes(body: mujoco.MjsBody, obj: SmallObject, name: str) -> None:
