@@ -54,7 +54,7 @@ from scenes_mjcf.sets import installed
 
 if TYPE_CHECKING:
     from converters.pipeline import ConvertConfig
-    from converters.records.limits import Gate
+    from converters.records.errors import Gate
 
 
 def bounds(gate: Gate) -> str:
@@ -200,8 +200,7 @@ class Convert(OnCluster, MeshFile, WithLibrary, Decomposing):
 
 
 def _convert_many(arguments: Convert, places: list[str], config: ConvertConfig, console: Console) -> int:
-    from converters.many import convert_many
-    from converters.sets import make_launcher
+    from converters.many import convert_many, make_launcher
 
     launcher, side_by_side = make_launcher(
         arguments.launcher, arguments.ray_address, min(arguments.jobs, len(places)), len(places)

@@ -104,7 +104,7 @@ class GenerateScenes(OnCluster):
 
     def run(self, console: Console) -> int:
         """Run the command."""
-        from converters.sets import SEEDS, Wanted, generate_scenes
+        from converters.many import SEEDS, Wanted, generate_scenes
 
         if self.tier:
             refuse_unused(self, "--recipes", "with --tier, which writes them")
@@ -128,7 +128,7 @@ class MakeScenes(Command):
 
     def run(self, console: Console) -> int:
         """Run the command."""
-        from converters.sets import make_packaged
+        from converters.many import make_packaged
 
         with stage_progress(console) as report:
             log = functools.partial(console.print, soft_wrap=True, highlight=False)

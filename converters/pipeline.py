@@ -14,21 +14,18 @@ import numpy as np
 
 from converters.annotate.session import with_annotations
 from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig, Decomposition, cache_folder, decompose_all
-from converters.bodies.objects import PlacedObject, name_objects, physical_properties, place_object
-from converters.bodies.placement import align_objects
-from converters.check.gates import drawn_shares, evaluate
+from converters.bodies.objects import PlacedObject, align_objects, name_objects, physical_properties, place_object
+from converters.check.gates import drawn_shares, evaluate, kept_share
 from converters.check.settle import Settled, settle
-from converters.check.surfaces import kept_share
 from converters.clock import Clock, Report
 from converters.geometry.boxes import Hull
-from converters.geometry.simplify import simplify_open, simplify_parts
-from converters.propose.report import floor_of, with_retrieved
+from converters.geometry.faces import simplify_open, simplify_parts
+from converters.propose.proposals import floor_of, with_retrieved
 from converters.read.homes.parts import built_in
 from converters.read.source import read_source
 from converters.read.surfaces import split_storeys
 from converters.records.cache import NOT_HASHED, StageCache
-from converters.records.errors import SceneRejected
-from converters.records.limits import Gate
+from converters.records.errors import Gate, SceneRejected
 from converters.records.raw import (
     ATTRIBUTION,
     CATEGORY_LABELS,
@@ -38,9 +35,8 @@ from converters.records.raw import (
     at_origin,
     joined_clouds,
 )
-from converters.structure.cut import CutResult, cut_furniture
+from converters.structure.clean import LIFT_M, CutResult, cut_furniture, level_floor
 from converters.structure.fill import fill_holes, wall_planes
-from converters.structure.floor import LIFT_M, level_floor
 from converters.structure.maps import FloorPlan, make_floor_plan, resample
 from converters.structure.walls import main_direction, wall_boxes
 from converters.write.emit import SceneParts, write_scene

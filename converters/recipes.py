@@ -13,8 +13,15 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from converters.check.preview import preview
 from converters.clock import Report
 from converters.generate import generate_building
-from converters.generate.design.config import BuildingConfig, GenerationError
-from converters.generate.homes.config import SHARE_TOLERANCE, TIERS, HomeConfig, home_config, home_fields
+from converters.generate.design.config import (
+    SHARE_TOLERANCE,
+    TIERS,
+    BuildingConfig,
+    GenerationError,
+    HomeConfig,
+    home_config,
+    home_fields,
+)
 from converters.generate.models.cad import MODELS
 from converters.pipeline import ConvertConfig, Converted, convert
 from interactive_nav_common.config import Natural, nearest

@@ -108,8 +108,7 @@ def label_unlabelled(arguments: Any, console: Console) -> None:
 def propose_unproposed(arguments: Any, console: Console) -> Path | None:
     """Write the models that fit beside the mesh, unless there are some; return their file, None if alignments exist."""
     from converters.propose.pieces import MIN_VOXELS
-    from converters.propose.proposals import as_scan2cad
-    from converters.propose.report import given_up, retrieve_sure
+    from converters.propose.proposals import as_scan2cad, given_up, retrieve_sure
     from converters.read.gibson import ALIGNMENTS
     from converters.read.surfaces import split_storeys
     from converters.segment.voxels import NAMES, classes_of
@@ -270,7 +269,7 @@ class Propose(WithLibrary):
 
     def run(self, console: Console) -> None:
         """Run the command."""
-        from converters.propose.report import propose
+        from converters.propose.proposals import propose
         from converters.propose.retrieval import read_library
         from converters.read.source import read_source
 

@@ -21,8 +21,7 @@ from converters.bodies.objects import PlacedObject, physical_properties
 from converters.check.gates import collide_with, physical_values
 from converters.check.settle import settle
 from converters.geometry.boxes import Hull, convex_hull, fit_box
-from converters.geometry.faces import merge_vertices
-from converters.geometry.simplify import simplify_to
+from converters.geometry.faces import merge_vertices, simplify_to
 from converters.read.files import SourceFolder
 from converters.read.meshes import clean_surface, colours_of_faces, read_surface
 from converters.read.obj import TexturedMesh

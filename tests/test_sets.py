@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from converters.__main__ import main
-from converters.generate.homes.config import TIERS, HomeConfig
+from converters.generate.design.config import TIERS, HomeConfig
 from converters.recipes import load_recipes
 from interactive_nav.episodes import load_episode_file
 from interactive_nav.scenes.scene import load_scene
@@ -206,7 +206,7 @@ def cached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_set(SceneSet("furnished", {"one": Member("test", 1, digest)}), home / "set.json")
     monkeypatch.setenv("INTERACTIVE_NAV_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("scenes_mjcf.sets.HERE", tmp_path / "package")
-    for module in ("scenes_mjcf.sets", "converters.sets", "converters.generating"):
+    for module in ("scenes_mjcf.sets", "converters.many", "converters.generating"):
         monkeypatch.setattr(f"{module}.PACKAGED", {"furnished": home})
     monkeypatch.chdir(tmp_path)
     return tmp_path / "cache" / "package" / "furnished"
@@ -247,7 +247,7 @@ def test_what_is_not_the_listed_scene_is_not_found_and_is_made_again(
         shutil.copytree(ROOT / "scenes_mjcf" / "alder", wanted.out / "one")
         return []
 
-    monkeypatch.setattr("converters.sets.generate_scenes", generate)
+    monkeypatch.setattr("converters.many.generate_scenes", generate)
     assert main(["scenes", "make", "one"]) == 0
     assert scene_folders(["furnished"]) == ("cache/package/furnished/one",)
     assert main(["scenes", "make", "one"]) == 0, "nothing is made a second time"
@@ -257,8 +257,8 @@ def test_scenes_that_are_made_by_name_are_compared(tmp_path: Path, monkeypatch: 
     """The generator is stood in for, and so is the package: it gives alder, and cedar where birch was wanted."""
     monkeypatch.setenv("INTERACTIVE_NAV_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("scenes_mjcf.sets.HERE", tmp_path / "package")
-    monkeypatch.setattr("converters.sets.PACKAGED", {"sparse": tmp_path / "package"})
-    monkeypatch.setattr("converters.sets.packaged_set", lambda name: read_set(COMMITTED / f"{name}.json"))
+    monkeypatch.setattr("converters.many.PACKAGED", {"sparse": tmp_path / "package"})
+    monkeypatch.setattr("converters.many.packaged_set", lambda name: read_set(COMMITTED / f"{name}.json"))
     shutil.copytree(ROOT / "scenes_mjcf" / "elm", tmp_path / "package" / "elm")
     asked = []
 
@@ -269,7 +269,7 @@ def test_scenes_that_are_made_by_name_are_compared(tmp_path: Path, monkeypatch: 
             shutil.copytree(ROOT / "scenes_mjcf" / given, wanted.out / name)
         return []
 
-    monkeypatch.setattr("converters.sets.generate_scenes", generate)
+    monkeypatch.setattr("converters.many.generate_scenes", generate)
     assert main(["scenes", "make", "alder", "elm"]) == 0
     assert f"elm: is there, {tmp_path / 'package' / 'elm'}" in capsys.readouterr().out.replace("\n", "")
     assert main(["scenes", "make", "birch", "sparse/test"]) == 1

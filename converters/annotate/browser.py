@@ -18,8 +18,8 @@ import trimesh
 from converters.annotate.session import Item, Session, Store, step_of
 from converters.bodies.alignment import MIN_POINTS, Alignment, AlignmentError, apply_alignment, gross_outliers
 from converters.check.pictures import camera_axes, mesh_picture
-from converters.propose.proposals import Proposal, bounds
-from converters.propose.report import floor_of
+from converters.propose.pieces import Proposal, bounds
+from converters.propose.proposals import floor_of
 from converters.propose.retrieval import retrieve
 from converters.read.obj import texels, textured_by_face
 from converters.records.raw import CEILING, CadModel, RawScene, ScanMesh
@@ -34,7 +34,7 @@ THUMBNAIL = 116
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """Of one object."""
+    """Hold where model and camera stand for one object."""
 
     bench: Alignment
     """CAD frame -> scan frame, where the model stands beside its object, facing the camera."""
@@ -94,12 +94,6 @@ def hit(mesh: trimesh.Trimesh, origin: np.ndarray, direction: np.ndarray) -> tup
     return (float(along[k]), points[k]) if k >= 0 else (math.inf, np.zeros(3))
 
 
-def thumbnail(cad: CadModel) -> np.ndarray:
-    """Draw a (`THUMBNAIL`, `THUMBNAIL`, 3) uint8 picture of a model from its front, right and above."""
-    mesh = cad.surface or textured_by_face(cad.vertices, cad.faces, cad.face_colours)
-    return mesh_picture(mesh, camera_axes() @ Y_UP_TO_Z_UP.T, THUMBNAIL)
-
-
 SYMMETRIES = {
     "none": "__SYM_NONE",
     "half turn": "__SYM_ROTATE_UP_2",
@@ -129,12 +123,17 @@ class Page:
         self._ranked: dict[int, list[str]] = {}
         self._drawn: dict[str, Any] = {}
         self._first, self._adding, self._error = 0, False, ""
-        self._picture = functools.cache(lambda cad_id: thumbnail(self.library[cad_id]))
+        self._picture = functools.cache(self._thumbnail)
         server.gui.configure_theme(control_width="large", show_share_button=False, show_logo=False)
         self._words()
         server.scene.on_click()(self._clicked)
         server.on_client_connect(lambda client: self._look([client]))
         self._draw()
+
+    def _thumbnail(self, cad_id: str) -> np.ndarray:
+        cad = self.library[cad_id]
+        mesh = cad.surface or textured_by_face(cad.vertices, cad.faces, cad.face_colours)
+        return mesh_picture(mesh, camera_axes() @ Y_UP_TO_Z_UP.T, THUMBNAIL)
 
     def _words(self) -> None:
         gui, classes = self.server.gui, sorted({cad.category for cad in self.library.values()})

@@ -15,7 +15,8 @@ from typing import Any, Literal
 import numpy as np
 
 from converters.bodies import alignment
-from converters.propose.proposals import Proposal, scan2cad_list, scan2cad_model
+from converters.propose.pieces import Proposal
+from converters.propose.proposals import scan2cad_list, scan2cad_model
 from converters.propose.retrieval import read_library
 from converters.read.annotations import ANNOTATION, inside_scan, parse_annotations
 from converters.read.files import SourceFolder, read_json

@@ -1,4 +1,4 @@
-"""Judge a scene's model, manifest and maps by acceptance values against one table of limits."""
+"""Judge a scene's model, surfaces, manifest and maps by acceptance values against one table of limits."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,16 +8,17 @@ from typing import Any
 import mujoco
 import numpy as np
 from scipy import ndimage
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, KDTree, QhullError
 from scipy.spatial.distance import pdist
 
-from converters.check.surfaces import surface_values
-from converters.records.limits import Gate, Limit
+from converters.geometry.faces import face_areas, sample_faces
+from converters.records.errors import Gate, Limit
 from converters.structure.walls import border_cells
 from interactive_nav_common.grids import clearance, largest_component
 from interactive_nav_common.records import read_packaged
 from scenes_mjcf.agreement import differences, sliding_friction
 from scenes_mjcf.categories import ANY_MASS_KG, TABLE
+from scenes_mjcf.look import geom_mesh
 from scenes_mjcf.robot_facts import SMALLEST
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, SceneObject, load_manifest, load_maps
 
@@ -315,3 +316,77 @@ def manifest_values(
         "physics_changed": float(len(changed)),
     }
     return values, {"manifest_differs": differs, "physics_changed": tuple(changed)}
+
+
+SPACING_M = 0.04
+"""Of the points on hulls and visuals."""
+HIDDEN_M, BARE_M = 0.1, 0.05
+"""A hull's side farther than the first from all that is drawn is hit unseen; what is drawn farther than the second
+outside of all hulls is driven through."""
+KEPT_M, POINTS = 0.15, 50_000
+"""A scan's point so near to the drawn structure is kept: floors are levelled by up to 0.12 m. Points that are looked
+at, about."""
+SIDE = 0.7
+"""Largest vertical component of the normal of what counts as a side: robots come along the floor."""
+
+
+def kept_share(vertices: np.ndarray, faces: np.ndarray, drawn: tuple[np.ndarray, np.ndarray]) -> float:
+    """Return the share of a scan's area, without furniture that was cut out, within `KEPT_M` of the drawn structure.
+
+    `drawn`: vertices (k, 3) m and faces of the drawn structure.
+    """
+    area = face_areas(vertices, faces)
+    if not area.sum():
+        return 1.0
+    spacing_m = max(SPACING_M, float(np.sqrt(area.sum() / POINTS)))
+    points, face = sample_faces(vertices, faces, spacing_m)
+    weight = area[face] / np.bincount(face, minlength=len(faces))[face]
+    tree = KDTree(sample_faces(*drawn, KEPT_M / 2)[0])
+    return float(weight[tree.query(points, distance_upper_bound=KEPT_M)[0] < KEPT_M].sum() / weight.sum())
+
+
+def body_shares(drawn: tuple[np.ndarray, np.ndarray], hulls: list[np.ndarray]) -> tuple[float, float]:
+    """Return the shares of the hulls' outer sides off the drawn mesh, and of the drawn mesh outside of the hulls."""
+    solids = [ConvexHull(hull) for hull in hulls]
+
+    def outside(points: np.ndarray, of: list[ConvexHull], by_m: float) -> np.ndarray:
+        free = np.ones(len(points), bool)
+        for s in of:
+            near = free & ((points > s.min_bound - by_m) & (points < s.max_bound + by_m)).all(axis=1)
+            free[near] = (points[near] @ s.equations[:, :3].T + s.equations[:, 3]).max(axis=1) > by_m
+        return free
+
+    sides = []
+    for k, solid in enumerate(solids):
+        points, face = sample_faces(hulls[k], solid.simplices.astype(np.int64), SPACING_M)
+        points = points[np.abs(solid.equations[face, 2]) < SIDE]
+        sides.append(points[outside(points, solids[:k] + solids[k + 1 :], 1e-3)])
+    visible = sample_faces(*drawn, SPACING_M)[0]
+    off = KDTree(visible).query(np.vstack(sides), distance_upper_bound=HIDDEN_M)[0] > HIDDEN_M
+    bare = outside(visible, solids, BARE_M)
+    return float(off.mean()) if len(off) else 0.0, float(bare.mean())
+
+
+def surface_values(
+    model: mujoco.MjModel, kept: Mapping[str, float]
+) -> tuple[dict[str, float], dict[str, tuple[str, ...]]]:
+    """Return the worst object's values of the gates on surfaces, and by gate the line that names it.
+
+    `kept`: object -> share of its model's area that is drawn, where it is given.
+    """
+    worst: dict[str, tuple[float, str]] = {"unseen_hulls": (0.0, ""), "unsolid_surface": (0.0, "")}
+    worst["surface_kept"] = min(((share, name) for name, share in kept.items()), default=(1.0, ""))
+    shares: dict[bytes, tuple[float, float]] = {}
+    names = [model.geom(g).name for g in range(model.ngeom)]
+    for body in np.flatnonzero(model.body_jntnum[1:] > 0) + 1:
+        geoms = np.flatnonzero(model.geom_bodyid == body).tolist()
+        drawn = [geom_mesh(model, g) for g in geoms if names[g].endswith("_visual")]
+        hulls = [geom_mesh(model, g)[0] for g in geoms if "_hull_" in names[g]]
+        if drawn and hulls:
+            key = b"".join(np.round(points, 4).tobytes() for points in (drawn[0][0], *hulls))
+            if key not in shares:
+                shares[key] = body_shares(drawn[0], hulls)
+            for gate, share in zip(("unseen_hulls", "unsolid_surface"), shares[key], strict=True):
+                worst[gate] = max(worst[gate], (share, model.body(body).name))
+    values = {gate: share for gate, (share, _) in worst.items()}
+    return values, {gate: (f"{gate}: {name} is worst",) for gate, (_, name) in worst.items() if name}

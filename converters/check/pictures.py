@@ -12,9 +12,9 @@ import numpy as np
 import shapely
 from PIL import Image, ImageDraw
 from scipy.ndimage import map_coordinates
+from scipy.spatial import ConvexHull
 from trimesh.intersections import slice_faces_plane
 
-from converters.check.surfaces import geom_outline, geom_surface
 from converters.generate.models.cad import LIBRARY, cad_model
 from converters.generate.models.parts import MATERIALS
 from converters.geometry.faces import face_vectors, unit_normals
@@ -24,7 +24,7 @@ from converters.write.texture import box_pixels
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.grids import cell_centres, clearance
-from scenes_mjcf.look import CameraPose, Lens, look_along, over
+from scenes_mjcf.look import CameraPose, Lens, geom_image, geom_mesh, look_along, mesh_of, over
 from scenes_mjcf.schema import SceneMaps
 
 NEAREST_M = 0.05
@@ -136,6 +136,23 @@ def _fitted(
     factor = min(int(per_pixel), rows, columns)
     small = texture if factor < 2 else np.asarray(Image.fromarray(texture).reduce(factor))
     return small, bool(per_pixel < SQUARE)
+
+
+def geom_surface(model: mujoco.MjModel, geom: int) -> TexturedMesh:
+    """Return a textured mesh geom as MuJoCo draws it, in the body's frame."""
+    uv, image = mesh_of(model, model.geom_dataid[geom])[2], geom_image(model, geom)
+    assert uv is not None and image is not None
+    return TexturedMesh(*geom_mesh(model, geom), uv * [1.0, -1.0] + [0.0, 1.0], image[..., :3])
+
+
+def geom_outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int, axes_w: np.ndarray) -> np.ndarray:
+    """Return (k, 2) m: outline of a mesh or box geom, viewed along the third of the axes."""
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
+        corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T * model.geom_size[geom]
+    else:
+        corners = mesh_of(model, model.geom_dataid[geom])[0]
+    points = (corners @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]) @ axes_w[:2].T
+    return points[ConvexHull(points).vertices]
 
 
 def world_surfaces(model: mujoco.MjModel, data: mujoco.MjData) -> Surfaces:

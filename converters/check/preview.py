@@ -21,11 +21,11 @@ from PIL import Image
 
 from converters.bodies.objects import PlacedObject
 from converters.check import pictures
-from converters.check.surfaces import geom_outline
+from converters.check.pictures import geom_outline
 from converters.geometry.boxes import convex_hull
 from converters.read.obj import in_colour, textured_by_face
 from converters.records.raw import RawScene, TexturedMesh
-from converters.structure.cut import cut_furniture
+from converters.structure.clean import cut_furniture
 from interactive_nav_common.files import check_name, whole_file
 from scenes_mjcf.categories import CATEGORIES
 from scenes_mjcf.look import geom_mesh, over

@@ -23,8 +23,14 @@ import numpy as np
 
 from converters.bodies.decompose import DecomposeConfig, cache_folder, decompose_all
 from converters.geometry.boxes import convex_hull
-from converters.geometry.faces import compacted, merge_vertices, sample_faces
-from converters.geometry.simplify import simplify_to, simplify_within, surface_loss
+from converters.geometry.faces import (
+    compacted,
+    merge_vertices,
+    sample_faces,
+    simplify_to,
+    simplify_within,
+    surface_loss,
+)
 from converters.library.store import Credit, Model, Shape, attribution, write_library
 from converters.read.files import SourceFolder, as_number
 from converters.read.meshes import colours_of_faces, read_surface
@@ -124,12 +130,10 @@ def _piece(library: str, of: dict[str, str], where: str, names: set[str]) -> Cat
 
 def read_catalogue(path: Path) -> Catalogue:
     """Read the pieces of a `.sh3f` file."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names, data = set(archive.namelist()), archive.read(PROPERTIES)
-    except (OSError, KeyError, zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError) as error:
-        reason = "no such file" if isinstance(error, FileNotFoundError) else " ".join(str(error).split())
-        raise SceneRejected(f"{path}: not readable as a furniture library ({reason}); fetch it again") from None
+    if not path.is_file():
+        raise SceneRejected(f"{path}: no such file; fetch it again")
+    with readable(path, SceneRejected, "fetch it again", " as a furniture library"), zipfile.ZipFile(path) as archive:
+        names, data = set(archive.namelist()), archive.read(PROPERTIES)
     of: dict[int, dict[str, str]] = {}
     whole = parse_properties(data)
     for key, value in whole.items():
@@ -145,16 +149,13 @@ def read_catalogue(path: Path) -> Catalogue:
 def unpack_model(catalogue: Catalogue, piece: CatalogueModel, folder: Path) -> Path:
     """Write a piece's model with what lies beside it into an empty folder; return the model's path."""
     home = PurePosixPath(piece.model).parent
-    try:
-        with zipfile.ZipFile(catalogue.path) as archive:
-            inside = [i for i in archive.infolist() if PurePosixPath(i.filename).parent == home and not i.is_dir()]
-            if sum(i.file_size for i in inside) > MOST_BYTES:
-                raise SceneRejected(f"{catalogue.path}: {piece.model} unpacks to over {MOST_BYTES >> 20} MiB")
-            for item in inside:  # by its bare name: no path of the archive leads anywhere else
-                (folder / PurePosixPath(item.filename).name).write_bytes(archive.read(item))
-    except (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError) as error:
-        reason = " ".join(str(error).split())
-        raise SceneRejected(f"{catalogue.path}: {piece.model}: damaged ({reason}); fetch the library again") from None
+    remedy = f"fetch the library again ({piece.model} is damaged)"
+    with readable(catalogue.path, SceneRejected, remedy), zipfile.ZipFile(catalogue.path) as archive:
+        inside = [i for i in archive.infolist() if PurePosixPath(i.filename).parent == home and not i.is_dir()]
+        if sum(i.file_size for i in inside) > MOST_BYTES:
+            raise SceneRejected(f"{catalogue.path}: {piece.model} unpacks to over {MOST_BYTES >> 20} MiB")
+        for item in inside:  # by its bare name: no path of the archive leads anywhere else
+            (folder / PurePosixPath(item.filename).name).write_bytes(archive.read(item))
     return folder / PurePosixPath(piece.model).name
 
 

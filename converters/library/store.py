@@ -19,7 +19,7 @@ from PIL import Image
 from converters.geometry.boxes import Hull
 from converters.records.raw import VisualMesh
 from converters.write.texture import quantise
-from interactive_nav_common.errors import FileError
+from interactive_nav_common.errors import FileError, readable
 
 PACKED = Path(__file__).with_name("models.zip")
 ATTRIBUTION = Path(__file__).with_name("ATTRIBUTION.md")
@@ -153,12 +153,8 @@ def attribution(models: Sequence[Model]) -> str:
 
 
 def _member(path: Path, name: str) -> bytes:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return archive.read(name)
-    except (OSError, KeyError, zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError, ValueError) as error:
-        reason = "no such file" if isinstance(error, FileNotFoundError) else " ".join(str(error).split())
-        raise FileError(f"{path}: {name} is not readable ({reason}); install the package again") from None
+    with readable(path, FileError, "install the package again"), zipfile.ZipFile(path) as archive:
+        return archive.read(name)
 
 
 @functools.cache

@@ -2,9 +2,13 @@
 
 Tables and desks are split where two tops meet in a step, or make the outline of two rectangles."""
 
+from __future__ import annotations
+
 import dataclasses
+import functools
 import itertools
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -31,7 +35,8 @@ FLAT = ("door",)
 """A line from above, whose breadth says nothing."""
 NECK_SHARE = 0.6
 """Where a footprint is narrower than this share of the narrower side's width, two things touch."""
-CORE_CELLS = 2.0
+CORE_CELLS, LEVELS = 2.0, 64
+"""Distance to the outline from which on cells are inner ones; heights at which it is looked for necks."""
 PART_SHARE = 0.7
 """A part of a piece is a thing from this share of the class's least usual width on."""
 TOPS_M = {c.name: c.top_m for c in TABLE if c.top_m is not None}
@@ -52,28 +57,64 @@ PART_DEPTH_M = 0.3
 
 
 @dataclasses.dataclass(frozen=True)
+class Proposal:
+    """Describe one instance that an annotator, or retrieval, should find a CAD model for."""
+
+    category: str
+    label: int
+    """NYU40 id that most of its voxels carry."""
+    points: np.ndarray
+    """(n, 3) samples of its surface, scan frame, m."""
+    centre: np.ndarray
+    """(3,) of the upright box, scan frame, m."""
+    extent_m: np.ndarray
+    """(3,) full sizes along the box's axes."""
+    yaw: float
+    """rad, of the box's x axis; modulo 90 degrees."""
+    n_voxels: int
+    confidence: float
+    """In [0, 1], see `_confidence`."""
+
+
+def box_iou(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> float:
+    """Return the intersection over union of two axis-aligned boxes, each (low (3,), high (3,))."""
+    shared = np.prod(np.maximum(np.minimum(one[1], other[1]) - np.maximum(one[0], other[0]), 0.0))
+    total = np.prod(one[1] - one[0]) + np.prod(other[1] - other[0]) - shared
+    return float(shared / total) if total > 0 else 0.0
+
+
+def bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (low (3,), high (3,)) of (n, 3) points."""
+    return points.min(axis=0), points.max(axis=0)
+
+
+@dataclasses.dataclass(frozen=True)
 class Piece:
-    """Connected voxels of one class, or several that were joined."""
+    """Hold connected voxels of one class, or several that were joined."""
 
     label: int
     points: np.ndarray
-    voxels: np.ndarray
-    """(n, 3) int."""
+    index: np.ndarray
+    """(n, 3) int: the voxel that each point lies in."""
+
+    @functools.cached_property
+    def voxels(self) -> np.ndarray:
+        """Return (k, 3) int: each occupied voxel once."""
+        return np.unique(self.index, axis=0)
+
+    def part(self, chosen: np.ndarray) -> Piece:
+        """Return the piece of some of its points."""
+        return Piece(self.label, self.points[chosen], self.index[chosen])
 
 
 def components(points: np.ndarray, label: int, origin: np.ndarray, voxel_m: float) -> list[Piece]:
     """Return the 26-connected pieces of one class."""
     index = np.floor((points - origin) / voxel_m).astype(np.int64)
-    low = index.min(axis=0)
-    grid = np.zeros(index.max(axis=0) - low + 1, bool)
-    grid[tuple((index - low).T)] = True
+    at = tuple((index - index.min(axis=0)).T)
+    grid = np.zeros(np.ptp(index, axis=0) + 1, bool)
+    grid[at] = True
     pieces, count = ndimage.label(grid, np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
-    piece = pieces[tuple((index - low).T)]
-    result = []
-    for k in range(1, count + 1):
-        members = np.flatnonzero(piece == k)
-        result.append(Piece(label, points[members], np.unique(index[members], axis=0)))
-    return result
+    return [Piece(label, points, index).part(pieces[at] == k) for k in range(1, count + 1)]
 
 
 def _footprint(voxels: np.ndarray) -> set[tuple[int, int]]:
@@ -89,9 +130,8 @@ def merge(pieces: list[Piece], same: Any) -> list[Piece]:
     while pair := next((p for p in itertools.combinations(range(len(pieces)), 2) if same(*(pieces[k] for k in p))), ()):
         i, j = pair
         both = pieces[i], pieces.pop(j)
-        labels = np.repeat([p.label for p in both], [len(p.voxels) for p in both])
-        voxels = np.unique(np.concatenate([p.voxels for p in both]), axis=0)
-        pieces[i] = Piece(int(np.bincount(labels).argmax()), np.concatenate([p.points for p in both]), voxels)
+        most = max(both, key=lambda p: len(p.voxels)).label
+        pieces[i] = Piece(most, *(np.concatenate([getattr(p, of) for p in both]) for of in ("points", "index")))
     return pieces
 
 
@@ -113,42 +153,23 @@ def same_box(one: Piece, other: Piece) -> bool:
 
 
 def _basins(mask: np.ndarray) -> np.ndarray:
-    """Return (rows, columns) numbers of basins from 1 on, 0 outside, around the peaks of the distance to the outline.
+    """Return (rows, columns) numbers of basins around the peaks of the distance to the outline, the nearest's outside.
 
-    This is a watershed from the highest peak down: a basin that meets a higher one where the distance is at least
-    `NECK_SHARE` of its greatest joins it.
+    A basin is parted at a neck where the distance is less than `NECK_SHARE` of the greatest on either side.
     """
-    distance = np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1)))
-    distance = np.where(np.pad(mask, 1), ndimage.gaussian_filter(distance, 0.7), 0.0)
-    basin = np.zeros(distance.shape, np.int64)
-    peak, parent = [0.0], [0]
-
-    def root(k: int) -> int:
-        while parent[k] != k:
-            k = parent[k]
-        return k
-
-    rows, columns = np.nonzero(np.pad(mask, 1))
-    for i in np.argsort(-distance[rows, columns], kind="stable"):
-        r, c = int(rows[i]), int(columns[i])
-        around = sorted(
-            {root(int(k)) for k in basin[r - 1 : r + 2, c - 1 : c + 2].ravel() if k}, key=lambda k: -peak[k]
-        )
-        if not around:
-            peak.append(float(distance[r, c]))
-            parent.append(len(parent))
-            basin[r, c] = len(parent) - 1
-            continue
-        for k in around[1:]:
-            if distance[r, c] >= NECK_SHARE * peak[k]:
-                parent[k] = around[0]
-        basin[r, c] = around[0]
-    final = np.array([root(k) for k in range(len(parent))])[basin]
-    # Cells along the outline were flooded from whichever side came first: they go with the nearest inner ones.
-    core = (final > 0) & (distance >= CORE_CELLS)
-    if core.any():
-        final = np.where(final > 0, final[tuple(nearest_cell(core))], 0)
-    return final[1:-1, 1:-1]
+    distance = ndimage.gaussian_filter(np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1))), 0.7)[1:-1, 1:-1]
+    distance, (basin, _) = np.where(mask, distance, 0.0), label(mask)
+    for level in np.linspace(0.0, distance.max(), LEVELS)[1:-1]:
+        finer, count = label(distance > level)
+        finer[level >= NECK_SHARE * np.asarray(ndimage.maximum(distance, finer, np.arange(count + 1)))[finer]] = 0
+        for k in np.unique(basin[finer > 0]):
+            inside = (basin == k) & (finer > 0)
+            if np.ptp(finer[inside]):
+                basin[basin == k] = 0
+                basin[inside] = basin.max() + finer[inside]
+    # Cells along the outline lie beside whichever came first: they go with the nearest inner ones.
+    core = (basin > 0) & (distance >= CORE_CELLS)
+    return basin[tuple(nearest_cell(core if core.any() else basin > 0))]
 
 
 def _wide(points: np.ndarray) -> tuple[float, float]:
@@ -157,43 +178,33 @@ def _wide(points: np.ndarray) -> tuple[float, float]:
     return 2 * float(max(half[:2])), 2 * float(min(half[:2]))
 
 
-def part_by_number(piece: Piece, chosen: np.ndarray, of_point: np.ndarray, of_voxel: np.ndarray) -> list[Piece]:
+def part_by_number(piece: Piece, chosen: Sequence[int], of_point: np.ndarray) -> list[Piece]:
     """Return one piece for each of the chosen numbers; what has another number goes to the nearest of them."""
     if len(chosen) < 2:
         return [piece]
-
-    def nearest(places: np.ndarray, of: np.ndarray) -> np.ndarray:
-        among = np.isin(of, chosen)
-        return np.where(among, of, of[among][KDTree(places[among]).query(places)[1]])
-
-    of_voxel, of_point = nearest(piece.voxels, of_voxel), nearest(piece.points, of_point)
-    return [Piece(piece.label, piece.points[of_point == k], piece.voxels[of_voxel == k]) for k in chosen]
+    among = np.isin(of_point, chosen)
+    of_point = of_point[among][KDTree(piece.points[among]).query(piece.points)[1]]
+    return [piece.part(of_point == k) for k in chosen]
 
 
-def split_at_necks(piece: Piece, origin: np.ndarray, voxel_m: float) -> list[Piece]:
+def split_at_necks(piece: Piece) -> list[Piece]:
     """Split a piece into things that touch where its footprint is narrow."""
     category = LABEL_CATEGORIES[piece.label]
     if category in FLAT:
         return [piece]
-    least = SIZES_M[category][0][0]
-    low = piece.voxels[:, :2].min(axis=0) - 1
-    mask = np.zeros(np.ptp(piece.voxels[:, :2], axis=0) + 3, bool)
-    mask[tuple((piece.voxels[:, :2] - low).T)] = True
+    at = tuple((piece.index[:, :2] - piece.index[:, :2].min(axis=0) + 1).T)
+    mask = np.zeros(np.ptp(piece.index[:, :2], axis=0) + 3, bool)
+    mask[at] = True
     # Gaps between slats and legs are part of the footprint; the space between two things is not closed by so little.
     mask = np.asarray(ndimage.binary_fill_holes(ndimage.binary_closing(mask, np.ones((3, 3)))), bool)
-    basin = _basins(mask)
-    of_voxel = basin[tuple((piece.voxels[:, :2] - low).T)]
-    cell = np.floor((piece.points[:, :2] - origin[:2]) / voxel_m).astype(np.int64) - low
-    of_point = basin[tuple(cell.T)]
-    large = [
-        k
-        for k in np.unique(of_voxel[of_voxel > 0])
-        if (of_voxel == k).sum() >= MIN_VOXELS and _wide(piece.points[of_point == k])[0] >= PART_SHARE * least
-    ]
-    return part_by_number(piece, np.array(large), of_point, of_voxel)
+    of_point = _basins(mask)[at]
+    parts = {k: piece.part(of_point == k) for k in np.unique(of_point).tolist()}
+    least = PART_SHARE * SIZES_M[category][0][0]
+    large = [k for k, p in parts.items() if len(p.voxels) >= MIN_VOXELS and _wide(p.points)[0] >= least]
+    return part_by_number(piece, large, of_point)
 
 
-def split_row(piece: Piece, origin: np.ndarray, voxel_m: float) -> list[Piece]:
+def split_row(piece: Piece) -> list[Piece]:
     """Split a piece that is too long for one thing into equal lengths, as many as have the usual shape."""
     category = LABEL_CATEGORIES[piece.label]
     if category not in LONGEST:
@@ -207,18 +218,13 @@ def split_row(piece: Piece, origin: np.ndarray, voxel_m: float) -> list[Piece]:
     if long / count < least or short > most:
         return [piece]
     box = upright_box(piece.points)
-    axis = box.rotation[:2, int(np.argmax(box.half[:2]))]
-    along = [
-        (xy - box.centre[:2]) @ axis / long + 0.5
-        for xy in (piece.points[:, :2], (piece.voxels[:, :2] + 0.5) * voxel_m + origin[:2])
-    ]
-    of_point, of_voxel = (np.clip((a * count).astype(int), 0, count - 1) for a in along)
-    return part_by_number(piece, np.arange(count), of_point, of_voxel)
+    along = (piece.points - box.centre) @ box.rotation[:, int(np.argmax(box.half[:2]))] / long + 0.5
+    return part_by_number(piece, range(count), np.clip((along * count).astype(int), 0, count - 1))
 
 
 @dataclasses.dataclass(frozen=True)
 class _Plan:
-    """A piece from above, along its main direction."""
+    """Hold a piece from above, along its main direction."""
 
     axes: np.ndarray
     """(2, 2) columns: directions of rows and columns."""
@@ -260,24 +266,18 @@ def _plan(points: np.ndarray, cell_m: float) -> _Plan:
     return _Plan(axes, low, cell_m, np.where(closed[2:-2, 2:-2], top[tuple(nearest_cell(hit))], np.nan))
 
 
-def _fill(mask: np.ndarray) -> float:
-    """Return the share of a mask's upright rectangle that it fills."""
+def _rectangle(mask: np.ndarray, cell_m: float) -> tuple[float, float, float]:
+    """Return the longer and the shorter side of a mask's upright rectangle, m, and the share of it that is filled."""
     rows, columns = np.nonzero(mask)
-    return len(rows) / float((np.ptp(rows) + 1) * (np.ptp(columns) + 1)) if len(rows) else 0.0
-
-
-def _sides(mask: np.ndarray, cell_m: float) -> tuple[float, float]:
-    """Return the longer and the shorter side of a mask's upright rectangle, m."""
-    rows, columns = np.nonzero(mask)
-    sides = sorted(((np.ptp(rows) + 1) * cell_m, (np.ptp(columns) + 1) * cell_m)) if len(rows) else [0.0, 0.0]
-    return sides[1], sides[0]
+    short, long = sorted((np.ptp(rows) + 1, np.ptp(columns) + 1)) if len(rows) else (0, 0)
+    return long * cell_m, short * cell_m, len(rows) / float(max(long * short, 1))
 
 
 def _usual_top(mask: np.ndarray, cell_m: float, category: str) -> bool:
     """Return whether a mask is as large as the class's tops are, and rectangular."""
-    long, short = _sides(mask, cell_m)
+    long, short, share = _rectangle(mask, cell_m)
     least, most = SIZES_M[category][0]
-    return PART_SHARE * least <= long <= most and short >= PART_DEPTH_M and _fill(mask) >= RECTANGULAR
+    return PART_SHARE * least <= long <= most and short >= PART_DEPTH_M and share >= RECTANGULAR
 
 
 def _two_levels(plan: _Plan) -> np.ndarray | None:
@@ -307,11 +307,10 @@ def _two_rectangles(plan: _Plan, shown_floor: np.ndarray | None, category: str) 
             parts = (shape & below, shape & (index[axis] > cut))  # the row between may hold some of both
             if not all(_usual_top(p, plan.cell_m, category) for p in parts):
                 continue
-            sides = [_sides(p, plan.cell_m) for p in parts]
+            sides = [_rectangle(p, plan.cell_m)[:2] for p in parts]
             boxes = np.zeros_like(shape)
             for p in parts:
-                rows, columns = np.nonzero(p)
-                boxes[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1] = True
+                boxes[ndimage.find_objects(p.astype(int))[0]] = True
             # Of two cuts that fit, as an L has them, the one with parts of usual proportions.
             odd = sum(abs(math.log(long / short / TOPS_M[category][2])) for long, short in sides)
             score = float(shape.sum() / boxes.sum()) - 0.1 * odd
@@ -330,10 +329,10 @@ def _two_rectangles(plan: _Plan, shown_floor: np.ndarray | None, category: str) 
 def _too_large(plan: _Plan, category: str) -> np.ndarray | None:
     """Return (rows, columns) numbers of the equal parts of a rectangle too long or deep for one top, or None."""
     shape = plan.shape
-    if _fill(shape) < RECTANGULAR:
-        return None
     deepest, longest, usual = TOPS_M[category]
-    long, short = _sides(shape, plan.cell_m)
+    long, short, share = _rectangle(shape, plan.cell_m)
+    if share < RECTANGULAR:
+        return None
     along = int(np.argmax(shape.shape))
     if short > deepest:
         along, count = 1 - along, math.ceil(short / deepest)
@@ -345,7 +344,7 @@ def _too_large(plan: _Plan, category: str) -> np.ndarray | None:
     return np.where(shape, 1 + index * count // shape.shape[along], 0)
 
 
-def split_tops(piece: Piece, floor_xy: np.ndarray, origin: np.ndarray, voxel_m: float) -> list[Piece]:
+def split_tops(piece: Piece, floor_xy: np.ndarray, voxel_m: float) -> list[Piece]:
     """Split a piece into tables or desks; `floor_xy`: (n, 2) places of floor that the scan shows, m."""
     category = LABEL_CATEGORIES[piece.label]
     if category not in TOPS_M:
@@ -364,12 +363,8 @@ def split_tops(piece: Piece, floor_xy: np.ndarray, origin: np.ndarray, voxel_m: 
     part = _too_large(plan, category) if part is None else part
     if part is None:
         return [piece]
-    numbers = np.unique(part[part > 0])
-    middles = (piece.voxels[:, :2] + 0.5) * voxel_m + origin[:2]
-    of_point, of_voxel = (
-        part[tuple(np.clip(plan.cells(xy), 0, np.array(part.shape) - 1).T)] for xy in (piece.points[:, :2], middles)
-    )
-    parts = part_by_number(piece, numbers, of_point, of_voxel)
+    of_point = part[tuple(np.clip(plan.cells(piece.points[:, :2]), 0, np.array(part.shape) - 1).T)]
+    parts = part_by_number(piece, np.unique(part[part > 0]).tolist(), of_point)
     if min(len(p.voxels) for p in parts) < MIN_VOXELS:
         return [piece]
-    return [smaller for p in parts for smaller in split_tops(p, floor_xy, origin, voxel_m)]
+    return [smaller for p in parts for smaller in split_tops(p, floor_xy, voxel_m)]

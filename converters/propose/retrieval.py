@@ -5,6 +5,7 @@ two-sided iterative closest point scheme with the same seven parameters (three s
 judged by how far the scan lies from the model and the model from the scan.
 """
 
+import bisect
 import dataclasses
 import math
 import re
@@ -16,16 +17,15 @@ import trimesh
 from scipy.spatial import KDTree
 
 from converters.bodies.alignment import Alignment, AlignmentError, apply_alignment, least_squares
-from converters.bodies.placement import PoseDifference, pose_difference, upright
+from converters.bodies.objects import PoseDifference, pose_difference, upright
 from converters.library.store import read_index, read_shape
-from converters.propose.pieces import SIZES_M
-from converters.propose.proposals import Proposal, bounds, box_iou
+from converters.propose.pieces import SIZES_M, Proposal, bounds, box_iou
 from converters.read.annotations import read_cad
 from converters.read.files import SourceFolder
 from converters.read.obj import texels
 from converters.records.errors import SceneRejected
 from converters.records.raw import CATEGORY_LABELS, SYNSETS, Annotation, CadModel, TexturedMesh
-from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, transformed, wrap_angle, yaw_matrix
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transformed, wrap_angle, yaw_matrix
 
 N_YAWS = 24
 """Starting yaws, even steps over the circle from the box's."""
@@ -46,7 +46,7 @@ CLOSE_M = 0.05
 
 @dataclasses.dataclass(frozen=True)
 class Retrieval:
-    """The best model and pose for one proposal."""
+    """Hold the best model and pose for one proposal."""
 
     cad: CadModel
     pose: Alignment
@@ -68,17 +68,11 @@ def _packaged() -> dict[str, CadModel]:
         if model.category not in SIZES_M:
             continue
         visual, hulls = (shape := read_shape(name)).visual, shape.hulls
-        corner_uv = visual.uv[visual.uv_faces]
-        turned = visual.vertices @ Y_UP_TO_Z_UP.T
-        library[re.sub("[^A-Za-z0-9_-]", "_", name)] = CadModel(
-            model.category,
-            re.sub("[^A-Za-z0-9_-]", "_", name),
-            turned,
-            visual.faces,
-            texels(visual.image, corner_uv.mean(axis=1)),
-            tuple((hull.vertices @ Y_UP_TO_Z_UP.T, hull.faces) for hull in hulls),
-            surface=TexturedMesh(turned, visual.faces, corner_uv, visual.image),
-        )
+        corner_uv, turned = visual.uv[visual.uv_faces], visual.vertices @ Y_UP_TO_Z_UP.T
+        look = turned, visual.faces, texels(visual.image, corner_uv.mean(axis=1))
+        solids = tuple((hull.vertices @ Y_UP_TO_Z_UP.T, hull.faces) for hull in hulls)
+        surface, cad_id = TexturedMesh(*look[:2], corner_uv, visual.image), re.sub("[^A-Za-z0-9_-]", "_", name)
+        library[cad_id] = CadModel(model.category, cad_id, *look, solids, surface=surface)
     return library
 
 
@@ -109,17 +103,13 @@ def _thin(points: np.ndarray, count: int) -> np.ndarray:
     """Return at most about `count` of the points, spread evenly: the first in each cell of the finest fitting grid."""
     if len(points) <= count:
         return points
-    low, high = 1e-3, float(np.ptp(points, axis=0).max())
-    chosen = np.arange(count)
-    for _ in range(14):
-        side = math.sqrt(low * high)
-        cell = np.floor((points - points.min(axis=0)) / side).astype(np.int64)
-        first = np.unique(cell, axis=0, return_index=True)[1]
-        if len(first) > count:
-            low = side
-        else:
-            high, chosen = side, np.sort(first)
-    return points[chosen]
+
+    def firsts(side_m: float) -> np.ndarray:
+        return np.unique(np.floor((points - points.min(axis=0)) / side_m), axis=0, return_index=True)[1]
+
+    sides_m = np.geomspace(max(float(np.ptp(points, axis=0).max()), 2e-3), 1e-3, 400).tolist()
+    finest = bisect.bisect_right(sides_m, count, key=lambda side_m: len(firsts(side_m))) - 1
+    return points[np.sort(firsts(sides_m[max(finest, 0)]))]
 
 
 def _surface(cad: CadModel, count: int) -> np.ndarray:
@@ -253,12 +243,6 @@ def retrieve(
     )
 
 
-def as_annotation(best: Retrieval) -> Annotation:
-    """Return the retrieved pose as an annotation without keypoints."""
-    pose = transform(yaw_matrix(best.pose.yaw) * best.pose.scale, best.pose.translation)
-    return Annotation(best.cad.category, best.cad.cad_id, pose, confidence=best.confidence)
-
-
 MIN_CONFIDENCE = 0.2
 """Retrievals less sure than this are not used by `--auto-align`."""
 
@@ -272,16 +256,12 @@ def without_annotation(
     proposals: tuple[Proposal, ...], annotations: tuple[Annotation, ...], cads: Mapping[str, CadModel]
 ) -> list[int]:
     """Return indices of the proposals of which less than half lies in the (10 cm larger) box of an annotated model."""
-    boxes = [bounds(annotated_vertices(a, cads)) for a in annotations]
-    result = []
-    for k, proposal in enumerate(proposals):
-        inside = [
-            ((proposal.points > low - 2 * CLOSE_M) & (proposal.points < high + 2 * CLOSE_M)).all(axis=1).mean()
-            for low, high in boxes
-        ]
-        if max(inside, default=0.0) < 0.5:
-            result.append(k)
-    return result
+    boxes = [np.array(bounds(annotated_vertices(a, cads))) + [[-2 * CLOSE_M], [2 * CLOSE_M]] for a in annotations]
+
+    def inside(points: np.ndarray) -> float:
+        return max((float(((points > low) & (points < high)).all(axis=1).mean()) for low, high in boxes), default=0.0)
+
+    return [k for k, proposal in enumerate(proposals) if inside(proposal.points) < 0.5]
 
 
 def auto_align(
@@ -303,7 +283,7 @@ def auto_align(
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """One retrieval against a person's annotation of the same object."""
+    """Compare one retrieval with a person's annotation of the same object."""
 
     category: str
     true_cad: str

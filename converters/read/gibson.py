@@ -1,21 +1,43 @@
-"""Read a raw Gibson folder; labels, alignments and maps are taken where they are.
+"""Read a raw Gibson folder, with labels, alignments and maps where there are any, or one of the interactive set.
 
 Files of the release: iGibson 0.0.4, `dataset.md`; z up, metres, maps of 0.01 m a pixel whose middle is
-the world's origin. `floors.txt` has one height a line; number k of the map files counts them from the lowest.
+the world's origin. `floors.txt` has one height a line; number k of the map files counts them from the lowest. In the
+interactive set `mesh_z_up_cleaned.obj` is the scan without the annotated furniture, `plane_z_up_<f>.obj` floor for the
+holes it left, `alignment_centered_<i>_<synset>.urdf` a piece of furniture whose orientation and scale are baked into
+its mesh, and `pos_<i>_<synset>.txt` the x y z of its origin.
 """
 
 import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
 
+from converters.geometry.boxes import upright_box
+from converters.geometry.faces import sample_faces
 from converters.read.annotations import inside_scan, parse_annotations, read_cad
 from converters.read.files import SourceFolder, read_image, read_json, read_labels, read_numbers
-from converters.read.obj import TexturedMesh, read_scan_obj, scan_of
-from converters.read.surfaces import check_upright, label_storeys, labelled, with_split_corners
+from converters.read.meshes import clean_surface, colours_of_faces
+from converters.read.obj import TexturedMesh, join_meshes, read_scan_obj, scan_of
+from converters.read.surfaces import check_extent, check_upright, label_storeys, labelled, with_split_corners
+from converters.read.urdf import read_urdf
 from converters.records.errors import SceneRejected
-from converters.records.raw import ATTRIBUTION, FLOOR, WINDOWS, GivenMap, RawScene, Storey, Window
+from converters.records.raw import (
+    ATTRIBUTION,
+    FLOOR,
+    SYNSETS,
+    WINDOWS,
+    Annotation,
+    CadModel,
+    GivenMap,
+    RawScene,
+    ScannedHinge,
+    Storey,
+    Window,
+    category_of_id,
+)
 from interactive_nav_common.errors import readable
+from interactive_nav_common.rotations import transform, transformed, yaw_matrix
 from interactive_nav_common.untrusted.reading import read_npz
 
 MESH = "mesh_z_up.obj"
@@ -164,3 +186,182 @@ def read_licence(source: SourceFolder) -> str:
         text = source.use(name, "").read_text(encoding="utf-8", errors="replace").strip()
         licence = " ".join(text.split())[:400] or licence
     return licence
+
+
+CLEANED = "mesh_z_up_cleaned.obj"
+PREFIX = "alignment_centered"
+CLASSES = SYNSETS | {"00000001": "door"}
+"""Synset ids of the release; doors had none."""
+DOOR_BAND_M = (0.3, 1.8)
+"""Heights above the door's foot at which walls stop a leaf."""
+DOOR_MOST_RAD = math.radians(120)
+SHOWN_M = 0.2
+"""Between the points of a surface that stop a leaf; small faces have one."""
+NEAR_HINGE_M = 0.15
+"""A wall this close to the hinge carries the leaf and does not stop it."""
+PLANE_CELL_M = 0.1
+SAME_SHARE = 0.5
+"""Two objects of one class that share this much of the smaller one's bounding box are one object."""
+
+
+def read_interactive_gibson(root: Path, strict: bool = False) -> RawScene:
+    """Read cleaned mesh, floor planes, furniture, floor heights and maps.
+
+    The furniture keeps its mass, friction and collision meshes. A door's yaw is taken out of its mesh and
+    goes into its pose, so that the leaf lies along its body's x axis; its hinge is assumed at the edge that stands
+    at a wall, and turns as far as walls let it.
+    """
+    source = SourceFolder(root, strict)
+    mesh = read_scan_obj(source, CLEANED, "expected the scan without its furniture")
+    heights = read_floors(source)
+    check_upright(str(root / CLEANED), mesh.vertices, mesh.faces, None, heights[0])
+    mesh = with_split_corners(mesh)
+    labels = label_storeys(mesh.vertices, mesh.faces, heights)
+    for k, height in enumerate(heights):
+        mesh, labels = _with_plane(source, k, height, mesh, labels)
+    points, _ = sample_faces(mesh.vertices, mesh.faces, SHOWN_M)
+    pairs = [_furniture(source, path, points) for path in sorted(root.glob(f"{PREFIX}*.urdf"))]
+    cads = {a.cad_id: c for a, c in pairs}
+    annotations = _without_doubles(source, tuple(a for a, _ in pairs), cads)
+    if annotations:
+        annotations = inside_scan(source, f"{PREFIX}_*.urdf", annotations, cads, mesh)
+    cads = {a.cad_id: cads[a.cad_id] for a in annotations}
+    return building(source, "interactive-gibson", mesh, labels, heights, cads, annotations)
+
+
+def _furniture(source: SourceFolder, path: Path, structure: np.ndarray) -> tuple[Annotation, CadModel]:
+    """Return one piece of furniture and its model."""
+    category = category_of_id(path.stem.rsplit("_", 1)[-1], f"{path}: category id is", CLASSES)
+    name = path.name.replace(PREFIX, "pos")[: -len("urdf")] + "txt"
+    place, position = read_numbers(source, name, f"expected x y z in metres, of {path.name}", lines=1)
+    if len(position) != 3 or not np.isfinite(position).all():
+        raise SceneRejected(f"{place}: holds {len(position)} numbers, expected x y z in metres, all finite")
+    item = read_urdf(source, path.name, "")
+    surface = item.surface.vertices, item.surface.faces, colours_of_faces(item.surface)
+    vertices, faces, colours = clean_surface(source, path.name, *surface)
+    turn, pieces = np.eye(3), item.pieces
+    if category == "door":
+        turn = leaf_turn(vertices)
+        vertices = vertices @ turn
+        pieces = None if pieces is None else tuple((v @ turn, f) for v, f in pieces)
+    name = path.stem.removeprefix(PREFIX).strip("_")
+    cad = CadModel(category, name, vertices, faces, colours, pieces, item.mass_kg, item.friction)
+    pose = transform(turn, position)
+    hinge = assume_hinge(vertices, pose, structure) if category == "door" else None
+    return Annotation(category, name, pose, hinge=hinge), cad
+
+
+def leaf_turn(leaf: np.ndarray) -> np.ndarray:
+    """Return the (3, 3) yaw that a door's leaf, (n, 3), is turned by from the x axis."""
+    box = upright_box(leaf)
+    yaw = math.atan2(box.rotation[1, 0], box.rotation[0, 0])
+    return yaw_matrix(yaw + math.pi / 2 if box.half[1] > box.half[0] else yaw)
+
+
+def assume_hinge(leaf: np.ndarray, pose: np.ndarray, structure: np.ndarray) -> ScannedHinge:
+    """Return the upright hinge of a door that came without one.
+
+    Of the leaf's two ends the hinge is the one with more structure around it; the leaf turns both ways from where it
+    stands until structure lies in it, by 120 degrees at most. What lies in the leaf as it stands is taken for the
+    scanned leaf itself.
+
+    `leaf`: (n, 3) vertices, CAD frame, the leaf along x.
+    `pose`: (4, 4) CAD frame -> scan frame, upright and unscaled.
+    `structure`: (m, 3) points of the scan, m.
+    """
+    low, high = leaf.min(axis=0), leaf.max(axis=0)
+    local = (structure - pose[:3, 3]) @ pose[:3, :3]
+    height = local[:, 2] - low[2]
+    local = local[(height > DOOR_BAND_M[0]) & (height < DOOR_BAND_M[1]), :2]
+    across = (low[1] + high[1]) / 2
+    half, length = (high[1] - low[1]) / 2 + 0.02, high[0] - low[0]
+    choices = []
+    for end, inward in ((low[0], 1.0), (high[0], -1.0)):
+        # Distance from the hinge along the leaf as it stands, and across it.
+        point = (local - [end, across]) * [inward, 1.0]
+        radius, angle = np.hypot(*point.T), np.arctan2(point[:, 1], point[:, 0])
+        reach = (radius > NEAR_HINGE_M) & (radius < length + 0.02)
+        itself = (np.abs(point[:, 1]) < half + 0.02) & (point[:, 0] > 0)
+        turns = np.arctan2(half, np.maximum(radius, half))  # a point stops the leaf this much before its middle line
+        stops = np.asarray(angle - np.sign(angle) * turns)[reach & ~itself]
+        # Three points make an obstacle; one or two are noise of the scan.
+        most = [DOOR_MOST_RAD] * 3
+        left, right = (np.sort([*some, *most])[2] for some in (stops[stops > 0], np.negative(stops[stops < 0])))
+        span = (-right, left) if inward > 0 else (-left, right)
+        choices.append((int((radius < NEAR_HINGE_M + half).sum()), left + right, (end, span)))
+    end, span = max(choices, key=lambda c: c[:2])[2]
+    return ScannedHinge(np.array([end, across, low[2]]), 1.0, (float(span[0]), float(span[1])), assumed=True)
+
+
+def _without_doubles(
+    source: SourceFolder, annotations: tuple[Annotation, ...], cads: dict[str, CadModel]
+) -> tuple[Annotation, ...]:
+    """Drop objects of one class that stand in an earlier one: the release annotates some furniture twice."""
+    kept: list[tuple[Annotation, np.ndarray, np.ndarray]] = []
+    for annotation in annotations:
+        placed = transformed(cads[annotation.cad_id].vertices, annotation.pose)
+        low, high = placed.min(axis=0), placed.max(axis=0)
+        doubles = []
+        for other, o_low, o_high in kept:
+            shared = np.prod(np.maximum(np.minimum(high, o_high) - np.maximum(low, o_low), 0.0))
+            smaller = max(min(np.prod(high - low), np.prod(o_high - o_low)), 1e-12)
+            if other.category == annotation.category and shared > SAME_SHARE * smaller:
+                doubles.append(other.cad_id)
+        if not doubles:
+            kept.append((annotation, low, high))
+        else:
+            source.note(f"{annotation.category} {annotation.cad_id} stands in {doubles[-1]}; it is left out")
+    return tuple(a for a, _, _ in kept)
+
+
+def _with_plane(
+    source: SourceFolder, number: int, height_m: float, mesh: TexturedMesh, labels: np.ndarray
+) -> tuple[TexturedMesh, np.ndarray]:
+    """Return the scan with squares of 0.1 m of the release's floor plane, with its texture.
+
+    They lie inside the mesh and on the map, where the scan shows no floor.
+    """
+    name = f"plane_z_up_{number}.obj"
+    if not source.has(name):
+        source.note(f"{name} is absent: the floor under the furniture is patched from the floor around it")
+        return mesh, labels
+    plane = read_scan_obj(source, name, "")
+    floor_faces = mesh.faces[(labels[mesh.faces] == FLOOR).all(axis=1)]
+    near = np.abs(mesh.vertices[floor_faces, 2].mean(axis=1) - height_m) < 0.5
+    shown = set()
+    if near.any():
+        shown = {tuple(c) for c in _cells(sample_faces(mesh.vertices, floor_faces[near], PLANE_CELL_M / 2)[0])}
+    mesh_xy, floor_xy = mesh.vertices[:, :2], mesh.vertices[labels == FLOOR, :2]
+    given = read_traversable(source, number, mesh_xy, floor_xy) if len(floor_xy) else None
+    check_extent("a floor plane", plane.vertices)
+    points, face = sample_faces(plane.vertices, plane.faces, PLANE_CELL_M / 2)
+    cell, first = np.unique(_cells(points), axis=0, return_index=True)
+    middle = (cell + 0.5) * PLANE_CELL_M
+    inside = np.atleast_1d(((middle > mesh_xy.min(axis=0)) & (middle < mesh_xy.max(axis=0))).all(axis=1))
+    wanted = np.flatnonzero([tuple(c) not in shown and bool(i) for c, i in zip(cell, inside, strict=True)])
+    if given is not None:
+        index = np.floor((middle - given.origin) / given.resolution_m).astype(np.int64)
+        on = np.atleast_1d(((index >= 0) & (index < given.traversable.shape[::-1])).all(axis=1))
+        index = np.where(on[:, None], index, 0)
+        wanted = wanted[on[wanted] & given.traversable[index[wanted, 1], index[wanted, 0]]]
+    cell, face = cell[wanted], face[first[wanted]]
+    if not len(cell):
+        return mesh, labels
+    corner = (cell[:, None] + np.array([(0, 0), (1, 0), (1, 1), (0, 1)])) * PLANE_CELL_M
+    vertices = np.column_stack([corner.reshape(-1, 2), np.full(4 * len(cell), height_m)])
+    start = 4 * np.arange(len(cell))[:, None]
+    faces = np.concatenate([start + [0, 1, 2], start + [0, 2, 3]])
+    patch = TexturedMesh(vertices, faces, None, None)
+    if plane.corner_uv is not None and plane.texture is not None:
+        a, b, c = (plane.vertices[plane.faces[face, k], :2] for k in range(3))
+        matrix = np.stack([b - a, c - a], axis=2)
+        weights = np.einsum("kij,knj->kni", np.linalg.pinv(matrix), corner - a[:, None])
+        uv = plane.corner_uv[face]
+        at = uv[:, None, 0] + weights @ (uv[:, 1:] - uv[:, :1])
+        corner_uv = np.clip(np.concatenate([at[:, [0, 1, 2]], at[:, [0, 2, 3]]]), 0.0, 1.0)
+        patch = TexturedMesh(vertices, faces, corner_uv, plane.texture)
+    return join_meshes(mesh, patch), np.concatenate([labels, np.full(len(vertices), FLOOR, np.int64)])
+
+
+def _cells(points: np.ndarray) -> np.ndarray:
+    return np.floor(points[:, :2] / PLANE_CELL_M).astype(np.int64)

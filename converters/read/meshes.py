@@ -19,11 +19,23 @@ from PIL import Image
 from trimesh.visual import ColorVisuals
 
 from converters.geometry.faces import merge_vertices
-from converters.geometry.upright import AXES, UNITS_M, faces_away, find_unit, find_up, turn_upright
 from converters.read import obj
 from converters.read.files import SourceFolder, as_number, check_mesh, read_labels
 from converters.read.formats.gltf import read_gltf
-from converters.read.surfaces import check_extent, floor_level, label_storeys, labelled, welded, with_split_corners
+from converters.read.surfaces import (
+    AXES,
+    UNITS_M,
+    check_extent,
+    faces_away,
+    find_unit,
+    find_up,
+    floor_level,
+    label_storeys,
+    labelled,
+    turn_upright,
+    welded,
+    with_split_corners,
+)
 from converters.records.errors import SceneRejected
 from converters.records.raw import RawScene
 from interactive_nav_common.errors import readable

@@ -18,8 +18,7 @@ from PIL import Image
 
 from converters.geometry.faces import stacked
 from converters.read.files import ObjMesh, SourceFolder, as_number, read_image, read_obj, read_text
-from converters.records.errors import SceneRejected
-from converters.records.limits import PIXELS
+from converters.records.errors import PIXELS, SceneRejected
 from converters.records.raw import ScanMesh, TexturedMesh
 
 GREY = (170, 170, 170)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from converters.read import annotations, gibson, interactive_gibson, meshes
+from converters.read import annotations, gibson, meshes
 from converters.read.datasets import scanned
 from converters.read.homes import habitat, mjcf, sdf, sh3d
 from converters.records.errors import SceneRejected
@@ -14,10 +14,8 @@ from converters.records.raw import RawScene
 
 READERS = {
     "interactive-gibson": (
-        lambda root: (
-            (root / interactive_gibson.MESH).is_file() and any(root.glob(f"{interactive_gibson.PREFIX}*.urdf"))
-        ),
-        interactive_gibson.read_interactive_gibson,
+        lambda root: (root / gibson.CLEANED).is_file() and any(root.glob(f"{gibson.PREFIX}*.urdf")),
+        gibson.read_interactive_gibson,
     ),
     "gibson": (lambda root: (root / gibson.MESH).is_file(), gibson.read_gibson),
     "scan2cad": (lambda root: (root / annotations.ANNOTATION).is_file(), annotations.read_scan2cad),
@@ -50,7 +48,7 @@ def detect_format(source: Path) -> str:
     if not source.exists():
         raise SceneRejected(f"{source}: no such file or folder; give the raw scene")
     raise SceneRejected(
-        f"{source}: no known layout; expected {gibson.MESH} (gibson), {interactive_gibson.MESH} with furniture URDFs "
+        f"{source}: no known layout; expected {gibson.MESH} (gibson), {gibson.CLEANED} with furniture URDFs "
         f"(interactive-gibson), {annotations.ANNOTATION} (scan2cad), worlds/*.world (sdf), "
         f"*{habitat.SCENE} (habitat), scene.xml (mjcf) or *{sh3d.ENDING} (sh3d) in it, "
         f"or one scene of {', '.join(scanned.COLLECTIONS)}"
@@ -69,7 +67,7 @@ def read_source(
     source: Path, layout: str = "auto", strict: bool = False, up: str = "auto", unit: str = "auto",
     within: Path | None = None, mirror: bool = False,
 ) -> RawScene:  # fmt: skip
-    """Reads a raw folder in the given layout, or in the one that its files show; or a file of a home, or a mesh."""
+    """Read a raw folder in the given layout, or in the one that its files show; or a file of a home, or a mesh."""
     about_mesh = (up, unit, mirror) != ("auto", "auto", False)
     chosen = READERS[layout][1] if layout != "auto" else None
     if source.is_file() and (chosen is None or chosen in [read for _, read in FILES.values()]):

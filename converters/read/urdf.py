@@ -18,6 +18,7 @@ from converters.read.files import SourceFolder, read_obj
 from converters.read.meshes import read_surface
 from converters.read.obj import TexturedMesh, find_file, in_colour, join_meshes
 from converters.records.errors import SceneRejected
+from interactive_nav_common.errors import readable
 from interactive_nav_common.rotations import transform, transformed
 
 READ = {
@@ -61,7 +62,7 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = Fal
     `hold`: take joints that move as fixed where they are at 0.
     """
     path = source.use(relative, remedy)
-    try:
+    with readable(path, SceneRejected, "fetch the file again", " as URDF"):
         root = ElementTree.parse(path).getroot()
         links = {str(e.get("name")): e for e in root.findall("link")}
         places = _link_places(path, root, links, hold)
@@ -72,10 +73,6 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = Fal
             [float(numbers(e.get("value"), (0.0,))[0]) for link in links.values() for e in link.findall(tag)[:1]]
             for tag in ("inertial/mass", "contact/lateral_friction")
         )
-    except (ElementTree.ParseError, ValueError, KeyError, LookupError) as error:
-        if isinstance(error, SceneRejected):
-            raise
-        raise SceneRejected(f"{path}: not readable as URDF ({type(error).__name__}: {error})") from error
     unread: Counter[str] = Counter()
     count_unread(root, READ, unread)
     report_unread(source, relative, unread)
@@ -108,10 +105,8 @@ def numbers(text: str | None, default: tuple[float, ...]) -> np.ndarray:
 
 def parse_xml(path: Path, kind: str, remedy: str = "fetch the file again") -> ElementTree.Element:
     """Return the root of an XML file."""
-    try:
+    with readable(path, SceneRejected, remedy, f" as {kind}"):
         return ElementTree.parse(path).getroot()
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise SceneRejected(f"{path}: not readable as {kind} ({error}); {remedy}") from error
 
 
 def count_unread(root: ElementTree.Element, table: dict[str, str], unread: Counter[str]) -> None:

@@ -1,29 +1,170 @@
-"""Label the vertices of an unlabelled scan with NYU40 ids; score how well they fit those of a labelled one."""
+"""Label the vertices of an unlabelled scan with NYU40 ids, and score how well they fit those of a labelled one.
+
+A 3-D U-Net, whose finest maps have half the resolution, scores the classes of every voxel of dense tiles: each cell of
+2 x 2 x 2 voxels is one place with eight times the channels, on the way in and out: an eighth of the work, and nothing
+is lost. Normalisation is over channels alone, so that a tile's size changes nothing.
+"""
 
 import dataclasses
+import functools
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
 import numpy as np
+from flax.traverse_util import unflatten_dict
 
 from converters.clock import Report
 from converters.generate import GenerationError
-from converters.propose.proposals import bounds, box_iou, propose_instances
+from converters.propose.pieces import bounds, box_iou
+from converters.propose.proposals import propose_instances
 from converters.propose.retrieval import annotated_vertices
 from converters.read.surfaces import floor_level, storey_of
+from converters.records.errors import SceneRejected
 from converters.records.raw import UNLABELLED, RawScene
-from converters.segment.network import WEIGHTS, Scores, load_network, make_scores, score_voxels
 from converters.segment.samples import TIERS, building_surface
 from converters.segment.voxels import (
+    BELOW_M,
+    FEATURES,
+    LAYERS,
     NAMES,
     NYU40,
+    VOXEL_M,
     Surface,
+    Voxels,
     at_vertices,
     classes_of,
     intersection_over_union,
     sample_surface,
     voxelise,
 )
+from interactive_nav_common.errors import readable
+from interactive_nav_common.runs import weights
+from interactive_nav_common.signals import signals_wait
+
+WEIGHTS = Path(__file__).with_name("weights.safetensors")
+"""The packaged ones."""
+TILE, MARGIN = 160, 16
+"""Voxels of a tile's side, and of its border, which is left to the next tile."""
+MULTIPLE = 8
+"""Sides of a tile are multiples of this many voxels."""
+
+
+class VoxelNet(nn.Module):
+    """Compute scores [N, X, Y, Z, classes] of tiles [N, X, Y, Z, FEATURES + 2]."""
+
+    widths: Sequence[int] = (40, 64, 96)
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Return the scores of every voxel; sides are multiples of `MULTIPLE`."""
+        x, skips = _fold(x.astype(self.dtype)), []
+        for level, width in enumerate(self.widths):
+            if level:
+                skips.append(x)
+                x = nn.Dense(width, dtype=self.dtype)(_fold(x))
+            x = self._block(x, width)
+        for skip in reversed(skips):
+            width = skip.shape[-1]
+            x = jnp.concatenate([_unfold(nn.Dense(8 * width, dtype=self.dtype)(x)), skip], axis=-1)
+            x = self._block(x, width)
+        return _unfold(nn.Dense(8 * len(NAMES), dtype=self.dtype)(x)).astype(jnp.float32)
+
+    def _block(self, x: jax.Array, width: int) -> jax.Array:
+        x = nn.relu(nn.LayerNorm(dtype=self.dtype)(nn.Conv(width, (3, 3, 3), dtype=self.dtype)(x)))
+        return nn.relu(x + nn.LayerNorm(dtype=self.dtype)(nn.Conv(width, (3, 3, 3), dtype=self.dtype)(x)))
+
+
+def _fold(x: jax.Array) -> jax.Array:
+    """Turn [N, X, Y, Z, C] into [N, X/2, Y/2, Z/2, 8C]."""
+    n, a, b, c, f = x.shape
+    x = x.reshape(n, a // 2, 2, b // 2, 2, c // 2, 2, f).transpose(0, 1, 3, 5, 2, 4, 6, 7)
+    return x.reshape(n, a // 2, b // 2, c // 2, 8 * f)
+
+
+def _unfold(x: jax.Array) -> jax.Array:
+    """Turn [N, X, Y, Z, 8C] into [N, 2X, 2Y, 2Z, C]."""
+    n, a, b, c, f = x.shape
+    x = x.reshape(n, a, b, c, 2, 2, 2, f // 8).transpose(0, 1, 4, 2, 5, 3, 6, 7)
+    return x.reshape(n, 2 * a, 2 * b, 2 * c, f // 8)
+
+
+def dense(index: jax.Array, features: jax.Array, shape: tuple[int, int]) -> jax.Array:
+    """Return [N, X, Y, LAYERS, FEATURES + 2] tiles: occupied, height over the floor (in 3 m), then the features.
+
+    Rows of the index [N, K, 3] with a negative x are none; features are [N, K, FEATURES] int8.
+    """
+    height = (index[..., 2:] + 0.5) * (VOXEL_M / 3) - BELOW_M / 3
+    given = jnp.concatenate([jnp.ones_like(height), height, features.astype(jnp.float32) / 127], axis=-1)
+    x, y, z = (jnp.where(index[..., :1] < 0, 1 << 20, index)[..., k] for k in range(3))
+    tile = jnp.arange(len(index))[:, None]
+    return jnp.zeros((len(index), *shape, LAYERS, FEATURES + 2)).at[tile, x, y, z].set(given, mode="drop")
+
+
+Scores = Callable[[jax.Array, jax.Array, tuple[int, int]], jax.Array]
+"""Index, features and shape of `dense` -> [N, X, Y, LAYERS, classes]."""
+
+
+def make_scores(net: VoxelNet, variables: Any) -> Scores:
+    """Return a network with weights, compiled once a shape."""
+
+    @signals_wait()  # a compilation that is left crashes the interpreter at its end
+    @functools.partial(jax.jit, static_argnums=2)
+    def scores(index: jax.Array, features: jax.Array, shape: tuple[int, int]) -> jax.Array:
+        out = net.apply(variables, dense(index, features, shape))
+        assert isinstance(out, jax.Array)
+        return jax.nn.log_softmax(out)
+
+    return scores
+
+
+def score_voxels(voxels: Voxels, scores: Scores, report: Callable[[float], None] = lambda share: None) -> np.ndarray:
+    """Return (k, classes) scores of occupied voxels, tile by tile."""
+    out = np.zeros((len(voxels.index), len(NAMES)), np.float32)
+    extent = voxels.index[:, :2].max(axis=0, initial=0) + 1
+    side = [min(TILE, int(-(-n // 16) * 16)) for n in extent]
+    step = [s - 2 * MARGIN if n > s else s for n, s in zip(extent, side, strict=True)]
+    starts = [(i, j) for i in range(0, int(extent[0]), step[0]) for j in range(0, int(extent[1]), step[1])]
+    tiles = []
+    for start in starts:
+        low = np.array(start) - [MARGIN if n > s else 0 for n, s in zip(extent, side, strict=True)]
+        at = voxels.index[:, :2] - low
+        near = np.flatnonzero(((at >= 0) & (at < side)).all(axis=1))
+        inner = ((voxels.index[near, :2] >= start) & (voxels.index[near, :2] < np.add(start, step))).all(axis=1)
+        if inner.any():
+            tiles.append((low, near, near[inner]))
+    most = max((len(near) for _, near, _ in tiles), default=0)
+    for k, (low, near, inner) in enumerate(tiles):
+        index, features = np.full((1, most, 3), -1), np.zeros((1, most, FEATURES), np.int8)
+        index[0, : len(near)], features[0, : len(near)] = voxels.index[near] - [*low, 0], voxels.features[near]
+        tile = scores(jnp.asarray(index), jnp.asarray(features), (side[0], side[1]))[0]
+        x, y, z = (voxels.index[inner] - [*low, 0]).T
+        out[inner] = np.asarray(tile[x, y, z])
+        report((k + 1) / len(tiles))
+    return out
+
+
+def save_network(path: Path, net: VoxelNet, variables: Any) -> None:
+    """Write weights of a byte each, with a factor for each output of a layer; vectors in half precision."""
+    params = {name: np.asarray(value, np.float32) for name, value in weights.flat(variables["params"]).items()}
+    tensors = {name: value if value.ndim > 1 else value.astype(np.float16) for name, value in params.items()}
+    about = {"task": "segment", "widths": list(net.widths), "names": list(NAMES), "voxel_m": VOXEL_M}
+    weights.write_weights(path, weights.rounded(tensors, step=0.0, least=0), about)
+
+
+def load_network(path: Path = WEIGHTS) -> tuple[VoxelNet, dict[str, Any]]:
+    """Return what `save_network` was given; weights of a byte each are restored."""
+    remedy = f"give {WEIGHTS.name} of 'python -m converters segment-train'"
+    tensors, about = weights.read_weights(path, SceneRejected, remedy)
+    with readable(path, SceneRejected, remedy):
+        net = VoxelNet(tuple(int(w) for w in about["widths"]))
+        params = {name: jnp.asarray(tensor, jnp.float32) for name, tensor in tensors.items()}
+        return net, {"params": unflatten_dict(params, sep="/")}
+
 
 MATCH_IOU = 0.5
 """Of boxes, from which on a proposal is an annotated object."""

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from converters.generate import BuildingConfig, GenerationError, HomeConfig, design_building, render_building
-from converters.generate.homes.config import home_config
+from converters.generate.design.config import home_config
 from converters.generate.models.cad import MODELS, Instance
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.scan import NYU40 as LABELS
-from converters.generate.surface.scan import smooth_noise
+from converters.generate.surface.scan import Volume, smooth_noise, visible_from
 from converters.records.raw import ScanMesh
 from converters.segment.voxels import LAYERS, NAMES, VOXEL_M, Surface, classes_of, joined, sample_surface, voxelise
 from interactive_nav_common.files import write_arrays
@@ -26,7 +26,7 @@ BASKETS = ("basket", "bin", "laundry_basket")
 
 @dataclasses.dataclass(frozen=True)
 class Crop:
-    """Occupied voxels of a square column."""
+    """Hold the occupied voxels of a square column."""
 
     index: np.ndarray
     """(k, 3) uint8."""
@@ -73,26 +73,14 @@ def building_surface(seed: int, tier: str, split: str) -> tuple[Surface, np.ndar
 
 
 def _visible(surface: Surface, rng: np.random.Generator, side_m: float) -> np.ndarray:
-    """(n,) bool: points that a sensor carried around the middle sees."""
-    occupied = voxelise(surface, 0.0)
-    grid = np.zeros((*(occupied.index[:, :2].max(axis=0, initial=0) + 3), LAYERS + 2), bool)
-    grid[tuple(occupied.index.T)] = True
-    top = np.array(grid.shape) - 1
-    at = occupied.index + 0.5
-    normal = occupied.features[:, :3] / 127
-    visible = np.zeros(len(at), bool)
-    for _ in range(int(rng.integers(3, 9))):
-        spread = rng.normal(0, side_m / 7, 2)
-        camera = (np.array([*spread, rng.uniform(0.8, 1.8)]) - occupied.origin) / VOXEL_M
-        start = at + 1.7 * normal
-        ray = camera - start
-        facing = np.flatnonzero(~visible & ((ray * normal).sum(axis=1) > 0.1 * np.linalg.norm(ray, axis=1)))
-        free = np.ones(len(facing), bool)
-        for t in np.linspace(0, 1, 64, endpoint=False):
-            cell = np.clip((start[facing] + t * ray[facing]).astype(int), 0, top)
-            free &= ~grid[tuple(cell.T)]
-        visible[facing[free]] = True
-    return visible[occupied.of_point] & (occupied.of_point >= 0)
+    """Return (n,) bool: points that a sensor carried around the middle sees."""
+    occupied, count = voxelise(surface, 0.0), int(rng.integers(3, 9))
+    free = np.ones((*(occupied.index[:, :2].max(axis=0, initial=0) + 3), LAYERS + 2), np.float32)
+    free[tuple(occupied.index.T)] = -1.0
+    volume = Volume(free, occupied.origin + VOXEL_M / 2, VOXEL_M)
+    cameras = np.column_stack([rng.normal(0, side_m / 7, (count, 2)), rng.uniform(0.8, 1.8, count)])
+    places, normals = volume.origin + VOXEL_M * occupied.index, occupied.features[:, :3] / 127
+    return visible_from(places, normals, cameras, volume)[occupied.of_point] & (occupied.of_point >= 0)
 
 
 def _recoloured(colours: np.ndarray | None, rng: np.random.Generator) -> np.ndarray | None:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from converters.segment.network import VoxelNet, dense, save_network
+from converters.segment.labelling import VoxelNet, dense, save_network
 from converters.segment.samples import Crop, generate_crops, read_crops
 from converters.segment.voxels import FEATURES, NAMES, UNKNOWN, intersection_over_union
 from interactive_nav_common.config import AtLeastOne, Count, Positive, Seed, Settings

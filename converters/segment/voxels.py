@@ -11,7 +11,7 @@ import numpy as np
 
 from converters.geometry.faces import face_areas, sum_at_vertices, unit_normals
 from converters.read.obj import texels
-from converters.records.limits import CLOUD
+from converters.records.errors import CLOUD
 from converters.records.raw import ScanMesh
 
 VOXEL_M = 0.04
@@ -35,7 +35,7 @@ FEATURES = 7
 
 @dataclasses.dataclass(frozen=True)
 class Surface:
-    """Points of a surface."""
+    """Hold points of a surface."""
 
     points: np.ndarray
     """(n, 3) m."""
@@ -49,7 +49,7 @@ class Surface:
 
 @dataclasses.dataclass(frozen=True)
 class Voxels:
-    """Occupied voxels."""
+    """Hold occupied voxels."""
 
     origin: np.ndarray
     """(3,) m, lowest corner of voxel (0, 0, 0)."""

@@ -1,6 +1,6 @@
 """Patch the holes that furniture left in floor and walls of a cleaned scan, by plane pieces behind them.
 
-Wall planes are fitted by RANSAC, as the floor's is (`converters.structure.floor`), whose waves are taken out by now. On
+Wall planes are fitted by RANSAC, as the floor's is (`converters.structure.clean`), whose waves are taken out by now. On
 a raster of each plane a cell is patched that ought to be surface and that the scan does not show. A patch
 lies behind the scan and reaches under its border on all sides, so that no crack shows from within the room.
 The picture's mesh never collides: nothing needs to be joined.
@@ -25,9 +25,9 @@ from converters.geometry.faces import (
     stacked,
     unit_normals,
 )
-from converters.records.limits import CLOUD
+from converters.records.errors import CLOUD
 from converters.records.raw import CEILING, FLOOR, STRUCTURE_LABELS, ColourCloud
-from converters.structure.floor import LIFT_M
+from converters.structure.clean import LIFT_M
 from converters.structure.maps import FloorPlan
 from interactive_nav_common.grids import label
 from interactive_nav_common.rotations import yaw_matrix

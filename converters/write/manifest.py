@@ -15,7 +15,7 @@ from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig
 from converters.bodies.objects import PlacedObject, to_world
 from converters.geometry.density import ROBOTS, must_push_shares
 from converters.geometry.faces import face_areas
-from converters.records.limits import Gate
+from converters.records.errors import Gate
 from converters.records.raw import RawScene
 from converters.structure.maps import Grid
 from converters.write.emit import SceneParts

@@ -11,10 +11,9 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from converters.bodies.objects import PlacedObject
-from converters.geometry.faces import face_areas, sample_faces, unit_normals, vertex_normals
-from converters.geometry.simplify import simplify_to, surface_loss
+from converters.geometry.faces import face_areas, sample_faces, simplify_to, surface_loss, unit_normals, vertex_normals
 from converters.read.obj import texels
-from converters.records.limits import CLOUD
+from converters.records.errors import CLOUD
 from converters.records.raw import ColourCloud, ScanMesh, TexturedMesh, VisualMesh
 from interactive_nav_common.grids import nearest_cell
 from interactive_nav_common.rotations import matrix_from_quat
@@ -83,6 +82,18 @@ def box_pixels(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return box, low[box] + np.stack([step % wide, step // wide], axis=1)
 
 
+def barycentric(corners: np.ndarray, points: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (n,) weights of the second and the third corner of triangles (n, 3, 2) at points (n, 2).
+
+    Where the triangle, twice as large as its area, is below `least`, which the third result says, it counts as that.
+    """
+    (ax, ay), (bx, by), (cx, cy) = (corners[:, k].T for k in range(3))
+    (px, py), d = (points - corners[:, 0]).T, (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+    good = np.abs(d) > least
+    d = np.where(good, d, least)
+    return (px * (cy - ay) - py * (cx - ax)) / d, ((bx - ax) * py - (by - ay) * px) / d, good
+
+
 def texel_surface(
     vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, uv_faces: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -96,13 +107,7 @@ def texel_surface(
     high = np.clip(np.ceil(corners.max(axis=1)).astype(int), low + 1, size)
     face, at = box_pixels(low, high)
     column, row = at.T
-    a, b, c = (corners[face, k] for k in range(3))
-    middle = np.stack([column + 0.5, row + 0.5], axis=1)
-    det = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
-    good = np.abs(det) > 1e-12
-    det = np.where(good, det, 1.0)
-    v = ((middle[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (middle[:, 1] - a[:, 1])) / det
-    w = ((b[:, 0] - a[:, 0]) * (middle[:, 1] - a[:, 1]) - (middle[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])) / det
+    v, w, good = barycentric(corners[face], np.stack([column + 0.5, row + 0.5], axis=1), 1e-12)
     slack = 0.02
     inside = good & (v >= -slack) & (w >= -slack) & (v + w <= 1 + slack)
     face, v, w = face[inside], v[inside], w[inside]
@@ -256,7 +261,7 @@ def bake_object(
 
 @dataclasses.dataclass(frozen=True)
 class Drawn:
-    """What is drawn of an object (body frame), and how much of its model's surface that is."""
+    """Hold what is drawn of an object (body frame), and how much of its model's surface that is."""
 
     mesh: VisualMesh
     shown_share: float

@@ -28,7 +28,7 @@ from converters.read.files import read_obj
 from converters.read.homes.parts import built_in
 from converters.read.source import read_source
 from converters.records.errors import SceneRejected
-from converters.structure.floor import LIFT_M
+from converters.structure.clean import LIFT_M
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import remove_stale
 from interactive_nav_common.rotations import matrix_from_quat

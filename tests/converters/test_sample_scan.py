@@ -11,7 +11,8 @@ import trimesh
 
 from converters.check.gates import check_folder
 from converters.pipeline import ConvertConfig, convert
-from converters.propose.proposals import bounds, box_iou, propose_instances
+from converters.propose.pieces import bounds, box_iou
+from converters.propose.proposals import propose_instances
 from converters.propose.retrieval import annotated_vertices
 from converters.read.annotations import read_scan2cad
 from scenes_mjcf.schema import load_maps

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from converters import sets
+from converters import many
 from converters.__main__ import main
 from converters.generate.design.config import GenerationError
 from converters.recipes import load_recipes
@@ -47,16 +47,16 @@ class Copier(LocalLauncher):
 
 
 def test_a_tiers_recipes_name_seeds_and_splits(tmp_path: Path) -> None:
-    sets.begin_set(tmp_path / "homes", "furnished", 10, 500)
+    many.begin_set(tmp_path / "homes", "furnished", 10, 500)
     recipes = load_recipes(tmp_path / "homes" / "recipes.yaml")
     assert [(r.name, r.seed, r.split, r.tier) for r in recipes.scenes][7:9] == [
         ("furnished_007", 507, "train", "furnished"),
         ("furnished_008", 508, "test", "furnished"),
     ]
     assert [r.split for r in recipes.scenes].count("test") == 2
-    sets.begin_set(tmp_path / "homes", "furnished", 10, 500)  # the same again is no error
+    many.begin_set(tmp_path / "homes", "furnished", 10, 500)  # the same again is no error
     with pytest.raises(GenerationError, match="holds other recipes than 11 of tier furnished from seed 500"):
-        sets.begin_set(tmp_path / "homes", "furnished", 11, 500)
+        many.begin_set(tmp_path / "homes", "furnished", 11, 500)
 
 
 @pytest.mark.parametrize(
@@ -80,19 +80,19 @@ def test_wrong_words_are_one_line_and_leave_nothing(tmp_path: Path, capsys, word
 
 def test_scenes_are_made_side_by_side_listed_and_found_by_name(tmp_path: Path, monkeypatch) -> None:
     out, lines, shares = tmp_path / "homes", [], []
-    sets.begin_set(out, "furnished", 5)
+    many.begin_set(out, "furnished", 5)
     runner = Copier(out)
-    monkeypatch.setattr(sets, "LocalLauncher", lambda jobs: runner)
-    wanted = sets.Wanted(out, None, None, 10, 0, (), False, 2, "local", "auto")
-    assert sets.generate_scenes(wanted, lambda _, share: shares.append(share), lines.append) == ["furnished_002"]
+    monkeypatch.setattr(many, "LocalLauncher", lambda jobs: runner)
+    wanted = many.Wanted(out, None, None, 10, 0, (), False, 2, "local", "auto")
+    assert many.generate_scenes(wanted, lambda _, share: shares.append(share), lines.append) == ["furnished_002"]
     assert runner.closed == 1 and len(runner.commands) == 5 and shares[-1] == 1.0
     assert runner.commands[0][:4] == [sys.executable, "-m", "converters", "generate-scenes"]
     assert "converters generate-scenes: furnished_002: no room" in lines
     assert not (out / "set.json").exists()
 
-    wanted = sets.Wanted(out, None, "furnished", 5, sets.SEEDS, (), False, 1, "local", "auto")
-    monkeypatch.setattr(sets, "make_scenes", lambda todo, *_: {recipe.name: ["drift_boxes"] for recipe in todo})
-    assert sets.generate_scenes(wanted, lambda _, share: None, lines.append) == ["furnished_002"]
+    wanted = many.Wanted(out, None, "furnished", 5, many.SEEDS, (), False, 1, "local", "auto")
+    monkeypatch.setattr(many, "make_scenes", lambda todo, *_: {recipe.name: ["drift_boxes"] for recipe in todo})
+    assert many.generate_scenes(wanted, lambda _, share: None, lines.append) == ["furnished_002"]
     assert lines[-4:] == [f"furnished_00{k}: is there, kept" for k in (0, 1, 3, 4)]
     members = read_set(out / "set.json").scenes
     assert members["furnished_000"].digest == scene_digest(SCENES / "apartment_0")
@@ -108,15 +108,15 @@ def test_a_scene_that_differs_from_the_list_is_told(tmp_path: Path) -> None:
     for name, source in (("one", "apartment_0"), ("two", "alder")):
         shutil.copytree(SCENES / source, tmp_path / name)
     recipes, lines = load_recipes(tmp_path / "recipes.yaml"), []
-    first = sets.list_set(recipes, tmp_path, lines.append)
+    first = many.list_set(recipes, tmp_path, lines.append)
     assert first.tier == "sparse" and lines == []
     shutil.rmtree(tmp_path / "two")
     shutil.copytree(SCENES / "birch", tmp_path / "two")
-    assert sets.list_set(recipes, tmp_path, lines.append) == first
+    assert many.list_set(recipes, tmp_path, lines.append) == first
     manifest = load_manifest(tmp_path / "one")  # converted anew: the same scene, seen in more detail
     measures = manifest.measures | {"specific_surface_1_m": 9.0}
     save_manifest(dataclasses.replace(manifest, measures=measures), tmp_path / "one")
-    assert sets.list_set(recipes, tmp_path).scenes["one"].measures["specific_surface_1_m"] == 9.0
+    assert many.list_set(recipes, tmp_path).scenes["one"].measures["specific_surface_1_m"] == 9.0
     assert lines == [f"two: not the scene that {tmp_path / 'set.json'} lists"]
 
 
@@ -125,7 +125,7 @@ def test_processes_that_still_run_are_ended(tmp_path: Path) -> None:
     commands = {name: [sys.executable, "-c", act, name] for name in ("slow", "quick", "late")}
     launcher = LocalLauncher(2)
     began = time.monotonic()
-    with contextlib.closing(sets.run_commands(commands, launcher, tmp_path, lambda *_: None, "scenes")) as results:
+    with contextlib.closing(many.run_commands(commands, launcher, tmp_path, lambda *_: None, "scenes")) as results:
         name, code, printed = next(results)
     assert (name, code) == ("quick", 3) and printed.strip().isdecimal()
     assert launcher.ended() == [] and time.monotonic() - began < 30 and list(tmp_path.iterdir()) == []

@@ -1,19 +1,235 @@
-"""Choose what each room of a plan is used for, and furnish the home; return it with its measures."""
+"""Choose what each room of a plan is used for, furnish the home, and meet the shares that must be pushed.
+
+These by a bounded search: one light piece is taken from where it stands and put into a passage or out of the way, what
+is then reached is measured, and the piece stays there where that is nearer to the wanted ranges.
+"""
 
 import dataclasses
 import itertools
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from converters.generate.design.config import BuildingConfig, GenerationError
+from converters.generate.design.config import SHARE_TOLERANCE, BuildingConfig, GenerationError, HomeConfig, Range
 from converters.generate.design.plan import Building, Plan, Rect, make_plan
 from converters.generate.design.space import rooms_joined, static_grid
-from converters.generate.homes.config import HomeConfig
-from converters.generate.homes.furnish import WIDE_M, Full, furnish_home
-from converters.generate.homes.passages import adjust
+from converters.generate.homes.arrange import TABLES, Arrangement, Group, GroupMember
+from converters.generate.homes.floor import CELL_M, Standing
+from converters.generate.homes.furnish import WIDE_M, Full, Home, clutter_category, furnish_home, settle
+from converters.generate.models.cad import place
+from converters.geometry.density import ROBOTS, Ways, must_push_shares
+from interactive_nav_common.grids import clearance
 from interactive_nav_common.records import read_packaged
+
+MOST_MOVES = 400
+"""Moves tried."""
+MOST_IN_VAIN = 100
+"""Moves in a row that bring nothing, after which a plan is given up."""
+BEFORE_M = (0.15, 0.85)
+"""From a doorway's middle to a piece that narrows it, along the way through."""
+PASSAGE_M = (0.15, 0.60)
+"""Clearance in the middle of what is taken for a passage."""
+
+
+FAR_M = 0.65
+"""Clearance beyond which more makes no difference."""
+DOUBT_M = (-0.02, 0.08)
+"""Radii this much smaller and larger are measured: a gap counts as barred where the smaller does not pass and as open
+where the larger does. Maps come out a centimetre or two off, and planners on a grid of 5 cm keep 6 to 8 cm away."""
+ROUND_M = 0.02
+"""Between a piece put into a passage and what stands there."""
+LEAST_GAIN = 1e-4
+"""A move that brings less is none."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Shares:
+    """Hold shares of pairs between which a robot must push, for a disc a little smaller than it and one larger."""
+
+    least: float
+    most: float
+
+    def miss(self, wanted: Range) -> float:
+        """Return how far they lie from a range: gaps that are nearly as wide as the robot count for neither side."""
+        return max(wanted[0] - self.least, self.most - wanted[1], 0.0)
+
+
+class Passages:
+    """Hold a home's floor as robots see it. Mutable, private to one search."""
+
+    def __init__(self, home: Home):
+        self.home = home
+        floor = home.floor
+        static = floor.inside & ~floor.fixed
+        self.ways = {
+            robot: [Ways.of(static, CELL_M, disc.radius_m + more) for more in DOUBT_M] for robot, disc in ROBOTS.items()
+        }
+        self.room_m = {robot: np.minimum(clearance(floor.free(robot), CELL_M), FAR_M) for robot in self.ways}
+        """Robot -> clearance of the floor as the furniture stands, up to `FAR_M`."""
+        self.shares = self.measure(self.room_m)
+
+    def measure(self, room_m: dict[str, np.ndarray]) -> dict[str, Shares]:
+        """Return the shares of pairs between which each robot must push, given the clearance."""
+        return {
+            robot: Shares(*(way.must_push_share(room_m[robot]) for way in ways)) for robot, ways in self.ways.items()
+        }
+
+    def room_after(self, standing: list[Standing]) -> dict[str, np.ndarray]:
+        """Return `room_m` as the furniture stands now, where it stood as listed when that was measured."""
+        floor, reach = self.home.floor, math.ceil(FAR_M / CELL_M)
+        out = {robot: room_m.copy() for robot, room_m in self.room_m.items()}
+        gone, come = _changed(standing, floor.standing)
+        for piece in gone + come:
+            # What is farther than `FAR_M` from a piece does not feel it, nor what is farther than that from there.
+            near, around = (
+                tuple(slice(max(s.start - k * reach, 0), s.stop + k * reach) for s in piece.window) for k in (1, 2)
+            )
+            inner = tuple(slice(n.start - a.start, n.stop - a.start) for n, a in zip(near, around, strict=True))
+            for robot, room_m in out.items():
+                room_m[near] = np.minimum(clearance(floor.free(robot)[around], CELL_M), FAR_M)[inner]
+        return out
+
+    def miss(self, shares: dict[str, Shares] | None = None) -> float:
+        """Return how far shares (those measured last) lie from the wanted ranges, summed."""
+        shares = shares or self.shares
+        return sum(shares[robot].miss(wanted) for robot, wanted in self.home.cfg.must_push.items())
+
+    def light(self) -> list[Standing]:
+        """Return what can be moved: light pieces, seats round tables among them."""
+        return [s for s in self.home.floor.standing if s.item.model.category in TABLES.light]
+
+    def trial(self, change: Callable[[], bool]) -> bool:
+        """Keep a change of what stands where if it brings the shares nearer to the wanted ranges; undo it otherwise."""
+        floor, cfg = self.home.floor, self.home.cfg
+        shares, standing, room_m = self.shares, list(floor.standing), self.room_m
+        if change() and floor.share > cfg.furniture_share - SHARE_TOLERANCE:
+            self.room_m = self.room_after(standing)
+            self.shares = self.measure(self.room_m)
+            if self.miss() < self.miss(shares) - LEAST_GAIN:
+                return True
+        gone, come = _changed(standing, floor.standing)
+        for pieces, by in ((come, -1), (gone, 1)):
+            for piece in pieces:
+                floor.cover(piece, by)
+        floor.standing, self.shares, self.room_m = standing, shares, room_m
+        return False
+
+    def narrowing(self, rng: np.random.Generator) -> tuple[np.ndarray, int] | None:
+        """Return a random place in a passage, half of the time before a doorway, and its room."""
+        floor, plan = self.home.floor, self.home.plan
+        if rng.random() < 0.5:
+            d = plan.doorways[rng.integers(len(plan.doorways))]
+            side = int(rng.integers(2))
+            xy = np.array(d.rect.centre)
+            xy[d.axis] += (1 if side else -1) * (d.rect.size[d.axis] / 2 + rng.uniform(*BEFORE_M))
+            xy[1 - d.axis] += rng.uniform(-0.5, 0.5)
+            return xy, d.rooms[side]
+        room_m = self.room_m[sorted(self.ways)[rng.integers(len(self.ways))]]
+        # The ridge of the clearance: as far from what stands left as from what stands right.
+        ridge = (room_m > PASSAGE_M[0]) & (room_m < PASSAGE_M[1]) & (floor.room >= 0)
+        across = [np.maximum(*(np.roll(room_m, way, axis) for way in (1, -1))) for axis in (0, 1)]
+        cells = np.argwhere(ridge & (room_m >= np.minimum(*across)))
+        if not len(cells):
+            return None
+        row, column = cells[rng.integers(len(cells))]
+        xy = floor.low + (np.array([column, row]) + 0.5) * CELL_M + rng.uniform(-0.1, 0.1, 2)
+        return xy, int(floor.room[row, column])
+
+
+def _changed(before: list[Standing], now: list[Standing]) -> tuple[list[Standing], list[Standing]]:
+    """Return pieces that stood and no longer do, and those that did not and now do."""
+    was, stands = {id(s) for s in before}, {id(s) for s in now}
+    return [s for s in before if id(s) not in stands], [s for s in now if id(s) not in was]
+
+
+def adjust(home: Home) -> dict[str, float]:
+    """Move light pieces until the shares that must be pushed lie in the wanted ranges; return them by robot."""
+    rng, passages = home.rng, Passages(home)
+    wanted = home.cfg.must_push
+    in_vain = 0
+    for _ in range(MOST_MOVES):
+        if passages.miss() < LEAST_GAIN or in_vain == MOST_IN_VAIN:
+            break
+        shares = passages.shares
+        too_low = any(shares[robot].least < low for robot, (low, _) in wanted.items())
+        too_high = any(shares[robot].most > high for robot, (_, high) in wanted.items())
+        if too_low and (not too_high or rng.random() < 0.5):
+            _narrow(home, passages)
+        else:
+            _clear(home, passages)
+        in_vain = in_vain + 1 if passages.shares is shares else 0
+    floor = home.floor
+    measured = must_push_shares(floor.inside & ~floor.fixed, {robot: floor.free(robot) for robot in ROBOTS}, CELL_M)
+    if passages.miss() < LEAST_GAIN and all(low <= measured[robot] <= high for robot, (low, high) in wanted.items()):
+        return measured
+    missed = [robot for robot in wanted if passages.shares[robot].miss(wanted[robot]) >= LEAST_GAIN] or list(wanted)
+    got = ", ".join(
+        f"must_push_{k} is {list(wanted[k])}, got {passages.shares[k].least:.3f} to {passages.shares[k].most:.3f}"
+        for k in missed
+    )
+    raise GenerationError(
+        f"{got} (for discs 2 cm smaller to 8 cm larger than the robot) after up to {MOST_MOVES} moves: "
+        "ask for a wider range or another furniture_share"
+    )
+
+
+def _narrow(home: Home, passages: Passages) -> None:
+    """Try one light piece in a passage."""
+    rng, floor = home.rng, home.floor
+    place_at = passages.narrowing(rng)
+    if place_at is None:
+        return
+    xy, room = place_at
+    alone = [s for s in passages.light() if ":" not in s.group]
+    piece, category = None, clutter_category(home, room)
+    if alone and (floor.share > home.cfg.furniture_share or rng.random() < 0.7):
+        piece = alone[rng.integers(len(alone))]
+        model, scale = piece.item.model, piece.item.scale
+    elif category in TABLES.light and floor.share < home.cfg.furniture_share + SHARE_TOLERANCE / 2:
+        model, scale = home.models.draw(category, rng)
+    else:
+        return
+    item = place(model, scale, xy, float(rng.uniform(-math.pi, math.pi)))
+
+    def change() -> bool:
+        if piece is not None:
+            floor.remove(piece)
+        if not home.takes([model.category], room):
+            return False
+        window, shadow = floor.raster([item.footprint.buffer(ROUND_M)])
+        free = floor.inside[window] & (floor.covered[window] == 0) & ~floor.swept[window]
+        if not (free | ~shadow).all():
+            return False
+        floor.add(item, room, model.category)
+        return True
+
+    passages.trial(change)
+
+
+def _clear(home: Home, passages: Passages) -> None:
+    """Try to put one light piece that bars a passage to where its room, or another, has space for it."""
+    rng, floor = home.rng, home.floor
+    light = passages.light()
+    if not light:
+        return
+    piece = light[rng.integers(len(light))]
+    model, scale = piece.item.model, piece.item.scale
+    group = Group(model.category, "anywhere")
+    alone = Arrangement(group, (GroupMember(model, scale, 0.0, 0.0, float(rng.uniform(-math.pi, math.pi))),), None)
+    rooms = [piece.room, *(int(k) for k in rng.permutation(len(home.plan.rooms))[:3])]
+
+    def change() -> bool:
+        standing = floor.standing
+        floor.remove(piece)
+        if passages.miss(passages.measure(passages.room_after(standing))) >= passages.miss() - LEAST_GAIN:
+            return False
+        takes = (room for room in rooms if home.takes([model.category], room))
+        any(settle(home, model.category, alone, room, home.narrow_m) for room in takes)
+        return True
+
+    passages.trial(change)
 
 
 @dataclasses.dataclass(frozen=True)

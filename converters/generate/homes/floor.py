@@ -173,8 +173,8 @@ class Floor:
         """Return the lower left corner of a room's window and running sums of what hinders there."""
         rows, columns = self.cells(self.plan.rooms[room])
         window = slice(max(rows.start - 8, 0), rows.stop + 8), slice(max(columns.start - 8, 0), columns.stop + 8)
-        layers = {"wall": self.room[window] != room, "taken": self.covered[window] > 0, "kept": self.kept[window],
-                  "front": self.front[window], "glass": self.glass[window], "swept": self.swept[window]}  # fmt: skip
+        layers = {"wall": self.room[window] != room, "taken": self.covered[window] > 0}
+        layers |= {name: getattr(self, name)[window] for name in ("kept", "front", "glass", "swept")}
         sums = {k: np.pad(layer.cumsum(0, dtype=np.int32).cumsum(1), ((1, 0), (1, 0))) for k, layer in layers.items()}
         return np.array([window[1].start, window[0].start]) * CELL_M + self.low, sums
 
@@ -186,9 +186,7 @@ class Floor:
             xs, ys = np.meshgrid(*(np.arange(k) * 2 * STEP_M + rng.uniform(0, 2 * STEP_M) for k in n))
             origin = np.stack([r.x0 + xs.ravel(), r.y0 + ys.ravel()], axis=1)
             side = rng.integers(4, size=len(origin))
-            near = np.stack([np.minimum(origin[:, 0] - r.x0, r.x1 - origin[:, 0]),
-                             np.minimum(origin[:, 1] - r.y0, r.y1 - origin[:, 1])], axis=1)  # fmt: skip
-            return Places(origin, side, near)
+            return Places(origin, side, np.minimum(origin - [r.x0, r.y0], [r.x1, r.y1] - origin))
         rows, half = [], arrangement.pieces[0].half_m[0]
         for side in range(4):
             length = r.size[1 - side % 2]

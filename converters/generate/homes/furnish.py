@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.generate.design.config import GenerationError
+from converters.generate.design.config import SHARE_TOLERANCE, GenerationError, HomeConfig
 from converters.generate.design.furnish import hang_doors
 from converters.generate.design.plan import Plan, Rect
 from converters.generate.homes.arrange import (
@@ -20,7 +20,6 @@ from converters.generate.homes.arrange import (
     on_floor,
     stand,
 )
-from converters.generate.homes.config import SHARE_TOLERANCE, HomeConfig
 from converters.generate.homes.floor import CELL_M, STRANDED_M2, Floor, Places
 from converters.generate.models.cad import Models
 from converters.geometry.density import ROBOTS
@@ -239,8 +238,9 @@ def grow(home: Home) -> None:
         hungry = {k: floor.room_share(k) / TABLES.rooms[use].appetite for k, use in enumerate(home.uses)}
         for room in sorted(hungry, key=lambda k: hungry[k]):
             chosen = _room_set(home, room)
-            groups = [(g, w) for g, w in (*((g, 1.0) for g, _ in chosen.base), *chosen.more)
-                      if (room, g) not in tired and home.count(g, room) < TABLES.groups[g].most]  # fmt: skip
+            every = (*((g, 1.0) for g, _ in chosen.base), *chosen.more)
+            every = [(g, w) for g, w in every if (room, g) not in tired]
+            groups = [(g, w) for g, w in every if home.count(g, room) < TABLES.groups[g].most]
             more_clutter = (room, "clutter") not in tired
             if not groups and (radius_m == WIDE_M or not more_clutter):
                 continue

@@ -16,11 +16,10 @@ from converters.generate.design.plan import Plan, Rect
 from converters.generate.models.cad import Instance
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface import sides as at_walls
-from converters.generate.surface.charts import Chart, assemble, piece_charts, plain, polygon
 from converters.generate.surface.finishes import FRAMES, Finish, finishes, framed
 from converters.generate.surface.scan import NYU40, Scan, building_solids, fuse, solid_from_box
 from converters.generate.surface.sides import CLOTHS, ENTRANCES, FLOOR_M, PICTURE, Side
-from converters.generate.surface.texture import Atlas
+from converters.generate.surface.texture import Atlas, Chart, assemble, piece_charts, plain, polygon
 from converters.records.raw import CEILING, FLOOR, WALL
 
 VOXEL_M = 0.05

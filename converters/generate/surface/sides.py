@@ -10,9 +10,9 @@ import numpy as np
 import shapely
 
 from converters.generate.design.plan import Doorway, PlanBox, Rect
-from converters.generate.surface.charts import Chart, plain, polygon
 from converters.generate.surface.finishes import SKIRTING_M, Colouring
 from converters.generate.surface.scan import NYU40
+from converters.generate.surface.texture import Chart, plain, polygon
 from converters.records.raw import FLOOR, WALL, WINDOW
 
 Span = tuple[float, float]

@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from converters.geometry.upright import find_up, turn_upright
 from converters.read.files import SourceFolder
 from converters.read.gibson import read_licence
 from converters.read.homes.parts import by_last_words, category_of
 from converters.read.obj import TexturedMesh, scan_of
-from converters.read.surfaces import floor_level, label_storeys
+from converters.read.surfaces import find_up, floor_level, label_storeys, turn_upright
 from converters.records.errors import SceneRejected
 from converters.records.raw import STRUCTURE_LABELS, UNLABELLED, RawScene
 from interactive_nav_common.errors import missing, optional, readable

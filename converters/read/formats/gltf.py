@@ -20,8 +20,7 @@ from PIL import Image
 
 from converters.read.files import SourceFolder, check_mesh
 from converters.read.obj import join_textures, read_texture, textured_by_face, use_named, wrapped
-from converters.records.errors import SceneRejected
-from converters.records.limits import NUMBERS, PIXELS, check_count
+from converters.records.errors import NUMBERS, PIXELS, SceneRejected, check_count
 from converters.records.raw import TexturedMesh
 from interactive_nav_common.records import Reader
 from interactive_nav_common.rotations import transformed

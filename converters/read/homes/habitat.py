@@ -20,8 +20,7 @@ from converters.read.homes.parts import HomePart, home
 from converters.read.meshes import SUFFIXES, read_surface
 from converters.read.obj import TexturedMesh
 from converters.read.urdf import placed, read_urdf
-from converters.records.errors import SceneRejected
-from converters.records.limits import PARTS, check_count
+from converters.records.errors import PARTS, SceneRejected, check_count
 from converters.records.raw import RawScene
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, matrix_from_quat, transform
 

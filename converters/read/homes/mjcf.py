@@ -20,8 +20,7 @@ from converters.read.files import SourceFolder, only_file
 from converters.read.homes.parts import LEVEL, HomePart, category_of, home
 from converters.read.obj import TexturedMesh, in_colour
 from converters.read.urdf import SHAPES, height_field, joined, parse_xml, placed, rectangle, solid
-from converters.records.errors import SceneRejected
-from converters.records.limits import FILES, GEOMS, PIXELS, check_count, check_image
+from converters.records.errors import FILES, GEOMS, PIXELS, SceneRejected, check_count, check_image
 from converters.records.raw import RawScene
 from interactive_nav_common.rotations import matrix_from_quat, transform
 from scenes_mjcf.categories import CATEGORIES, Category

@@ -19,14 +19,12 @@ import shapely
 from converters.geometry.boxes import MAX_PIECES, convex_pieces
 from converters.geometry.faces import face_vectors, merge_vertices, sample_faces
 from converters.read.files import SourceFolder
-from converters.read.gibson import read_attribution, read_licence
-from converters.read.interactive_gibson import SHOWN_M, assume_hinge, leaf_turn
+from converters.read.gibson import SHOWN_M, assume_hinge, leaf_turn, read_attribution, read_licence
 from converters.read.meshes import clean_surface, colours_of_faces
 from converters.read.obj import TexturedMesh, at_most, join_meshes, scan_of, textured_by_face
 from converters.read.surfaces import check_extent, floor_level, label_storeys, storey_of, with_split_corners
 from converters.read.urdf import joined, placed
-from converters.records.errors import SceneRejected
-from converters.records.limits import MOVABLES, check_count
+from converters.records.errors import MOVABLES, SceneRejected, check_count
 from converters.records.raw import UNLABELLED, Annotation, CadModel, RawScene, ScannedHinge, Storey
 from interactive_nav_common.records import read_packaged
 from interactive_nav_common.rotations import transform, transformed

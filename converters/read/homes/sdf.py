@@ -23,8 +23,7 @@ from converters.read.files import SourceFolder, only_file, read_image
 from converters.read.homes.parts import LEVEL, HomePart, home
 from converters.read.meshes import UP_AXES, collada_frame, read_surface
 from converters.read.obj import GREY, TexturedMesh, find_file, in_colour
-from converters.records.errors import SceneRejected
-from converters.records.limits import PARTS, check_count
+from converters.records.errors import PARTS, SceneRejected, check_count
 from converters.records.raw import RawScene
 from interactive_nav_common.records import read_packaged
 from interactive_nav_common.rotations import matrix_from_quat, transform, transformed

@@ -30,8 +30,7 @@ from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh
 from converters.read.surfaces import check_extent, storey_of
 from converters.read.urdf import count_unread, report_unread
-from converters.records.errors import SceneRejected
-from converters.records.limits import DRAWN, UNPACKED, check_count
+from converters.records.errors import DRAWN, UNPACKED, SceneRejected, check_count
 from converters.records.raw import Lamp, RawScene
 from interactive_nav_common.records import read_packaged
 from interactive_nav_common.rotations import transformed

@@ -10,8 +10,8 @@ import numpy as np
 
 from converters.read.files import as_number
 from converters.read.urdf import parse_xml
-from converters.records.errors import SceneRejected
-from converters.records.limits import ENTRIES, UNPACKED, check_count
+from converters.records.errors import ENTRIES, UNPACKED, SceneRejected, check_count
+from interactive_nav_common.errors import readable
 
 HOME, JAVAS = "Home.xml", "Home"
 MOST = 1e6
@@ -23,25 +23,22 @@ MODELS = (".obj", ".dae")
 def unpack(path: Path, folder: Path, budget: list[int] | None = None) -> None:
     """Write the files of an archive into an empty folder; count down the `budget` of bytes that it shares."""
     budget = [UNPACKED] if budget is None else budget
-    try:
-        with zipfile.ZipFile(path) as archive:
-            inside = archive.infolist()
-            check_count(path, len(inside), ENTRIES, "files in its archive")
-            budget[0] -= sum(i.file_size for i in inside)
-            check_count(path, UNPACKED - budget[0], UNPACKED, "bytes once unpacked")
-            for item in inside:
-                name = PurePosixPath(item.filename)
-                if name.is_absolute() or ".." in name.parts or set('\\:*?"<>|\0') & set(item.filename):
-                    raise SceneRejected(f"{path}: holds a file '{name}', which leads out of it; save the home again")
-                if item.is_dir() or item.filename == JAVAS:
-                    continue
-                (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                (folder / name).write_bytes(archive.read(item))
-    except SceneRejected:
-        raise
-    except Exception as error:  # damaged archives fail in zipfile, zlib or the file system
-        reason = " ".join(str(error).replace(str(folder), "").split())[:200] or type(error).__name__
-        raise SceneRejected(f"{path}: not readable as a Sweet Home 3D file ({reason}); save the home again") from None
+    with (
+        readable(path, SceneRejected, "save the home again", " as a Sweet Home 3D file"),
+        zipfile.ZipFile(path) as archive,
+    ):
+        inside = archive.infolist()
+        check_count(path, len(inside), ENTRIES, "files in its archive")
+        budget[0] -= sum(i.file_size for i in inside)
+        check_count(path, UNPACKED - budget[0], UNPACKED, "bytes once unpacked")
+        for item in inside:
+            name = PurePosixPath(item.filename)
+            if name.is_absolute() or ".." in name.parts or set('\\:*?"<>|\0') & set(item.filename):
+                raise SceneRejected(f"{path}: holds a file '{name}', which leads out of it; save the home again")
+            if item.is_dir() or item.filename == JAVAS:
+                continue
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(archive.read(item))
 
 
 def read_xml(path: Path, folder: Path) -> ElementTree.Element:

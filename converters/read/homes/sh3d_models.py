@@ -22,8 +22,7 @@ from converters.read.homes.sh3d_archive import called, colour, metres, model_pat
 from converters.read.meshes import read_surface
 from converters.read.obj import GREYS, TexturedMesh, distinct, join_textures, read_painted_obj
 from converters.read.urdf import placed, solid
-from converters.records.errors import SceneRejected
-from converters.records.limits import EXTENT_M, GEOMS, check_count
+from converters.records.errors import EXTENT_M, GEOMS, SceneRejected, check_count
 from interactive_nav_common.records import read_packaged
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, yaw_matrix
 

@@ -16,8 +16,7 @@ import shapely
 from converters.read.homes.parts import HomePart
 from converters.read.homes.sh3d_archive import called, metres, number, outline, point
 from converters.read.homes.sh3d_models import WHITE, Look, Sheet, fitted
-from converters.records.errors import SceneRejected
-from converters.records.limits import EXTENT_M
+from converters.records.errors import EXTENT_M, SceneRejected
 from converters.records.raw import Window
 
 HEIGHT_M, LOW_M = 2.5, 1.2

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from converters.check.pictures import Picture, world_surfaces
-from converters.propose.proposals import bounds, box_iou
+from converters.propose.pieces import bounds, box_iou
 from converters.records.raw import TexturedMesh
 from converters.segment.labelling import MATCH_IOU
 from scenes_mjcf.look import over

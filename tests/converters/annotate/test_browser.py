@@ -15,8 +15,9 @@ from converters.__main__ import main
 from converters.annotate.browser import Page, hit
 from converters.annotate.session import Store, start
 from converters.bodies.alignment import apply_alignment
-from converters.bodies.placement import upright
-from converters.propose.proposals import bounds, box_iou, propose_instances
+from converters.bodies.objects import upright
+from converters.propose.pieces import bounds, box_iou
+from converters.propose.proposals import propose_instances
 from converters.propose.retrieval import annotated_vertices, read_library
 from converters.read.source import read_source
 from interactive_nav_common.rotations import wrap_angle

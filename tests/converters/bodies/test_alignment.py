@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from converters.bodies.alignment import Alignment, AlignmentError, gross_outliers, solve_alignment
-from converters.bodies.placement import compare, pose_difference, upright
+from converters.bodies.objects import compare, pose_difference, upright
 from converters.records.raw import Annotation
 from interactive_nav_common.rotations import wrap_angle, yaw_matrix
 

@@ -9,8 +9,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from converters.check.gates import check_folder, judge
-from converters.check.surfaces import kept_share
+from converters.check.gates import check_folder, judge, kept_share
 from converters.read.source import read_source
 from converters.structure.maps import make_floor_plan
 from scenes_mjcf.schema import load_maps, save_maps

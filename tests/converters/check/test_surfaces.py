@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from converters.check.gates import LIMITS, check_folder, judge
-from converters.check.surfaces import body_shares
+from converters.check.gates import LIMITS, body_shares, check_folder, judge
 from converters.geometry.faces import face_areas, simplify
 from converters.library.store import read_shape
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP

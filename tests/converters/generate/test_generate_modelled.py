@@ -14,14 +14,13 @@ import shapely
 from PIL import Image
 
 from converters.generate import GENERATOR_VERSION, Building, GenerationError, design_building, render_building
+from converters.generate.design.config import HomeConfig, home_config
 from converters.generate.design.plan import Plan, Rect
-from converters.generate.homes.config import HomeConfig, home_config
 from converters.generate.models.cad import Instance
-from converters.generate.surface.charts import assemble, polygon
 from converters.generate.surface.modelled import model_building, space_of
 from converters.generate.surface.scan import NYU40, Scan
 from converters.generate.surface.sides import FLOOR_M, entrance_place, sides_of
-from converters.generate.surface.texture import Atlas
+from converters.generate.surface.texture import Atlas, assemble, polygon
 from converters.generate.surface.write import annotate_items, write_npz, write_scan
 from converters.pipeline import ConvertConfig, _structure_visual
 from converters.read.gibson import read_gibson

@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from converters.generate import Building, BuildingConfig, GenerationError, HomeConfig, design_building
+from converters.generate.design.config import MOST_SHARE, TIERS, home_config, home_fields
 from converters.generate.design.furnish import Effort, furnish_plan
 from converters.generate.design.plan import Plan, Rect, make_plan
-from converters.generate.homes import design, furnish, passages
+from converters.generate.homes import design, furnish
 from converters.generate.homes.arrange import TABLES, apart, arrange, draw_set, stand
-from converters.generate.homes.config import MOST_SHARE, TIERS, home_config, home_fields
 from converters.generate.homes.design import USES, assign_uses, home_plan, programme
 from converters.generate.homes.floor import Floor
 from converters.generate.homes.furnish import Home, furnish_home
@@ -40,7 +40,7 @@ def furnished(seed: int, tier: str = "furnished") -> Home:
     """A home with what belongs together still known."""
     home = first_home(home_config(tier, FLAT), seed)
     with contextlib.suppress(GenerationError):
-        passages.adjust(home)
+        design.adjust(home)
     return home
 
 
@@ -241,7 +241,7 @@ def test_the_largest_share_is_reached_by_a_home_of_five_rooms():
 
 def test_shares_that_cannot_be_met_by_moving_things_are_refused(monkeypatch):
     cfg = home_config("furnished", FLAT | {"must_push_turtlebot": (0.99, 1.0), "furniture_share": 0.05})
-    monkeypatch.setattr("converters.generate.homes.passages.MOST_MOVES", 5)
+    monkeypatch.setattr("converters.generate.homes.design.MOST_MOVES", 5)
     with pytest.raises(
         GenerationError, match=r"seed 1: must_push_turtlebot is \[0\.99, 1\.0\], got 0\.\d{3} to 0\.\d{3} \(for"
     ):
@@ -250,13 +250,13 @@ def test_shares_that_cannot_be_met_by_moving_things_are_refused(monkeypatch):
 
 def test_the_clearance_after_moves_is_that_of_the_whole_floor_measured_again():
     home = first_home(home_config("cluttered", FLAT), 3)
-    found = passages.Passages(home)
+    found = design.Passages(home)
     for _ in range(25):
-        passages._narrow(home, found)
-        passages._clear(home, found)
+        design._narrow(home, found)
+        design._clear(home, found)
     for robot, room_m in found.room_m.items():
-        whole = passages.clearance(home.floor.free(robot), passages.CELL_M)
-        np.testing.assert_allclose(room_m, np.minimum(whole, passages.FAR_M))
+        whole = design.clearance(home.floor.free(robot), design.CELL_M)
+        np.testing.assert_allclose(room_m, np.minimum(whole, design.FAR_M))
         assert (home.floor.below[robot] < 9).all()  # nothing was taken away that was not there
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from converters.geometry.simplify import Surface, simplify_open, simplify_parts, surface_loss
+from converters.geometry.faces import Surface, simplify_open, simplify_parts, surface_loss
 
 
 def wall() -> tuple[np.ndarray, np.ndarray]:

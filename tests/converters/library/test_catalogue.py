@@ -78,7 +78,7 @@ def test_a_broken_archive_is_one_line(tmp_path):
             read_catalogue(tmp_path / "broken.sh3f")
     at = data.index(b"v 2 0 0")
     path.write_bytes(data[:at] + b"x" + data[at + 1 :])
-    with pytest.raises(SceneRejected, match="chair.obj: damaged"):
+    with pytest.raises(SceneRejected, match="chair.obj is damaged"):
         unpack_model(catalogue, catalogue.pieces[0], tmp_path)
     with pytest.raises(SceneRejected, match="no such file"):
         read_catalogue(tmp_path / "absent.sh3f")

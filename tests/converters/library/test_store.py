@@ -10,8 +10,7 @@ import pytest
 import trimesh
 import yaml
 
-from converters.geometry.faces import loose_parts
-from converters.geometry.simplify import Surface, simplify_within
+from converters.geometry.faces import Surface, loose_parts, simplify_within
 from converters.library.build import (
     MOST_FACES,
     SELECTION,
@@ -78,9 +77,9 @@ def test_packing_twice_gives_the_same_bytes_and_a_damaged_archive_is_one_line(tm
     assert read_index(tmp_path / "a.zip") == {n: INDEX[n] for n in names}
     (tmp_path / "c.zip").write_bytes((tmp_path / "a.zip").read_bytes()[:500])
     for read in (read_index, lambda path: read_shape(names[0], path)):
-        with pytest.raises(FileError, match="is not readable"):
+        with pytest.raises(FileError, match="not readable"):
             read(tmp_path / "c.zip")
-    with pytest.raises(FileError, match="Nobody/nothing.arrays is not readable"):
+    with pytest.raises(FileError, match="not readable .*Nobody/nothing.arrays"):
         read_shape("Nobody/nothing")
 
 

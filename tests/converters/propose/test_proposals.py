@@ -16,7 +16,8 @@ from converters.__main__ import main
 from converters.bodies.alignment import apply_alignment
 from converters.generate.models.cad import cad_model
 from converters.generate.surface.write import write_cad
-from converters.propose.proposals import Proposal, as_scan2cad, bounds, box_iou, propose_instances
+from converters.propose.pieces import Proposal, bounds, box_iou
+from converters.propose.proposals import as_scan2cad, propose_instances
 from converters.propose.retrieval import fit_model, read_library, retrieve, without_annotation
 from converters.read.annotations import parse_annotations, read_scan2cad
 from converters.records.errors import SceneRejected
@@ -239,7 +240,7 @@ def test_what_fails_while_drawing_leaves_the_older_files(scan2cad_raw, tmp_path,
     def fail(*_):
         raise failure
 
-    monkeypatch.setattr("converters.propose.report._draw", fail)
+    monkeypatch.setattr("converters.propose.proposals._draw", fail)
     assert main(["propose", str(scan2cad_raw), "-o", str(tmp_path)]) == (130 if failure.args == () else 2)
     assert capsys.readouterr().err.count("\n") == 1
     assert [(tmp_path / name).read_text() for name in ("proposals.json", "proposals.png")] == ["older", "older"]

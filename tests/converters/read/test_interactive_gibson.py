@@ -13,8 +13,7 @@ import trimesh
 from PIL import Image
 
 from converters.pipeline import ConvertConfig, convert
-from converters.read.gibson import read_gibson
-from converters.read.interactive_gibson import assume_hinge, read_interactive_gibson
+from converters.read.gibson import assume_hinge, read_gibson, read_interactive_gibson
 from converters.read.source import detect_format
 from converters.records.errors import SceneRejected
 from converters.records.raw import FLOOR

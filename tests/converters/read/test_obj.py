@@ -50,6 +50,16 @@ def test_a_door_frame_of_one_polygon_stays_open(tmp_path, plane):
     assert np.abs(area.sum(axis=0)).max() == pytest.approx(50)  # all face one way
 
 
+def test_a_ring_with_a_bridge_keeps_its_hole(tmp_path):
+    """A square of 3 x 3 around one of 1 x 1, joined by an edge that the outline runs along twice."""
+    corners = [(0, 0), (3, 0), (3, 3), (0, 3), (1, 1), (1, 2), (2, 2), (2, 1)]
+    text = "".join(f"v {x} {y} 0\n" for x, y in corners) + "f 1 2 3 4 1 5 6 7 8 5\n"
+    mesh = read_obj(obj(tmp_path, text))
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    np.testing.assert_allclose((np.cross(b - a, c - a)[:, 2] / 2).sum(), np.abs(np.cross(b - a, c - a)).sum() / 2)
+    assert len(mesh.faces) == 8 and np.abs(np.cross(b - a, c - a)).sum() / 2 == pytest.approx(8)
+
+
 def test_a_polygon_that_crosses_itself_is_a_fan(tmp_path):
     text = "v 0 0 0\nv 3 0 0\nv 1 1 0\nv 3 2 0\nv 2 -1 0\nf 1 2 3 4 5\n"
     assert read_obj(obj(tmp_path, text)).faces.shape == (3, 3)

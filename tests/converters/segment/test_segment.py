@@ -20,8 +20,7 @@ from converters.read.source import read_source
 from converters.records.errors import SceneRejected
 from converters.records.raw import ScanMesh
 from converters.segment import labelling
-from converters.segment.labelling import label_scan, score_homes
-from converters.segment.network import VoxelNet, load_network, save_network, score_voxels
+from converters.segment.labelling import VoxelNet, label_scan, load_network, save_network, score_homes, score_voxels
 from converters.segment.samples import Crop, building_surface, make_crop, read_crops
 from converters.segment.train import HELD_OUT_SEED, SegmentConfig, batch_of, make_step, score_crops, turned
 from converters.segment.voxels import (

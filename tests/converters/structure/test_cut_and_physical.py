@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from converters.bodies.objects import MATERIALS, physical_properties, place_object
-from converters.bodies.placement import upright
+from converters.bodies.objects import MATERIALS, physical_properties, place_object, upright
 from converters.geometry.boxes import Hull, convex_hull
 from converters.geometry.faces import face_labels, loose_parts
 from converters.read.annotations import read_scan2cad
 from converters.records.raw import WALL
-from converters.structure.cut import cut_furniture, depth_in_hulls
+from converters.structure.clean import cut_furniture, depth_in_hulls
 from tests.converters import tiny_raw
 
 

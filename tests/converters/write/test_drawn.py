@@ -11,8 +11,7 @@ import trimesh
 from PIL import Image
 
 from converters.bodies.objects import PlacedObject
-from converters.geometry.faces import sample_faces
-from converters.geometry.simplify import Surface, simplify_to, surface_loss
+from converters.geometry.faces import Surface, sample_faces, simplify_to, surface_loss
 from converters.records.raw import ColourCloud, TexturedMesh
 from converters.write.texture import as_it_is, as_png, draw_objects
 

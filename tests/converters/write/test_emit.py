@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.spatial import KDTree
 
 from converters.bodies.objects import PlacedObject, physical_properties
-from converters.check.surfaces import geom_surface
+from converters.check.pictures import geom_surface
 from converters.geometry.boxes import convex_hull, fit_box
 from converters.records.raw import VisualMesh
 from converters.write.emit import SceneParts, paired, write_obj, write_scene

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from converters.geometry.upright import AXES, find_unit, find_up, turn_upright
 from converters.read.files import read_mesh
+from converters.read.surfaces import AXES, find_unit, find_up, turn_upright
 from converters.records.errors import SceneRejected
 from tests.converters import tiny_raw
 
@@ -97,3 +97,9 @@ def test_turns_are_turns(seed):
         np.testing.assert_allclose(turn @ axis, [0, 0, 1], atol=1e-9)
         np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
         assert np.linalg.det(turn) == pytest.approx(1.0)
+
+
+def test_a_mesh_without_area_has_no_height():
+    points = np.array([(0, 0, 0), (1, 0, 0), (2, 0, 0)], float)
+    with pytest.raises(SceneRejected, match="is 0 units high"):
+        find_unit(points, np.array([[0, 1, 2]]), "line")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from converters.records.errors import SceneRejected
-from converters.structure.floor import LIFT_M, FloorFit, fit_floor, level_floor
+from converters.structure.clean import LIFT_M, FloorFit, fit_floor, level_floor
 from tests.converters import tiny_raw
 
 
