@@ -147,7 +147,11 @@ def make_dataset(
         drawn = []
         for scene, plan in zip(scenes, plans, strict=True):
             (out / scene.name).mkdir(exist_ok=True)
-            write_arrays(out / scene.name / "plan.npz", **_plan_arrays(plan))
+            passages = {f"passage_{f.name}": getattr(plan.passages, f.name) for f in dataclasses.fields(Passages)}
+            arrays = {name: getattr(plan, name) for name in ("xy_w", "room", "test")} | passages
+            arrays |= {"cluster_xy_w": plan.rooms.points_w, "cluster_label": plan.rooms.labels}
+            how = np.asarray([plan.rooms.method, plan.rooms.chosen_by])
+            write_arrays(out / scene.name / "plan.npz", **arrays, how=how)
             files = _shards(out / scene.name, plan, robot, config)
             drawn.append((scene.name, lambda scene=scene: scene, files))
         total = sum(len(p.xy_w) * 3 * config.headings + len(p.passages) for p in plans)
@@ -205,19 +209,6 @@ def load_plan(folder: Path, scene: str) -> ScenePlan:
         return ScenePlan(rooms, arrays["xy_w"], arrays["room"], arrays["test"], passages)
 
 
-def _plan_arrays(plan: ScenePlan) -> dict[str, np.ndarray]:
-    passages = {f"passage_{f.name}": getattr(plan.passages, f.name) for f in dataclasses.fields(Passages)}
-    return {
-        "xy_w": plan.xy_w,
-        "room": plan.room,
-        "test": plan.test,
-        "cluster_xy_w": plan.rooms.points_w,
-        "cluster_label": plan.rooms.labels,
-        "how": np.asarray([plan.rooms.method, plan.rooms.chosen_by]),
-        **passages,
-    }
-
-
 def _about(scene: Scene, plan: ScenePlan) -> dict[str, Any]:
     recorded = recorded_rooms(scene.digest)
     return {
@@ -266,14 +257,8 @@ def draw_passages(space: FreeSpace, rooms: Rooms, config: DataConfig, rng: np.ra
     heading = (phase[:, None] + 2 * np.pi * np.arange(each) / each).ravel() % (2 * np.pi)
     start = np.repeat(sources, each, 0)
     free = free_lengths(space, start, heading, config)
-    every = Passages(
-        start,
-        heading,
-        free,
-        np.repeat(np.arange(n, dtype=np.int32), each),
-        np.repeat(room, each),
-        np.repeat(test, each),
-    )
+    of_sources = (np.repeat(values, each) for values in (np.arange(n, dtype=np.int32), room, test))
+    every = Passages(start, heading, free, *of_sources)
     scored = free[:, config.passage_column]
     kept = [balanced(np.flatnonzero(every.test == held), scored, rng) for held in (False, True)]
     return every.take(np.sort(np.concatenate(kept)))

@@ -124,10 +124,8 @@ def as_seen_from(images: np.ndarray, config: DomainConfig, xy_w: np.ndarray, hea
     if _changes_nothing(config) or not len(images):
         return images
     places = np.rint(1000.0 * np.concatenate([xy_w, np.asarray(heading_rad)[:, None]], -1)).astype(np.int64) % 2**32
-    drawn = [
-        _chance(np.random.default_rng([config.seed, *place]), config, (1, *images.shape[1:]))
-        for place in places.tolist()
-    ]
+    rngs = (np.random.default_rng([config.seed, *place]) for place in places.tolist())
+    drawn = [_chance(rng, config, (1, *images.shape[1:])) for rng in rngs]
     ways, stops, noise = (np.concatenate(one) for one in zip(*drawn, strict=True))
     return _taken(images, config, ways, stops, noise)
 

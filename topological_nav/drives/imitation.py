@@ -91,13 +91,8 @@ def make_sequences(
     at, end = np.array(rows, int).reshape(-1, window + 1), np.array(ends, int)[:, None]
     capped = np.minimum(at, end - 1).astype(np.int32)
     command = drives.command[capped[:, :-1]]
-    return Sequences(
-        capped,
-        at[:, :-1] < end,
-        at[:, 1:] < end,
-        classes(command[..., 0], values[0]),
-        classes(command[..., 1], values[1]),
-    )
+    commanded = (classes(command[..., k], of) for k, of in enumerate(values))
+    return Sequences(capped, at[:, :-1] < end, at[:, 1:] < end, *commanded)
 
 
 def turning_share(sequences: Sequences, config: PolicyConfig) -> np.ndarray:

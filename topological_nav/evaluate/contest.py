@@ -307,14 +307,10 @@ def _stem(scene: ContestScene, contender: str) -> str:
     return f"{scene.scene.name}-{contender}-{digest_of(scene.request(contender))}"
 
 
-def _files(out: Path, stem: str) -> list[Path]:
-    return sorted((out / "rows").glob(f"{stem}-*.parquet"))
-
-
 def _missing(out: Path, stem: str, count: int) -> np.ndarray:
     """Return the numbers of the episodes that no file has."""
-    there = _rows(out, stem, count)["episode"].to_numpy() if _files(out, stem) else np.zeros(0, int)
-    return np.setdiff1d(np.arange(count), there)
+    some = any((out / "rows").glob(f"{stem}-*.parquet"))
+    return np.setdiff1d(np.arange(count), _rows(out, stem, count)["episode"].to_numpy() if some else [])
 
 
 def _rows(out: Path, stem: str, count: int) -> pa.Table:
@@ -322,7 +318,7 @@ def _rows(out: Path, stem: str, count: int) -> pa.Table:
 
     An episode that two commands played at the same time counts as the first of the files has it.
     """
-    rows = read_rows(_files(out, stem), COLUMNS.check)
+    rows = read_rows(list((out / "rows").glob(f"{stem}-*.parquet")), COLUMNS.check)
     number, first = np.unique(rows["episode"].to_numpy(), return_index=True)
     return rows.take(first[number < count])
 

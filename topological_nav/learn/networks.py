@@ -156,11 +156,8 @@ def augmented(key: jax.Array, images: jax.Array, flip: bool) -> jax.Array:
     x = images.astype(jnp.float32)
     gain = jax.random.uniform(key_gain, (n, 2, 1, 3), minval=0.8, maxval=1.25)
     mean = x.mean((1, 2, 3), keepdims=True)
-    x = (
-        (x - mean) * gain[:, :1, :, :1]
-        + mean * gain[:, 1:]
-        + jax.random.uniform(key_offset, (n, 1, 1, 1), minval=-20.0, maxval=20.0)
-    )
+    offset = jax.random.uniform(key_offset, (n, 1, 1, 1), minval=-20.0, maxval=20.0)
+    x = (x - mean) * gain[:, :1, :, :1] + mean * gain[:, 1:] + offset
     dy, dx = max(height // 16, 1), max(width // 16, 1)
     padded = jnp.pad(x, ((0, 0), (dy, dy), (dx, dx), (0, 0)), mode="edge")
     places = jnp.broadcast_to(jnp.asarray([2 * dy + 1, 2 * dx + 1]), (n, 2))

@@ -220,10 +220,7 @@ def _scores(trained: Trained, work: _Work) -> dict[str, Any]:
 
 def class_scores(truth: np.ndarray, chosen: np.ndarray, classes: int = 0) -> dict[str, Any]:
     """Return accuracy and macro F1 of [N] classes; given their number, also the confusion, a row for each true one."""
-    out = {
-        "accuracy": float((chosen == truth).mean()),
-        "macro_f1": float(f1_score(truth, chosen, average="macro")),
-    }
+    out = {"accuracy": float((chosen == truth).mean()), "macro_f1": float(f1_score(truth, chosen, average="macro"))}
     return out | ({"confusion": confusion_matrix(truth, chosen, labels=range(classes)).tolist()} if classes else {})
 
 
@@ -248,13 +245,11 @@ def localisation(
     for name, mine in rows_by_scene(rooms).items():
         nodes, queries = mine & ~rooms.test, there.get(name, np.zeros_like(other_rooms.test)) & other_rooms.test
         if nodes.any() and queries.any():
-            looked = (
-                other.embed(other_rooms.images[queries][:, level, ::3]),
-                trained.embed(rooms.images[nodes][:, level]),
-            )
+            looked = other.embed(other_rooms.images[queries][:, level, ::3])
+            shown = trained.embed(rooms.images[nodes][:, level])
             rows[name] = localisation_scores(
-                Places(looked[0], other_rooms.xy_w[queries], other_rooms.label[queries]),
-                Places(looked[1], rooms.xy_w[nodes], rooms.label[nodes]),
+                Places(looked, other_rooms.xy_w[queries], other_rooms.label[queries]),
+                Places(shown, rooms.xy_w[nodes], rooms.label[nodes]),
             )
             weights.append(int(queries.sum()))
     if rows:

@@ -284,10 +284,8 @@ def _joined(space: FreeSpace, xy: np.ndarray, edge_m: float, margin_m: float, po
     free = space.free(margin_m)
     # Cells that share a side: the straight way between their centres is as free as they are.
     cost = 1.0 + TIGHT_COST * np.clip(1.0 - space.clearance_m / ROOMY_M, 0.0, 1.0)
-    lattice, centres = (
-        grid_graph(free, cost, space.resolution_m, MOVES_4),
-        cell_centres(np.ones_like(free), space.resolution_m, space.origin_w),
-    )
+    lattice = grid_graph(free, cost, space.resolution_m, MOVES_4)
+    centres = cell_centres(np.ones_like(free), space.resolution_m, space.origin_w)
     while True:
         parts = parts_of(free_edges(space, xy, edge_m, margin_m, points), len(xy))
         column, row = space.inner_cells(xy).T

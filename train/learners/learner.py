@@ -12,10 +12,14 @@ import numpy as np
 from brax.envs import Env
 
 from interactive_nav.physics import compiler_options
+from interactive_nav_common.errors import UserError
 from train.config import RunConfig
-from train.errors import DivergedError
 
 PyTree = Any
+
+
+class DivergedError(UserError):
+    """The learner's loss, parameters or statistics stopped being finite numbers."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,6 +114,10 @@ def run_loop(
     log_every = whole_updates(run.log_every_steps, steps_per_update)
     save_every = log_every * whole_updates(run.checkpoint_every_steps, log_every * steps_per_update)
 
+    def update_typed(learner: PyTree, env_state: PyTree) -> tuple[PyTree, PyTree, Update]:
+        learner, env_state, update = update_fn(learner, env_state)
+        return strong_types(learner), strong_types(env_state), update
+
     learner, env_state = strong_types((start.learner, start.env_state))
     done = start.env_steps // steps_per_update
     callbacks.on_start(start, total * steps_per_update)
@@ -119,7 +127,7 @@ def run_loop(
         return TrainResult(start, metrics, completed=done >= total)
 
     clock = time.perf_counter()
-    lowered = jax.jit(_strongly_typed(update_fn), donate_argnums=1).lower(learner, env_state)
+    lowered = jax.jit(update_typed, donate_argnums=1).lower(learner, env_state)
     compiled = lowered.compile(compiler_options())
     compile_s = time.perf_counter() - clock
 
@@ -129,7 +137,12 @@ def run_loop(
         before = learner
         learner, env_state, update = compiled(learner, env_state)
         if not bool(update.finite):
-            raise _diverged(Snapshot(done * steps_per_update, before, None), update, callbacks)
+            bad = [name for name, loss in sorted(update.losses.items()) if not np.isfinite(loss)]
+            saved = callbacks.on_diverged(Snapshot(done * steps_per_update, before, None), update)
+            raise DivergedError(
+                f"diverged after env step {done * steps_per_update}: {', '.join(bad or ['parameters'])} not finite; "
+                f"batch and learner before it are in {saved}; lower the learning rate or mend the batch"
+            )
         done += 1
         interval.append(dataclasses.replace(update, batch=None))
         callbacks.on_update(done * steps_per_update)
@@ -145,16 +158,6 @@ def run_loop(
             callbacks.on_checkpoint(Snapshot(done * steps_per_update, learner, env_state))
             clock = time.perf_counter()
     return TrainResult(Snapshot(done * steps_per_update, learner, env_state), metrics, completed=done >= total)
-
-
-def _diverged(before: Snapshot, update: Update, callbacks: Callbacks) -> DivergedError:
-    """Return what to raise after an update whose numbers blew up, once that is saved."""
-    bad = [name for name, loss in sorted(update.losses.items()) if not np.isfinite(loss)]
-    saved = callbacks.on_diverged(before, update)
-    return DivergedError(
-        f"diverged after env step {before.env_steps}: {', '.join(bad or ['parameters'])} not finite; "
-        f"batch and learner before it are in {saved}; lower the learning rate or mend the batch"
-    )
 
 
 def interval_metrics(updates: list[Update]) -> dict[str, float]:
@@ -188,11 +191,3 @@ def all_finite(tree: PyTree) -> jax.Array:
 def strong_types(tree: PyTree) -> PyTree:
     """Return the tree with weakly typed leaves cast to strong types, so that every update has the same signature."""
     return jax.tree.map(lambda x: jax.lax.convert_element_type(jnp.asarray(x), jnp.asarray(x).dtype), tree)
-
-
-def _strongly_typed(update_fn: UpdateFn) -> UpdateFn:
-    def update(learner: PyTree, env_state: PyTree) -> tuple[PyTree, PyTree, Update]:
-        learner, env_state, reported = update_fn(learner, env_state)
-        return strong_types(learner), strong_types(env_state), reported
-
-    return update

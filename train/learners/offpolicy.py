@@ -9,6 +9,11 @@ The replay is data, not learner: it travels with the environments in `Snapshot.e
 update and written in place, and a checkpoint that has no room for it (`run.env_state_limit_mb`) leaves it out. Such a
 run begins new episodes when resumed and fills the replay with the policy it has before it learns on; those steps
 count like any others.
+
+It is a ring [slots, envs, ...]: one slot holds what every environment observed and did in one step. The next
+observation of a step is the observation in the next slot, so nothing is stored twice, and the newest `n_steps` slots
+cannot be drawn yet. Where an episode ended, the next slot belongs to another episode: its discount is 0, or, at a time
+limit, its truncation is 1 and the losses leave it out (see `sample`).
 """
 
 import functools
@@ -19,13 +24,137 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 from brax.envs import Env
+from brax.training import types
 
 from interactive_nav_common.errors import ConfigError
 from train.config import OffPolicyConfig
-from train.learners import networks, replay_buffer
+from train.learners import networks
 from train.learners.actor_critic import ActorCritic
 from train.learners.learner import Snapshot, Update, all_finite, episode_sums, reset_envs
-from train.learners.replay_buffer import ReplayBuffer
+
+
+@flax.struct.dataclass
+class ReplayBuffer:
+    """The ring."""
+
+    observation: Any
+    """[slots, envs, ...] before the step; images in their type, vectors as configured."""
+    action: jax.Array
+    """[slots, envs, A]."""
+    reward: jax.Array
+    """[slots, envs] f32."""
+    done: jax.Array
+    """[slots, envs] bool: the step ended its episode, for whatever reason."""
+    truncated: jax.Array
+    """[slots, envs] bool: it was the time limit that did."""
+    position: jax.Array
+    """() i32: the slot that is written next."""
+    filled: jax.Array
+    """() i32: slots written so far, at most all."""
+
+
+def empty_replay(slots: int, observation: Any, action_size: int, vector_dtype: str = "float32") -> ReplayBuffer:
+    """Return an empty ring for observations shaped as [envs, ...], with vectors in float32 or float16."""
+    envs = jax.tree.leaves(observation)[0].shape[0]
+    return ReplayBuffer(
+        observation=_cast(jax.tree.map(lambda x: jnp.zeros((slots, *x.shape), x.dtype), observation), vector_dtype),
+        action=jnp.zeros((slots, envs, action_size)),
+        reward=jnp.zeros((slots, envs)),
+        done=jnp.zeros((slots, envs), bool),
+        truncated=jnp.zeros((slots, envs), bool),
+        position=jnp.zeros((), jnp.int32),
+        filled=jnp.zeros((), jnp.int32),
+    )
+
+
+def nbytes(replay: ReplayBuffer) -> int:
+    """Return the memory of a ring, or of one with the shapes that `jax.eval_shape` computes, bytes."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(replay))
+
+
+def describe(replay: ReplayBuffer) -> str:
+    """Return a line about a ring's memory; as `nbytes`."""
+    slots, envs = replay.reward.shape
+    total, transitions = nbytes(replay), slots * envs
+    return (
+        f"replay of {transitions:,} transitions ({slots:,} steps of {envs:,} environments) of "
+        f"{total / transitions:,.0f} bytes each takes {total / 1e9:.2f} GB on the device"
+    )
+
+
+def insert(
+    replay: ReplayBuffer, observation: Any, action: jax.Array, reward: jax.Array, done: jax.Array, truncated: jax.Array
+) -> ReplayBuffer:
+    """Return the ring with one step of every environment in place of its oldest.
+
+    The observation [envs, ...] is that before the step, action is [envs, A], the others are [envs]: `done` is not 0
+    where the step ended an episode, `truncated` where the time limit did.
+    """
+    at, slots = replay.position, replay.reward.shape[0]
+
+    def write(ring: jax.Array, x: jax.Array) -> jax.Array:
+        if ring.dtype == jnp.float16:  # beyond its range: its largest number, not infinity
+            x = jnp.clip(x, -65504.0, 65504.0)
+        return ring.at[at].set(x.astype(ring.dtype))
+
+    return ReplayBuffer(
+        observation=jax.tree.map(write, replay.observation, observation),
+        action=write(replay.action, action),
+        reward=write(replay.reward, reward),
+        done=write(replay.done, done),
+        truncated=write(replay.truncated, truncated),
+        position=(at + 1) % slots,
+        filled=jnp.minimum(replay.filled + 1, slots),
+    )
+
+
+def replay_size(replay: ReplayBuffer) -> jax.Array:
+    """Return () i32: transitions in the ring, including those that cannot be drawn yet."""
+    return replay.filled * replay.reward.shape[1]
+
+
+def sample(replay: ReplayBuffer, key: jax.Array, batch_size: int, n_steps: int, discounting: float) -> types.Transition:
+    """Draw transitions [batch, ...] uniformly, with replacement, from all that have `n_steps` >= 1 younger slots.
+
+    A transition covers `n_steps` steps, or fewer where the episode ends. For m steps of discount g it holds
+    reward r_1 + g r_2 + ... + g^(m-1) r_m and discount g^(m-1), or 0 where the last one is a failure or success:
+    Brax's losses multiply by the last g themselves. At a time limit there is no observation of what comes after
+    (the next slot shows a new episode): a window that meets one ends before that step and bootstraps from the
+    observation there; a window that begins with it has truncation 1, and the losses leave it out, as Brax's do. Vectors
+    are f32, images as stored.
+    """
+    slots, envs = replay.reward.shape
+    key_age, key_env = jax.random.split(key)
+    age = jax.random.randint(key_age, (batch_size,), 0, jnp.maximum(replay.filled - n_steps, 1))
+    env = jax.random.randint(key_env, (batch_size,), 0, envs)
+    first = replay.position - replay.filled + age
+
+    step = jnp.arange(n_steps)[None]
+    window = ((first[:, None] + step) % slots, env[:, None])
+    done, truncated = replay.done[window], replay.truncated[window]
+    ended_before = jnp.cumsum(done, 1) - done > 0
+    counts = ~ended_before & ~(truncated & (step > 0))
+    length = jnp.sum(counts, 1)
+    reward = jnp.sum(jnp.where(counts, replay.reward[window] * discounting**step, 0.0), 1)
+    alive = ~jnp.any(counts & done, 1)
+
+    def at(slot: jax.Array) -> Any:
+        return _cast(jax.tree.map(lambda ring: ring[slot % slots, env], replay.observation), "float32")
+
+    return types.Transition(  # type: ignore[call-arg]
+        observation=at(first),
+        action=replay.action[first % slots, env],
+        reward=reward,
+        discount=alive * jnp.float32(discounting) ** (length - 1),
+        next_observation=at(first + length),
+        extras={"policy_extras": {}, "state_extras": {"truncation": truncated[:, 0].astype(jnp.float32)}},  # type: ignore
+    )
+
+
+def _cast(observation: Any, dtype: str) -> Any:
+    """Return the observation with its vectors in another type; images pass."""
+    vectors = jax.tree.map(lambda x: x.astype(dtype), networks.vector_part(observation))
+    return {**observation, **vectors} if isinstance(observation, Mapping) else vectors
 
 
 @flax.struct.dataclass
@@ -45,7 +174,7 @@ class OffPolicyData:
     @property
     def note(self) -> str:
         """Return what a user should know before training starts, in one line."""
-        return replay_buffer.describe(self.replay)
+        return describe(self.replay)
 
 
 def collect(
@@ -67,7 +196,7 @@ def collect(
         action = jnp.where(at_random, random, action)
         after = env.step(before, action)
         done, truncated = after.done, after.info["truncation"]
-        replay = replay_buffer.insert(data.replay, before.obs, action, after.reward, done, truncated)
+        replay = insert(data.replay, before.obs, action, after.reward, done, truncated)
         collected = {
             "observation": networks.vector_part(before.obs),
             "action": action,
@@ -97,7 +226,7 @@ def learn(
     assert c.grad_steps_per_update and c.batch_size and c.min_replay_size, "the config must be resolved"
     keys = jax.random.split(key, c.grad_steps_per_update)
     settings = {"batch_size": c.batch_size, "n_steps": c.n_steps, "discounting": c.discounting}
-    draw = functools.partial(replay_buffer.sample, replay, **settings)
+    draw = functools.partial(sample, replay, **settings)
 
     def one(learner: Any, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
         key_draw, key_step = jax.random.split(key)
@@ -111,7 +240,7 @@ def learn(
 
     _, metrics = jax.eval_shape(one, learner, keys[0])
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), metrics)
-    ready = (replay_buffer.size(replay) >= c.min_replay_size) & (replay.filled > c.n_steps)
+    ready = (replay_size(replay) >= c.min_replay_size) & (replay.filled > c.n_steps)
     count = jnp.where(ready, c.grad_steps_per_update, 0)
     learner, sums, good = jax.lax.fori_loop(0, count, body, (learner, zeros, jnp.zeros((), jnp.int32)))
     means = jax.tree.map(lambda x: x / jnp.maximum(count, 1), sums)
@@ -130,7 +259,7 @@ def update(agent: ActorCritic, env: Env, learner: Any, data: OffPolicyData) -> t
     losses = {
         **losses,
         "reward_per_step": jnp.mean(collected["reward"]),
-        "replay_size": replay_buffer.size(data.replay).astype(jnp.float32),
+        "replay_size": replay_size(data.replay).astype(jnp.float32),
     }
     finite = all_finite((losses, learner))
     return learner, data, Update(losses, sums, finite, {"collected": collected, "learned": batch})
@@ -141,7 +270,7 @@ def start(agent: ActorCritic, env: Env, seed: int) -> Snapshot:
     c = agent.config
     key_networks, key_env, key_updates = jax.random.split(jax.random.PRNGKey(seed), 3)
     env_state = reset_envs(agent, env, key_env)
-    make_replay = functools.partial(replay_buffer.init, c.replay_slots, env_state.obs, env.action_size, c.replay_dtype)
+    make_replay = functools.partial(empty_replay, c.replay_slots, env_state.obs, env.action_size, c.replay_dtype)
     check_memory(c, jax.eval_shape(make_replay), agent.section)
     data = OffPolicyData(env_state, make_replay(), agent.init_noise())
     return Snapshot(0, jax.jit(agent.init)(key_networks, key_updates), data)
@@ -149,10 +278,10 @@ def start(agent: ActorCritic, env: Env, seed: int) -> Snapshot:
 
 def check_memory(config: OffPolicyConfig, replay: ReplayBuffer, section: str) -> None:
     """Raise `ConfigError` where the replay, or one of such shapes, takes more than `replay_limit_gb`."""
-    if replay_buffer.nbytes(replay) > config.replay_limit_gb * 1e9:
+    if nbytes(replay) > config.replay_limit_gb * 1e9:
         images = isinstance(replay.observation, Mapping)
         smaller = "env.image_dtype=uint8" if images else f"{section}.replay_dtype=float16"
         raise ConfigError(
-            f"{section}.replay_limit_gb is {config.replay_limit_gb:g}, but the {replay_buffer.describe(replay)}; lower "
+            f"{section}.replay_limit_gb is {config.replay_limit_gb:g}, but the {describe(replay)}; lower "
             f"{section}.max_replay_size, choose {smaller} if it is not chosen yet, or raise the limit"
         )

@@ -34,6 +34,9 @@ from train.learners import networks as nets
 from train.learners.learner import Snapshot, Update, all_finite, episode_sums, reset_envs
 from train.learners.networks import ObservationSize
 
+OF_LOSS = ("entropy_cost", "discounting", "reward_scaling", "gae_lambda", "clipping_epsilon", "normalize_advantage")
+"""Settings that Brax's loss takes."""
+
 
 @flax.struct.dataclass
 class SharedParams:
@@ -183,12 +186,7 @@ def minibatch_step(
     whole_loss = functools.partial(ppo_losses.compute_ppo_loss, ppo_network=parts.nets)
     loss_fn = functools.partial(
         functools.partial(shared_loss, parts.nets) if parts.shared else whole_loss,
-        entropy_cost=config.entropy_cost,
-        discounting=config.discounting,
-        reward_scaling=config.reward_scaling,
-        gae_lambda=config.gae_lambda,
-        clipping_epsilon=config.clipping_epsilon,
-        normalize_advantage=config.normalize_advantage,
+        **{name: getattr(config, name) for name in OF_LOSS},
         vf_coefficient=config.vf_loss_coefficient,
     )
     loss_and_grad = gradients.loss_and_pgrad(loss_fn, pmap_axis_name=None, has_aux=True)  # type: ignore[arg-type]

@@ -18,13 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav_common.config import Natural
-from interactive_nav_common.errors import regular
+from interactive_nav_common.errors import UserError, regular
 from interactive_nav_common.files import check_name, remove_stale, whole_folder, write_text, writing
 from interactive_nav_common.records import Reader
 from interactive_nav_common.runs import weights
 from interactive_nav_common.runs.folder import GOES_ON, write_state
 from interactive_nav_common.untrusted.reading import read_npz
-from train.errors import CheckpointError
 from train.runs.run_folder import RunFolder
 
 LEARNER, ENV_STATE, META = "learner.msgpack", "env_state.npz", "meta.json"
@@ -34,6 +33,10 @@ STEP = 0.5
 """Step to which large weights are rounded, in standard deviations of an output's weights: about 3 bits a weight."""
 SHOWN = ("algorithm", "robot", "observations", "observation_size", "action_size", "env_steps")
 """Fields of `CheckpointMeta` that a policy's file repeats."""
+
+
+class CheckpointError(UserError):
+    """A checkpoint that is missing, damaged or belongs to something else."""
 
 
 @dataclasses.dataclass(frozen=True)

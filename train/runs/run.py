@@ -28,11 +28,10 @@ from interactive_nav_common.versions import versions
 from scenes_mjcf.sets import scene_folders
 from train import config_io
 from train.config import EnvConfig, TrainConfig, resolve
-from train.errors import CheckpointError
 from train.learners.algorithms import ALGORITHMS
 from train.learners.learner import Snapshot, TrainResult, Update
 from train.runs import checkpoint, tracking
-from train.runs.checkpoint import CheckpointMeta
+from train.runs.checkpoint import CheckpointError, CheckpointMeta
 from train.runs.run_folder import RunFolder, claim
 from train.runs.tracking import TrainingDisplay, describe
 

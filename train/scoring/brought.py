@@ -11,12 +11,15 @@ import jax
 import numpy as np
 
 from interactive_nav.task.rollout import HostPolicy
-from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.imports import first_line, import_function
-from train.errors import PolicyError
 
 TAKEN = ("learned", "random", "follower", "avoider", "namo")
 EXPECTED = "expected [name=]module:factory or [name=]path/to/file.py:factory"
+
+
+class PolicyError(UserError):
+    """A policy of the user's that cannot be loaded, raises, or returns what are no actions."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,7 +11,6 @@ friction.
 """
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -34,12 +33,6 @@ ALIGNED_RAD = jnp.pi / 3
 """Beyond this bearing the follower turns on the spot."""
 
 
-def random_policy(action_size: int, observation: Observation, key: jax.Array) -> jax.Array:
-    """Draw an action uniformly."""
-    del observation
-    return jax.random.uniform(key, (action_size,), minval=-1.0, maxval=1.0)
-
-
 def steer(robot: RobotSpec, target_b: jax.Array) -> jax.Array:
     """Return actions (A,) in [-1, 1] that lead to a point: turn towards it, and drive the faster the better aligned.
 
@@ -51,20 +44,13 @@ def steer(robot: RobotSpec, target_b: jax.Array) -> jax.Array:
     return robot.drive(speed_m_s, turn_rad_s, jnp)
 
 
-def waypoint_follower(robot: RobotSpec, waypoint: int, observation: Observation, key: jax.Array) -> jax.Array:
-    """Steer to one of the waypoints at the start of the observation (numbers 2i and 2i + 1); ignore objects."""
-    del key
-    vector = observation["state"] if isinstance(observation, Mapping) else observation
-    return steer(robot, vector[2 * waypoint : 2 * waypoint + 2])
-
-
 def make_random(env: Any) -> PolicyFn:
-    """Build the random baseline."""
-    return functools.partial(random_policy, env.action_size)
+    """Build the baseline that draws actions uniformly."""
+    return lambda observation, key: jax.random.uniform(key, (env.action_size,), minval=-1.0, maxval=1.0)
 
 
 def make_follower(env: Any) -> PolicyFn:
-    """Build the baseline that follows the shortest path."""
+    """Build the baseline that follows the shortest path, by a waypoint of the observation; it ignores objects."""
     config = env.config
     need_twist(env.robot, "policy follower")
     if "waypoints" not in config.observations:
@@ -72,8 +58,13 @@ def make_follower(env: Any) -> PolicyFn:
             f"policy follower: observations are {', '.join(config.observations)}, "
             "expected waypoints among them; leave it out of --policies"
         )
-    waypoint = min(max(round(LOOK_AHEAD_M / config.waypoint_spacing_m), 1), config.num_waypoints) - 1
-    return functools.partial(waypoint_follower, env.robot, waypoint)
+    first = 2 * min(max(round(LOOK_AHEAD_M / config.waypoint_spacing_m), 1), config.num_waypoints) - 2
+
+    def follow(observation: Observation, key: jax.Array) -> jax.Array:
+        vector = observation["state"] if isinstance(observation, Mapping) else observation
+        return steer(env.robot, vector[first : first + 2])
+
+    return follow
 
 
 REPLAN_STEPS = 10

@@ -15,9 +15,8 @@ from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import whole_file, writing
 from interactive_nav_common.records import METRICS, PACKED_METRICS, mean_over_episodes, read_metrics, write_metrics
 from interactive_nav_common.rows import read_notes, read_rows, write_parquet
-from train.errors import CheckpointError
 from train.runs import checkpoint
-from train.runs.checkpoint import STEP
+from train.runs.checkpoint import STEP, CheckpointError
 from train.runs.run_folder import PATHS, RunFolder, files_of_run, paths_beside
 from train.scoring.statistics import run_means
 from train.sweep.folder import SweepFolder
@@ -66,8 +65,12 @@ def export(folder: SweepFolder, out: Path, step: float = STEP) -> tuple[int, dic
             (target / METRICS).unlink(missing_ok=True)
             shutil.rmtree(target / "checkpoints", ignore_errors=True)
         best = best_runs(folder, runs)
-        for name in best.values():
-            _keep_checkpoint(folder, name, out / "runs" / name / "checkpoints", step)
+        for name in best.values():  # the policy of the checkpoint that was evaluated
+            try:
+                path, _ = checkpoint.find(folder.runs / name / "checkpoints", folder.sweep.config.evaluate.checkpoint)
+            except CheckpointError:
+                continue
+            checkpoint.keep_policy(path, out / "runs" / name / "checkpoints" / path.name, step)
     return sum(path.stat().st_size for path in out.rglob("*") if path.is_file()), best
 
 
@@ -155,12 +158,3 @@ def thinned(lines: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
             merged[name] = mean_over_episodes(group, name)
         out.append({name: value if isinstance(value, int) else float(f"{value:.5g}") for name, value in merged.items()})
     return out
-
-
-def _keep_checkpoint(folder: SweepFolder, run: str, target: Path, step: float) -> None:
-    """Write the policy of the checkpoint that was evaluated."""
-    try:
-        path, _ = checkpoint.find(folder.runs / run / "checkpoints", folder.sweep.config.evaluate.checkpoint)
-    except CheckpointError:
-        return
-    checkpoint.keep_policy(path, target / path.name, step)

@@ -141,21 +141,17 @@ class Sweep:
 def load_sweep(name_or_path: str) -> Sweep:
     """Read a sweep by name or path."""
     path, plain = config_io.read_file(name_or_path, SWEEP_DIR, "sweep")
-    return expand(parse_sweep(plain, path.name, path.stem), path.name)
+    return expand(plain, path.name, path.stem)
 
 
-def parse_sweep(plain: Any, where: str, default_name: str) -> SweepConfig:
-    """Parse nested plain values as a typed sweep."""
+def expand(plain: Any, where: str, default_name: str) -> Sweep:
+    """Expand nested plain values to a sweep's runs with their complete configs."""
     config = overlay(SweepConfig(), plain, where)
-    check_name(config.name or default_name, f"{where}: name", ConfigError)
+    name = check_name(config.name or default_name, f"{where}: name", ConfigError)
     if not config.preset:
         raise ConfigError(f"{where}: preset is missing; expected a preset, for example turtlebot_ppo")
     evaluate = dataclasses.replace(config.evaluate, scenes=scene_folders(config.evaluate.scenes))
-    return dataclasses.replace(config, name=config.name or default_name, evaluate=evaluate)
-
-
-def expand(config: SweepConfig, where: str) -> Sweep:
-    """Expand a sweep to its runs with their complete configs."""
+    config = dataclasses.replace(config, name=name, evaluate=evaluate)
     settings = list(flatten(TrainConfig()))
     for axis, values in config.grid.items():
         if axis not in settings:

@@ -19,10 +19,10 @@ from tests.train.toy_env import batched
 from tests.train.toy_run import build_toy, toy_config
 from train import config_io
 from train.config import AUTO
-from train.errors import CheckpointError
 from train.learners.algorithms import ALGORITHMS
 from train.learners.learner import Snapshot
 from train.runs import checkpoint
+from train.runs.checkpoint import CheckpointError
 from train.runs.run import train_run
 from train.runs.run_folder import RunFolder
 from train.scoring.evaluation import BatchPlayer, load_policy

@@ -18,11 +18,10 @@ from tests.train.learners.test_ppo import Recorder, copy_snapshot
 from tests.train.toy_env import ToyConfig, ToyEnv, batched
 from tests.train.toy_pixels import SMALL, ToyPixels
 from train.config import DDPGConfig, EnvConfig, OffPolicyConfig, RunConfig, SACConfig, TrainConfig
-from train.errors import DivergedError
-from train.learners import offpolicy, replay_buffer
+from train.learners import offpolicy
 from train.learners.actor_critic import DDPG, SAC
 from train.learners.algorithms import ALGORITHMS
-from train.learners.learner import Snapshot, Update
+from train.learners.learner import DivergedError, Snapshot, Update
 
 STEPS = 16 * 4
 """Environment steps in an update of `tiny`."""
@@ -164,7 +163,7 @@ def test_the_compiled_update_writes_the_replay_in_place_and_normalises_no_image(
     agent = SAC.of(env, config)
     begin = offpolicy.start(agent, env, 0)
     data: Any = begin.env_state
-    size = replay_buffer.nbytes(data.replay)
+    size = offpolicy.nbytes(data.replay)
     assert size == 16 * 16384 * (2 * 144 + 6 * 4 + 2 * 4 + 4 + 2) + 8
     compiled = (
         jax.jit(lambda s, d: offpolicy.update(agent, env, s, d), donate_argnums=1).lower(begin.learner, data).compile()
@@ -189,9 +188,9 @@ def test_a_replay_beyond_its_limit_is_refused():
     told = str(caught.value)
     assert "sac.replay_limit_gb is 6e-05, but the replay of 512 transitions" in told
     assert "of 130 bytes each" in told and "sac.max_replay_size" in told and "float16" in told
-    replay = replay_buffer.init(32, jnp.zeros((16, 29)), 2)
+    replay = offpolicy.empty_replay(32, jnp.zeros((16, 29)), 2)
     offpolicy.check_memory(dataclasses.replace(config.sac, replay_limit_gb=6.7e-5), replay, "sac")
-    images = replay_buffer.init(32, {"pixels/depth": jnp.zeros((16, 12, 12, 1))}, 2)
+    images = offpolicy.empty_replay(32, {"pixels/depth": jnp.zeros((16, 12, 12, 1))}, 2)
     with pytest.raises(ConfigError, match="choose env.image_dtype=uint8"):
         offpolicy.check_memory(config.sac, images, "sac")
 
@@ -238,7 +237,7 @@ def test_the_saved_batch_is_the_first_that_was_not_finite():
     """One of 40 rewards is NaN: of ten batches of four, some hold it, and the first of those is kept."""
     sizes: dict[str, Any] = {"num_envs": 1, "max_replay_size": 41, "min_replay_size": 41}
     agent: Any = Summing(OffPolicyConfig(**sizes, batch_size=4, grad_steps_per_update=10))
-    replay = replay_buffer.init(41, jnp.zeros((1, 1)), 1)
+    replay = offpolicy.empty_replay(41, jnp.zeros((1, 1)), 1)
     replay = replay.replace(  # type: ignore[attr-defined]
         reward=jnp.arange(41.0)[:, None].at[7].set(jnp.nan), filled=jnp.int32(41), position=jnp.int32(0)
     )
@@ -248,7 +247,7 @@ def test_the_saved_batch_is_the_first_that_was_not_finite():
         key = jax.random.PRNGKey(seed)
         learner, metrics, batch = learn(replay, key)
         draws = [jax.random.split(k)[0] for k in jax.random.split(key, 10)]
-        batches = [np.asarray(replay_buffer.sample(replay, k, 4, 1, 0.99).reward) for k in draws]
+        batches = [np.asarray(offpolicy.sample(replay, k, 4, 1, 0.99).reward) for k in draws]
         bad = [i for i, rewards in enumerate(batches) if np.isnan(rewards).any()]
         found += bool(bad)
         np.testing.assert_array_equal(batch.reward, batches[bad[0] if bad else 9])

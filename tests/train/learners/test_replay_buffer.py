@@ -13,12 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare
 
-from train.learners import replay_buffer
+from train.learners import offpolicy
 
 SLOTS, ENVS, DISCOUNT = 5, 3, 0.5
 VECTORS = jnp.zeros((ENVS, 2))
-insert = jax.jit(replay_buffer.insert)
-sample = jax.jit(replay_buffer.sample, static_argnums=(2, 3, 4))
+insert = jax.jit(offpolicy.insert)
+sample = jax.jit(offpolicy.sample, static_argnums=(2, 3, 4))
 Step = list[tuple[int, int]]
 """For each environment (done, truncated) of one time step."""
 
@@ -31,9 +31,9 @@ def reward(time: int, env: int) -> float:
     return 1.0 + time + 0.125 * env
 
 
-def fill(history: list[Step]) -> replay_buffer.ReplayBuffer:
+def fill(history: list[Step]) -> offpolicy.ReplayBuffer:
     """The ring after a history; observations and actions say which step they are of."""
-    replay = replay_buffer.init(SLOTS, VECTORS, 1)
+    replay = offpolicy.empty_replay(SLOTS, VECTORS, 1)
     for time, step in enumerate(history):
         ids = np.array([[time, env] for env in range(ENVS)], np.float32)
         rewards = np.array([reward(time, env) for env in range(ENVS)], np.float32)
@@ -94,11 +94,11 @@ IMAGES = {
 @pytest.mark.parametrize(("dtype", "vector_bytes"), [("float32", 4), ("float16", 2)])
 def test_memory_is_what_is_told_beforehand(dtype: str, vector_bytes: int):
     """By hand, each step: 32 pixels, 6 numbers, 2 actions and a reward of 4 bytes, two flags of 1; two counters."""
-    make = functools.partial(replay_buffer.init, SLOTS, IMAGES, 2, dtype)
+    make = functools.partial(offpolicy.empty_replay, SLOTS, IMAGES, 2, dtype)
     each = 32 + 6 * vector_bytes + 2 * 4 + 4 + 2
     actual = sum(leaf.nbytes for leaf in jax.tree.leaves(make()))
-    assert actual == replay_buffer.nbytes(jax.eval_shape(make)) == SLOTS * ENVS * each + 8
-    told = replay_buffer.describe(jax.eval_shape(lambda: replay_buffer.init(1000, jnp.zeros((2000, 29)), 2)))
+    assert actual == offpolicy.nbytes(jax.eval_shape(make)) == SLOTS * ENVS * each + 8
+    told = offpolicy.describe(jax.eval_shape(lambda: offpolicy.empty_replay(1000, jnp.zeros((2000, 29)), 2)))
     assert told == (
         "replay of 2,000,000 transitions (1,000 steps of 2,000 environments) of 130 bytes each takes "
         "0.26 GB on the device"
@@ -106,7 +106,7 @@ def test_memory_is_what_is_told_beforehand(dtype: str, vector_bytes: int):
 
 
 def test_images_stay_bytes_and_half_precision_rounds():
-    replay = replay_buffer.init(SLOTS, IMAGES, 2, "float16")
+    replay = offpolicy.empty_replay(SLOTS, IMAGES, 2, "float16")
     zeros = jnp.zeros(ENVS)
     observation = {**IMAGES, "state": jnp.full((ENVS, 6), 1 / 3).at[:, 0].set(1e9)}
     for _ in range(2):
@@ -120,22 +120,20 @@ def test_images_stay_bytes_and_half_precision_rounds():
 
 
 def test_an_insertion_into_a_donated_ring_copies_nothing():
-    replay = replay_buffer.init(4096, IMAGES, 2)
+    replay = offpolicy.empty_replay(4096, IMAGES, 2)
     one = jnp.zeros(ENVS)
     compiled = (
-        jax.jit(replay_buffer.insert, donate_argnums=0)
-        .lower(replay, IMAGES, jnp.zeros((ENVS, 2)), one, one, one)
-        .compile()
+        jax.jit(offpolicy.insert, donate_argnums=0).lower(replay, IMAGES, jnp.zeros((ENVS, 2)), one, one, one).compile()
     )
     memory: Any = compiled.memory_analysis()
-    size = replay_buffer.nbytes(replay)
+    size = offpolicy.nbytes(replay)
     assert memory.alias_size_in_bytes >= size
     assert memory.temp_size_in_bytes < size / 100
 
 
 def test_windows_of_one_step_are_plain_transitions():
     """The commonest case spelled out: steps 0 and 1 of one environment, the second a failure."""
-    replay = replay_buffer.init(4, jnp.zeros((1, 1)), 1)
+    replay = offpolicy.empty_replay(4, jnp.zeros((1, 1)), 1)
     one, zero = jnp.ones(1), jnp.zeros(1)
     for time, done in enumerate([zero, one, zero]):
         replay = insert(replay, jnp.full((1, 1), float(time)), one[:, None], 10.0 + time * one, done, zero)

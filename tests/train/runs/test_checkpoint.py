@@ -16,8 +16,8 @@ import pytest
 from rich.console import Console
 
 from tests.train.toy_run import UPDATE_STEPS, build_toy, toy_config
-from train.errors import CheckpointError
 from train.runs import checkpoint
+from train.runs.checkpoint import CheckpointError
 from train.runs.run import train_run
 
 META = checkpoint.CheckpointMeta(0, 0.0, None, "ppo", "turtlebot", ("goal",), 3, 2)

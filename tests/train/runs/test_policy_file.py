@@ -20,10 +20,10 @@ from interactive_nav_common.runs import weights
 from tests.train.toy_pixels import SMALL, ToyPixels
 from tests.train.toy_run import build_toy, toy_config
 from train.config import EnvConfig, TrainConfig, resolve
-from train.errors import CheckpointError
 from train.learners.algorithms import ALGORITHMS
 from train.learners.learner import Snapshot
 from train.runs import checkpoint
+from train.runs.checkpoint import CheckpointError
 from train.runs.run import train_run
 
 TOY = EnvConfig.of(scenes=("toy",), backend="native")

@@ -29,8 +29,9 @@ from tests.train.toy_run import UPDATE_STEPS, build_toy, toy_config
 from train import __main__ as program
 from train.config import resolve
 from train.config_io import from_yaml
-from train.errors import CheckpointError, DivergedError
+from train.learners.learner import DivergedError
 from train.runs import checkpoint, run, run_folder
+from train.runs.checkpoint import CheckpointError
 from train.runs.run import check_fits, failures, train_run
 from train.runs.run_folder import RunFolder, claim
 

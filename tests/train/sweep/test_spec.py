@@ -43,7 +43,7 @@ launch: {runs_per_gpu: 4}
 
 
 def sweep_of(text: str) -> spec.Sweep:
-    return spec.expand(spec.parse_sweep(yaml.safe_load(text), "s.yaml", "s"), "s.yaml")
+    return spec.expand(yaml.safe_load(text), "s.yaml", "s")
 
 
 def test_every_combination_but_the_skipped_has_its_own_settings():
