@@ -206,8 +206,11 @@ class Contender(HostPolicy):
         self._played = Played(track_w=[[] for _ in range(n)], **fresh(Played, n))
         self._runs, self._last_w = np.zeros((3, n), int), np.zeros((n, 2), np.float32)
         """Runs started, ended, and the last one with a contact; places."""
-        progress = {"on_progress": lambda over, step: on_progress(over, step * env.dt)}
-        self.player.rollout(self, keys, starts, fewest=2, **progress)
+
+        def report(over: int, step: int) -> None:
+            on_progress(over, step * env.dt)
+
+        self.player.rollout(self, keys, starts, fewest=2, on_progress=report)
         ends = zip(self._played.track_w, self._last_w, strict=True)
         tracks = [np.array([*track, last], float) for track, last in ends]
         return dataclasses.replace(self._played, track_w=tracks)

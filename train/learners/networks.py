@@ -176,24 +176,6 @@ class TwinHead(linen.Module):
         return jnp.concatenate([head(features, action) for head in heads], -1)
 
 
-def check_image_size(config: NetworkConfig, size: ObservationSize) -> None:
-    """Raise ConfigError where the images are too small for the convolutions, or of several sizes."""
-    sides = {shape[0] for name, shape in size.items() if name.startswith(PIXELS)} if isinstance(size, Mapping) else ()
-    if len(sides) > 1:
-        raise ConfigError(
-            f"images have sides of {sorted(sides)} pixels, expected one size of all cameras (env.cameras)"
-        )
-    for side in sides:
-        left = side
-        for kernel, stride in zip(config.conv_kernels, config.conv_strides, strict=True):
-            left = (left - kernel) // stride + 1
-        if left < 1:
-            raise ConfigError(
-                f"images of {side} x {side} pixels are too small for kernels {config.conv_kernels} with strides "
-                f"{config.conv_strides}; expected larger images (env.image_size) or smaller kernels (network)"
-            )
-
-
 @dataclasses.dataclass
 class Split(FeedForwardNetwork):
     """A network in two parts, with parameters `{"encoder": ..., "head": ...}`."""
@@ -215,7 +197,20 @@ def make_split(
 ) -> Split:
     """Build an encoder with a head behind it."""
     assert isinstance(size, Mapping)
-    check_image_size(config, size)
+    sides = {shape[0] for name, shape in size.items() if name.startswith(PIXELS)}
+    if len(sides) > 1:
+        raise ConfigError(
+            f"images have sides of {sorted(sides)} pixels, expected one size of all cameras (env.cameras)"
+        )
+    for side in sides:
+        left = side
+        for kernel, stride in zip(config.conv_kernels, config.conv_strides, strict=True):
+            left = (left - kernel) // stride + 1
+        if left < 1:
+            raise ConfigError(
+                f"images of {side} x {side} pixels are too small for kernels {config.conv_kernels} with strides "
+                f"{config.conv_strides}; expected larger images (env.image_size) or smaller kernels (network)"
+            )
     if not images and "state" not in size:
         raise ConfigError(
             "network.critic_inputs is 'state', but the observation holds images only; expected 'all', or "

@@ -100,21 +100,17 @@ class Tracker:
         self._run.finish()
 
 
-class TrainingDisplay:
+class TrainingDisplay(contextlib.ExitStack):
     """A live bar on a terminal; one line a log interval elsewhere."""
 
     def __init__(self, console: Console):
-        self.console = console
-        self._shown = progress_bar(console, "training")
-        self._total = 0
+        super().__init__()
+        self.console, self._total = console, 0
 
     def __enter__(self) -> TrainingDisplay:
-        self._bar = self._shown.__enter__()
+        self._bar = self.enter_context(progress_bar(self.console, "training"))
         self._bar(status="compiling")
         return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._shown.__exit__(*error)
 
     def begin(self, env_steps: int, total_steps: int) -> None:
         """Set the range of steps to show."""
