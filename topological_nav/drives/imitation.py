@@ -141,7 +141,19 @@ def train_policy(frames: Frames, out: Path, config: PolicyConfig, host: Host = A
 
         key = jax.random.PRNGKey(config.seed)
         learner = run_epochs(out, "policy", learner, one, config.epochs, key, host)
-        about = _about(frames, out, config, values, learner)
+        about = {
+            "task": "policy",
+            "hidden": config.hidden,
+            "projection": config.projection,
+            "width": int(frames.features.shape[1]),
+            "linear_m_s": values[0].tolist(),
+            "angular_rad_s": values[1].tolist(),
+            "networks": [
+                {"run": os.path.relpath(network.run.resolve(), out.resolve()), "digest": network.about["digest"]}
+                for network in frames.networks
+            ],
+            "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params["policy"]))),
+        }
         write_network(out, {"params": learner.params["policy"], "scale": learner.batch_stats}, about)
         results: dict[str, Any] = {
             "task": "policy",
@@ -212,25 +224,6 @@ def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: 
         return (shuffled(key, count, batch),)
 
     return descent_epoch(steps, loss_of, optax.adam(learning_rate))
-
-
-def _about(
-    frames: Frames, out: Path, config: PolicyConfig, values: tuple[np.ndarray, np.ndarray], learner: Learner
-) -> dict[str, Any]:
-    """Return the content of network.json, but for the digest."""
-    return {
-        "task": "policy",
-        "hidden": config.hidden,
-        "projection": config.projection,
-        "width": int(frames.features.shape[1]),
-        "linear_m_s": values[0].tolist(),
-        "angular_rad_s": values[1].tolist(),
-        "networks": [
-            {"run": os.path.relpath(network.run.resolve(), out.resolve()), "digest": network.about["digest"]}
-            for network in frames.networks
-        ],
-        "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params["policy"]))),
-    }
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))

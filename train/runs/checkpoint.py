@@ -81,8 +81,9 @@ def save_snapshot(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, en
     kept = list_checkpoints(root)
     best = best_checkpoint(kept)
     for old in kept[:-keep]:
-        if old != best:
-            _remove(root / f"{old.env_steps:012d}")
+        if old != best:  # at once: a reader sees all of it or nothing
+            folder = root / f"{old.env_steps:012d}"
+            shutil.rmtree(folder.rename(folder.with_name(f".{folder.name}.part-{os.getpid()}")))
     for old in kept[:-1]:
         (root / f"{old.env_steps:012d}" / ENV_STATE).unlink(missing_ok=True)
     return final
@@ -253,11 +254,6 @@ def remove_partial(root: Path) -> None:
     """Remove what a killed run left half written."""
     for left_over in root.glob(".[0-9]*"):
         remove_stale(root / left_over.name.split(".")[1])
-
-
-def _remove(folder: Path) -> None:
-    """Remove a folder at once: a reader sees all of it or nothing."""
-    shutil.rmtree(folder.rename(folder.with_name(f".{folder.name}.part-{os.getpid()}")))
 
 
 def _sha256(path: Path) -> str:

@@ -168,9 +168,3 @@ def paths_beside(rows: Path) -> Path:
     in_dataset = re.search(r"-[0-9a-f]{8}\.parquet$", rows.name)
     folder = rows.parent / PATHS if in_dataset else rows.parent
     return folder / f"{rows.stem}.npz"
-
-
-def lonely_paths(dataset: Path, run: str) -> list[Path]:
-    """Return recorded paths of one run without their rows, which are written after them."""
-    every = files_of_run(dataset / PATHS, run, ".npz")
-    return [path for path in every if not (dataset / f"{path.stem}.parquet").is_file()]

@@ -31,7 +31,7 @@ from interactive_nav_common.files import is_locked, remove_partial, write_text
 from interactive_nav_common.records import RUNS
 from interactive_nav_common.rows import console_table, read_notes
 from train.config_io import to_yaml
-from train.runs.run_folder import PATHS, EvaluationRequest, RunFolder, files_of_run, lonely_paths, paths_beside
+from train.runs.run_folder import PATHS, EvaluationRequest, RunFolder, files_of_run, paths_beside
 from train.sweep.spec import EvaluateConfig, RunSpec, Sweep
 
 TAIL_BYTES = 1 << 16
@@ -82,8 +82,9 @@ class SweepFolder:
         for folder in (self.rows, self.rows / PATHS):
             remove_partial(folder)
         for run in self.sweep.runs:
-            for paths in lonely_paths(self.rows, run.name):
-                if not is_locked(self.lock(run.name)):  # else its rows are yet to come
+            for paths in files_of_run(self.rows / PATHS, run.name, ".npz"):
+                rows = self.rows / f"{paths.stem}.parquet"
+                if not rows.is_file() and not is_locked(self.lock(run.name)):  # else they are yet to come
                     paths.unlink(missing_ok=True)
 
     def config(self, run: str) -> Path:
