@@ -25,6 +25,7 @@ from converters.generate.design.config import (
 from converters.generate.models.cad import MODELS
 from converters.pipeline import ConvertConfig, Converted, convert
 from interactive_nav_common.config import Natural, nearest
+from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import check_name, part_folder, publish
 from interactive_nav_common.records import Reader
 from interactive_nav_common.untrusted.reading import read_bytes
@@ -111,9 +112,9 @@ def building_of(tier: str, settings: dict[str, Any], split: str, where: str) -> 
     values = {key: _value(value, fields[key], f"{where}: {key}") for key, value in settings.items()}
     try:
         if tier == SPARSE:
-            return BuildingConfig(**values, models=MODELS[split][0]).validate()
+            return BuildingConfig(**values, models=MODELS[split][0])
         return home_config(tier, values, MODELS[split][1])
-    except GenerationError as error:
+    except ConfigError as error:
         raise GenerationError(f"{where}: {error}") from error
 
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from interactive_nav_common.config import Bounds, NotNegative, Settings, Share
 from interactive_nav_common.errors import ConfigError
 
-ImageSide = Annotated[int, (32, 512)]
+ImageSide = Annotated[int, Bounds(32, 512)]
 FovDeg = Annotated[float | None, Bounds(0, 180, open=True)]
 
 

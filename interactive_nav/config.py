@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from interactive_nav.camera_config import CameraNoise, CameraView, FovDeg, ImageSide
 from interactive_nav_common.config import (
     AtLeastOne,
+    Bounds,
     Natural,
     NotNegative,
     Positive,
@@ -273,7 +274,7 @@ class SensorConfig(CameraNoise):
     """Standard deviation of depth, as a share of it."""
     lidar_rays: AtLeastOne = 228
     """Beams of the planar scan, evenly over `lidar_fov_deg` from the right; by default the TurtleBot's Hokuyo."""
-    lidar_fov_deg: Annotated[Positive, (0, 360)] = 240.0
+    lidar_fov_deg: Annotated[Positive, Bounds(0, 360)] = 240.0
     """Angle that the scan covers, ahead in its middle."""
     lidar_range_m: Positive = 5.6
     """Distances are divided by it; 1 where nothing is nearer."""

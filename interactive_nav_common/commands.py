@@ -53,8 +53,9 @@ class Command:
     """Base of the dataclasses of commands; a field `settings` of type `Words` collects `key=value` words."""
 
     def __post_init__(self) -> None:
-        for name, hint in get_type_hints(type(self), include_extras=True).items():
-            check(_option(name, hint), getattr(self, name), hint)
+        hints = get_type_hints(type(self), include_extras=True)
+        names = {f.name: _option(f.name, hints[f.name]) for f in dataclasses.fields(self)}  # type: ignore[arg-type]
+        check({name: getattr(self, key) for key, name in names.items()}, {names[key]: hints[key] for key in names})
 
     @classmethod
     def epilog(cls) -> str:
@@ -168,7 +169,8 @@ def _refuse(hints: Mapping[str, Any], event: events.ParseErrorEvent) -> NoReturn
     elif isinstance(event, events.MissingArgs):
         problem = f"missing {', '.join(_name(each.arg) for each in event.missing_arguments)}"
     elif isinstance(event, events.InvalidChoice):
-        choices = ", ".join(choice for choice in event.choices if choice != "None")
+        declared = str(event.argument.field.type_stripped)  # tyro keeps those of `Literal[...] | None` in a set
+        choices = ", ".join(sorted({*event.choices} - {"None"}, key=lambda choice: declared.find(f"'{choice}'")))
         near = nearest(event.value, event.choices)
         problem = f"{_name(event.argument)} is {event.value!r}, expected one of {choices}{near}"
     elif isinstance(event, events.InstantiationFailure) and event.argument:

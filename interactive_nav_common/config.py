@@ -11,6 +11,7 @@ import dataclasses
 import difflib
 import functools
 import inspect
+import json
 import math
 import textwrap
 import types
@@ -19,6 +20,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar
 
 import yaml
+from pydantic import ConfigDict, TypeAdapter, ValidationError, with_config
+from pydantic_core import PydanticCustomError, core_schema
+from typing_extensions import TypedDict
 
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.untrusted.reading import Loader
@@ -30,16 +34,17 @@ AUTO = "auto"  # how None ("chosen for you") is written in files and on the comm
 
 
 class Bounds(NamedTuple):
-    """Numbers that a setting may be; a plain pair `(low, high)` means the same."""
+    """Numbers that a setting or a value in a file may be."""
 
     low: float
     high: float = math.inf
     open: bool = False
     """Both ends are excluded."""
 
-    def hold(self, value: float) -> bool:
-        """Return whether a number is within the bounds."""
-        return self.low < value < self.high if self.open else self.low <= value <= self.high
+    def hold(self, value: Any) -> bool:
+        """Return whether a number is within the bounds, or an ascending pair of numbers."""
+        first, last = value if isinstance(value, tuple) else (value, value)
+        return self.low < first <= last < self.high if self.open else self.low <= first <= last <= self.high
 
     def __str__(self) -> str:
         low, high = (f"{end:g}" if isinstance(end, float) else str(end) for end in self[:2])
@@ -47,14 +52,33 @@ class Bounds(NamedTuple):
             return f"between {low} and {high}{', both excluded' if self.open else ''}"
         return "a positive number" if self.open else f"at least {low}" if self.low else "0 or more"
 
+    def __get_pydantic_core_schema__(self, source: Any, handler: Callable[[Any], Any]) -> Any:
+        """Check what pydantic has accepted by its type; None is still to be chosen."""
 
-Seed = Annotated[int, (0, 2**32 - 1)]
-Count = Annotated[int, (1, 10**6)]
+        def checked(value: Any) -> Any:
+            if value is not None and not self.hold(value):
+                raise PydanticCustomError(
+                    "bounds", "{expected}", {"expected": f"{self}{', ascending' if isinstance(value, tuple) else ''}"}
+                )
+            return value
+
+        return core_schema.no_info_after_validator_function(checked, handler(source))
+
+
+STRICT = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
+EXPECTED = {
+    **{"int_type": "a whole number", "float_type": "a number", "string_type": "a string", "bool_type": "true or false"},
+    **dict.fromkeys(("tuple_type", "list_type", "is_instance_of"), "a list"),
+    **dict.fromkeys(("dict_type", "dataclass_type", "dataclass_exact_type", "mapping_type"), "a mapping"),
+}
+"""A mistake, as pydantic names it -> what should stand there."""
+Seed = Annotated[int, Bounds(0, 2**32 - 1)]
+Count = Annotated[int, Bounds(1, 10**6)]
 AtLeastOne = Annotated[int, Bounds(1)]
 Natural = Annotated[int, Bounds(0)]
 NotNegative = Annotated[float, Bounds(0)]
 Positive = Annotated[float, Bounds(0, open=True)]
-Share = Annotated[float, (0.0, 1.0)]
+Share = Annotated[float, Bounds(0.0, 1.0)]
 
 
 class Settings:
@@ -68,10 +92,10 @@ class Settings:
     hold, they are refused unless they are 0 or their default."""
 
     def __post_init__(self) -> None:
-        for name, hint in _hints(type(self)).items():
+        for name in _hints(type(self)):
             if isinstance(value := getattr(self, name), list):
                 object.__setattr__(self, name, tuple(value))
-            check(name, getattr(self, name), hint)
+        check({name: getattr(self, name) for name in _hints(type(self))}, _hints(type(self)))
         for names, needs, used in (row for cls in type(self).__mro__ for row in cls.__dict__.get("IDLE", ())):
             for name in () if used(self) else names.split():
                 if (value := getattr(self, name)) not in (0, getattr(type(self), name, 0)):
@@ -91,24 +115,78 @@ def _hints(config_type: type) -> dict[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(config_type)}
 
 
-def check(name: str, value: Any, hint: Any) -> None:
-    """Raise `ConfigError` for a value that its type does not allow; None is still to be chosen."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if value is None or origin is None:
-        return
-    if origin is Literal:
-        if value not in arguments:
-            choices = [str(choice) for choice in arguments]
-            near = nearest(str(value), choices)
-            raise ConfigError(f"{name} is {value!r}, expected one of {', '.join(choices)}{near}")
-    elif origin is tuple:
-        for item in value:
-            check(name, item, arguments[0])
-    else:  # `X | None`, Annotated[X, bounds]
-        check(name, value, arguments[0])
-        for bounds in arguments[1:] if origin is Annotated else ():
-            if isinstance(bounds, tuple) and not Bounds(*bounds).hold(value):
-                raise ConfigError(f"{name} is {value!r}, expected {Bounds(*bounds)}")
+def check(values: Mapping[str, Any], hints: Mapping[str, Any]) -> None:
+    """Raise `ConfigError` unless each value is what the type of its name allows."""
+    try:
+        _adapter(tuple(hints.items())).validate_python(dict(values))
+    except ValidationError as error:
+        raise ConfigError(mistake_of(error, values, hints)) from None
+
+
+@functools.cache
+def _adapter(hints: tuple[tuple[str, Any], ...]) -> Any:
+    return TypeAdapter(with_config(STRICT)(TypedDict("Values", dict(hints))))  # type: ignore[misc]
+
+
+def mistake_of(error: ValidationError, value: Any, hint: Any, root: str = "", show: Callable[[Any], str] = repr) -> str:
+    """Return the first mistake in a value of the type `hint`: `ROOT: key[2] is 5, expected a number`.
+
+    Of several types that were possible, it is the mistake of the last one.
+    """
+    details = error.errors(include_url=False)
+    keys = {"unexpected_keyword_argument", "missing"}
+    walked = [_resolve(each["loc"][:-1] if each["type"] in keys else each["loc"], value, hint) for each in details]
+    (path, got, at), last = [pair for pair in zip(walked, details, strict=True) if pair[0][0] == walked[0][0]][-1]
+    kind, arguments, place = last["type"], typing.get_args(at), (root + path).removeprefix(": ")
+    if kind in keys and dataclasses.is_dataclass(at):
+        key, names = str(last["loc"][-1]), sorted(_hints(typing.cast(type, at)))
+        if kind == "missing":
+            return f"{place}: missing key '{key}'"
+        return f"{place}: unknown key '{key:.60}'{nearest(key, names)}; known keys: {', '.join(names)}"
+    expected = EXPECTED.get(kind, last["msg"])
+    if kind == "literal_error":
+        choices = list(map(str, arguments))
+        expected = f"one of {', '.join(choices)}{nearest(str(got), choices)}"
+    elif kind == "bounds":
+        expected = f"{'a whole number, ' if at is int and root else ''}{last.get('ctx', {})['expected']}"
+    elif kind in ("missing", "too_long"):
+        expected = f"a list of {len(arguments)}"
+    text = repr(got) if kind == "literal_error" and isinstance(got, str) and len(got) < 60 else show(got)
+    return (
+        f"{place}: got {text}, expected {expected}"
+        if kind.startswith("dataclass") or not path
+        else f"{place} is {text}, expected {expected}"
+    )
+
+
+def _resolve(loc: Sequence[str | int], value: Any, hint: Any) -> tuple[str, Any, Any]:
+    """Return a place in words, what stands there, and its type; pydantic's names of alternatives are passed over."""
+    path = ""
+    for key in (*loc, None):
+        while typing.get_origin(hint) in (Annotated, types.UnionType, typing.Union):  # without bounds and None
+            kinds = [kind for kind in typing.get_args(hint) if kind is not type(None)]
+            hint = kinds[0 if typing.get_origin(hint) is Annotated else -1]
+        arguments: Any = typing.get_args(hint) or (Any,)
+        if isinstance(value, Mapping) and key in value:
+            path += f": {key!s:.60}"
+            named = hint if isinstance(hint, Mapping) else _hints(hint) if dataclasses.is_dataclass(hint) else {}
+            hint = named.get(str(key), arguments[-1])
+        elif isinstance(value, (list, tuple)) and isinstance(key, int) and key < len(value):
+            path += f"[{key}]"
+            hint = arguments[key if key < len(arguments) and arguments[-1] is not ... else 0]
+        else:
+            continue
+        value = value[typing.cast(Any, key)]
+    return path, value, hint
+
+
+def shown(value: Any, most: int = 60) -> str:
+    """Return a value as a file writes it, cut to `most` characters."""
+    try:
+        text = json.dumps(value, default=repr)
+    except (ValueError, TypeError, RecursionError):  # a number of thousands of digits, a key of another kind, a circle
+        text = type(value).__name__
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def replace(config: Config, **changes: Any) -> Config:
@@ -209,7 +287,7 @@ def overlay(base: Config, plain: Any, where: str, prefix: str = "", elsewhere: S
     plain = {} if plain is None else plain
     if not isinstance(plain, Mapping):
         section = prefix.rstrip(".") or "the file"
-        raise ConfigError(f"{where}: {section}: got {_shown(plain)}, expected a mapping of settings")
+        raise ConfigError(f"{where}: {section}: got {shown(plain)}, expected a mapping of settings")
     hints = _hints(type(base))
     changes: dict[str, Any] = {}
     for key, value in plain.items():
@@ -221,7 +299,7 @@ def overlay(base: Config, plain: Any, where: str, prefix: str = "", elsewhere: S
         if dataclasses.is_dataclass(hint):
             changes[key] = overlay(getattr(base, key), value, where, f"{name}.", elsewhere)
         else:
-            changes[key] = _convert(value, hint, f"{where}: {name}")
+            changes[key] = _plain(value, hint)
     try:
         return replace(base, **changes)
     except ConfigError as error:  # the dataclass's check: "<field> is <value>, expected ..."
@@ -262,49 +340,33 @@ def settings_help(config: Any, notes: Mapping[str, str] | None = None, equals: s
     return "\n".join(f"  {left:<{width}}{right}" for left, right in lines)
 
 
-def _convert(value: Any, kind: Any, where: str) -> Any:
-    """Return a value as the type of its field, or raise a `ConfigError` that says what was expected."""
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin in (types.UnionType, typing.Union):  # `X | None`
-        if value is None or value == AUTO:
-            return None
-        return _convert(value, arguments[0], where)
-    if origin is Annotated:
-        return _convert(value, arguments[0], where)
-    if origin in (Mapping, Sequence):  # whose items are checked by who reads them
-        expected, empty = ("a mapping of settings", {}) if origin is Mapping else ("a list", [])
-        if not isinstance(empty if value is None else value, type(empty)):
-            raise ConfigError(f"{where}: got {_shown(value)}, expected {expected}")
-        return value or empty
-    if origin is Literal:  # which choices there are is checked with the bounds
-        return value
-    if origin is tuple:
-        items = [item for item in value.split(",") if item] if isinstance(value, str) else value
-        items = items if isinstance(items, (list, tuple)) else [items]
-        return tuple(_convert(item, arguments[0], where) for item in items)
-    converted = _scalar(value, kind)
-    if converted is None:
-        names = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
-        raise ConfigError(f"{where}: got {_shown(value)}, expected {names[kind]}")
-    return converted
+def _plain(value: Any, hint: Any) -> Any:
+    """Return a value of YAML or of a word as its type has it, where that is clear; what is not is refused later.
 
-
-def _scalar(value: Any, kind: type) -> Any:
-    """Return `value` as `kind`, or None where it is not one. YAML takes 1e-4 for text; text is read as a number."""
-    if kind is bool or isinstance(value, bool):
-        return value if kind is bool and isinstance(value, bool) else None
-    if kind is str:
-        return "" if value is None else str(value) if isinstance(value, (str, int, float)) else None
-    if isinstance(value, str):
-        try:
-            value = float(value)
-        except ValueError:
-            return None
-    if not isinstance(value, (int, float)) or not (abs(value) < 2.0**64 or abs(value) == math.inf):
+    `auto` is None, `1e-4`, which YAML takes for text, a number, and `a,b` a tuple.
+    """
+    while typing.get_origin(hint) is Annotated:
+        hint = typing.get_args(hint)[0]
+    if type(None) in typing.get_args(hint) and (value is None or value == AUTO):
         return None
-    if kind is int:
-        return int(value) if float(value).is_integer() else None
-    return float(value)
+    _, _, kind = _resolve((), value, hint)
+    arguments = typing.get_args(kind)
+    if typing.get_origin(kind) is tuple:
+        items = [item for item in value.split(",") if item] if isinstance(value, str) else value
+        return tuple(_plain(item, arguments[0]) for item in (items if isinstance(items, (list, tuple)) else [items]))
+    if typing.get_origin(kind) in (Mapping, Sequence):
+        return ({} if typing.get_origin(kind) is Mapping else []) if value is None else value
+    if kind is str and not isinstance(value, (bool, Mapping, list)):
+        return "" if value is None else str(value)
+    if kind in (int, float) and isinstance(value, (str, int, float)) and not isinstance(value, bool):
+        try:
+            number = float(value)
+        except (ValueError, OverflowError):
+            return value
+        if kind is int:
+            return int(value if isinstance(value, int) else number) if number.is_integer() else value
+        return number if abs(number) < 2.0**64 or math.isinf(number) else value
+    return value
 
 
 def nearest(word: str, candidates: Sequence[str]) -> str:
@@ -316,8 +378,3 @@ def nearest(word: str, candidates: Sequence[str]) -> str:
     near = difflib.get_close_matches(word, candidates, n=1, cutoff=0.6)
     near = near or [tails[match] for match in difflib.get_close_matches(tail, list(tails), n=1, cutoff=0.6)]
     return f", did you mean {near[0]!r}?" if near else ""
-
-
-def _shown(value: Any) -> str:
-    text = repr(value)
-    return f"{text if len(text) < 80 else text[:76] + '...'} ({type(value).__name__})"

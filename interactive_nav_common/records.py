@@ -8,15 +8,15 @@ import dataclasses
 import functools
 import gzip
 import json
-import types
 import typing
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import yaml
+from pydantic import TypeAdapter, ValidationError
 
-from interactive_nav_common.config import Bounds, nearest
+from interactive_nav_common.config import STRICT, mistake_of, shown
 from interactive_nav_common.errors import FileError, UserError, readable
 from interactive_nav_common.files import whole_file, write_text
 from interactive_nav_common.untrusted.reading import Loader, read_bytes, unpack
@@ -24,32 +24,12 @@ from interactive_nav_common.untrusted.reading import Loader, read_bytes, unpack
 Record = TypeVar("Record")
 LARGEST = 2.0**64
 """Of numbers: seeds and sizes in bytes are below, and no float of 32 bits overflows."""
-KINDS: dict[Any, tuple[type | types.UnionType, str]] = {
-    str: (str, "a string"),
-    bool: (bool, "true or false"),
-    int: (int, "a whole number"),
-    float: (int | float, "a number"),
-    tuple: (list | tuple, "a list"),
-    list: (list | tuple, "a list"),
-    dict: (dict, "a mapping"),
-}
-"""A type -> what decoded files hold for it, and its name in errors."""
 
 
 @functools.cache
-def _fields(cls: type) -> dict[str, tuple[Any, bool]]:
-    """Return the type of each field by its name, and whether it must be given."""
-    hints, none = typing.get_type_hints(cls, include_extras=True), dataclasses.MISSING
-    return {f.name: (hints[f.name], f.default is none and f.default_factory is none) for f in dataclasses.fields(cls)}
-
-
-def shown(value: Any, most: int = 60) -> str:
-    """Return a decoded value as a file writes it, cut to `most` characters."""
-    try:
-        text = json.dumps(value, default=repr)
-    except (ValueError, TypeError, RecursionError):  # a number of thousands of digits, a key of another kind, a circle
-        text = type(value).__name__
-    return text if len(text) <= most else f"{text[: most - 3]}..."
+def _adapter(hint: Any) -> Any:
+    """Return what checks a value of a type; in a tuple, so that records in it are as strict."""
+    return TypeAdapter(tuple.__class_getitem__((hint,)), config=STRICT)  # type: ignore[arg-type]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,62 +68,19 @@ class Reader:
 
         `where` is named in errors; with `others`, keys that the record lacks are passed over.
         """
-        if not isinstance(data, dict):
-            raise self.error(f"{where}: got {shown(data)}, expected a mapping; {self.remedy}")
-        fields = _fields(cls)
-        data = {key: value for key, value in data.items() if key in fields} if others else data
-        for key in data:
-            if key not in fields:
-                expected = sorted(fields)
-                near = nearest(str(key), expected)
-                raise self.error(f"{where}: unknown key '{key!s:.60}'{near}; known keys: {', '.join(expected)}")
-        for key, (_, required) in fields.items():
-            if required and key not in data:
-                raise self.error(f"{where}: missing key '{key}'; {self.remedy}")
-        return cls(**{key: self.typed(value, fields[key][0], f"{where}: {key}") for key, value in data.items()})
+        if others and isinstance(data, dict):
+            names = {field.name for field in dataclasses.fields(typing.cast(Any, cls))}
+            data = {key: value for key, value in data.items() if key in names}
+        return self.typed(data, cls, where)
 
     def typed(self, value: Any, hint: Any, where: str) -> Any:
         """Return a decoded value as its type requires it."""
-        origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-        if hint is Any or (origin in (types.UnionType, typing.Union) and value is None and type(None) in arguments):
-            return value
-        if dataclasses.is_dataclass(hint):
-            return self.record(value, typing.cast(type, hint), where)
-        if origin in (types.UnionType, typing.Union):  # the first that takes it; else what the last one says
-            *others, last = (kind for kind in arguments if kind is not type(None))
-            for kind in others:
-                try:
-                    return self.typed(value, kind, where)
-                except self.error:
-                    continue
-            return self.typed(value, last, where)
-        if origin is Literal:
-            if not isinstance(value, str) or value not in arguments:
-                got = repr(value) if isinstance(value, str) and len(value) < 60 else shown(value)
-                raise self.error(f"{where} is {got}, expected one of {', '.join(map(str, arguments))}; {self.remedy}")
-            return value
-        if origin is Annotated:
-            bounds = Bounds(*arguments[1])
-            if not bounds.hold(self.typed(value, arguments[0], where)):
-                what = f"a whole number, {bounds}" if arguments[0] is int else bounds
-                raise self.error(f"{where} is {shown(value)}, expected {what}; {self.remedy}")
-            return value
-        kinds, words = KINDS[origin or hint]
-        items: Any = value
-        if not isinstance(value, kinds) or (isinstance(value, bool) and hint is not bool):
-            raise self.error(f"{where} is {shown(value)}, expected {words}; {self.remedy}")
-        if origin is dict:
-            return {key: self.typed(item, arguments[1], f"{where}: {key!s:.60}") for key, item in items.items()}
-        if origin is list:
-            return [self.typed(item, arguments[0], f"{where}[{i}]") for i, item in enumerate(items)]
-        if origin is tuple:
-            each = [arguments[0]] * len(items) if arguments[1:] == (...,) else arguments
-            if len(each) != len(items):
-                raise self.error(f"{where} is {shown(value)}, expected a list of {len(each)}; {self.remedy}")
-            return tuple(
-                self.typed(v, kind, f"{where}[{i}]") for i, (v, kind) in enumerate(zip(items, each, strict=True))
-            )
-        return value
+        try:
+            return _adapter(hint).validate_json(json.dumps([value], default=str))[0]
+        except ValidationError as error:
+            raise self.error(
+                f"{mistake_of(error, [value], tuple[hint], where, shown)}; {self.remedy}".replace("[0]", "", 1)
+            ) from None
 
     def _check_numbers(self, value: Any, where: str) -> None:
         left = [(where, value)]

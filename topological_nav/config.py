@@ -27,15 +27,15 @@ class CameraConfig(Settings):
     """Whose camera draws."""
     engine: Literal["warp", "gl"] = "warp"
     """Who draws: MJX-Warp's ray tracer (CPU or GPU), or MuJoCo's renderer (needs EGL or OSMesa)."""
-    width: Annotated[int, (16, 2048)] = 128
+    width: Annotated[int, Bounds(16, 2048)] = 128
     """Of a stored image, pixels."""
-    height: Annotated[int, (16, 2048)] = 96
+    height: Annotated[int, Bounds(16, 2048)] = 96
     """Of a stored image, pixels."""
-    supersample: Annotated[int, (1, 16)] = 5
+    supersample: Annotated[int, Bounds(1, 16)] = 5
     """Images are drawn this many times larger along each side and averaged: 5 x 128 x 96 is 640 x 480."""
-    fov_deg: Annotated[float | None, (1.0, 170.0)] = None
+    fov_deg: Annotated[float | None, Bounds(1.0, 170.0)] = None
     """Vertical field of view; auto: the robot's camera's."""
-    quality: Annotated[int, (1, 100)] = 90
+    quality: Annotated[int, Bounds(1, 100)] = 90
     """WebP quality of stored images; 100 stores them without loss."""
 
 
@@ -45,11 +45,11 @@ class DataConfig(CameraConfig):
 
     room_method: Literal["kmeans", "gmm", "spectral"] = "gmm"
     """How free positions are clustered into rooms."""
-    num_rooms: Annotated[int | None, (1, 10**6)] = None
+    num_rooms: Annotated[int | None, Bounds(1, 10**6)] = None
     """Rooms a scene; auto: as recorded for the scene, else chosen by BIC (gmm) or silhouette."""
     positions: Count = 100
     """Free positions drawn in a scene for room images."""
-    clearance_m: Annotated[float, (0.0, 10.0)] = 0.2
+    clearance_m: Annotated[float, Bounds(0.0, 10.0)] = 0.2
     """Their least distance from obstacles."""
     max_per_room: Count = 10
     """Of them kept in a room."""
@@ -57,21 +57,21 @@ class DataConfig(CameraConfig):
     """Share of a room's positions (and of its passages' sources) that are for testing only."""
     headings: int = 18
     """Images around a position, for each pitch; a multiple of 3, because testing takes every third."""
-    pitch_deg: Annotated[float, (0.0, 80.0)] = 20.0
+    pitch_deg: Annotated[float, Bounds(0.0, 80.0)] = 20.0
     """How far up and down the camera looks; the third pitch is level."""
     passage_sources: Count = 10
     """Sources a room of passage images."""
     passage_targets: Count = 10
     """Directions a source, evenly about it from a drawn one on."""
-    passage_clearance_m: Annotated[float, (0.0, 10.0)] = 0.3
+    passage_clearance_m: Annotated[float, Bounds(0.0, 10.0)] = 0.3
     """Least distance of sources from obstacles."""
-    passage_length_m: Annotated[float, (0.05, 100.0)] = 2.0
+    passage_length_m: Annotated[float, Bounds(0.05, 100.0)] = 2.0
     """Length of the segment that is navigable or not: passages are balanced on it and detectors scored by it."""
     passage_lengths_m: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 2.5)
     """Lengths that passages are labelled for, ascending, `passage_length_m` among them: how far the way is free."""
-    passage_points: Annotated[int, (2, 10**4)] = 50
+    passage_points: Annotated[int, Bounds(2, 10**4)] = 50
     """Points of the segment looked up on the map, both ends included."""
-    passage_margin_m: Annotated[float, (0.0, 10.0)] = 0.225
+    passage_margin_m: Annotated[float, Bounds(0.0, 10.0)] = 0.225
     """Distance from obstacles that each point needs: half of TTbot's width; 0: it may touch them."""
     shard: Count = 10
     """Sheets of images a file: what an interrupted rendering loses at most."""
@@ -123,13 +123,13 @@ class NetworkTrainConfig(Settings):
     """Images an update."""
     learning_rate: Annotated[float, (1e-9, 10.0)] = 1e-4
     """Adam's."""
-    label_smoothing: Annotated[float, (0.0, 0.999)] = 0.1
+    label_smoothing: Annotated[float, Bounds(0.0, 0.999)] = 0.1
     """Share of a room label's weight that is spread over all rooms."""
     augment: bool = True
     """Vary brightness, contrast and colour, and shift images by up to a sixteenth, anew in every epoch."""
     selfsup_epochs: Count = 30
     """Passes without labels, where init is selfsup."""
-    selfsup_batch: Annotated[int, (2, 10**6)] = 128
+    selfsup_batch: Annotated[int, Bounds(2, 10**6)] = 128
     """Pairs of images an update of them."""
     selfsup_learning_rate: Annotated[float, (1e-9, 10.0)] = 1e-3
     """Adam's, of them."""
@@ -143,13 +143,13 @@ TASKS = {"rooms": NetworkTrainConfig(), "passages": NetworkTrainConfig(batch=32,
 class MapConfig(Settings):
     """Set where nodes stand, and which edges join them."""
 
-    clearance_m: Annotated[float, (0.0, 10.0)] = 0.4
+    clearance_m: Annotated[float, Bounds(0.0, 10.0)] = 0.4
     """Least distance of nodes from obstacles: robots turn about there; TTbot's corners reach 0.33 m."""
-    min_per_room: Annotated[int, (1, 1000)] = 3
+    min_per_room: Annotated[int, Bounds(1, 1000)] = 3
     """Nodes a room, at least."""
-    spacing_m: Annotated[float, (0.1, 100.0)] = 0.9
+    spacing_m: Annotated[float, Bounds(0.1, 100.0)] = 0.9
     """No free place of a room is farther than this from one of its nodes."""
-    edge_m: Annotated[float, (0.1, 100.0)] = 2.5
+    edge_m: Annotated[float, Bounds(0.1, 100.0)] = 2.5
     """Nodes nearer than this are joined, both ways."""
     edge_image: Literal["exact", "nearest"] = "exact"
     """The image that an edge is judged by: drawn along it, or the nearest of the node's images."""
@@ -157,10 +157,10 @@ class MapConfig(Settings):
     """Add nodes until every free place that one can drive to is joined by free edges."""
     passable: Share = 0.5
     """Edges with at least this probability count as open where connectedness is reported."""
-    supersample: Annotated[int | None, (1, 16)] = None
+    supersample: Annotated[int | None, Bounds(1, 16)] = None
     """Images are drawn this many times larger along each side and averaged; auto: as the networks' were, on a CPU at
     most 2 (docs/topological.md says what that changes)."""
-    check: Annotated[int, (0, 10**6)] = 0
+    check: Annotated[int, Bounds(0, 10**6)] = 0
     """Free places, drawn by chance, at which to try how well the finished map localises."""
 
 
@@ -168,51 +168,51 @@ class MapConfig(Settings):
 class NavigatorConfig(Settings):
     """Set how the navigator localises, turns and drives. Defaults: the report's where it gives a value."""
 
-    images: Annotated[int, (1, 1000)] = 18
+    images: Annotated[int, Bounds(1, 1000)] = 18
     """Images that one localisation looks at, evenly about; a divisor of the map's images a node."""
     match: Literal["aligned", "nearest"] = "aligned"
     """An image is compared with the nodes' images of the same heading, and all are summed (aligned); or with all of
     them, and the nearest of all decides (nearest)."""
     passable: Share = 0.5
     """The passage detector agrees from this probability on."""
-    swing_deg: Annotated[float, (1.0, 180.0)] = 15.0
+    swing_deg: Annotated[float, Bounds(1.0, 180.0)] = 15.0
     """Step of the swing left and right."""
-    swings: Annotated[int, (1, 1000)] = 4
+    swings: Annotated[int, Bounds(1, 1000)] = 4
     """Steps to each side before an edge counts as blocked."""
-    ahead_m: Annotated[float, (0.05, 100.0)] = 2.0
+    ahead_m: Annotated[float, Bounds(0.05, 100.0)] = 2.0
     """Facing an edge, the way must be free for the edge's length less `slack_m`, at most this far: a run leads no
     farther at 0.4 m/s."""
-    slack_m: Annotated[float, (0.0, 100.0)] = 0.3
+    slack_m: Annotated[float, Bounds(0.0, 100.0)] = 0.3
     """The robot is not exactly at its node; at most half of the edge's length."""
-    clear_m: Annotated[float, (0.05, 100.0)] = 1.0
+    clear_m: Annotated[float, Bounds(0.05, 100.0)] = 1.0
     """How far the way must be free for the baseline policy to drive on (it takes this to stop and turn) and where the
     map has no way; and of which heading is the most open."""
-    tolerance_deg: Annotated[float, (0.1, 45.0)] = 3.0
+    tolerance_deg: Annotated[float, Bounds(0.1, 45.0)] = 3.0
     """A heading is reached when it is off by less."""
-    runs: Annotated[int, (1, 1000)] = 12
+    runs: Annotated[int, Bounds(1, 1000)] = 12
     """Runs of the local policy between two localisations."""
-    run_s: Annotated[float, (0.1, 1e6)] = 5.0
+    run_s: Annotated[float, Bounds(0.1, 1e6)] = 5.0
     """Length of a run."""
     glance: bool = True
     """After every run, judge by the image ahead whether the robot is still at its node or at one joined to it, and plan
     again from there."""
-    watch_s: Annotated[float, (0.0, 1e6)] = 0.5
+    watch_s: Annotated[float, Bounds(0.0, 1e6)] = 0.5
     """How often to look, within a run, whether the edge's head is passed (nearest of all, and getting farther), which
     ends the run; 0: never. Needs `glance`."""
-    metre_cost: Annotated[float, (0.0, 1e6)] = 0.3
+    metre_cost: Annotated[float, Bounds(0.0, 1e6)] = 0.3
     """Added to the cost of an edge, -log p, for each of its metres: of ways that are all but surely free the shorter is
     taken; 0: the report's."""
-    retry_cost: Annotated[float, (0.0, 1e6)] = 1.0
+    retry_cost: Annotated[float, Bounds(0.0, 1e6)] = 1.0
     """Added to the cost of an edge each time that it was driven and the robot was then not nearer to its head."""
-    limit_s: Annotated[float, (0.1, 1e6)] = 1800.0
+    limit_s: Annotated[float, Bounds(0.1, 1e6)] = 1800.0
     """Time after which an episode has failed."""
-    kp: Annotated[float, (0.0, 100.0)] = 2.0
+    kp: Annotated[float, Bounds(0.0, 100.0)] = 2.0
     """Proportional gain of turning, 1/s."""
-    ki: Annotated[float, (0.0, 100.0)] = 0.2
+    ki: Annotated[float, Bounds(0.0, 100.0)] = 0.2
     """Integral gain, 1/s^2."""
-    kd: Annotated[float, (0.0, 100.0)] = 0.05
+    kd: Annotated[float, Bounds(0.0, 100.0)] = 0.05
     """Derivative gain."""
-    max_turn_rad_s: Annotated[float, (0.01, 10.0)] = 1.0
+    max_turn_rad_s: Annotated[float, Bounds(0.01, 10.0)] = 1.0
     """Fastest turn on the spot."""
 
 
@@ -222,23 +222,23 @@ class EvaluationConfig(NavigatorConfig):
 
     seed: Seed = 0
     """Of the episodes."""
-    episodes: Annotated[int | None, (1, 10**6)] = None
+    episodes: Annotated[int | None, Bounds(1, 10**6)] = None
     """A scene; auto: one for every 2 square metres of floor, 25 to 60."""
-    min_goal_m: Annotated[float, (0.0, 1000.0)] = 2.5
+    min_goal_m: Annotated[float, Bounds(0.0, 1000.0)] = 2.5
     """Start and goal are in different rooms and farther apart than this."""
-    success_m: Annotated[float, (0.0, 1000.0)] = 1.5
+    success_m: Annotated[float, Bounds(0.0, 1000.0)] = 1.5
     """A run that ends nearer to the goal than this has reached it."""
-    clearance_m: Annotated[float, (0.0, 1000.0)] = 0.35
+    clearance_m: Annotated[float, Bounds(0.0, 1000.0)] = 0.35
     """Least distance of starts and goals from obstacles; TTbot's corners reach 0.33 m."""
-    thinned: Annotated[float, (0.01, 1.0)] = 0.4
+    thinned: Annotated[float, Bounds(0.01, 1.0)] = 0.4
     """Share of each room's nodes that the sparse map of the ablation keeps."""
-    batch: Annotated[int | None, (1, 10**6)] = None
+    batch: Annotated[int | None, Bounds(1, 10**6)] = None
     """Episodes played at a time; auto: all of a scene on an accelerator, 8 on a CPU."""
     backend: Literal["auto", "warp", "jax", "native"] = "auto"
     """Physics: as in `interactive_nav`."""
-    objects: Annotated[int, (0, 100)] = 0
+    objects: Annotated[int, Bounds(0, 100)] = 0
     """Small objects strewn over the floor; images of goals and maps are of the scene without them."""
-    supersample: Annotated[int | None, (1, 16)] = None
+    supersample: Annotated[int | None, Bounds(1, 16)] = None
     """Images are drawn this many times larger along each side and averaged; auto: as the networks' were, on a CPU at
     most 2."""
 
@@ -247,45 +247,45 @@ class EvaluationConfig(NavigatorConfig):
 class ExpertConfig(Settings):
     """Set the expert: what it may command, how far it looks ahead, and what it weighs."""
 
-    linear_m_s: Annotated[float, (0.01, 100.0)] = 0.5
+    linear_m_s: Annotated[float, Bounds(0.01, 100.0)] = 0.5
     """Fastest forward; it never reverses."""
-    angular_rad_s: Annotated[float, (0.01, 100.0)] = 0.5
+    angular_rad_s: Annotated[float, Bounds(0.01, 100.0)] = 0.5
     """Fastest turn, either way."""
-    linear_samples: Annotated[int, (2, 101)] = 5
+    linear_samples: Annotated[int, Bounds(2, 101)] = 5
     """Forward velocities tried, evenly from 0 to the fastest, each as near as a control period can bring it."""
-    angular_samples: Annotated[int, (2, 101)] = 11
+    angular_samples: Annotated[int, Bounds(2, 101)] = 11
     """The same, of turning; an odd number has straight ahead."""
-    acceleration_m_s2: Annotated[float, (0.01, 100.0)] = 1.0
+    acceleration_m_s2: Annotated[float, Bounds(0.01, 100.0)] = 1.0
     """What can be reached: change of the forward velocity."""
-    angular_acceleration_rad_s2: Annotated[float, (0.01, 100.0)] = 4.0
+    angular_acceleration_rad_s2: Annotated[float, Bounds(0.01, 100.0)] = 4.0
     """The same, of turning."""
-    horizon_s: Annotated[float, (0.1, 100.0)] = 1.6
+    horizon_s: Annotated[float, Bounds(0.1, 100.0)] = 1.6
     """Velocities are judged by where they would lead in this time."""
-    horizon_steps: Annotated[int, (1, 1000)] = 8
+    horizon_steps: Annotated[int, Bounds(1, 1000)] = 8
     """Places on the way there that are looked at."""
-    margin_m: Annotated[float, (0.0, 100.0)] = 0.04
+    margin_m: Annotated[float, Bounds(0.0, 100.0)] = 0.04
     """Least gap between the footprint and any obstacle."""
-    caution_m: Annotated[float, (0.001, 10.0)] = 0.25
+    caution_m: Annotated[float, Bounds(0.001, 10.0)] = 0.25
     """A gap less than this costs."""
-    weigh_progress: Annotated[float, (0.0, 100.0)] = 1.0
+    weigh_progress: Annotated[float, Bounds(0.0, 100.0)] = 1.0
     """Of the way that is left at the horizon, over the longest that can be driven until then."""
-    weigh_heading: Annotated[float, (0.0, 100.0)] = 1.2
+    weigh_heading: Annotated[float, Bounds(0.0, 100.0)] = 1.2
     """Of the angle there to the way on, over a half turn."""
-    weigh_gap: Annotated[float, (0.0, 100.0)] = 0.4
+    weigh_gap: Annotated[float, Bounds(0.0, 100.0)] = 0.4
     """Of a gap of 0; at `caution_m` it is nothing."""
-    lidar_rays: Annotated[int, (1, 1000)] = 135
+    lidar_rays: Annotated[int, Bounds(1, 1000)] = 135
     """Beams of the scan."""
-    lidar_fov_deg: Annotated[float, (1.0, 360.0)] = 270.0
+    lidar_fov_deg: Annotated[float, Bounds(1.0, 360.0)] = 270.0
     """Angle that they cover."""
-    lidar_range_m: Annotated[float, (0.1, 100.0)] = 4.0
+    lidar_range_m: Annotated[float, Bounds(0.1, 100.0)] = 4.0
     """Largest distance that the scanner measures, m."""
-    radius_m: Annotated[float, (0.001, 10.0)] = 0.27
+    radius_m: Annotated[float, Bounds(0.001, 10.0)] = 0.27
     """The planned way keeps its middle this far from obstacles."""
-    near_m: Annotated[float, (0.001, 10.0)] = 0.3
+    near_m: Annotated[float, Bounds(0.001, 10.0)] = 0.3
     """Within this much more a metre of it counts for more, up to `near_cost` more."""
-    near_cost: Annotated[float, (0.0, 100.0)] = 3.0
+    near_cost: Annotated[float, Bounds(0.0, 100.0)] = 3.0
     """Metres added to a metre along the obstacle."""
-    reached_m: Annotated[float, (0.001, 10.0)] = 0.35
+    reached_m: Annotated[float, Bounds(0.001, 10.0)] = 0.35
     """A node nearer than this is passed."""
 
 
@@ -301,21 +301,21 @@ class DriveConfig(ExpertConfig, CameraConfig):
     """Begun in each scene."""
     legs: Count = 3
     """Edges a drive, at most: on from each node by a random edge that turns less than `turn_deg`."""
-    turn_deg: Annotated[float, (0.0, 180.0)] = 30.0
+    turn_deg: Annotated[float, Bounds(0.0, 180.0)] = 30.0
     """Sharpest turn from one edge to the next: nothing but the images shows the policy where to go."""
-    edge_m: Annotated[float, (0.1, 1000.0)] = 2.5
+    edge_m: Annotated[float, Bounds(0.1, 1000.0)] = 2.5
     """Longest edge, as in maps."""
-    least_edge_m: Annotated[float, (0.0, 100.0)] = 1.0
+    least_edge_m: Annotated[float, Bounds(0.0, 100.0)] = 1.0
     """Shortest edge that a drive begins with."""
-    detour: Annotated[float, (1.0, 100.0)] = 2.0
+    detour: Annotated[float, Bounds(1.0, 100.0)] = 2.0
     """Edges are driven whose planned way, a metre near obstacles counting more, is at most so many times as long."""
-    start_off_m: Annotated[float, (0.0, 10.0)] = 0.3
+    start_off_m: Annotated[float, Bounds(0.0, 10.0)] = 0.3
     """Drives begin up to this far from their node."""
-    start_turn_deg: Annotated[float, (0.0, 180.0)] = 15.0
+    start_turn_deg: Annotated[float, Bounds(0.0, 180.0)] = 15.0
     """And up to this much turned away from their edge, as a robot is that was turned along it by its compass."""
-    start_clear_m: Annotated[float, (0.0, 10.0)] = 0.36
+    start_clear_m: Annotated[float, Bounds(0.0, 10.0)] = 0.36
     """Least distance of the start from obstacles: the robot's corners swing within 0.34 m."""
-    leg_s: Annotated[float, (0.1, 1000.0)] = 12.0
+    leg_s: Annotated[float, Bounds(0.1, 1000.0)] = 12.0
     """A drive has failed that takes longer for an edge."""
     test_share: Annotated[float, Bounds(0, 1, open=True)] = 0.1
     """Share of the nodes whose drives are for testing only."""
@@ -331,17 +331,17 @@ class PolicyConfig(Settings):
     """The one seed of weights, order and thinning."""
     hidden: Count = 500
     """Numbers in the memory of each of the two GRU cells."""
-    projection: Annotated[int, (0, 10**6)] = 0
+    projection: Annotated[int, Bounds(0, 10**6)] = 0
     """Features are mapped to so many numbers before the cells, which makes these smaller; 0: they are not."""
     forward_hidden: Count = 512
     """Units of each of the forward model's two layers."""
-    linear_classes: Annotated[int, (2, 1000)] = 3
+    linear_classes: Annotated[int, Bounds(2, 1000)] = 3
     """Forward velocities, evenly from 0 to the expert's fastest."""
-    angular_classes: Annotated[int, (2, 1000)] = 5
+    angular_classes: Annotated[int, Bounds(2, 1000)] = 5
     """Turning velocities, evenly from the fastest right to the fastest left."""
-    steps: Annotated[int, (2, 1000)] = 50
+    steps: Annotated[int, Bounds(2, 1000)] = 50
     """Control steps a sequence."""
-    overlap_s: Annotated[float, (0.0, 1e6)] = 4.0
+    overlap_s: Annotated[float, Bounds(0.0, 1e6)] = 4.0
     """Longest overlap of two sequences of a drive."""
     straight_share: Share = 0.2
     """A sequence that turns in less than this share of its steps is nearly straight."""
@@ -349,9 +349,9 @@ class PolicyConfig(Settings):
     """Share of the nearly straight sequences that is learned from."""
     mirror: bool = True
     """Learn from mirrored drives too."""
-    alpha: Annotated[float, (0.0, 1e6)] = 10.0
+    alpha: Annotated[float, Bounds(0.0, 1e6)] = 10.0
     """Weight of the commands' cross-entropies."""
-    lam: Annotated[float, (0.0, 1e6)] = 0.5
+    lam: Annotated[float, Bounds(0.0, 1e6)] = 0.5
     """Weight of forward consistency: lambda."""
     epochs: Count = 50
     """Passes over the sequences."""
@@ -367,11 +367,11 @@ class PolicyConfig(Settings):
 class ExportConfig(Settings):
     """Set what an export must keep to."""
 
-    limit_mib: Annotated[float, (0.001, 1e6)] = 8.0
+    limit_mib: Annotated[float, Bounds(0.001, 1e6)] = 8.0
     """The whole folder is no larger."""
     places: Count = 24
     """Places by whose images exported networks are compared with those of the runs."""
-    tolerance: Annotated[float, (0.0, 10.0)] = 0.02
+    tolerance: Annotated[float, Bounds(0.0, 10.0)] = 0.02
     """Most by which a passage's probability, or an embedding (of length 1.41), may differ."""
     commit: str | None = None
     """Of runs whose versions.json names none."""

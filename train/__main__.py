@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from interactive_nav_common.commands import Command, Words, option, parse
+from interactive_nav_common.commands import Command, Flag, Words, option, parse
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.jobs.progress import SafeConsole
 from train import config_io
 from train.config import TrainConfig
-from train.runs.run_folder import RunFolder
 
 
 @dataclasses.dataclass
@@ -28,6 +27,8 @@ class Train(Command):
     """Sets env.robot: a name, a URDF or MJCF file, or path.py:function."""
     checkpoint: Annotated[str, option(metavar="best|last|STEPS")] = "last"
     """With --resume: the checkpoint to continue from."""
+    print_config: Flag = False
+    """Print the whole config as YAML, which --config reads, and do nothing."""
 
     @classmethod
     def epilog(cls) -> str:
@@ -43,6 +44,8 @@ class Train(Command):
         if self.config:
             return config_io.load_config(self.config, words)
         assert self.resume is not None
+        from train.runs.run_folder import RunFolder  # heavy
+
         config = RunFolder(self.resume).read_config()
         run = dataclasses.replace(config.run, out_dir=str(self.resume.parent), name=self.resume.resolve().name)
         return config_io.apply_overrides(dataclasses.replace(config, run=run), words)
@@ -53,6 +56,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Train; return 0 when done, 2 on a user's error, 128 + signal when stopped by one (after saving)."""
     arguments = parse(Train, "python -m train", argv)
     config = arguments.read_config()
+    if arguments.print_config:
+        print(config_io.to_yaml(config), end="")
+        return 0
     # Heavy: after the config has been checked.
     from train.runs.run import train_run
 

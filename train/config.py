@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import yaml
 
 from interactive_nav.config import IMAGES, NavConfig
-from interactive_nav_common.config import AtLeastOne, NotNegative, Positive, Seed, Settings, Share, replace
+from interactive_nav_common.config import AtLeastOne, Bounds, NotNegative, Positive, Seed, Settings, Share, replace
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import check_name
 
@@ -164,7 +164,7 @@ class SACConfig(OffPolicyConfig):
     """Share of the critics in their targets at each gradient step."""
     initial_alpha: Positive = 0.01
     """Temperature to begin with; 1 in the original, but rewards are a few centimetres of progress a step here."""
-    target_entropy_per_action: Annotated[float, (-1e6, 1e6)] = -1.0
+    target_entropy_per_action: Annotated[float, Bounds(-1e6, 1e6)] = -1.0
     """Entropy that the temperature aims at, times the number of actions: -1 in the original, -0.5 in Brax."""
 
 

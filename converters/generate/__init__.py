@@ -34,7 +34,7 @@ def design_building(seed: int, config: BuildingConfig | HomeConfig | None = None
     """Draw plan and furniture; the same seed gives the same building."""
     if seed < 0:
         raise GenerationError(f"seed is {seed}: expected a whole number of 0 or more")
-    cfg = (config or BuildingConfig()).validate()
+    cfg = config or BuildingConfig()
     rng = _streams(seed)[0]
     if isinstance(cfg, HomeConfig):
         try:
@@ -82,7 +82,7 @@ def generate_building(
     if not existing.is_dir():
         raise GenerationError(f"{out_dir}: {existing} is a file, expected a folder; name a place inside a folder")
     report = progress or (lambda stage, share: None)
-    cfg = (config or BuildingConfig()).validate()
+    cfg = config or BuildingConfig()
     with part_folder(out_dir, overwrite=True) as work:
         report("drawing the plan", 0.0)
         building = design_building(seed, cfg)

@@ -79,7 +79,7 @@ def test_inherited_settings_are_among_those_of_the_whole():
         ({"radius_m": math.inf}, "radius_m is inf, expected a positive number"),
         ({"kind": "ruber"}, "kind is 'ruber', expected one of rubber, 4, did you mean 'rubber'?"),
         ({"kind": 4, "spokes": 5}, "spokes is 5, which changes nothing here: expected kind rubber; or leave it out"),
-        ({"sizes": (1, 0)}, "sizes is 0, expected at least 1"),
+        ({"sizes": (1, 0)}, "sizes[1] is 0, expected at least 1"),
         ({"tilt_deg": 90.0}, "tilt_deg is 90.0, expected between 0 and 90, both excluded"),
         ({"tilt": 1.0}, "unknown setting 'tilt'; did you mean 'tilt_deg'? known settings: kind, radius_m, sizes"),
     ],

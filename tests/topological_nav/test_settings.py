@@ -19,11 +19,11 @@ def test_words_are_read_by_the_types_of_the_settings():
     [
         ("epoch=3", "unknown key 'epoch', did you mean 'epochs'?"),
         ("epochs", "expected key=value"),
-        ("epochs=2.5", "epochs: got 2.5 .float., expected a whole number"),
+        ("epochs=2.5", "epochs is 2.5, expected a whole number"),
         ("epochs=0", "epochs is 0, expected between 1"),
         ("network=vgg", "network is 'vgg', expected one of resnet18, alexnet"),
-        ("augment=1", "augment: got 1 .int., expected true or false"),
-        ("learning_rate=fast", "learning_rate: got 'fast' .str., expected a number"),
+        ("augment=1", "augment is 1, expected true or false"),
+        ("learning_rate=fast", "learning_rate is 'fast', expected a number"),
     ],
 )
 def test_wrong_words_are_refused(word, told):

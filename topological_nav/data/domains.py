@@ -13,7 +13,7 @@ from typing import Annotated
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from interactive_nav_common.config import Count, Seed, Settings, Share
+from interactive_nav_common.config import Bounds, Count, Seed, Settings, Share
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.records import read_packaged
 
@@ -28,26 +28,26 @@ class DomainConfig(Settings):
 
     seed: Seed = 0
     """Of noise and of what differs from image to image."""
-    zoom: Annotated[float, (1.0, 10.0)] = 1.0
+    zoom: Annotated[float, Bounds(1.0, 10.0)] = 1.0
     """Focal length over the renderer's: 1.3 sees the middle 77 % of the picture's height."""
-    barrel: Annotated[float, (0.0, 2.0)] = 0.0
+    barrel: Annotated[float, Bounds(0.0, 2.0)] = 0.0
     """Radial distortion: what is shown at radius r (1 in the corners) comes from r (1 + barrel r^2) / (1 + barrel): the
     middle bulges, as in wide lenses."""
     vignette: Share = 0.0
     """Share of light that the corners lose."""
-    blur_px: Annotated[float, (0.0, 1000.0)] = 0.0
+    blur_px: Annotated[float, Bounds(0.0, 1000.0)] = 0.0
     """Longest way of a point during the exposure, along the rows: a robot that turns. Images differ, from 0 to this."""
-    exposure_ev: Annotated[float, (-10.0, 10.0)] = 0.0
+    exposure_ev: Annotated[float, Bounds(-10.0, 10.0)] = 0.0
     """Stops brighter (+) or darker (-)."""
-    exposure_spread_ev: Annotated[float, (0.0, 10.0)] = 0.0
+    exposure_spread_ev: Annotated[float, Bounds(0.0, 10.0)] = 0.0
     """Standard deviation of the exposure from image to image."""
-    warmth: Annotated[float, (-0.9, 0.9)] = 0.0
+    warmth: Annotated[float, Bounds(-0.9, 0.9)] = 0.0
     """White balance: red gains, and blue loses, this share of light."""
-    contrast: Annotated[float, (0.1, 10.0)] = 1.0
+    contrast: Annotated[float, Bounds(0.1, 10.0)] = 1.0
     """Of the tone curve about middle grey, in grey levels."""
-    shot_noise: Annotated[float, (0.0, 10.0)] = 0.0
+    shot_noise: Annotated[float, Bounds(0.0, 10.0)] = 0.0
     """Standard deviation of light at full scale, as a share of it; it goes with the root of the light."""
-    read_noise: Annotated[float, (0.0, 10.0)] = 0.0
+    read_noise: Annotated[float, Bounds(0.0, 10.0)] = 0.0
     """Standard deviation of light in the dark, as a share of full scale."""
 
 
@@ -80,9 +80,9 @@ class AdaptConfig(Settings):
     """features: Adam's, of the critic."""
     hidden: Count = 512
     """features: units of each of the critic's two layers."""
-    fine_tune: Annotated[int, (2, 10**6)] = 252
+    fine_tune: Annotated[int, Bounds(2, 10**6)] = 252
     """passages: target images to learn from, at most."""
-    test: Annotated[int, (2, 10**6)] = 108
+    test: Annotated[int, Bounds(2, 10**6)] = 108
     """passages: target images to test, at most."""
     fine_tune_epochs: Count = 20
     """passages: passes over them."""
@@ -90,7 +90,7 @@ class AdaptConfig(Settings):
     """passages: images an update."""
     fine_tune_learning_rate: Annotated[float, (1e-9, 10.0)] = 1e-4
     """passages: Adam's."""
-    edge_m: Annotated[float, (0.1, 100.0)] = 2.5
+    edge_m: Annotated[float, Bounds(0.1, 100.0)] = 2.5
     """map: nodes nearer than this are joined, both ways."""
     passable: Share = 0.5
     """map: edges with at least this probability count as open."""

@@ -37,7 +37,7 @@ class Sweep(Command):
     """With --export: round the checkpoint's weights to so many standard deviations."""
     resume: Flag = False
     """Only continue: refuse a sweep that was never begun."""
-    only: Annotated[Literal["train", "evaluate"] | None, option()] = None
+    only: Annotated[Literal["train", "evaluate"] | None, option(metavar="train|evaluate")] = None
     """Train without evaluating, or evaluate what is trained."""
     redo: Flag = False
     """Evaluate again what is evaluated."""

@@ -16,6 +16,7 @@ from converters.generate import Building, BuildingConfig, GenerationError, desig
 from converters.generate.design.furnish import DOOR_GAP_M
 from converters.generate.design.space import GRID_M, floor_maps, free_grid, image_size, passes, room_mask, static_grid
 from converters.generate.models.cad import TEST_MODELS, Instance, cad_model, place
+from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.grids import clearance
 
 SEEDS = range(8)
@@ -214,18 +215,18 @@ def test_a_large_test_building_uses_held_out_models_only(seed):
     [
         ({"floor_area_m2": (9.0, 9.0)}, "no plan in"),
         ({"n_sofas": (12, 12), "n_chairs": (30, 30)}, "no way to furnish"),
-        ({"n_rooms": (4, 3)}, "n_rooms is (4, 3)"),
+        ({"n_rooms": (4, 3)}, "n_rooms is (4, 3), expected at least 1, ascending"),
         ({"voxel_m": -1.0}, "voxel_m is -1.0"),
         ({"models": ("chair_throne",)}, "unknown CAD models"),
         ({"models": ("chair_slat",)}, "names no table"),
         ({"n_bottlenecks": 9}, "each bottleneck needs a chair"),
         ({"n_blockers": 3}, "each bottleneck needs a chair"),
         ({"passage_chairs": ("sofa_two",)}, "passage_chairs names ['sofa_two']"),
-        ({"corner_doorways": 1.5}, "expected a share of 0 to 1"),
+        ({"corner_doorways": 1.5}, "corner_doorways is 1.5, expected between 0 and 1"),
     ],
 )
 def test_what_cannot_be_built_is_said_in_one_line(changes, message):
-    with pytest.raises(GenerationError) as caught:
+    with pytest.raises(ConfigError) as caught:
         design_building(0, dataclasses.replace(BuildingConfig(), **changes), max_plans=1)
     assert message in str(caught.value) and "\n" not in str(caught.value)
 

@@ -26,6 +26,7 @@ from converters.generate.homes.floor import Floor
 from converters.generate.homes.furnish import Home, furnish_home
 from converters.generate.models.cad import HOME_TRAIN_MODELS, LIBRARY, Instance, Models
 from converters.geometry.density import ROBOTS
+from interactive_nav_common.errors import ConfigError
 from scenes_mjcf.categories import CATEGORIES
 from tests.converters.generate.test_generate_plan import polygon, turned
 
@@ -393,14 +394,18 @@ def test_a_seed_gives_the_same_home_and_another_another():
     ("tier", "settings", "message"),
     [
         ("full", {}, "tier is 'full': expected one of furnished, cluttered"),
-        ("furnished", {"furniture_share": 0.7}, "furniture_share is 0.7: expected 0 to 0.42"),
-        ("furnished", {"must_push_fetch": (0.5, 0.4)}, "must_push_fetch is (0.5, 0.4): expected 0 <= lowest"),
+        ("furnished", {"furniture_share": 0.7}, "furniture_share is 0.7, expected between 0 and 0.42"),
+        (
+            "furnished",
+            {"must_push_fetch": (0.5, 0.4)},
+            "must_push_fetch is (0.5, 0.4), expected between 0 and 1, ascending",
+        ),
         ("furnished", {"clutter_per_10_m2": (2.0, 1.0)}, "clutter_per_10_m2 is (2.0, 1.0)"),
         ("furnished", {"voxel_m": -1.0}, "voxel_m is -1.0"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused_by_name(tier, settings, message):
-    with pytest.raises(GenerationError) as caught:
+    with pytest.raises(ConfigError) as caught:
         home_config(tier, settings)
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
