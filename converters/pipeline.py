@@ -318,6 +318,11 @@ def convert_building(
         warn: called with what is wrong with the source as soon as it is read; all warnings stand in the result too.
         floors: that it must have; None: any number.
         annotations: Scan2CAD's file, in place of the source's; its models are those of `config.library`.
+
+    Raises:
+        SceneRejected: a source that cannot be used, or that has another number of floors.
+        FileError: a target that exists already or cannot be written.
+        StageFailed: a stage gave no usable result.
     """
     clock = Clock(report or (lambda stage, share: None))
     if config.library is None and (source / "cad").is_dir():

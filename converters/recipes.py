@@ -140,7 +140,7 @@ def parse_recipes(data: Any, where: str) -> Recipes:
 
 
 def load_recipes(path: Path) -> Recipes:
-    """Read a recipe file."""
+    """Read a recipe file; raise `GenerationError` if it cannot be used."""
     try:
         text = read_bytes(path)
     except OSError as error:
@@ -233,7 +233,7 @@ def make_scenes(
     """Generate scenes one after the other; return name -> gates that fail, of the scenes generated now.
 
     After an interruption, `chosen` names those that are left: a scene is there whole or not at all. `log` is called
-    with one line for each scene.
+    with one line for each scene. Raise `GenerationError` where a recipe gives no scene with any of its seeds.
     """
     weight = [sum(r.building.floor_area_m2) for r in todo]
     failed: dict[str, list[str]] = {}

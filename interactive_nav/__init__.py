@@ -72,8 +72,9 @@ def make(
         A `brax.envs.Env` with pure `reset` and `step` for one environment; batch it with `jax.vmap`.
 
     Raises:
-        ConfigError: unknown robot or setting (the message names the nearest valid one), impossible value,
-            or an unusable scene (`SceneError`).
+        ConfigError: unknown robot or setting (the message names the nearest valid one), or an impossible value.
+        FileError: a robot file that lacks a part, or whose parts do not fit.
+        SceneError: an unusable scene.
     """
     from interactive_nav.config import make_config
     from interactive_nav.robots import RobotSpec, get_robot

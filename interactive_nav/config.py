@@ -316,7 +316,7 @@ class SensorConfig(CameraNoise):
 
 @dataclasses.dataclass(frozen=True)
 class NavConfig(SensorConfig, PhysicsConfig, TaskRules):
-    """Settings of an interactive navigation environment (defaults: reference benchmark, section 11)."""
+    """Settings of an environment (defaults: reference benchmark, section 11); impossible ones raise `ConfigError`."""
 
 
 def make_config(variant: str = "paper", **settings: Any) -> NavConfig:

@@ -84,7 +84,7 @@ _FILES = Reader(EpisodeFileError, "make it again")
 def draw_episode_file(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
     """Draw episodes: number i depends on the seed and i alone, and is what `env.reset` gives for that key.
 
-    The environment is not batched.
+    The environment is not batched; fewer than one episode raises `ConfigError`.
     """
     if episodes < 1:
         raise ConfigError(f"episodes is {episodes}, expected at least 1")
@@ -175,7 +175,7 @@ def _check_fits(file: EpisodeFile, env: InteractiveNav, where: str) -> dict[str,
 
 
 def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -> EpisodeStart:
-    """Return the file's episodes for `jax.vmap(env.reset_to)`, leaves [N, ...]; `env` has the file's scenes."""
+    """Return the file's episodes for `jax.vmap(env.reset_to)`; raise `EpisodeFileError` if `env` is not theirs."""
     scene_of_digest = _check_fits(file, env, where)
     rows, count = file.episodes, len(file.objects)
     small = [[o or [0.0, 0.0, 0.0] for o in row["objects"]] for row in rows]
@@ -218,7 +218,7 @@ def save_episode_file(file: EpisodeFile, path: str | Path) -> None:
 
 
 def load_episode_file(path: str | Path) -> EpisodeFile:
-    """Read and check a file."""
+    """Read and check a file; raise `EpisodeFileError` if it cannot be used."""
     try:
         text = read_bytes(path)
         text = unpack(text, "gzip") if Path(path).suffix == PACKED else text

@@ -64,6 +64,10 @@ class Compositor:
             scene: the folder that it was played in.
             height: rows of the view from behind; a multiple of 12, so that every part has whole, even pixels.
             views: of `VIEWS`, side by side in place of the view from behind and the robot's camera.
+
+        Raises:
+            ConfigError: another height.
+            ReplayError: the scene has changed since the replay was recorded.
         """
         check_height(height)
         check_replay_scene(replay, scene)
@@ -193,7 +197,7 @@ def write_video(
 
     Args:
         compositor: the frames.
-        path: ends in .mp4 (H.264), .gif or .webp.
+        path: ends in .mp4 (H.264), .gif or .webp; another ending raises `ReplayError`.
         every: control steps from one frame to the next.
         on_progress: called with the number of frames written.
 

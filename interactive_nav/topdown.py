@@ -52,7 +52,12 @@ def shadow(boxes: np.ndarray, pos_w: np.ndarray, quat_w: np.ndarray) -> Any:
 
 
 def draw_topdown(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "time") -> None:
-    """Draw one replay, its path coloured by "time" (first step dark, last bright) or "contact"."""
+    """Draw one replay, its path coloured by "time" (first step dark, last bright) or "contact".
+
+    Raises:
+        ConfigError: another `colour_by`.
+        ReplayError: the scene has changed since the replay was recorded.
+    """
     if colour_by not in COLOUR_BY:
         raise ConfigError(f"colour_by is {colour_by!r}, expected one of {', '.join(COLOUR_BY)}")
     check_replay_scene(replay, scene)

@@ -119,7 +119,8 @@ class Columns:
 def read_rows(paths: Sequence[Path], check: Callable[[pa.Table, Path], None] | None = None) -> pa.Table:
     """Return the rows of several files as one table, each checked; a column that a file lacks is empty there.
 
-    An episode that stands in several files (`IDENTITY`) is taken once, from the last of them by name.
+    An episode that stands in several files (`IDENTITY`) is taken once, from the last of them by name. Raise
+    `FileError` for a file that cannot be read or does not fit the others.
     """
     tables = []
     for path in sorted(paths):

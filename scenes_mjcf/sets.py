@@ -57,8 +57,8 @@ class SceneSet:
 
 
 def scene_digest(folder: Path) -> str:
-    """SHA-256 of what a scene is made of, the same on every machine that makes it: its map, and its bodies, joints and
-    geoms with numbers rounded to 0.1 mm (the last digits of fitted boxes differ between processors), but no windows.
+    """Return the SHA-256 of what a scene is made of, the same on every machine that makes it: its map, and its bodies,
+    joints and geoms, but no windows. Numbers are rounded to 0.1 mm: the last digits of boxes differ between processors.
     """
     try:
         tree = ElementTree.parse(folder / "scene.xml")
@@ -81,7 +81,7 @@ def _rounded(text: str) -> str:
 
 
 def read_set(path: Path) -> SceneSet:
-    """Reads and checks a set's file."""
+    """Read and check a set's file; raise `SceneError` if it cannot be used."""
     scenes = _SETS.record(_SETS.json(path), SceneSet, str(path))
     for name in scenes.scenes:
         check_name(name, f"{path}: scenes: a name", SceneError)
@@ -89,7 +89,7 @@ def read_set(path: Path) -> SceneSet:
 
 
 def write_set(scenes: SceneSet, path: Path) -> None:
-    """Writes a set's file, whole or not at all."""
+    """Write a set's file, whole or not at all."""
     write_text(path, json.dumps(dataclasses.asdict(scenes), indent=1, sort_keys=True) + "\n")
 
 
@@ -112,7 +112,7 @@ def is_listed(folder: Path, member: Member) -> bool:
 
 
 def installed(path: str | Path) -> Path:
-    """Return a path if it exists, else the path of the same name in the package or in the cache."""
+    """Return a path, or that of its name in package or cache; raise `SceneError` if it is not what its set lists."""
     found = Path(path)
     roots = () if found.exists() or found.is_absolute() else (HERE.parent, cache_folder())
     place = next((root / found for root in roots if (root / found).exists()), found)
@@ -175,7 +175,7 @@ def _members(word: str) -> list[str] | None:
 
 
 def scene_folders(words: Sequence[str | Path]) -> tuple[str, ...]:
-    """Scene folders in which names of sets are replaced by the sets' own.
+    """Return scene folders, those of a set for its name; raise `SceneError` where some are missing.
 
     Args:
         words: scene folders, relative to the current folder; sets (`cluttered`, or a folder with a `set.json`); their

@@ -258,7 +258,7 @@ class TrainConfig(Settings):
 
 
 def resolve(config: TrainConfig, backend: str) -> TrainConfig:
-    """Return the config with the backend named and every None of the learners filled in, checked across fields."""
+    """Return the config with the backend named and every None of the learners filled in; raise as `validate` does."""
     sections: dict[str, Any] = {}
     for name, auto in AUTO.items():
         if backend not in auto:

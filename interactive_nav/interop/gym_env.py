@@ -192,7 +192,7 @@ class InteractiveNavEnv(_Playing, gymnasium.Env):
         self._step = jax.jit(self.env.step)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Draw an episode; with a seed, always the same sequence of episodes from here on."""
+        """Draw an episode, with a seed always the same ones from here on; an unknown option raises `ConfigError`."""
         _refuse_fork()
         super().reset(seed=seed)
         given = _check_options(options, ("start",))
@@ -202,7 +202,7 @@ class InteractiveNavEnv(_Playing, gymnasium.Env):
         return _to_numpy(self._state.obs), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Advance by one control period."""
+        """Advance by one control period; raise `gymnasium.error.ResetNeeded` before the first `reset`."""
         self._check_begun()
         action = np.asarray(action, np.float32)
         self._state = state = self._step(self._state, jnp.asarray(action))
@@ -277,7 +277,7 @@ class InteractiveNavVectorEnv(_Playing, VectorEnv):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Draw an episode for each environment, or for some of them.
+        """Draw an episode for each environment, or for some of them; raise `ConfigError` for unusable options.
 
         Args:
             seed: s gives environment i the seed s + i; or a list with one (or None) each. None: each goes on.

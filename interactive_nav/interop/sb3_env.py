@@ -27,7 +27,7 @@ class SB3VecEnv(VecEnv):
     """
 
     def __init__(self, robot: str, scenes: Sequence[str], num_envs: int = 16, **settings: Any):
-        """Build it.
+        """Build it; errors are those of `InteractiveNavVectorEnv`.
 
         Args:
             robot: a name from `robot_names()`.

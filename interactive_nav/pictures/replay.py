@@ -187,7 +187,7 @@ def save_replay(replay: Replay, path: str | Path) -> None:
 
 
 def load_replay(path: str | Path) -> Replay:
-    """Read a replay."""
+    """Read a replay; raise `ReplayError` if it is missing, damaged or of another format."""
     path = Path(path)
     if not path.is_file():
         raise ReplayError(f"{path}: no such file, expected a replay (npz)")

@@ -29,6 +29,7 @@ def get_robot(name: str, control_mode: str = "native") -> RobotSpec:
 
     Raises:
         ConfigError: unknown name or mode (the message lists the available ones), or an unusable file.
+        FileError: a file that lacks a part, or whose parts do not fit.
     """
     factory = _FACTORIES.get(str(name))
     if factory is None and is_reference(str(name)):

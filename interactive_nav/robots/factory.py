@@ -175,6 +175,10 @@ def from_file(
 
     Returns:
         control mode -> `RobotSpec`.
+
+    Raises:
+        ConfigError: an impossible argument, or a file that cannot be read.
+        FileError: a file that lacks a named part, or whose parts do not fit.
     """
     speeds = {"max_linear_m_s": max_linear_m_s, "max_angular_rad_s": max_angular_rad_s}
     _check(name, max_wheel_speed_rad_s, {"body_width_m": body_width_m, "track_m": track_m} | speeds)

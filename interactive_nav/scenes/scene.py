@@ -271,7 +271,11 @@ def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, fri
 
 
 def load_scene(folder: str | Path) -> Scene:
-    """Read and check a scene folder: scene.xml, scene.json, maps.npz; one that is `installed`, too."""
+    """Read and check a scene folder: scene.xml, scene.json, maps.npz; one that is `installed`, too.
+
+    Raises:
+        SceneError: no such folder, a file that is missing or damaged, or files that disagree.
+    """
     folder, word = installed(folder), str(folder)
     if not folder.exists():
         raise SceneError(

@@ -158,7 +158,7 @@ def shuffled(key: jax.Array, count: int, batch: int) -> jax.Array:
 
 
 def over(epoch: Epoch, images: Any, labels: Any) -> Callable[[Learner, int, jax.Array], Any]:
-    """Return an epoch over these images and labels, from now on kept on the device, as `runs.run_epochs` takes it."""
+    """Return an epoch over these images and labels, from now on kept on the device, as `run_epochs` takes it."""
     x, y = jnp.asarray(images), jnp.asarray(labels)
     return lambda learner, _, key: epoch(learner, x, y, key)
 

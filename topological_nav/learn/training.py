@@ -69,7 +69,7 @@ class Trained:
         return self._rows(images, "__call__")
 
     def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
-        """Return the probability that the path is free so far, of images [N, H, W, 3] u8; see `passages.logits_at`."""
+        """Return the probability that the path is free so far, of images [N, H, W, 3] u8; see `logits_at`."""
         logits = self.logits(images).astype(float)
         return 1.0 / (1.0 + np.exp(-logits_at(logits, self.about["lengths_m"], ahead_m)))
 

@@ -73,7 +73,7 @@ class TopologicalMap:
         return lengths(self.xy_w, self.edges)
 
     def plan(self, start: int, goal: int) -> Route:
-        """Return the cheapest way between two nodes, by Dijkstra's algorithm."""
+        """Return the cheapest path between two nodes, by Dijkstra's algorithm; raise `FileError` if there is none."""
         for node in (start, goal):
             if not 0 <= node < len(self.xy_w):
                 raise FileError(f"node {node} is not in the map of '{self.scene}', expected 0 to {len(self.xy_w) - 1}")
@@ -199,7 +199,7 @@ def save_map(nav_map: TopologicalMap, path: Path) -> None:
 
 
 def load_map(path: Path, digest: str | None = None) -> TopologicalMap:
-    """Read a map, and check that it is of the scene with this digest; None: not checked."""
+    """Read a map; raise `FileError` if it is damaged or not of the scene with this digest (None: not checked)."""
     with read_npz(path, FileError, "build the map: python -m topological_nav map SCENE") as stored:
         header = json.loads(stored["header"].tobytes())
         arrays = {name: stored[name] for name in _ARRAYS}

@@ -57,7 +57,8 @@ class Navigator:
     def __init__(self, nav_map: TopologicalMap, sight: Sight, policy: LocalPolicy, config: NavigatorConfig):
         """Take a map, whose nodes' positions are not used, what judges images, and what drives along edges.
 
-        A policy's `period`, if it has one, says that it looks at every so manieth image only.
+        A policy with a `period` looks at every `period`-th image only. Raise `ConfigError` if `config.images` does not
+        divide the number of the map's images a node.
         """
         around = nav_map.embeddings.shape[1]
         if config.match == "aligned" and around % config.images:

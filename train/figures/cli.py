@@ -60,7 +60,7 @@ def figures_of(results: Path, split: str | None = "auto") -> Iterator[tuple[str,
     """Yield every picture that the files under a folder give: (name, how to draw it).
 
     Args:
-        results: a run folder, a sweep's folder, or any folder of their files.
+        results: a run folder, a sweep's folder, or any folder of their files; one without any raises `FileError`.
         split: train or test scenes, None for all, auto: test where there are rows of them.
     """
     files = Results(results)

@@ -233,6 +233,12 @@ def train_run(
 
     Returns:
         The result, the folder, and the signal that ended it early, if one did.
+
+    Raises:
+        ConfigError: settings that exclude each other.
+        FileError: a folder of another run, or one that is being trained.
+        CheckpointError: a checkpoint that the run cannot continue from.
+        DivergedError: a number is no longer finite.
     """
     if config.run.wandb:
         tracking.import_wandb()

@@ -101,6 +101,9 @@ def load_policy(
         deterministic: take the mode of the actions.
         cached: filled and used by calls for the same environment: policies of equal networks then share one function,
             and what is compiled for it.
+
+    Raises:
+        CheckpointError: there is none, or it is damaged or of another robot or other observations.
     """
     path, meta = checkpoint.find(folder.checkpoints, which)
     check_fits(meta, path, dataclasses.replace(config.env, robot=env.robot.name), env)
@@ -161,6 +164,9 @@ def evaluate(
 
     Yields:
         After each policy, rows of all that have played, one an episode; and their episodes by policy.
+
+    Raises:
+        UserError: a policy or an episode that cannot be played in this environment.
     """
     env = player.env
     # Everything that can be refused is refused before the first episode.
