@@ -280,7 +280,7 @@ class Picture(Command):
     """The video: .mp4, .gif or .webp."""
     height: int = 360
     """Rows of the view from behind."""
-    views: tuple[Literal["eye", "follow", "above"], ...] = ()
+    views: Annotated[tuple[Literal["eye", "follow", "above"], ...], option()] = ()
     """Textured views, side by side, instead."""
     every: AtLeastOne = 1
     """Control steps from one frame to the next."""

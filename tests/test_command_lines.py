@@ -31,6 +31,7 @@ def shown(program: str) -> str:
         for words, text in help_of(program).items()
     }
     text = "\n".join(f"$ {words} --help\n{text}" for words, text in kept.items())
+    text = "".join(f"{line.rstrip()}\n" for line in text.splitlines() if line.strip(" -"))  # without frames
     return re.sub(r"(Scenes|Models|sources\.|Decompositions)([^()]*)\(default: \d+\)", r"\1\2(default: cores)", text)
 
 
