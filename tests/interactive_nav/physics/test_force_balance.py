@@ -20,7 +20,7 @@ from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, base, make_physics, mjx_batch
 from interactive_nav.physics import native as native_backend
 from interactive_nav.robots import get_robot
-from interactive_nav.scenes import spec as spec_module
+from interactive_nav.scenes import world as spec_module
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
 from interactive_nav_common.config import replace

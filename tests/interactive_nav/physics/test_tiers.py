@@ -85,7 +85,7 @@ def test_tiers_hold_what_was_counted():
     "words", [["0.7 2 1 1"], ["0.7 2 1 1 x"], ["0.6 2 1 1 9", "0.5 3 1 1 9"], ["0.6 2 1 1 9", "0.2 1 1 1 9"], "auto"]
 )
 def test_tiers_that_cannot_be_are_refused(words):
-    with pytest.raises(ConfigError, match="expected such as"):
+    with pytest.raises(ConfigError, match="expected (such as|a list)"):
         NavConfig.of(windows=words)
     assert parse_window_tiers(["0.7 2 1 1 12"]) == (WindowTier(0.7, 2, 1, 1, 12),)
 
