@@ -5,6 +5,7 @@ import functools
 import importlib.metadata
 import inspect
 import operator
+import os
 import re
 import sys
 import tomllib
@@ -154,7 +155,7 @@ def _split(hints: Mapping[str, Any], words: list[str]) -> tuple[list[str], list[
     settings, others, before = [], [], ""
     for word in words:
         is_value = re.match("--?[a-z]", before) and "=" not in before and before not in flags
-        is_setting = not is_value and re.match(r"[A-Za-z_][\w.]*=", word) and not Path(word).exists()
+        is_setting = not is_value and re.match(r"[A-Za-z_][\w.]*=", word) and not os.path.exists(word)
         (settings if is_setting else others).append(word)
         before = word
     return settings, others

@@ -114,8 +114,8 @@ def is_listed(folder: Path, member: Member) -> bool:
 def installed(path: str | Path) -> Path:
     """Return a path, or that of its name in package or cache; raise `SceneError` if it is not what its set lists."""
     found = Path(path)
-    roots = () if found.exists() or found.is_absolute() else (HERE.parent, cache_folder())
-    place = next((root / found for root in roots if (root / found).exists()), found)
+    roots = () if os.path.exists(found) or found.is_absolute() else (HERE.parent, cache_folder())
+    place = next((root / found for root in roots if os.path.exists(root / found)), found)
     name = next((n for n, folder in PACKAGED.items() if place == in_cache(folder / place.name)), None)
     member = packaged_set(name).scenes.get(place.name) if name else None
     if member and not is_listed(place, member):
@@ -139,7 +139,7 @@ def meant(word: str) -> str:
 def _file_of(name: str) -> Path | None:
     """Return the file that describes a set: in a folder of that name, or in the package."""
     for path in (Path(name) / FILE, HERE / name / FILE, COMMITTED / f"{name}.json"):
-        if path.is_file():
+        if os.path.isfile(path):
             return path
     return None
 
@@ -186,6 +186,6 @@ def scene_folders(words: Sequence[str | Path]) -> tuple[str, ...]:
     """
     found: list[str] = []
     for word in map(str, words):
-        is_scene = (Path(word) / "scene.json").is_file()
+        is_scene = os.path.isfile(Path(word) / "scene.json")  # no error for names that are too long
         found += [word] if is_scene else _members(word) or [str(installed(word))]
     return tuple(found)

@@ -298,3 +298,7 @@ def test_a_wrong_name_is_told_the_nearest(word: str, right: str) -> None:
 def test_a_name_like_none_is_told_the_sets() -> None:
     with pytest.raises(SceneError, match=r"yscen: no such file; expected a scene folder or a set \(sparse, furnished"):
         load_scene("yscen")
+
+
+def test_a_name_longer_than_a_file_may_have_names_no_scene():
+    assert scene_folders(["x" * 300]) == ("x" * 300,)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,7 @@ def read_file(name_or_path: str, folder: Path, what: str, prefix: str = "") -> t
     path = Path(name_or_path)
     if path.suffix not in (".yaml", ".yml"):
         path = folder / f"{name_or_path}.yaml"
-        if not path.is_file():
+        if not os.path.isfile(path):
             names = preset_names(folder)
             raise ConfigError(
                 f"{prefix}no {what} {name_or_path!r}{nearest(name_or_path, names)}; "

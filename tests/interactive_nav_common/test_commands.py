@@ -73,6 +73,7 @@ def test_settings_and_places_may_stand_anywhere(tmp_path):
     assert read.settings == ("a=1", "b.c=[1,2]", "d=x", "h=2")
     assert (read.places, read.scenes, read.policy) == ((Path("p"),), ("A", "B"), ("e=f:g",))
     assert draw("p", "-n", "2", "q", "--fast", "r").places == (Path("p"), Path("q"), Path("r"))
+    assert draw("p", "a=" + "x" * 5000).settings == ("a=" + "x" * 5000,)  # longer than names of files may be
     (tmp_path / "a=b").mkdir()
     assert draw(f"{tmp_path}/a=b").places == (tmp_path / "a=b",)
 
