@@ -17,6 +17,10 @@ from jax import custom_batching
 from interactive_nav.config import TaskRules
 
 
+def _broadcast(tree: Any, batched: Any, size: int) -> Any:
+    return jax.tree.map(lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape)), tree, batched)
+
+
 def _many(batch: Callable[..., Any], args: tuple) -> Any:
     @custom_batching.custom_vmap
     def many(*args):
@@ -24,10 +28,7 @@ def _many(batch: Callable[..., Any], args: tuple) -> Any:
 
     @many.def_vmap
     def rule(axis_size, in_batched, *args):
-        def whole(x, batched):
-            return x if batched else jnp.broadcast_to(x, (axis_size, *x.shape))
-
-        args = jax.tree.map(whole, args, tuple(in_batched))
+        args = _broadcast(args, tuple(in_batched), axis_size)
         inner = jax.tree.leaves(args)[0].shape[1]
         out = _many(batch, jax.tree.map(lambda x: x.reshape((axis_size * inner, *x.shape[2:])), args))
         out = jax.tree.map(lambda x: x.reshape((axis_size, inner, *x.shape[1:])), out)
@@ -38,7 +39,17 @@ def _many(batch: Callable[..., Any], args: tuple) -> Any:
 
 def one_of_batch(batch: Callable[..., Any], args: tuple) -> Any:
     """Return a batch function's result for one element; vmaps of it call the batch function once, with all elements."""
-    return jax.tree.map(lambda x: x[0], _many(batch, jax.tree.map(lambda x: x[None], args)))
+
+    @custom_batching.custom_vmap
+    def single(*args):
+        return jax.tree.map(lambda x: x[0], _many(batch, jax.tree.map(lambda x: x[None], args)))
+
+    @single.def_vmap
+    def rule(axis_size, in_batched, *args):
+        out = _many(batch, _broadcast(args, tuple(in_batched), axis_size))
+        return out, jax.tree.map(lambda _: True, out)
+
+    return single(*args)
 
 
 TOUCH_FORCE_N = 1e-4

@@ -249,11 +249,11 @@ def _without_sensors(spec: mujoco.MjSpec) -> mujoco.MjModel:
     return spec.compile()
 
 
-def measure_buffers(world: World, window: PhysicsWindow) -> tuple[int, int]:
+def measure_buffers(world: World, window: PhysicsWindow, head_room: float = 1.6) -> tuple[int, int]:
     """Return contact slots and constraint rows per environment that the window needs, measured at rest.
 
     Everything rests, the small objects laid out on the floor; the window holds the bodies with the most contacts.
-    Head room leaves place for a robot that pushes objects into each other. Metrics count what overflows anyway.
+    `head_room` leaves place for a robot that pushes objects into each other. Metrics count what overflows anyway.
     """
     contacts = rows = 0
     for model, qpos in zip(world.models, world.rest_qpos, strict=True):
@@ -266,7 +266,7 @@ def measure_buffers(world: World, window: PhysicsWindow) -> tuple[int, int]:
         in_window = int(sum(slots)) + int(per_body[world.layout.robot_bodies].sum())
         contacts = max(contacts, in_window)
         rows = max(rows, in_window * max(2 * (dims - 1), 1) + (data.nefc - data.ne - (data.efc_type >= _CONTACT).sum()))
-    extra, head_room = 24, 1.6
+    extra = 24
     contacts, rows = int(contacts * head_room) + extra, int(rows * head_room) + 4 * extra
     return contacts, -(-rows // 16) * 16
 

@@ -75,7 +75,7 @@ class Painter:
 
             key = (model, lens, tuple(groups))
             if key not in self._painters:
-                self._painters[key] = WarpColour(model.model, lens, list(groups))
+                self._painters[key] = WarpColour(model.model, lens, 1, list(groups))
             arrays = model.data.geom_xpos[None], model.data.geom_xmat.reshape(1, -1, 3, 3)
             return np.asarray(self._painters[key].draw(*arrays, one))[0]
         return None
@@ -92,7 +92,11 @@ class PictureCamera:
     """Takes pictures of one environment."""
 
     def __init__(self, env: Any, engine: str = "auto", fov_deg: float | None = None):
-        """Prepare nothing before it is needed; `fov_deg` is the robot's camera's, vertical, or its observations'."""
+        """Prepare nothing before it is needed.
+
+        Args:
+            fov_deg: vertical field of view of the robot's camera; None: that of its observations.
+        """
         self._env, self._painter, self._fov_deg = env, Painter(engine), fov_deg or env.sensors.lens.fov_deg
         world, classes = env.world, env.sensors.boxes.classes
         self._model = functools.cache(
@@ -112,11 +116,16 @@ class PictureCamera:
         streams: tuple[str, ...] = ("rgb",),
         view: str = "robot",
     ) -> dict[str, np.ndarray]:
-        """Draw pictures of `width` x `height` pixels of where a state is now.
+        """Draw pictures of where a state is now.
 
-        These are rgb [H, W, 3] u8; normals [H, W, 3] f32, unit vectors in the camera's frame (right, up, towards the
-        viewer), 0 where nothing is; depth [H, W] f32, m along the optical axis, 0 where nothing is; segmentation
-        [H, W] u8 class ids.
+        Args:
+            width: pixels.
+            height: pixels.
+
+        Returns:
+            rgb [H, W, 3] u8; normals [H, W, 3] f32, unit vectors in the camera's frame (right, up, towards the
+            viewer), 0 where nothing is; depth [H, W] f32, m along the optical axis, 0 where nothing is;
+            segmentation [H, W] u8 class ids.
         """
         unknown = [s for s in streams if s not in STREAMS]
         if unknown or not streams:
@@ -263,9 +272,9 @@ def behind(model: SceneModel) -> CameraPose:
 class ThirdPerson:
     """The camera behind the robot, for a running environment."""
 
-    def __init__(self, env: Any):
+    def __init__(self, env: Any, rows: int = 360, columns: int = 480):
         """Prepare nothing before it is needed; `env` is an `InteractiveNav`."""
-        self._env, self._lens = env, Lens(480, 360, 60.0)
+        self._env, self._lens = env, Lens(columns, rows, 60.0)
         small, classes = env.world.small_objects, env.config.segmentation_classes
         self._view = functools.cache(lambda scene: SceneView(env.robot, env.scenes[scene], small, classes))
 
@@ -273,17 +282,19 @@ class ThirdPerson:
         """Draw [rows, columns, 3] u8 of each environment of a batch, or of one that is alone."""
         nav, qpos = state.info["nav"], np.asarray(state.pipeline_state.qpos)
         which = np.asarray(nav.scene_index).reshape(-1), np.asarray(nav.goal_xy_w).reshape(-1, 2)
-        frames = []
-        for scene, row, goal_xy_w in zip(which[0].tolist(), qpos.reshape(-1, qpos.shape[-1]), which[1], strict=True):
-            view, paint = self._view(scene), FloorPaint(goal_xy_w, self._env.success_distance_m)
-            view.pose(self._env.world, scene, row)
-            frames.append(view.textured(behind(view), self._lens, (*SCENE, ROBOT), paint))
-        return tuple(frames)
+        each = zip(which[0], qpos.reshape(-1, qpos.shape[-1]), which[1], strict=True)
+        return tuple(self._frame(int(scene), *row) for scene, *row in each)
+
+    def _frame(self, scene: int, qpos: np.ndarray, goal_xy_w: np.ndarray) -> np.ndarray:
+        view = self._view(scene)
+        view.pose(self._env.world, scene, qpos)
+        paint = FloorPaint(goal_xy_w, self._env.success_distance_m)
+        return view.textured(behind(view), self._lens, (*SCENE, ROBOT), paint)
 
 
-def depth_picture(depth_m: np.ndarray) -> np.ndarray:
-    """Convert [rows, columns] depth to [rows, columns, 3] u8: near bright, beyond 5 m and nothing (0) black."""
-    near = np.where(depth_m > 0, 1.0 - np.clip(depth_m / 5.0, 0.0, 1.0), 0.0)
+def depth_picture(depth_m: np.ndarray, far_m: float = 5.0) -> np.ndarray:
+    """Convert [rows, columns] depth to [rows, columns, 3] u8: near bright, far and nothing (0) black."""
+    near = np.where(depth_m > 0, 1.0 - np.clip(depth_m / far_m, 0.0, 1.0), 0.0)
     return np.repeat((255 * near**2).astype(np.uint8)[..., None], 3, -1)
 
 

@@ -90,27 +90,31 @@ class Layout:
 
 
 def find_layout(model: mujoco.MjModel, robot: RobotSpec, slots: list[tuple[str, str]]) -> Layout:
-    """Return where the robot and slots, (name, kind) each, are in a compiled model's state."""
-    bodies = [model.body(name).id for name, _ in slots]
-    base, structure = model.body(robot.base_body).id, model.body("structure").id
-    joints, joint = model.body_jntadr[bodies], int(model.body_jntadr[base])
-    subtree = np.flatnonzero(model.body_rootid == base)
-    sensors = [model.sensor(f"force_{name}").adr[0] for name in (*range(len(slots)), "structure")]
-    joint_ids = np.flatnonzero(np.isin(model.jnt_bodyid, subtree))
-    assert (joint_ids == joint + np.arange(len(joint_ids))).all(), "a robot's joints must follow its free joint"
+    def body(name: str) -> int:
+        return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+
+    joints = [model.body_jntadr[body(name)] for name, _ in slots]
+    base = body(robot.base_body)
+    joint = model.body_jntadr[base]
+    subtree = [b for b in range(model.nbody) if b == base or model.body_rootid[b] == base]
+    sensors = [model.sensor(f"force_{i}").adr[0] for i in range(len(slots))]
+    width = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
+    joint_ids = [j for j in range(model.njnt) if model.jnt_bodyid[j] in subtree]
+    assert joint_ids == list(range(joint, joint + len(joint_ids))), "a robot's joints must follow its free joint"
+    sizes = [width.get(mujoco.mjtJoint(int(model.jnt_type[j])), (1, 1)) for j in joint_ids]
     return Layout(
         robot_qpos=int(model.jnt_qposadr[joint]),
         robot_qvel=int(model.jnt_dofadr[joint]),
-        robot_nq=int(np.diff([*model.jnt_qposadr, model.nq])[joint_ids].sum()),
-        robot_nv=int(np.diff([*model.jnt_dofadr, model.nv])[joint_ids].sum()),
+        robot_nq=sum(q for q, _ in sizes),
+        robot_nv=sum(v for _, v in sizes),
         slot_kind=tuple(kind for _, kind in slots),
-        slot_qpos=np.asarray(model.jnt_qposadr[joints], np.int32),
-        slot_qvel=np.asarray(model.jnt_dofadr[joints], np.int32),
-        slot_body=np.asarray(bodies, np.int32),
+        slot_qpos=np.asarray([model.jnt_qposadr[j] for j in joints], np.int32),
+        slot_qvel=np.asarray([model.jnt_dofadr[j] for j in joints], np.int32),
+        slot_body=np.asarray([body(name) for name, _ in slots], np.int32),
         robot_bodies=np.asarray(subtree, np.int32),
-        structure_body=structure,
-        wall_geoms=np.flatnonzero(model.geom_bodyid == structure),
-        force_sensors=np.asarray(sensors, np.int32),
+        structure_body=body("structure"),
+        wall_geoms=np.flatnonzero(model.geom_bodyid == body("structure")),
+        force_sensors=np.asarray([*sensors, model.sensor("force_structure").adr[0]], np.int32),
     )
 
 

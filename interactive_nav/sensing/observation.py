@@ -55,10 +55,15 @@ def task_observation(
 def advance_odometry(
     pose: jax.Array, moved_w: jax.Array, yaw_rad: jax.Array, turned_rad: jax.Array, noise: jax.Array
 ) -> jax.Array:
-    """Advance dead reckoning, a pose (3,) of x, y (m) and yaw (rad), by one control step, in the start's frame.
+    """Advance dead reckoning by one control step, in the frame of the episode's start.
 
-    `moved_w` (2,), m, is the true displacement, `noise` (2,) the relative error of distance and angle. The new yaw is
-    not wrapped.
+    Args:
+        pose: (3,) x, y (m), yaw (rad) reckoned so far.
+        moved_w: (2,) m, true displacement.
+        noise: (2,) relative error of the distance and of the angle of this step.
+
+    Returns:
+        (3,) the new pose; its yaw is not wrapped.
     """
     cos, sin = jnp.cos(yaw_rad), jnp.sin(yaw_rad)
     ahead, left = cos * moved_w[0] + sin * moved_w[1], -sin * moved_w[0] + cos * moved_w[1]

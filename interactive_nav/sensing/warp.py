@@ -56,6 +56,13 @@ class WarpRenderer(BoxRenderer):
             )
         return self._contexts[n].pytree()  # type: ignore[attr-defined]
 
+    def render_batch(self, scene, qpos, camera):
+        depth, geom = self.trace_batch(scene, qpos, camera)
+        n, boxes = scene.shape[0], self.tables.num_boxes
+        ids = jnp.concatenate([self.tables.class_id, jnp.zeros((len(self.tables.class_id), 1), jnp.uint8)], 1)[scene]
+        flat = jnp.where(geom < 0, boxes, geom).reshape(n, -1)
+        return depth, jnp.take_along_axis(ids, flat, 1).reshape(depth.shape)
+
     def trace_batch(self, scene, qpos, camera):
         n = scene.shape[0]
         context = self._context(n)
@@ -111,10 +118,13 @@ def morton_codes(xy_m: jax.Array, hidden: jax.Array) -> jax.Array:
 
 
 class WarpColour:
-    """Draws RGB of one scene's visual meshes, with textures."""
+    """RGB of one scene's visual meshes, with textures, for a batch of poses of it."""
 
-    def __init__(self, model: mujoco.MjModel, lens: Lens, groups: list[int]):
-        """Create a context for a model with one camera and the geom groups to draw; the first picture compiles."""
+    def __init__(self, model: mujoco.MjModel, lens: Lens, n: int, groups: list[int]):
+        """Create a context; the first picture compiles.
+
+        The model has visual meshes and one camera; `n` is pictures a call, `groups` are the geom groups that are drawn.
+        """
         keep_collector_out()
         model = copy.copy(model)
         model.cam_fovy[:] = lens.fov_deg
@@ -122,7 +132,7 @@ class WarpColour:
         self._model = uncommitted(mjx.put_model(model, impl="warp"))
         self._context = mjx.create_render_context(
             model,
-            nworld=1,
+            nworld=n,
             cam_res=(lens.width, lens.height),
             render_rgb=True,
             render_depth=False,
@@ -134,7 +144,8 @@ class WarpColour:
         self.draw = jax.jit(self._draw)
 
     def _draw(self, geom_xpos, geom_xmat, camera: CameraPose) -> jax.Array:
-        """Draw geoms' poses [1, ngeom, 3] and [1, ngeom, 3, 3] and a camera, leaves [1, ...], to [1, H, W, 3] u8."""
+        """Draw geoms' poses [N, ngeom, 3] and [N, ngeom, 3, 3], cameras [N, ...] to [N, H, W, 3] u8."""
+        n = geom_xpos.shape[0]
         context, template = self._context.pytree(), mjx.make_data(self._host, impl="warp", naconmax=1, njmax=1)
         geoms = {"geom_xpos": geom_xpos, "geom_xmat": geom_xmat}
         fields = {name: jnp.asarray(x, jnp.float32) for name, x in geoms.items()} | _data_of_camera(camera, self._host)
@@ -143,7 +154,7 @@ class WarpColour:
             data = mjx.refit_bvh(self._model, template.replace(**fields), context)
             return mjx.render(self._model, data, context)[0]
 
-        packed = jax.vmap(one)(fields).reshape(1, self._lens.height, self._lens.width)
+        packed = jax.vmap(one)(fields).reshape(n, self._lens.height, self._lens.width)
         return jnp.stack([(packed >> shift) & 255 for shift in (16, 8, 0)], -1).astype(jnp.uint8)
 
 

@@ -133,11 +133,12 @@ _LAWS = {"native": _velocity_law, "velocity": _velocity_law, "rate": _rate_law, 
 
 
 def quadrotor(control_mode: str = "native") -> RobotSpec:
-    """Return the Quadrotor's spec in a control mode.
+    """Return the Quadrotor's spec.
 
-    `velocity`, also called `native`: velocity along the heading and yaw rate, flown physically; `twist`: forward
-    velocity and yaw rate at a height of 0.8 m; `rate`: angular rates and total thrust; `thrust`: four rotor thrusts;
-    `kinematic`: the original's six base velocities, without gravity.
+    Args:
+        control_mode: `velocity`, also called `native`: velocity along the heading and yaw rate, flown physically;
+            `twist`: forward velocity and yaw rate at a height of 0.8 m; `rate`: angular rates and total thrust;
+            `thrust`: four rotor thrusts; `kinematic`: the original's six base velocities, without gravity.
     """
     check_mode("quadrotor", control_mode, _MODES)
     (names, low, high, matrix), law = _TABLE[control_mode], _LAWS.get(control_mode)
