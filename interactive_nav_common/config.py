@@ -1,6 +1,6 @@
 """Read `key=value` words and plain mappings into a frozen dataclass of settings; each mistake is reported in one line.
 
-A setting's type says what it may be: `Literal` for choices, `Annotated` with `Bounds` (or a plain pair) for ranges. A
+A setting's type says what it may be: `Literal` for choices, `Annotated` with `Bounds` for ranges. A
 dataclass may be composed of others: in files and on the command line they are sections (`ppo.learning_rate`).
 """
 

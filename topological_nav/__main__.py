@@ -24,7 +24,7 @@ class _Listed(Command):
     """Base of the commands that list their settings."""
 
     LISTED: ClassVar[dict[str, Any]]
-    """What settings are of -> their defaults."""
+    """Name of a group of settings -> their defaults."""
 
     @classmethod
     def epilog(cls) -> str:

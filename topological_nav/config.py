@@ -121,7 +121,7 @@ class NetworkTrainConfig(Settings):
     """Passes over the training images."""
     batch: Count = 20
     """Images an update."""
-    learning_rate: Annotated[float, (1e-9, 10.0)] = 1e-4
+    learning_rate: Annotated[float, Bounds(1e-9, 10.0)] = 1e-4
     """Adam's."""
     label_smoothing: Annotated[float, Bounds(0.0, 0.999)] = 0.1
     """Share of a room label's weight that is spread over all rooms."""
@@ -131,7 +131,7 @@ class NetworkTrainConfig(Settings):
     """Passes without labels, where init is selfsup."""
     selfsup_batch: Annotated[int, Bounds(2, 10**6)] = 128
     """Pairs of images an update of them."""
-    selfsup_learning_rate: Annotated[float, (1e-9, 10.0)] = 1e-3
+    selfsup_learning_rate: Annotated[float, Bounds(1e-9, 10.0)] = 1e-3
     """Adam's, of them."""
 
 
@@ -359,7 +359,7 @@ class PolicyConfig(Settings):
     """Share of them, the first, in which only the forward model learns."""
     batch: Count = 50
     """Sequences an update."""
-    learning_rate: Annotated[float, (1e-9, 10.0)] = 1e-4
+    learning_rate: Annotated[float, Bounds(1e-9, 10.0)] = 1e-4
     """Adam's."""
 
 

@@ -199,7 +199,7 @@ PART_SAMPLES = 1500
 MOST_M, LEAST_AREA = 0.01, 0.97
 """How far a surface may be simplified."""
 LOOSER, ROUNDS = 1.6, 3
-"""What exceeds a number of faces is simplified to an error larger by this factor, so many times."""
+"""A mesh with too many faces is simplified again with an error larger by this factor, at most so many times."""
 SPREAD, NEAREST, WORST = 6000, 8, 200
 """Samples of a mesh, about, that a distance is sought at; how many of them; distances that are computed exactly."""
 RIM_ROUNDS = 5

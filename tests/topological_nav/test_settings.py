@@ -1,10 +1,15 @@
 """Words in, settings out; wrong ones refused by name."""
 
+import importlib
+import typing
+
 import pytest
 
-from interactive_nav_common.config import overlay, overridden, settings_help, to_dict
+from interactive_nav_common.config import Bounds, Settings, overlay, overridden, settings_help, to_dict
 from interactive_nav_common.errors import ConfigError
-from topological_nav.config import TASKS, DataConfig, NetworkTrainConfig
+from topological_nav.config import TASKS, DataConfig, NetworkTrainConfig, PolicyConfig
+from topological_nav.data.domains import AdaptConfig
+from topological_nav.ros.config import HeadingConfig
 
 
 def test_words_are_read_by_the_types_of_the_settings():
@@ -56,3 +61,40 @@ def test_help_names_every_setting_with_its_meaning():
     text = settings_help(NetworkTrainConfig())
     assert "network=resnet18" in text and "[resnet18 | alexnet]" in text
     assert len(text.splitlines()) == len(to_dict(NetworkTrainConfig()))
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "wrong"),
+    [
+        (PolicyConfig, "learning_rate", 0.0),
+        (AdaptConfig, "critic_learning_rate", 11.0),
+        (HeadingConfig, "heading_rad", 6.3),
+        (HeadingConfig, "gain", 0.0),
+    ],
+)
+def test_ranges_with_small_ends_are_checked(kind, name, wrong):
+    with pytest.raises(ConfigError, match=f"{name} is {wrong}, expected between"):
+        kind(**{name: wrong})
+
+
+def _inner(hint):
+    yield from getattr(hint, "__metadata__", ())
+    for argument in typing.get_args(hint):
+        yield from _inner(argument)
+
+
+def _subclasses(kind):
+    for below in kind.__subclasses__():
+        yield below
+        yield from _subclasses(below)
+
+
+def test_every_annotation_of_a_setting_is_bounds():
+    """Pydantic passes over what it does not know: a plain pair would check nothing."""
+    for module in ("train.sweep.spec", "converters.segment.train", "converters.generate.design.config"):
+        importlib.import_module(module)
+    kinds = {kind for kind in _subclasses(Settings) if not kind.__module__.startswith("tests")}
+    hints = [hint for kind in kinds for hint in typing.get_type_hints(kind, include_extras=True).values()]
+    marks = [mark for hint in hints for mark in _inner(hint)]
+    assert len(kinds) > 20 and len(marks) > 200
+    assert [mark for mark in marks if not isinstance(mark, Bounds)] == []

@@ -74,9 +74,9 @@ class AdaptConfig(Settings):
     """features: passes over the target images."""
     batch: Count = 50
     """features: images of each domain an update."""
-    learning_rate: Annotated[float, (1e-9, 10.0)] = 1e-4
+    learning_rate: Annotated[float, Bounds(1e-9, 10.0)] = 1e-4
     """features: Adam's, of the extractor."""
-    critic_learning_rate: Annotated[float, (1e-9, 10.0)] = 1e-3
+    critic_learning_rate: Annotated[float, Bounds(1e-9, 10.0)] = 1e-3
     """features: Adam's, of the critic."""
     hidden: Count = 512
     """features: units of each of the critic's two layers."""
@@ -88,7 +88,7 @@ class AdaptConfig(Settings):
     """passages: passes over them."""
     fine_tune_batch: Count = 32
     """passages: images an update."""
-    fine_tune_learning_rate: Annotated[float, (1e-9, 10.0)] = 1e-4
+    fine_tune_learning_rate: Annotated[float, Bounds(1e-9, 10.0)] = 1e-4
     """passages: Adam's."""
     edge_m: Annotated[float, Bounds(0.1, 100.0)] = 2.5
     """map: nodes nearer than this are joined, both ways."""

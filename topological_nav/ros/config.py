@@ -49,15 +49,15 @@ class SimulatorConfig(Settings):
 class HeadingConfig(Settings):
     """Turn, then drive straight ahead for a while."""
 
-    heading_rad: Annotated[float, (-2 * math.pi, 2 * math.pi)] = 0.0
+    heading_rad: Annotated[float, Bounds(-2 * math.pi, 2 * math.pi)] = 0.0
     """To drive along, in the map's frame."""
     linear_mps: Annotated[float, Bounds(-2.0, 2.0)] = 0.4
     """Along it."""
     drive_s: Annotated[float, Bounds(0.0, 10**6)] = 5.0
     """For how long, once the heading is met."""
-    gain: Annotated[float, (1e-6, 100.0)] = 2.0
+    gain: Annotated[float, Bounds(1e-6, 100.0)] = 2.0
     """1/s: turn for each rad of error."""
-    max_angular_radps: Annotated[float, (1e-6, 100.0)] = 1.0
+    max_angular_radps: Annotated[float, Bounds(1e-6, 100.0)] = 1.0
     """Of turns."""
-    tolerance_rad: Annotated[float, (1e-6, 100.0)] = 0.1
+    tolerance_rad: Annotated[float, Bounds(1e-6, 100.0)] = 0.1
     """The heading is met within this much."""

@@ -183,7 +183,7 @@ def paint(
             weave = 1 + 0.05 * np.sin(90 * p[:, 0]) * np.sin(90 * p[:, 1] + 40 * p[:, 2])
             value = np.array(MATERIALS[name]) * weave[:, None]
         colour[here] = value
-    # What is of a library model has the colour of the model's nearest point.
+    # Points of a library model take the colour of the model's nearest point.
     items = {id(s.item): s.item for s in scan.solids if s.item is not None and s.item.model.surface is not None}
     of = np.array([id(s.item) for s in scan.solids])[solid]
     order = np.argsort(of, kind="stable")

@@ -83,7 +83,7 @@ def _labels(source: SourceFolder, dataset: Any, scene: str, about: Collection) -
     try:
         return dataset.get_segmentation(scene, **about.options)
     except (FileNotFoundError, importlib.import_module("scenezoo").UnsupportedOperationError) as error:
-        source.note(f"{scene}: has no labels ({' '.join(str(error).split())[:200]}); structure is told by shape")
+        source.note(f"{scene}: has no labels ({' '.join(str(error).split())[:200]}); shape decides what is structure")
         return None
 
 
