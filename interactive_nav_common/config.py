@@ -84,7 +84,7 @@ Share = Annotated[float, Bounds(0.0, 1.0)]
 class Settings:
     """Base of a frozen dataclass of settings, each with a default, that refuses what their types do not allow.
 
-    Lists become tuples. A class may inherit from several: it then has the settings of all of them.
+    Lists become tuples, and NumPy's numbers Python's. A class that inherits from several has the settings of all.
     """
 
     IDLE: ClassVar[Sequence[tuple[str, str, Callable[[Any], bool]]]] = ()
@@ -95,6 +95,8 @@ class Settings:
         for name in _hints(type(self)):
             if isinstance(value := getattr(self, name), list):
                 object.__setattr__(self, name, tuple(value))
+            elif type(value).__module__ == "numpy" and not getattr(value, "shape", ()):  # a number of `np.linspace`
+                object.__setattr__(self, name, value.item())
         check({name: getattr(self, name) for name in _hints(type(self))}, _hints(type(self)))
         for names, needs, used in (row for cls in type(self).__mro__ for row in cls.__dict__.get("IDLE", ())):
             for name in () if used(self) else names.split():

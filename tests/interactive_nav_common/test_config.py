@@ -7,6 +7,7 @@ import inspect
 import math
 from typing import Annotated, Literal
 
+import numpy as np
 import pytest
 
 from interactive_nav.config import NavConfig
@@ -56,6 +57,14 @@ class Train(Settings):
     """Of it."""
     cars: AtLeastOne = 1
     """Of it."""
+
+
+def test_numbers_of_numpy_become_pythons():
+    train = Train.of(cart=Cart.of(tilt_deg=np.float32(2.5)), cars=np.int64(3))
+    assert (type(train.cars), train.cars) == (int, 3)
+    assert (type(train.cart.tilt_deg), train.cart.tilt_deg) == (float, 2.5)
+    with pytest.raises(ConfigError, match="cars is 0, expected at least 1"):
+        Train.of(cars=np.int64(0))
 
 
 def test_inherited_settings_are_among_those_of_the_whole():
