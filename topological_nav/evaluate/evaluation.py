@@ -225,9 +225,9 @@ class NavigatorPlayer(Contender):
         config: EvaluationConfig,
         navigator: Navigator,
         camera: Camera,
-        watch: Callable[[float, Snapshot, State, Events], None] = lambda *_: None,
+        watch: Callable[[float, Snapshot, State], None] = lambda *_: None,
     ):
-        """Take its parts; `watch` is called with time, poses, new state and events of every step."""
+        """Take its parts; `watch` is called with time, poses and new state of every step."""
         super().__init__(player, config)
         self._navigator, self._camera, self._watch = navigator, camera, watch
         self.state: State | None = None
@@ -255,9 +255,9 @@ class NavigatorPlayer(Contender):
         looks = np.flatnonzero(self._navigator.looks(mind, now.yaw_rad, time_s))
         if len(looks):  # the others keep an old image, which nobody looks at
             self._images[looks] = self._camera(now.xy_w[looks], now.yaw_rad[looks], now.qpos[looks])
-        self.state, linear, angular, events = self._navigator.step(mind, self._images, now.yaw_rad, time_s)
-        self._watch(time_s, now, self.state, events)
-        return np.asarray(robot.drive(linear, angular, np), np.float32), events
+        self.state = self._navigator.step(mind, self._images, now.yaw_rad, time_s)
+        self._watch(time_s, now, self.state)
+        return np.asarray(robot.drive(self.state.linear, self.state.angular, np), np.float32), self.state
 
 
 Act = Callable[[Any, np.ndarray, np.ndarray, int], Any]
@@ -279,13 +279,9 @@ class ActionPlayer(Contender):
         """See `Contender`."""
         config, dt_s = self.config, self.player.env.dt
         edge = running & (step % max(1, round(config.run_s / dt_s)) == 0)
-        none = np.zeros(len(running), bool)
-        events = Events(
-            **dict.fromkeys(("localised", "glanced", "lost", "blocked", "arrived"), none),
-            run_started=edge,
-            run_ended=edge & (step > 0),
-            timed_out=running & (step * dt_s >= config.limit_s - 1e-3),
-        )
+        late = running & (step * dt_s >= config.limit_s - 1e-3)
+        events = {"run_started": edge, "run_ended": edge & (step > 0), "timed_out": late}
+        events = Events(**fresh(Events, len(running)) | events)
         return self._act(state, self._episodes.number[self._rows], running, step), events
 
 

@@ -25,7 +25,7 @@ from topological_nav.evaluate.contest import Contest, ContestScene, contest_scen
 from topological_nav.evaluate.evaluation import DrivenEpisodes, NavigatorPlayer, Played
 from topological_nav.maps.build import Built
 from topological_nav.maps.graph import Route, TopologicalMap
-from topological_nav.navigate.state import FACE, PHASES, Events, State
+from topological_nav.navigate.state import FACE, PHASES, State
 from topological_nav.scenes.rendering import Snapshot
 from topological_nav.scenes.space import FreeSpace
 
@@ -296,11 +296,11 @@ def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callabl
     log: list[str] = []
     every = _film_every(venue)
 
-    def watch(time_s: float, now: Snapshot, state: State, events: Events) -> None:
+    def watch(time_s: float, now: Snapshot, state: State) -> None:
         if filmed and not contest.truth and len(steps) % every == 0:
             views[len(steps)] = venue.camera(now.xy_w[:1], now.yaw_rad[:1], now.qpos[:1])[0]
         steps.append((time_s, now.xy_w[0], now.yaw_rad[0], int(state.phase[0])))
-        log.extend(f"{time_s:7.1f} s  {line}" for line in _log_lines(graph, state, events))
+        log.extend(f"{time_s:7.1f} s  {line}" for line in _log_lines(graph, state))
 
     player = NavigatorPlayer(venue.player, contest.config, navigator, venue.camera, watch)
     played = player.play(journey, lambda _, time_s: progress(time_s))
@@ -310,25 +310,25 @@ def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callabl
     return Driven(venue, graph, journey, played, int(player.state.goal[0]), *columns, views=views, log=log)
 
 
-def _log_lines(graph: TopologicalMap, state: State, events: Events) -> Iterator[str]:
+def _log_lines(graph: TopologicalMap, state: State) -> Iterator[str]:
     node, edge = int(state.node[0]), int(state.edge[0])
-    if events.localised[0] or events.glanced[0]:
-        yield f"{'looked about' if events.localised[0] else 'glanced'}: at node {node}"
-    still = bool(events.run_ended[0]) and not events.glanced[0] and state.phase[0] == FACE
+    if state.localised[0] or state.glanced[0]:
+        yield f"{'looked about' if state.localised[0] else 'glanced'}: at node {node}"
+    still = bool(state.run_ended[0]) and not state.glanced[0] and state.phase[0] == FACE
     if still:
         yield f"glanced: still at node {node}"
-    if events.blocked[0]:
+    if state.blocked[0]:
         yield "no heading near the edge's is open"
-    if events.lost[0]:
+    if state.lost[0]:
         yield f"the map has no way from node {node} to {int(state.goal[0])}"
-    elif edge >= 0 and (events.localised[0] or events.glanced[0] or events.blocked[0] or still):
+    elif edge >= 0 and (state.localised[0] or state.glanced[0] or state.blocked[0] or still):
         degrees = np.rad2deg(graph.angle_rad[edge])
         yield f"next: node {graph.edges[edge, 1]}, heading {degrees:.0f} degrees, p {graph.p[edge]:.2f}"
-    if events.run_started[0] and state.run[0] == 0:
+    if state.run_started[0] and state.run[0] == 0:
         yield "drives"
-    if events.arrived[0]:
+    if state.arrived[0]:
         yield "is at the goal's node"
-    if events.timed_out[0]:
+    if state.timed_out[0]:
         yield "out of time"
 
 

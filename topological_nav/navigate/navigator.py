@@ -40,7 +40,6 @@ from topological_nav.navigate.state import (
     TURNING,
     Events,
     State,
-    Work,
 )
 
 PENALTY = 3.0
@@ -105,19 +104,17 @@ class Navigator:
         acts = ends | (state.acts % self._period == 0) | self._watches(state, np.asarray(time_s))
         return reached | ((state.phase == DRIVE) & acts)
 
-    def step(
-        self, state: State, images: np.ndarray, heading_rad: np.ndarray, time_s: np.ndarray | float
-    ) -> tuple[State, np.ndarray, np.ndarray, Events]:
+    def step(self, state: State, images: np.ndarray, heading_rad: np.ndarray, time_s: np.ndarray | float) -> State:
         """Take one control step from a state of `start` or `step`.
 
         Images [B, ...] that `looks` leaves out may be anything; headings [B] are those of a compass, world frame;
-        times, [B] or one for all, must not go back. Return the new state, linear [B] (m/s) and angular [B] (rad/s)
-        velocity to command, and what happened.
+        times, [B] or one for all, must not go back. Return the new state, with the velocities to command and what
+        happened.
         """
         batch = len(state.phase)
         heading = np.asarray(heading_rad, float)
         time = np.broadcast_to(np.asarray(time_s, float), (batch,))
-        s = Work(state, batch)
+        s = dataclasses.replace(jax.tree.map(np.array, state), **fresh(Events, batch))
         unset = np.isnan(s.began_s)
         s.began_s[unset] = time[unset]
         late = ~state.over & (time - s.began_s >= self.config.limit_s - SLACK_S)
@@ -133,8 +130,7 @@ class Navigator:
         still = s.phase >= ARRIVED
         s.linear[still] = s.angular[still] = 0.0
         s.clock_s[:] = time
-        new, events = s.end()
-        return new, new.linear.copy(), new.angular.copy(), events
+        return s
 
     def _first_heading(self, heading: np.ndarray) -> np.ndarray:
         """Return the nearest heading along which nodes have images."""
@@ -144,19 +140,19 @@ class Navigator:
     def _no_evidence(self, batch: int) -> np.ndarray:
         return np.full((batch, len(self.map.xy_w)), 0.0 if self.sight.summed else np.inf)
 
-    def _reached(self, s: Work, heading: np.ndarray, *phases: int) -> np.ndarray:
+    def _reached(self, s: State, heading: np.ndarray, *phases: int) -> np.ndarray:
         """Return the rows in one of the phases whose heading is reached."""
         return np.flatnonzero(
             _any_of(s.phase, phases) & (np.abs(wrap_angle(s.target_rad - heading)) <= self._tolerance)
         )
 
-    def _watches(self, s: State | Work, time: np.ndarray) -> np.ndarray:
+    def _watches(self, s: State, time: np.ndarray) -> np.ndarray:
         """Return who looks now, within a run, whether the edge's head is passed, [B] bool."""
         if not self.config.glance or not self.config.watch_s:
             return np.zeros(len(s.phase), bool)
         return (s.phase == DRIVE) & (s.edge >= 0) & (time >= s.watch_s - SLACK_S)
 
-    def _localise(self, s: Work, images: np.ndarray, heading: np.ndarray) -> None:
+    def _localise(self, s: State, images: np.ndarray, heading: np.ndarray) -> None:
         rows = self._reached(s, heading, LOCALISE)
         if not len(rows):
             return
@@ -172,7 +168,7 @@ class Navigator:
         s.phase[there], s.arrived[there] = ARRIVED, True
         self._plan(s, done[s.node[done] != s.goal[done]], heading)
 
-    def _located(self, s: Work, rows: np.ndarray, node: np.ndarray) -> None:
+    def _located(self, s: State, rows: np.ndarray, node: np.ndarray) -> None:
         """Note where the robots are; an edge that was driven and did not lead nearer to its head costs more."""
         s.node[rows] = node
         edge = s.driven[rows]
@@ -181,7 +177,7 @@ class Navigator:
         s.penalty[rows[failed], edge[failed]] += self.config.retry_cost
         s.driven[rows] = -1
 
-    def _plan(self, s: Work, rows: np.ndarray, heading: np.ndarray) -> None:
+    def _plan(self, s: State, rows: np.ndarray, heading: np.ndarray) -> None:
         for i in rows:
             edge = self.map.next_edge(int(s.node[i]), int(s.goal[i]), s.penalty[i])
             s.edge[i] = edge
@@ -196,7 +192,7 @@ class Navigator:
         s.swing[rows], s.best_p[rows] = 0, -1.0
         s.restart_pid(rows)
 
-    def _face(self, s: Work, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> None:
+    def _face(self, s: State, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> None:
         self._begin_drive(s, self._reached(s, heading, LEAN), time)
         rows = self._reached(s, heading, FACE, SWING)
         if not len(rows):
@@ -227,18 +223,18 @@ class Navigator:
         tried = rows[(s.phase[rows] == SWING) & (s.swing[rows] > max(2 * self.config.swings, self._all_round))]
         s.phase[tried], s.target_rad[tried] = LEAN, s.best_rad[tried]
 
-    def _begin_drive(self, s: Work, rows: np.ndarray, time: np.ndarray) -> None:
+    def _begin_drive(self, s: State, rows: np.ndarray, time: np.ndarray) -> None:
         s.phase[rows], s.driven[rows] = DRIVE, s.edge[rows]
         self._begin_run(s, rows, time)
 
-    def _begin_run(self, s: Work, rows: np.ndarray, time: np.ndarray) -> None:
+    def _begin_run(self, s: State, rows: np.ndarray, time: np.ndarray) -> None:
         if len(rows):
             s.run_end_s[rows], s.acts[rows] = time[rows] + self.config.run_s, 0
             s.watch_s[rows], s.least[rows] = time[rows] + self.config.watch_s, np.inf
             s.run_started[rows] = True
             s.put_hidden(rows, self.policy.start(len(rows)))
 
-    def _drive(self, s: Work, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> None:
+    def _drive(self, s: State, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> None:
         over = (time >= s.run_end_s - SLACK_S) | self._passed(s, images, heading, time)
         ended = np.flatnonzero((s.phase == DRIVE) & over)
         if len(ended):
@@ -272,7 +268,7 @@ class Navigator:
             s.angular[acting] = np.asarray(angular)[: len(acting)]
         s.acts[s.phase == DRIVE] += 1
 
-    def _passed(self, s: Work, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> np.ndarray:
+    def _passed(self, s: State, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> np.ndarray:
         """Return where of all nodes in question the edge's head is nearest, and getting farther, [B] bool."""
         passed = np.zeros(len(s.phase), bool)
         rows = np.flatnonzero(self._watches(s, time))
@@ -286,14 +282,14 @@ class Navigator:
             s.least[rows] = np.minimum(s.least[rows], there)
         return passed
 
-    def _begin_localise(self, s: Work, rows: np.ndarray) -> None:
+    def _begin_localise(self, s: State, rows: np.ndarray) -> None:
         s.phase[rows], s.looks[rows], s.edge[rows], s.run[rows] = LOCALISE, 0, -1, 0
         s.target_rad[rows] = np.nan
         s.evidence[rows] = self._no_evidence(len(rows))
         s.linear[rows] = s.angular[rows] = 0.0
         s.restart_pid(rows)
 
-    def _turn(self, s: Work, heading: np.ndarray, time: np.ndarray) -> None:
+    def _turn(self, s: State, heading: np.ndarray, time: np.ndarray) -> None:
         """Turn by PID to the target heading, as `simple_pid.PID` computes it."""
         rows = np.flatnonzero(_any_of(s.phase, TURNING) & ~np.isnan(s.target_rad))
         config, most = self.config, self.config.max_turn_rad_s

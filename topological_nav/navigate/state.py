@@ -1,9 +1,8 @@
-"""Define what a batch of navigators remembers, what happens to it in a step, and a copy that a step writes into."""
+"""Define what a batch of navigators remembers, and what happened to it in its last step."""
 
 from __future__ import annotations
 
 import dataclasses
-import types
 from typing import Any
 
 import jax
@@ -17,8 +16,26 @@ TURNING, OVER = (LOCALISE, FACE, SWING, LEAN), (ARRIVED, STOPPED, TIMED_OUT)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class State:
-    """Hold what a batch of B navigators remembers; N nodes, E edges. Every leaf has B rows."""
+class Events:
+    """Hold what happened in a step, [B] bool each; a caller may stop an episode whose run ended."""
+
+    localised: np.ndarray = column(False, bool)
+    """Turned about, and `State.node` is new."""
+    glanced: np.ndarray = column(False, bool)
+    """Saw a neighbour of the last node after a run, and `State.node` is new."""
+    lost: np.ndarray = column(False, bool)
+    """The map has no way from there."""
+    blocked: np.ndarray = column(False, bool)
+    """No heading near the edge's is open."""
+    run_started: np.ndarray = column(False, bool)
+    run_ended: np.ndarray = column(False, bool)
+    arrived: np.ndarray = column(False, bool)
+    timed_out: np.ndarray = column(False, bool)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class State(Events):
+    """Hold what a batch of B navigators remembers, and its last step; N nodes, E edges. Every leaf has B rows."""
 
     phase: np.ndarray = column(LOCALISE, np.int8)
     """i8, one of `PHASES`."""
@@ -80,51 +97,14 @@ class State:
         """Return which have arrived, stopped or run out of time, [B] bool."""
         return self.phase >= ARRIVED
 
-
-jax.tree_util.register_dataclass(State, [f.name for f in dataclasses.fields(State)], [])
-
-
-@dataclasses.dataclass(frozen=True)
-class Events:
-    """Hold what happened in a step, [B] bool each; a caller may stop an episode whose run ended."""
-
-    localised: np.ndarray
-    """Turned about, and `State.node` is new."""
-    glanced: np.ndarray
-    """Saw a neighbour of the last node after a run, and `State.node` is new."""
-    lost: np.ndarray
-    """The map has no way from there."""
-    blocked: np.ndarray
-    """No heading near the edge's is open."""
-    run_started: np.ndarray
-    run_ended: np.ndarray
-    arrived: np.ndarray
-    timed_out: np.ndarray
-
-
-class Work(types.SimpleNamespace):
-    """Hold a copy of a state that a step writes into, and its events."""
-
-    def __init__(self, state: State, batch: int):
-        """Copy the state of a batch."""
-        copied = {name: value if name == "hidden" else value.copy() for name, value in vars(state).items()}
-        super().__init__(**copied, **{field.name: np.zeros(batch, bool) for field in dataclasses.fields(Events)})
-
     def restart_pid(self, rows: np.ndarray) -> None:
         """Start turning to a new target: errors of before say nothing."""
         self.integral[rows], self.error_rad[rows] = 0.0, np.nan
 
     def put_hidden(self, rows: np.ndarray, new: Any) -> None:
         """Set rows of the local policy's state."""
+        for old, value in zip(jax.tree.leaves(self.hidden), jax.tree.leaves(new), strict=True):
+            old[rows] = np.asarray(value)
 
-        def put(old: Any, value: Any) -> np.ndarray:
-            out = np.array(old)
-            out[rows] = np.asarray(value)
-            return out
 
-        self.hidden = jax.tree.map(put, self.hidden, new)
-
-    def end(self) -> tuple[State, Events]:
-        """Return what it has become, and what happened."""
-        state, events = ({f.name: getattr(self, f.name) for f in dataclasses.fields(kind)} for kind in (State, Events))
-        return State(**state), Events(**events)
+jax.tree_util.register_dataclass(State, [f.name for f in dataclasses.fields(State)], [])

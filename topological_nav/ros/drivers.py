@@ -87,9 +87,10 @@ class PilotDriver:
     def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> VelocityCommand:
         """See `Driver.step`."""
         now = image[None], np.array([heading_rad]), np.array([time_s])
-        self._state, linear, angular, events = self._navigator.step(self._state, *now)
-        done = bool(events.arrived[0]) or bool(events.timed_out[0])
-        return VelocityCommand(0.0, 0.0, done=True) if done else VelocityCommand(float(linear[0]), float(angular[0]))
+        self._state = state = self._navigator.step(self._state, *now)
+        done = bool(state.arrived[0]) or bool(state.timed_out[0])
+        velocity = (0.0, 0.0) if done else (float(state.linear[0]), float(state.angular[0]))
+        return VelocityCommand(*velocity, done)
 
 
 def topological_driver(

@@ -75,8 +75,8 @@ def watched(contest):
     navigator.policy = Recorded(navigator.policy)
     steps = []
 
-    def watch(time_s, seen, state, events):
-        steps.append((time_s, seen, state, events, len(navigator.policy.calls)))
+    def watch(time_s, seen, state):
+        steps.append((time_s, seen, state, len(navigator.policy.calls)))
 
     played = NavigatorPlayer(venue.player, config, navigator, venue.camera, watch).play(venue.episodes)
     return venue, navigator.policy, steps, played
@@ -84,7 +84,7 @@ def watched(contest):
 
 def test_a_trained_policy_starts_every_run_with_a_fresh_memory_and_keeps_it_within(watched):
     _, policy, steps, played = watched
-    started = [steps[i][4] - 1 for i in range(len(steps)) if steps[i][3].run_started[0]]
+    started = [steps[i][3] - 1 for i in range(len(steps)) if steps[i][2].run_started[0]]
     assert played.runs[0] >= 2 and len(started) >= 2
     for number, (before, *_) in enumerate(policy.calls):
         if number in started:
@@ -101,9 +101,9 @@ def test_it_is_shown_level_images_of_where_the_robot_is_and_its_words_are_comman
     renderer = SceneRenderer(venue.scene, Lens(32, 32, venue.networks.camera.fov_deg))
     world = venue.player.env.world
     robot, about = get_robot("ttbot"), policy.policy.about
-    acted = [i for i in range(1, len(steps)) if steps[i][4] > steps[i - 1][4]]
+    acted = [i for i in range(1, len(steps)) if steps[i][3] > steps[i - 1][3]]
     for i in acted[:: max(1, len(acted) // 5)]:
-        _, seen, state, _, count = steps[i]
+        _, seen, state, count = steps[i]
         _, images, _, linear, angular = policy.calls[count - 1]
         assert images.shape == (1, 32, 32, 3) and images.dtype == np.uint8
         names, own, pos_w, quat_w = world_poses(world, 0, seen.qpos)
@@ -127,13 +127,13 @@ def test_its_memory_stays_with_its_episode_when_others_are_over(contest):
     )  # fmt: skip
     rows = np.array([2, 0])
     for t in range(5):
-        state, *_ = navigator.step(state, images[t], np.zeros(3), 0.1 * t)
+        state = navigator.step(state, images[t], np.zeros(3), 0.1 * t)
     fewer = state.take(rows)
     assert all(len(x) == 2 for x in jax.tree.leaves(fewer.hidden))
     for t in range(5, 10):
-        state, linear, angular, _ = navigator.step(state, images[t], np.zeros(3), 0.1 * t)
-        fewer, *commands = navigator.step(fewer, images[t][rows], np.zeros(2), 0.1 * t)
-        assert (commands[0] == linear[rows]).all() and (commands[1] == angular[rows]).all()
+        state = navigator.step(state, images[t], np.zeros(3), 0.1 * t)
+        fewer = navigator.step(fewer, images[t][rows], np.zeros(2), 0.1 * t)
+        assert (fewer.linear == state.linear[rows]).all() and (fewer.angular == state.angular[rows]).all()
     for whole, part in zip(jax.tree.leaves(state.hidden), jax.tree.leaves(fewer.hidden), strict=True):
         assert whole[rows] == pytest.approx(part, abs=1e-5) and np.abs(whole[0] - whole[2]).max() > 1e-3
 

@@ -67,9 +67,9 @@ class Robot:
         target = self.state.target_rad[0]
         if self.state.phase[0] in nav.TURNING and not math.isnan(target):
             self.heading = float(target)
-        out = self.navigator.step(self.state, seen((node, p)), np.array([self.heading]), self.time)
-        self.state, self.linear, self.angular, events = out
-        self.events.append(events)
+        self.state = self.navigator.step(self.state, seen((node, p)), np.array([self.heading]), self.time)
+        self.linear, self.angular = self.state.linear, self.state.angular
+        self.events.append(self.state)
         self.time = round(self.time + dt, 6)
         return int(self.state.phase[0])
 
@@ -405,12 +405,12 @@ def test_turning_is_what_simple_pid_computes():
     for k in range(40):
         dt = 0.1 if k % 3 else 0.15
         time += dt
-        state, linear, angular, _ = navigator.step(state, seen((0, 0.0)), np.array([heading]), time)
+        state = navigator.step(state, seen((0, 0.0)), np.array([heading]), time)
         expected = pid(-float(wrap_angle(3.0 - heading)), dt=dt)
         if state.phase[0] != FACE:  # reached
             break
-        assert angular[0] == pytest.approx(expected, abs=1e-9) and linear[0] == 0.0
-        heading += 0.9 * angular[0] * dt
+        assert state.angular[0] == pytest.approx(expected, abs=1e-9) and state.linear[0] == 0.0
+        heading += 0.9 * state.angular[0] * dt
     assert k > 10 and abs(wrap_angle(3.0 - heading)) <= math.radians(3.0)
     assert wrap_angle(np.array([math.pi, -math.pi, 3 * math.pi / 2])).tolist() == pytest.approx(
         [-math.pi, -math.pi, -math.pi / 2]
@@ -435,23 +435,23 @@ def played(navigator, goals, seeds, garbage=False, steps=900):
         images = seen(*[(nodes[t], p[t]) for nodes, p, _ in scripts])
         if garbage:
             images[~navigator.looks(state, heading, 0.1 * t)] = np.nan
-        state, _, angular, events = navigator.step(state, images, heading, 0.1 * t)
-        heading = heading + angular * [gain[t] for *_, gain in scripts] * 0.1
-        out.append((state, events))
+        state = navigator.step(state, images, heading, 0.1 * t)
+        heading = heading + state.angular * [gain[t] for *_, gain in scripts] * 0.1
+        out.append(state)
     return out
 
 
 def assert_same(a, b, rows_a=slice(None), rows_b=slice(None)):
     """Whether two plays are equal, row by row."""
     for one, two in zip(a, b, strict=True):
-        for x, y in zip(jax.tree.leaves(one[0]), jax.tree.leaves(two[0]), strict=True):
+        for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
             np.testing.assert_array_equal(x[rows_a], y[rows_b])
 
 
 def test_episodes_of_a_batch_know_nothing_of_each_other():
     navigator = square(swings=2, images=3)
     together = played(navigator, [1, 2, 3], [5, 6, 7])
-    phases = {int(p) for state, _ in together for p in state.phase}
+    phases = {int(p) for state in together for p in state.phase}
     assert {LOCALISE, FACE, SWING, DRIVE} <= phases
     for i, (goal, seed) in enumerate(zip([1, 2, 3], [5, 6, 7], strict=True)):
         assert_same(together, played(navigator, [goal], [seed]), slice(i, i + 1))
@@ -464,7 +464,7 @@ def test_images_that_are_not_looked_at_may_be_anything():
 
 def test_a_step_leaves_its_state_as_it_was():
     navigator = square()
-    state = played(navigator, [1, 2], [3, 4], steps=200)[-1][0]
+    state = played(navigator, [1, 2], [3, 4], steps=200)[-1]
     before = jax.tree.map(np.copy, state)
     navigator.step(state, seen((1, 0.9), (2, 0.9)), np.zeros(2), 20.0)
     for x, y in zip(jax.tree.leaves(state), jax.tree.leaves(before), strict=True):
