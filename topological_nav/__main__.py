@@ -20,11 +20,14 @@ from topological_nav.config import DATASET, RUNS
 from topological_nav.data.domains import AdaptConfig
 
 
+@dataclasses.dataclass(kw_only=True)
 class _Listed(Command):
-    """Base of the commands that list their settings."""
+    """Base of all commands, which have settings."""
 
     LISTED: ClassVar[dict[str, Any]]
     """Name of a group of settings -> their defaults."""
+    settings: Words = ()
+    """Change settings, listed below."""
 
     @classmethod
     def epilog(cls) -> str:
@@ -37,8 +40,6 @@ class _Listed(Command):
 class _Networks(_Listed):
     """Base of the commands that use networks."""
 
-    settings: Words = ()
-    """Change settings, listed below."""
     localiser: Annotated[Path | None, option(metavar="RUN")] = None
     """Network that embeds images (default: a trained one, else the packaged)."""
     detector: Annotated[Path | None, option(metavar="RUN")] = None
@@ -67,8 +68,6 @@ class Data(_Listed):
     LISTED = {"": configs.DataConfig(), " of drives": configs.DriveConfig()}
     scenes: Annotated[tuple[str, ...], *word("SCENE")]
     """Scene folders or sets of them."""
-    settings: Words = ()
-    """Change settings, listed below."""
     drives: Flag = False
     """Drive through the scenes, and render what the robot sees."""
     out: Annotated[Path | None, option("-o", metavar="DIR")] = None
@@ -155,8 +154,6 @@ class Export(_Listed):
     """Write finished runs as a small folder of weights in half precision."""
 
     LISTED = {"": configs.ExportConfig()}
-    settings: Words = ()
-    """Change settings, listed below."""
     localiser: Annotated[Path, option(metavar="RUN")] = RUNS / "rooms"
     """Network that embeds images."""
     detector: Annotated[Path, option(metavar="RUN")] = RUNS / "passages"

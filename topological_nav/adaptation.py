@@ -34,23 +34,13 @@ from interactive_nav_common.runs.folder import claimed, run_epochs
 from topological_nav.config import PITCHES
 from topological_nav.data.dataset import PassageImages, RoomImages, balanced, load_passages, load_rooms, read_header
 from topological_nav.data.domains import AdaptConfig, as_seen, preset
-from topological_nav.learn.learning import (
-    RESULTS,
-    Learner,
-    compiled_epoch,
-    initial,
-    keyed_batches,
-    labelled_epoch,
-    make_learner,
-    over,
-    phase_key,
-)
+from topological_nav.learn import learning
 from topological_nav.learn.networks import Network, Places, in_words, joined, localisation_scores, normalised
 from topological_nav.learn.training import (
-    Networks,
     Trained,
     class_scores,
     length_scores,
+    load_networks,
     load_trained,
     localisation,
     need_task,
@@ -105,7 +95,7 @@ def make_adapting(
     """Return the target's extractor as the source's, and a fresh critic."""
     critic = Critic(config.hidden)
     shapes = jax.eval_shape(critic.init, jax.random.PRNGKey(0), jax.ShapeDtypeStruct((1, size), jnp.float32))
-    weights = initial(shapes, config.seed)["params"]
+    weights = learning.initial(shapes, config.seed)["params"]
     # Copies: an epoch gives its argument's memory away, and the source's network is still needed.
     params, stats = jax.tree.map(jnp.array, (variables["params"], variables["batch_stats"]))
     tx, critic_tx = _optimisers(config)
@@ -145,7 +135,7 @@ def adversarial_epoch(network: Network, critic: Critic, config: AdaptConfig):
         new = Adapting(optax.apply_updates(state.params, change), stats, opt, weights, critic_opt)
         return new, {"loss": loss, "critic_loss": critics, "critic_accuracy": right}
 
-    return compiled_epoch(keyed_batches(config.batch), update)
+    return learning.compiled_epoch(learning.keyed_batches(config.batch), update)
 
 
 def target_statistics(trained: Trained, images: np.ndarray, batch: int, passes: int = 3) -> Trained:
@@ -177,8 +167,8 @@ def adapt_features(
         learned, unlabelled = (x.images[~x.test].reshape(-1, *x.images.shape[3:]) for x in (near, far))
         embedded = trained.embed(learned)
         state, critic = make_adapting(trained.network, trained.variables, embedded.shape[1], config)
-        epoch: Any = over(adversarial_epoch(trained.network, critic, config), unlabelled, embedded)
-        keys, kept = phase_key(config.seed, 3), "checkpoint-features.msgpack"
+        epoch: Any = learning.over(adversarial_epoch(trained.network, critic, config), unlabelled, embedded)
+        keys, kept = learning.phase_key(config.seed, 3), "checkpoint-features.msgpack"
         state = run_epochs(out, "features", state, epoch, config.epochs, keys, host, kept)
         variables = {"params": state.params, "batch_stats": state.batch_stats}
         adapted = save_trained(out, Trained(trained.network, variables, adapted_about(trained, config)))
@@ -192,7 +182,7 @@ def adapt_features(
         for name, network in (("before", trained), ("statistics", fitted), ("after", adapted)):
             nodes = (trained, near) if same else (network, far)
             results[name] = localisation_between(*nodes, network, far)
-        return write_json(out / RESULTS, results)
+        return write_json(out / learning.RESULTS, results)
 
 
 def adapted_about(trained: Trained, config: AdaptConfig) -> dict[str, Any]:
@@ -243,13 +233,14 @@ def passage_configurations(
     with claimed(out, {"task": "transfer", **to_dict(config), **about}):
         network, tx = trained.network, optax.adam(config.fine_tune_learning_rate)
         shape = (trained.about["data"]["height"], trained.about["data"]["width"])
-        fresh = make_learner(network, shape, tx, config.seed)
-        epoch = labelled_epoch(network, tx, config.fine_tune_batch, 0.0, True, learned.scored)
-        one, keys = over(epoch, learned.images, learned.free.astype(np.int32)), phase_key(config.seed, 3)
+        fresh = learning.make_learner(network, shape, tx, config.seed)
+        epoch = learning.labelled_epoch(network, tx, config.fine_tune_batch, 0.0, True, learned.scored)
+        one = learning.over(epoch, learned.images, learned.free.astype(np.int32))
+        keys = learning.phase_key(config.seed, 3)
         results: dict[str, Any] = {"fine_tuned_on": len(learned.images), "tested_on": len(tested.images)}
         for name, (from_source, tunes) in CONFIGURATIONS.items():
             # A copy: an epoch gives its argument's memory away.
-            learner = jax.tree.map(jnp.array, Learner.start(trained.variables, tx) if from_source else fresh)
+            learner = jax.tree.map(jnp.array, learning.Learner.start(trained.variables, tx) if from_source else fresh)
             if tunes:
                 kept = f"checkpoint-{name}.msgpack"
                 learner = run_epochs(out, name, learner, one, config.fine_tune_epochs, keys, host, kept)
@@ -259,7 +250,7 @@ def passage_configurations(
             results[name]["lengths"] = length_scores(logits, tested.free, trained.about["lengths_m"])
             if name == "D":
                 save_trained(out, dataclasses.replace(tuned, about=adapted_about(trained, config)))
-        return write_json(out / RESULTS, results)
+        return write_json(out / learning.RESULTS, results)
 
 
 def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detector_run: Path, config: AdaptConfig):
@@ -268,8 +259,7 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
     An edge is judged by the image of its node nearest to it in angle, 10 degrees off at most for 18 headings. Scores of
     the `build.Built` say how held-out images of the target are localised on it.
     """
-    localiser, detector = load_trained(localiser_run), load_trained(detector_run)
-    need_task(detector.about, "passages", "the detector")
+    networks = load_networks(localiser_run, detector_run, same=())
     scene = load_scene(scene_folder)
     header, data = read_header(target)
     rooms = target_rooms(target, config)
@@ -285,10 +275,10 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
     if not len(near_pairs(xy, config.edge_m)):
         raise FileError(f"no two positions of '{scene.name}' in {target} are within {config.edge_m} m; collect more")
     about = {"settings": to_dict(config), "data": header["settings"], "domain": to_dict(preset(config.domain))}
-    space, networks = free_space(scene, get_robot(data.robot).height_m), Networks(localiser, detector)
+    space = free_space(scene, get_robot(data.robot).height_m)
     built = judged_map(scene, space, xy, room, shown, networks, config.edge_m, config.passable, about)
     if held.any():
-        queries = Places(localiser.embed(level[held][:, ::3]), rooms.xy_w[held], rooms.label[held])
+        queries = Places(networks.localiser.embed(level[held][:, ::3]), rooms.xy_w[held], rooms.label[held])
         nodes = Places(built.map.embeddings, built.map.xy_w, label)
         built.scores["held-out images localised"] = in_words(localisation_scores(queries, nodes))
     return built

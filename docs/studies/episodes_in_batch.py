@@ -105,7 +105,7 @@ def measure(
     real = venue.sight(made)
     distances, passage = clock.timed("networks", real.distances), clock.timed("networks", real.passage)
     sight: Any = SimpleNamespace(summed=real.summed, distances=distances, passage=passage)
-    policy: Any = local_policy(contest, sight, venue.networks)
+    policy: Any = local_policy(contest.policy, sight, contest.config, venue.networks or ())
     policy.act = clock.timed("local policy", policy.act)
     for name in ("_reset_to", "_step"):
         setattr(venue.player, name, clock.timed("physics", getattr(venue.player, name)))

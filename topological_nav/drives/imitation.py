@@ -31,6 +31,7 @@ from topological_nav.drives.driving import Forward, Frames, Policy, fresh_params
 from topological_nav.drives.expert import CONTROL_S
 from topological_nav.learn.learning import RESULTS, Epoch, Learner, descent_epoch, shuffled, write_network
 from topological_nav.learn.training import class_scores
+from topological_nav.scenes.rendering import batched
 
 GRID = [(alpha, lam) for alpha in (0.1, 10.0, 50.0) for lam in (0.1, 0.5, 1.0)]
 """All pairs of the alphas and lambdas in the report's table II, which has three of them."""
@@ -239,14 +240,13 @@ def _scores(
     features: np.ndarray, learner: Learner, policy: Policy, forward: Forward, held_out: Sequences, config: PolicyConfig
 ) -> dict[str, Any]:
     """Compare the policy's commands on held-out drives with the expert's, and the forward model with no change."""
-    columns = []
-    for first in range(0, len(held_out), config.batch):
-        rows = np.minimum(np.arange(first, first + config.batch), len(held_out) - 1)
-        part = held_out.take(rows)
-        u = jnp.asarray(features[part.rows], jnp.float32)
-        judged = _judged(policy, forward, learner.params, learner.batch_stats, u, part.linear, part.angular)
-        columns.append([np.asarray(c)[: len(held_out) - first] for c in judged])
-    linear, angular, predicted, still = (np.concatenate(c) for c in zip(*columns, strict=True))
+
+    def judged(rows: np.ndarray, *commands: np.ndarray) -> Any:
+        u = jnp.asarray(features[rows], jnp.float32)
+        return _judged(policy, forward, learner.params, learner.batch_stats, u, *commands)
+
+    parts = held_out.rows, held_out.linear, held_out.angular
+    linear, angular, predicted, still = batched(judged, parts, (config.batch,))
     out: dict[str, Any] = {"steps": int(held_out.valid.sum())}
     for name, chosen, truth, count in (
         ("linear", linear, held_out.linear, config.linear_classes),

@@ -35,8 +35,7 @@ from interactive_nav_common.versions import versions
 from topological_nav.config import PASSAGE_POLICY, DataConfig, EvaluationConfig, MapConfig
 from topological_nav.data.domains import as_seen_from, preset
 from topological_nav.data.folders import lens_of
-from topological_nav.drives import driving
-from topological_nav.drives.driving import LocalPolicy
+from topological_nav.drives.driving import local_policy
 from topological_nav.evaluate.evaluation import (
     ActionPlayer,
     Contender,
@@ -100,6 +99,8 @@ class Contest:
             raise ConfigError("contender ppo needs the run folder of a trained policy: --ppo RUN")
         if preset(self.domain) != preset("clean") and self.truth:
             raise ConfigError(f"--domain {self.domain} is of images, --truth has none; leave one of them out")
+        if self.truth and self.policy != PASSAGE_POLICY:
+            raise ConfigError(f"--policy {self.policy} looks at images, --truth has none; leave one of them out")
         names = [Path(s).resolve().name for s in self.scenes]
         if len(set(names)) < len(names):
             raise ConfigError(f"scenes are {', '.join(names)}, expected different names")
@@ -181,7 +182,8 @@ class ContestScene:
         """Return the navigator of the dense or the sparse map."""
         graph = self.map_of(contender)
         sight = self.sight(graph)
-        return Navigator(graph, sight, local_policy(self.contest, sight, self.networks), self.contest.config)
+        policy = local_policy(self.contest.policy, sight, self.contest.config, self.networks or ())
+        return Navigator(graph, sight, policy, self.contest.config)
 
     def contender(self, name: str) -> Contender:
         """Return the contender of a name, with what plays its episodes."""
@@ -224,13 +226,6 @@ class ContestScene:
                 size = [drawn.supersample] if drawn.supersample != learned_from.supersample else []
                 request["drawn"] = [drawn.engine, drawn.fov_deg, *size]
         return {**request, "policy": self.contest.policy, "weights": _digest_of(self.contest.policy)}
-
-
-def local_policy(contest: Contest, sight: Sight, networks: Networks | None) -> LocalPolicy:
-    """Return what drives along edges; a trained policy sees through adapted networks where the navigator does."""
-    if contest.truth and contest.policy != PASSAGE_POLICY:
-        raise ConfigError(f"--policy {contest.policy} looks at images, --truth has none; leave one of them out")
-    return driving.local_policy(contest.policy, sight, contest.config, networks or ())
 
 
 def _digest_of(policy: str) -> str:

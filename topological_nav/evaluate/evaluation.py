@@ -22,8 +22,7 @@ from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.grids import label
 from interactive_nav_common.rows import Rows, column, fresh
 from topological_nav.config import EvaluationConfig
-from topological_nav.navigate.navigator import Navigator
-from topological_nav.navigate.state import Events, State
+from topological_nav.navigate.navigator import Events, Navigator, State
 from topological_nav.scenes.rendering import Camera, Snapshot, episode_starts
 from topological_nav.scenes.space import FreeSpace, Rooms
 

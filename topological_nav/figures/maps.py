@@ -25,7 +25,7 @@ from topological_nav.evaluate.contest import Contest, ContestScene, contest_scen
 from topological_nav.evaluate.evaluation import DrivenEpisodes, NavigatorPlayer, Played
 from topological_nav.maps.build import Built
 from topological_nav.maps.graph import Route, TopologicalMap
-from topological_nav.navigate.state import FACE, PHASES, State
+from topological_nav.navigate.navigator import FACE, PHASES, State
 from topological_nav.scenes.rendering import Snapshot
 from topological_nav.scenes.space import FreeSpace
 

@@ -177,18 +177,6 @@ def _norm(train: bool) -> Any:
     return nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5)
 
 
-def nearest_node(queries: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the node with the nearest embedding over all images of all nodes, and the distance to that image.
-
-    Queries [Q, D] and nodes [N, K, D] give [Q] i32 nodes, of equals the first, and [Q] f32 Euclidean distances.
-    """
-    # In double precision: images of neighbouring nodes differ by less than single precision loses here.
-    queries, flat = queries.astype(float), nodes.reshape(-1, nodes.shape[-1]).astype(float)
-    best = squares_between(queries, flat).argmin(1)
-    gap = np.linalg.norm(queries - flat[best], axis=-1)
-    return (best // nodes.shape[1]).astype(np.int32), gap.astype(np.float32)
-
-
 def squares_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the squared distances [n, m] of rows [n, D] and [m, D]."""
     return (a**2).sum(-1)[:, None] + (b**2).sum(-1) - 2.0 * a @ b.T
@@ -216,14 +204,16 @@ class Places(NamedTuple):
 
 
 def localisation_scores(queries: Places, nodes: Places) -> dict[str, float]:
-    """Return how well `nearest_node` does in one scene.
+    """Return how well queries are localised in one scene, by the nearest embedding over all images of all nodes.
 
     `node` is the share of queries given the node that is nearest in truth; `room`: share given a node of the same
     room; `error_m`: median distance to the node given; `least_error_m`: the same for the nearest in truth.
     """
     each = queries.embeddings.shape[1]
     xy_w, room = np.repeat(queries.xy_w, each, 0), np.repeat(queries.room, each)
-    node, _ = nearest_node(queries.embeddings.reshape(-1, queries.embeddings.shape[-1]), nodes.embeddings)
+    # In double precision: images of neighbouring nodes differ by less than single precision loses here.
+    looked, shown = (of.embeddings.reshape(-1, of.embeddings.shape[-1]).astype(float) for of in (queries, nodes))
+    node = squares_between(looked, shown).argmin(1) // nodes.embeddings.shape[1]
     away = np.linalg.norm(xy_w[:, None] - nodes.xy_w, axis=-1)
     return {
         "node": float((node == away.argmin(1)).mean()),

@@ -27,21 +27,7 @@ from interactive_nav_common.jobs.progress import ALONE, Host
 from interactive_nav_common.runs.folder import CHECKPOINT, claimed, read_state, run_epochs
 from topological_nav.config import PITCHES, DataConfig, NetworkTrainConfig
 from topological_nav.data.dataset import RoomImages, load_passages, load_rooms, logits_at, read_header
-from topological_nav.learn.learning import (
-    DESCRIPTION,
-    RESULTS,
-    in_batches,
-    labelled_epoch,
-    make_learner,
-    over,
-    paired_epoch,
-    phase_key,
-    read_description,
-    read_weights,
-    variable_shapes,
-    with_backbone,
-    write_network,
-)
+from topological_nav.learn import learning
 from topological_nav.learn.networks import Contrast, Network, Places, localisation_scores
 
 SAME = ("robot", "engine", "width", "height", "fov_deg")
@@ -84,7 +70,7 @@ class Trained:
                 f"images are {images.shape[-3:]}, expected {expected}, the size that the network learned from"
             )
         method_of = functools.partial(_applied, self.network, method, self.variables)
-        rows = in_batches(method_of, images.reshape(-1, *expected))
+        rows = learning.in_batches(method_of, images.reshape(-1, *expected))
         return rows.reshape(*images.shape[:-3], *rows.shape[1:])
 
 
@@ -122,25 +108,26 @@ def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host:
     with claimed(out, {"task": task, "dataset": header, **to_dict(config)}):
         outputs, tx = len(work.lengths_m or work.rooms.names), optax.adam(config.learning_rate)
         network = Network(task, config.network, config.width, config.hidden, outputs)
-        learner = make_learner(network, (data.height, data.width), tx, config.seed)
+        learner = learning.make_learner(network, (data.height, data.width), tx, config.seed)
         if config.init == "selfsup":
             saved = read_state(out / CHECKPOINT)
             if not saved or saved["phase"] == "pairs":  # that of the later phase holds this one's outcome
                 places = work.rooms.images[~work.rooms.test]
                 places = places.reshape(-1, *places.shape[2:])  # the headings of a place and pitch
                 contrast, pairs_tx = Contrast(config.network, config.width), optax.adam(config.selfsup_learning_rate)
-                one = over(paired_epoch(contrast, pairs_tx, config.selfsup_batch), places, np.zeros(0, np.int32))
-                paired = make_learner(contrast, places.shape[2:4], pairs_tx, config.seed)
-                key, epochs = phase_key(config.seed, 1), config.selfsup_epochs
+                epoch = learning.paired_epoch(contrast, pairs_tx, config.selfsup_batch)
+                one = learning.over(epoch, places, np.zeros(0, np.int32))
+                paired = learning.make_learner(contrast, places.shape[2:4], pairs_tx, config.seed)
+                key, epochs = learning.phase_key(config.seed, 1), config.selfsup_epochs
                 paired = run_epochs(out, "pairs", paired, one, epochs, key, host)
-                learner = with_backbone(learner, paired.variables)
+                learner = learning.with_backbone(learner, paired.variables)
         elif config.init != "scratch":
             donor = load_trained(Path(config.init))
             about = f"it is {donor.about['backbone']} of width {donor.about['width']}"
-            learner = with_backbone(learner, donor.variables, f"init: {config.init} does not fit", about)
-        epoch = labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment, work.scored)
-        one = over(epoch, work.images, work.labels)
-        learner = run_epochs(out, "labels", learner, one, config.epochs, phase_key(config.seed, 2), host)
+            learner = learning.with_backbone(learner, donor.variables, f"init: {config.init} does not fit", about)
+        epoch = learning.labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment, work.scored)
+        one = learning.over(epoch, work.images, work.labels)
+        learner = run_epochs(out, "labels", learner, one, config.epochs, learning.phase_key(config.seed, 2), host)
         about = {
             "task": task,
             "backbone": config.network,
@@ -153,29 +140,30 @@ def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host:
             "fov_deg": header["fov_deg"],
             "parameters": int(sum(np.size(x) for x in jax.tree.leaves(learner.params))),
         }
-        return write_json(out / RESULTS, _scores(save_trained(out, Trained(network, learner.variables, about)), work))
+        trained = save_trained(out, Trained(network, learner.variables, about))
+        return write_json(out / learning.RESULTS, _scores(trained, work))
 
 
 def save_trained(out: Path, trained: Trained) -> Trained:
     """Write a network as `load_trained` reads it; return it with the digest of its weights in `about`."""
     about = {name: value for name, value in trained.about.items() if name != "export"}
-    write_network(out, trained.variables, about)
+    learning.write_network(out, trained.variables, about)
     return dataclasses.replace(trained, about=about)
 
 
 def load_trained(run: Path) -> Trained:
     """Load the network of a finished run, or of an export of one: its weights are f32 in memory either way."""
     run = Path(run)
-    about = read_description(run, "network", "TASK")
+    about = learning.read_description(run, "network", "TASK")
     if about["task"] == "passages" and "lengths_m" not in about:
         raise FileError(
             f"{run}: does not say for which lengths it judges passages (lengths_m): it is of an older version; make "
             "its dataset again and train it again"
         )
-    with readable(run / DESCRIPTION, FileError, "train again"):
+    with readable(run / learning.DESCRIPTION, FileError, "train again"):
         network = Network(about["task"], about["backbone"], about["width"], about["hidden"], about["outputs"])
-        template = variable_shapes(network, (about["data"]["height"], about["data"]["width"]))
-    return Trained(network, read_weights(run, template, about), about, run)
+        template = learning.variable_shapes(network, (about["data"]["height"], about["data"]["width"]))
+    return Trained(network, learning.read_weights(run, template, about), about, run)
 
 
 def _work(task: str, dataset: Path, config: NetworkTrainConfig) -> _Work:

@@ -198,11 +198,6 @@ def build_map(
     """Build a scene's map by the run folders of a network whose embedding localises and of a passage detector.
 
     Drawn images are kept in the folder `parts`, if any, so that a map that was stopped goes on.
-
-    Raises:
-        ConfigError: no place of the scene is clear enough.
-        FileError: a run without such a network.
-        SceneError: an unusable scene.
     """
     networks = load_networks(localiser_run, detector_run)
     data = drawn_for(networks.camera, config.supersample)

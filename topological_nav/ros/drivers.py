@@ -18,8 +18,7 @@ from topological_nav.drives.driving import local_policy
 from topological_nav.learn.training import load_networks
 from topological_nav.maps.build import NetworkSight
 from topological_nav.maps.graph import load_map
-from topological_nav.navigate.navigator import Navigator
-from topological_nav.navigate.state import State
+from topological_nav.navigate.navigator import Navigator, State
 from topological_nav.ros.config import HeadingConfig
 from topological_nav.ros.messages import seen_through
 from topological_nav.weights.export import Choice

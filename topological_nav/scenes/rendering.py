@@ -157,8 +157,8 @@ def calls(count: int, sizes: tuple[int, ...]) -> list[int]:
     return out
 
 
-def batched(function: Callable[..., Any], arrays: Sequence[np.ndarray], sizes: tuple[int, ...]) -> np.ndarray:
-    """Return a function's rows of arrays [N, ...], in calls of these sizes only, each of which is compiled.
+def batched(function: Callable[..., Any], arrays: Sequence[np.ndarray], sizes: tuple[int, ...]) -> Any:
+    """Return a function's rows, a tree, of arrays [N, ...], in calls of these sizes only, each of which is compiled.
 
     The last call is padded by the last row.
     """
@@ -167,9 +167,9 @@ def batched(function: Callable[..., Any], arrays: Sequence[np.ndarray], sizes: t
         rows = np.minimum(np.arange(first, first + size), count - 1)
         call, first = function(*(array[rows] for array in arrays)), first + size
         if waiting is not None:  # copied while an accelerator works on the next
-            out.append(np.asarray(waiting))
+            out.append(jax.tree.map(np.asarray, waiting))
         waiting = call
-    return np.concatenate([*out, np.asarray(waiting)])[:count]
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *out, jax.tree.map(np.asarray, waiting))
 
 
 def shrink(images: Any, by: int) -> Any:

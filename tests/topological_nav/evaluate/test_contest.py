@@ -24,7 +24,7 @@ from topological_nav.learn.learning import WEIGHTS
 from topological_nav.learn.training import load_trained, save_trained
 from topological_nav.maps.build import drawn_for
 from topological_nav.maps.graph import load_map, save_map
-from topological_nav.navigate.state import DRIVE
+from topological_nav.navigate.navigator import DRIVE
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose
 from topological_nav.scenes.space import RECORDED
 

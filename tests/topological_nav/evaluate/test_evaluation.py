@@ -26,7 +26,7 @@ from topological_nav.config import EvaluationConfig
 from topological_nav.evaluate import contest as contests
 from topological_nav.evaluate.contest import Contest, ContestScene, _stem, contest_scenes, play_contest
 from topological_nav.evaluate.evaluation import Contender, DrivenEpisodes, count_of, draw_episodes, learned
-from topological_nav.navigate.state import Events
+from topological_nav.navigate.navigator import Events
 from topological_nav.scenes.rendering import Snapshot, episode_starts
 from topological_nav.scenes.space import RECORDED, find_rooms
 from topological_nav.weights import export as packaged

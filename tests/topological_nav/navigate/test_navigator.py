@@ -13,8 +13,17 @@ from interactive_nav_common.rotations import wrap_angle
 from tests.topological_nav.maps.test_graph import hand_map
 from topological_nav.config import NavigatorConfig
 from topological_nav.navigate import navigator as nav
-from topological_nav.navigate.navigator import Navigator
-from topological_nav.navigate.state import ARRIVED, DRIVE, FACE, LEAN, LOCALISE, STOPPED, SWING, TIMED_OUT
+from topological_nav.navigate.navigator import (
+    ARRIVED,
+    DRIVE,
+    FACE,
+    LEAN,
+    LOCALISE,
+    STOPPED,
+    SWING,
+    TIMED_OUT,
+    Navigator,
+)
 
 SQUARE = ((0.0, 0.0), (2.0, 0.0), (2.0, 2.0), (0.0, 2.0))
 """Nodes 0 to 3 around a square of 2 m; edges reach 2.9 m, so that its diagonals are edges too."""
