@@ -25,7 +25,8 @@ import jax
 from interactive_nav_common.config import overridden
 from interactive_nav_common.rows import markdown
 from topological_nav.config import EvaluationConfig
-from topological_nav.evaluate.contest import Contest, ContestScene, local_policy
+from topological_nav.drives.driving import local_policy
+from topological_nav.evaluate.contest import Contest, ContestScene
 from topological_nav.evaluate.evaluation import NavigatorPlayer, Played
 from topological_nav.learn.training import load_networks
 from topological_nav.navigate.navigator import Navigator

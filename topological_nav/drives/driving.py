@@ -238,8 +238,7 @@ class TrainedPolicy:
 
     def start(self, batch: int) -> Any:
         """See `LocalPolicy`."""
-        fresh = np.zeros((batch, self._policy.hidden), np.float32)
-        return fresh, fresh.copy()
+        return jax.tree.map(np.asarray, self._policy.fresh(batch))
 
     def act(self, state: Any, images: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
         """See `LocalPolicy`."""

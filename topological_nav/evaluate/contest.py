@@ -99,8 +99,6 @@ class Contest:
             raise ConfigError("contender ppo needs the run folder of a trained policy: --ppo RUN")
         if preset(self.domain) != preset("clean") and self.truth:
             raise ConfigError(f"--domain {self.domain} is of images, --truth has none; leave one of them out")
-        if self.truth and self.policy != PASSAGE_POLICY:
-            raise ConfigError(f"--policy {self.policy} looks at images, --truth has none; leave one of them out")
         names = [Path(s).resolve().name for s in self.scenes]
         if len(set(names)) < len(names):
             raise ConfigError(f"scenes are {', '.join(names)}, expected different names")
@@ -182,8 +180,10 @@ class ContestScene:
         """Return the navigator of the dense or the sparse map."""
         graph = self.map_of(contender)
         sight = self.sight(graph)
-        policy = local_policy(self.contest.policy, sight, self.contest.config, self.networks or ())
-        return Navigator(graph, sight, policy, self.contest.config)
+        name, config = self.contest.policy, self.contest.config
+        if self.contest.truth and name != PASSAGE_POLICY:
+            raise ConfigError(f"--policy {name} looks at images, --truth has none; leave one of them out")
+        return Navigator(graph, sight, local_policy(name, sight, config, self.networks or ()), config)
 
     def contender(self, name: str) -> Contender:
         """Return the contender of a name, with what plays its episodes."""

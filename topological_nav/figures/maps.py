@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import io
 import textwrap
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -91,11 +90,11 @@ def plan_picture(space: FreeSpace, graph: TopologicalMap, passable: float, heigh
     floor_plan(axis, space)
     axis.set_aspect("auto")
     map_lines(axis, graph, passable)
-    memory = io.BytesIO()
-    figure.savefig(memory, dpi=100, format="png")
+    canvas: Any = figure.canvas
+    canvas.draw()
+    picture = np.asarray(Image.fromarray(np.array(canvas.buffer_rgba())).convert("RGB").resize((width, height)))
     (x0, x1), (y0, y1) = axis.get_xlim(), axis.get_ylim()
     plt.close(figure)
-    picture = np.asarray(Image.open(memory).convert("RGB").resize((width, height)))
     scale = np.array([width / (x1 - x0), -height / (y1 - y0)])
 
     def pixels(xy_w: np.ndarray) -> np.ndarray:

@@ -105,8 +105,6 @@ class Navigator(Command):
         if self.driver == "heading":
             options = "--map --localiser --detector --policy --goal --goal-heading"
             refuse_unused(self, options, "with --driver heading, only with --driver topological")
-        elif self.map is None:
-            raise UserError("--driver topological needs a map: --map PATH")
 
     @classmethod
     def epilog(cls) -> str:
@@ -139,6 +137,16 @@ def need_ros() -> Any:
     for module in ("sensor_msgs.msg", "nav_msgs.msg", "geometry_msgs.msg", "rosgraph_msgs.msg", "std_msgs.msg"):
         optional(module, line)
     return optional("rclpy", line)
+
+
+def _networks(arguments: Navigator) -> Any:
+    from topological_nav.weights.export import choose
+
+    if arguments.map is None:
+        raise UserError("--driver topological needs a map: --map PATH")
+    chosen = choose(arguments.localiser, arguments.detector, arguments.policy)
+    chosen.report()
+    return chosen
 
 
 def _all(arguments: All, stops: list[int]) -> None:
@@ -194,19 +202,15 @@ def _sim(arguments: Sim, stops: list[int]) -> None:
 
 def _navigator(arguments: Navigator, stops: list[int]) -> None:
     config = overridden(DRIVERS[arguments.driver](), arguments.settings)
-    chosen = None
-    if arguments.map is not None:
-        from topological_nav.weights.export import choose
-
-        chosen = choose(arguments.localiser, arguments.detector, arguments.policy)
-        chosen.report()
+    chosen = _networks(arguments) if arguments.driver == "topological" else None
     need_ros()
     from topological_nav.ros import drivers
     from topological_nav.ros.nodes import NavigatorNode, ros_node
 
-    if arguments.map is None or chosen is None:
+    if chosen is None:
         driver: drivers.Driver = drivers.HeadingDriver(config)
     else:
+        assert arguments.map is not None
         goal = arguments.goal, arguments.goal_heading or 0.0
         driver = drivers.topological_driver(arguments.map, chosen, *goal, config)
     with ros_node("navigator") as node:

@@ -17,8 +17,9 @@ from tests.topological_nav.conftest import Made
 from topological_nav.__main__ import main
 from topological_nav.config import DataConfig, EvaluationConfig
 from topological_nav.data.domains import as_seen_from, preset
+from topological_nav.drives.driving import local_policy
 from topological_nav.evaluate import contest as rows
-from topological_nav.evaluate.contest import Contest, contest_scenes, local_policy
+from topological_nav.evaluate.contest import Contest, contest_scenes
 from topological_nav.evaluate.evaluation import NavigatorPlayer
 from topological_nav.learn.learning import WEIGHTS
 from topological_nav.learn.training import load_trained, save_trained
@@ -216,7 +217,7 @@ def test_a_map_collected_in_the_target_domain_is_driven_on_there(contest, made, 
     saved = save_trained(adapted, dataclasses.replace(saved, about={**about, "adapted_from": "another"}))
     (venue,) = contest_scenes(there)
     with pytest.raises(FileError, match="is not the network that .* learned with"):
-        local_policy(there, None, venue.networks)  # type: ignore[arg-type]
+        local_policy(there.policy, None, there.config, venue.networks)  # type: ignore[arg-type]
 
 
 def test_images_are_drawn_by_the_maps_engine_and_lens(contest, made, tmp_path):
