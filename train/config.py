@@ -275,22 +275,6 @@ def validate(config: TrainConfig) -> None:
     """Raise `ConfigError` where values exclude each other; what is still None is not looked at."""
     if not config.env.scenes:
         raise ConfigError("env.scenes is empty, expected at least one scene folder: env.scenes=PATH[,PATH...]")
-    _validate_used(config)
-    section = getattr(config, config.algorithm)
-    if isinstance(section, OffPolicyConfig):
-        _validate_replay(config.algorithm, section, config.run.num_timesteps)
-    ppo = config.ppo
-    if ppo.num_envs and ppo.batch_size and ppo.num_minibatches:
-        collected = ppo.batch_size * ppo.num_minibatches
-        if collected % ppo.num_envs:
-            raise ConfigError(
-                f"ppo.batch_size * ppo.num_minibatches is {collected} sequences, expected a multiple of "
-                f"ppo.num_envs ({ppo.num_envs}); change one of the three"
-            )
-
-
-def _validate_used(config: TrainConfig) -> None:
-    """Raise `ConfigError` where a setting of a section that is not used was changed."""
     images = any(name in config.env.observations for name in IMAGES)
     for name in ("network", *AUTO):
         section, auto = getattr(config, name), AUTO.get(name, {}).values()
@@ -302,6 +286,17 @@ def _validate_used(config: TrainConfig) -> None:
                 needs = "images among env.observations" if name == "network" else f"algorithm {name}"
                 problem = f"{name}.{field.name} is {value!r}, which changes nothing here"
                 raise ConfigError(f"{problem}: expected {needs}; or leave it out")
+    section = getattr(config, config.algorithm)
+    if isinstance(section, OffPolicyConfig):
+        _validate_replay(config.algorithm, section, config.run.num_timesteps)
+    ppo = config.ppo
+    if ppo.num_envs and ppo.batch_size and ppo.num_minibatches:
+        collected = ppo.batch_size * ppo.num_minibatches
+        if collected % ppo.num_envs:
+            raise ConfigError(
+                f"ppo.batch_size * ppo.num_minibatches is {collected} sequences, expected a multiple of "
+                f"ppo.num_envs ({ppo.num_envs}); change one of the three"
+            )
 
 
 def _validate_replay(name: str, config: OffPolicyConfig, num_timesteps: int) -> None:

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import signal
 from typing import Any
 
 from interactive_nav_common.errors import ConfigError, missing, optional
@@ -9,7 +10,7 @@ from interactive_nav_common.jobs.processes import LOST, Child, Job, Launcher, Sh
 
 
 class Worker(Child):
-    """In the actor: the job's process, with the GPU that Ray gave it; `stop` and `kill` come while `wait` waits."""
+    """In the actor: the job's process, with the GPU that Ray gave it; `send` comes while `wait` waits."""
 
     def __init__(self, job: Job, cwd: str, fraction: float):
         os.chdir(cwd)
@@ -35,13 +36,9 @@ class Actor:
         self._ray.kill(self._worker)
         return code
 
-    def stop(self) -> None:
-        """Ask the job to save and end."""
-        self._worker.stop.remote()
-
-    def kill(self) -> None:
-        """End the job."""
-        self._worker.kill.remote()
+    def send(self, number: signal.Signals) -> None:
+        """Send the job a signal."""
+        self._worker.send.remote(number)
 
 
 class RayLauncher(Launcher):
@@ -80,9 +77,9 @@ class RayLauncher(Launcher):
         room = self._worker.options(num_cpus=job.cpus, num_gpus=share[1])
         return Actor(self._ray, room.remote(job, os.getcwd(), share[1]))
 
-    def start(self, job: Job) -> str | None:
-        """Start a job; which node runs it, the cluster decides."""
-        return super().start(job) and "ray"
+    def where(self, share: Share) -> str:
+        """Return the cluster's name: which node runs a job, it decides."""
+        return "ray"
 
     def close(self) -> None:
         """Leave the cluster."""

@@ -2,13 +2,14 @@
 
 import contextlib
 import dataclasses
+import itertools
 import math
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +96,7 @@ class Child:
             return LOCKED
         code = self._process.poll()
         if code is None and time.monotonic() > self._until:
-            self.kill()
+            self.send(signal.SIGKILL)
             self._process.wait()
             return LATE
         return code
@@ -104,15 +105,8 @@ class Child:
         """Wait until it has ended; return what `poll` does."""
         return LOCKED if self._process is None else self._process.wait()
 
-    def stop(self) -> None:
-        """Ask it to save and end."""
-        self._signal(signal.SIGTERM)
-
-    def kill(self) -> None:
-        """End it and its children."""
-        self._signal(signal.SIGKILL)
-
-    def _signal(self, number: signal.Signals) -> None:
+    def send(self, number: signal.Signals) -> None:
+        """Ask it to save and end with SIGTERM; end it and its children with SIGKILL."""
         if self._process is not None and self._process.poll() is None:
             if number == signal.SIGKILL:
                 os.killpg(self._process.pid, number)
@@ -125,7 +119,7 @@ class Launcher:
 
     def __init__(self) -> None:
         self.running: list[tuple[Any, Any, Share]] = []
-        """Job, its process (a `Child`, or what has its `poll`, `stop` and `kill`), and its share."""
+        """Job, its process (a `Child`, or what has its `poll` and `send`), and its share."""
 
     def take(self, job: Any) -> Share | None:
         """Return a share for a job, beside those that run; None where there is no room now."""
@@ -141,6 +135,10 @@ class Launcher:
         if share is None:
             return None
         self.running.append((job, self.begin(job, share), share))
+        return self.where(share)
+
+    def where(self, share: Share) -> str:
+        """Return where a job with a share runs, in a few words."""
         return "cpu" if share[0] is None else f"gpu {share[0]}"
 
     def ended(self) -> list[tuple[Any, int]]:
@@ -149,24 +147,19 @@ class Launcher:
         self.running = [one for one, code in polled if code is None]
         return [(job, code) for (job, *_), code in polled if code is not None]
 
-    def stop(self) -> None:
-        """Ask every job to save and end."""
+    def send(self, number: signal.Signals) -> None:
+        """Send SIGTERM, so that they save and end, or SIGKILL to all jobs."""
         for _, process, _ in self.running:
-            process.stop()
-
-    def kill(self) -> None:
-        """End every job."""
-        for _, process, _ in self.running:
-            process.kill()
+            process.send(number)
 
     def end(self, grace_s: float) -> None:
         """Stop what still runs, kill it after `grace_s`, and close."""
-        self.stop()
+        self.send(signal.SIGTERM)
         deadline = time.monotonic() + grace_s
         while self.running and time.monotonic() < deadline:
             self.ended()
             time.sleep(POLL_S)
-        self.kill()
+        self.send(signal.SIGKILL)
         self.close()
 
     def close(self) -> None:
@@ -185,18 +178,44 @@ class LocalLauncher(Launcher):
         return (None, 1.0 / self._side_by_side) if len(self.running) < self._side_by_side else None
 
 
-def run_jobs(launcher: Launcher, jobs: Iterable[Job], grace_s: float) -> Generator[tuple[Job, int], None, None]:
+def run_jobs(
+    launcher: Launcher,
+    jobs: Iterable[Any] | Callable[[], Iterable[Any] | None],
+    grace_s: float,
+    poll_s: float = POLL_S,
+) -> Generator[tuple[Any, int], None, None]:
     """Run jobs where there is room; yield each, with its exit code, as it ends: one that fails stops no other.
 
-    A job is drawn from `jobs` once the one before has room. Closed early, by a signal or an error, it ends what runs.
+    Closed early, by a signal or an error, it ends what runs.
+
+    Args:
+        launcher: where they run.
+        jobs: in turn, each drawn once the one before has room; or a function that returns those that may start now, the
+            most urgent first, or None if no more will come. It is called before each look for room, so what it returns
+            may depend on what has ended: stages, jobs to try again, limits.
+        grace_s: between asking what runs to save and end, and killing it.
+        poll_s: between two looks.
     """
-    left = iter(jobs)
-    job = next(left, None)
+    ready = jobs if callable(jobs) else _in_turn(jobs)
     try:
-        while job or launcher.running:
-            while job and launcher.start(job):
-                job = next(left, None)
+        while (todo := ready()) is not None or launcher.running:
+            for job in todo or ():
+                if not launcher.start(job):
+                    break
+            time.sleep(poll_s)
             yield from launcher.ended()
-            time.sleep(POLL_S)
     finally:
         launcher.end(grace_s)
+
+
+def _in_turn(jobs: Iterable[Any]) -> Callable[[], Iterator[Any] | None]:
+    """Return a function that returns the jobs that are left; one is left until the next one is drawn."""
+    left = iter(jobs)
+    head = list(itertools.islice(left, 1))
+
+    def drawn() -> Iterator[Any]:
+        while head:
+            yield head[0]
+            head[:] = itertools.islice(left, 1)
+
+    return lambda: drawn() if head else None

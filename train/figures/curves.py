@@ -20,7 +20,6 @@ GOALS = "goals_per_1000_steps"
 GOALS_LABEL = "goals reached in 1,000 env steps"
 """Of sweeps: their runs may end before every environment has had the time of a whole episode, and until then the
 episodes that end are those that succeed; goals reached in a number of steps count the others by their steps."""
-SHARES = ("episode/success", "episode/ins_0.5")
 SMOOTHED = 40
 """Curves of more points than this are drawn as running means over a twentieth of them."""
 
@@ -32,7 +31,9 @@ def learning_curves(runs: Mapping[str, list[dict[str, Any]]]) -> Figure:
         for name, lines in runs.items():
             points = _points(lines, key)
             axis.plot(*points.T, label=name, marker="." if len(points) < 30 else None)
-        _label(axis, key, label)
+        if key in ("episode/success", "episode/ins_0.5"):
+            axis.set_ylim(-0.02, 1.02)
+        _label(axis, label)
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8)
     figure.suptitle("training episodes (exploring policy), means over log intervals", fontsize=10)
@@ -91,19 +92,16 @@ def cell_curves(cells: Mapping[style.Cell, Sequence[Sequence[Mapping[str, Any]]]
         points = [estimate(column) for column in values.T]
         draw_means(axes[looks.robots.index(robot)], steps, points, (0.0, np.inf), **look)
     for axis, robot in zip(axes, looks.robots, strict=True):
-        _label(axis, GOALS, GOALS_LABEL if axis is axes[0] else "")
+        axis.set_ylim(bottom=0.0)
+        _label(axis, GOALS_LABEL if axis is axes[0] else "")
         axis.set_title(style.robot_name(robot))
     legend(figure, [*looks.algorithm_handles(markersize=4), *looks.k_int_handles(markersize=4)], 3)
     figure.suptitle(f"exploring policy, mean of {style.seeds_text(seeds)}, 95 % t interval", fontsize=9)
     return figure
 
 
-def _label(axis: Any, key: str, label: str) -> None:
+def _label(axis: Any, label: str) -> None:
     """Label the axes of a metric over environment steps."""
-    if key == GOALS:
-        axis.set_ylim(bottom=0.0)
-    elif key in SHARES:
-        axis.set_ylim(-0.02, 1.02)
     axis.set_xlabel("environment steps")
     axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     axis.set_ylabel(label)

@@ -176,12 +176,13 @@ def shared_loss(
     return ppo_losses.compute_ppo_loss(heads, None, data, key, ppo_network=of_heads, **settings)
 
 
-def minibatch_step(
-    parts: PPOParts, normalizer_params: Any, carry: tuple[Any, Any, jax.Array], data: types.Transition
-) -> tuple[tuple[Any, Any, jax.Array], dict[str, jax.Array]]:
-    """Take a gradient step on transitions [batch, time, ...]; carry is (optimiser state, params, key)."""
-    optimizer_state, params, key = carry
-    key, key_loss = jax.random.split(key)
+def learn(
+    parts: PPOParts, state: PPOState, data: types.Transition, normalizer_params: Any, key: jax.Array
+) -> tuple[Any, Any, dict[str, jax.Array]]:
+    """Pass over transitions [sequences, time, ...] several times, in shuffled minibatches.
+
+    Return the optimiser's state, the parameters, and losses [passes, minibatches].
+    """
     config = parts.config
     whole_loss = functools.partial(ppo_losses.compute_ppo_loss, ppo_network=parts.nets)
     loss_fn = functools.partial(
@@ -190,38 +191,35 @@ def minibatch_step(
         vf_coefficient=config.vf_loss_coefficient,
     )
     loss_and_grad = gradients.loss_and_pgrad(loss_fn, pmap_axis_name=None, has_aux=True)  # type: ignore[arg-type]
-    (_, losses), grads = loss_and_grad(params, normalizer_params, data, key_loss)
-    if config.learning_rate_schedule == "adaptive_kl":
-        optimizer_state, rate = ppo_optimizer.adaptive_kl_learning_rate(
-            optimizer_state, losses["kl_mean"], config.desired_kl
-        )
-    else:
-        rate = jnp.asarray(config.learning_rate)
-    updates, optimizer_state = parts.optimizer.update(grads, optimizer_state)
-    params = optax.apply_updates(params, updates)
-    return (optimizer_state, params, key), {**losses, "learning_rate": rate, "grad_norm": optax.tree.norm(grads)}
 
+    def minibatch_step(carry: Any, batch: types.Transition) -> tuple[Any, dict[str, jax.Array]]:
+        optimizer_state, params, key = carry
+        key, key_loss = jax.random.split(key)
+        (_, losses), grads = loss_and_grad(params, normalizer_params, batch, key_loss)
+        if config.learning_rate_schedule == "adaptive_kl":
+            optimizer_state, rate = ppo_optimizer.adaptive_kl_learning_rate(
+                optimizer_state, losses["kl_mean"], config.desired_kl
+            )
+        else:
+            rate = jnp.asarray(config.learning_rate)
+        updates, optimizer_state = parts.optimizer.update(grads, optimizer_state)
+        params = optax.apply_updates(params, updates)
+        return (optimizer_state, params, key), {**losses, "learning_rate": rate, "grad_norm": optax.tree.norm(grads)}
 
-def sgd_pass(
-    parts: PPOParts,
-    data: types.Transition,
-    normalizer_params: Any,
-    carry: tuple[Any, Any, jax.Array],
-    _: None,
-) -> tuple[tuple[Any, Any, jax.Array], dict[str, jax.Array]]:
-    """Pass over the data once, in shuffled minibatches; carry is (optimiser state, params, key)."""
-    optimizer_state, params, key = carry
-    key, key_perm, key_grad = jax.random.split(key, 3)
+    def one_pass(carry: Any, _: None) -> tuple[Any, dict[str, jax.Array]]:
+        optimizer_state, params, key = carry
+        key, key_perm, key_grad = jax.random.split(key, 3)
 
-    def shuffle(x: jax.Array) -> jax.Array:
-        return jax.random.permutation(key_perm, x).reshape((parts.config.num_minibatches, -1) + x.shape[1:])
+        def shuffle(x: jax.Array) -> jax.Array:
+            return jax.random.permutation(key_perm, x).reshape((config.num_minibatches, -1) + x.shape[1:])
 
-    (optimizer_state, params, _key), losses = jax.lax.scan(
-        functools.partial(minibatch_step, parts, normalizer_params),
-        (optimizer_state, params, key_grad),
-        jax.tree.map(shuffle, data),
-    )
-    return (optimizer_state, params, key), losses
+        carry = optimizer_state, params, key_grad
+        (optimizer_state, params, _key), losses = jax.lax.scan(minibatch_step, carry, jax.tree.map(shuffle, data))
+        return (optimizer_state, params, key), losses
+
+    carry = state.optimizer_state, state.params, key
+    (optimizer_state, params, _), losses = jax.lax.scan(one_pass, carry, None, length=config.num_updates_per_batch)
+    return optimizer_state, params, losses
 
 
 def update(parts: PPOParts, env: Env, state: PPOState, env_state: Any) -> tuple[PPOState, Any, Update]:
@@ -232,12 +230,7 @@ def update(parts: PPOParts, env: Env, state: PPOState, env_state: Any) -> tuple[
     late = parts.config.learning_rate_schedule == "adaptive_kl"
     statistics = nets.update_normalizer(state.normalizer_params, data.observation)
     normalizer_params = state.normalizer_params if late else statistics
-    (optimizer_state, params, _), losses = jax.lax.scan(
-        functools.partial(sgd_pass, parts, data, normalizer_params),
-        (state.optimizer_state, state.params, key_sgd),
-        None,
-        length=parts.config.num_updates_per_batch,
-    )
+    optimizer_state, params, losses = learn(parts, state, data, normalizer_params, key_sgd)
     losses = {**jax.tree.map(jnp.mean, losses), "reward_per_step": jnp.mean(data.reward)}
     new_state = PPOState(optimizer_state=optimizer_state, params=params, normalizer_params=statistics, key=key_next)
     finite = all_finite((losses, params, statistics.mean, statistics.std))

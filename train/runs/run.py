@@ -21,7 +21,8 @@ from interactive_nav.types import FAILURES
 from interactive_nav_common.config import flatten, replace
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import locked, write_json, writing
-from interactive_nav_common.records import mean_over_episodes
+from interactive_nav_common.jobs.progress import progress_bar
+from interactive_nav_common.records import cut_metrics, mean_over_episodes
 from interactive_nav_common.runs.folder import append_metrics, write_state
 from interactive_nav_common.signals import stop_signals
 from interactive_nav_common.versions import versions
@@ -33,7 +34,7 @@ from train.learners.learner import Snapshot, TrainResult, Update
 from train.runs import checkpoint, tracking
 from train.runs.checkpoint import CheckpointError, CheckpointMeta
 from train.runs.run_folder import RunFolder, claim
-from train.runs.tracking import TrainingDisplay, describe
+from train.runs.tracking import describe
 
 
 def build_env(config: EnvConfig) -> Any:
@@ -78,13 +79,15 @@ class FolderCallbacks:
         folder: RunFolder,
         config: TrainConfig,
         env: Any,
-        display: TrainingDisplay,
+        console: Console,
+        bar: Callable[..., None],
         stops: list[int],
         resume_from: str = "last",
     ):
         self._folder, self._config, self._env, self._resume_from = folder, config, env, resume_from
         self._scenes = {scene.name: scene.task_digest for scene in getattr(env, "scenes", ())}
-        self._display, self._stops = display, stops
+        self._console, self._bar, self._stops = console, bar, stops
+        self._total_steps = 0
         self._wall_before_s = 0.0
         self._began_together = 0
         self._began = time.perf_counter()
@@ -101,7 +104,7 @@ class FolderCallbacks:
         with warnings.catch_warnings(record=True) as passed_over:
             path, meta = checkpoint.find(self._folder.checkpoints, self._resume_from)
         for warning in passed_over:
-            self._display.console.print(str(warning.message), style="yellow", markup=False, soft_wrap=True)
+            self._console.print(str(warning.message), style="yellow", markup=False, soft_wrap=True)
         if not checkpoint.is_whole(path):
             raise CheckpointError(
                 f"{path}: holds the policy alone, as `train.sweep --export` writes it, expected all of the learner to "
@@ -115,7 +118,7 @@ class FolderCallbacks:
                     "set run.name to begin another run"
                 )
         for later in checkpoint.set_aside(self._folder.checkpoints, meta.env_steps):
-            self._display.console.print(f"{later}: renamed to aside-{later.name}", markup=False, soft_wrap=True)
+            self._console.print(f"{later}: renamed to aside-{later.name}", markup=False, soft_wrap=True)
         self._wall_before_s = meta.wall_s
         learner = checkpoint.load_learner(path, template.learner)
         env_state = checkpoint.load_env_state(path, template.env_state)
@@ -136,27 +139,34 @@ class FolderCallbacks:
         one_mb, env_mb = map(checkpoint.megabytes, (snapshot.learner, snapshot.env_state))
         env_mb = 2 * env_mb if env_mb <= self._config.run.env_state_limit_mb else 0.0
         claim(self._folder.path, one_mb * (self._config.run.keep_checkpoints + 2) + env_mb)
-        self._folder.cut_metrics(snapshot.env_steps)
+        cut_metrics(self._folder.metrics, lambda line: line["env_steps"] <= snapshot.env_steps)
         if snapshot.env_steps < total_steps:
             self._folder.summary.unlink(missing_ok=True)  # of a shorter run, which this one goes on from
         if self._config.run.tensorboard:
             self._logs.append(tracking.Events(self._folder.tensorboard, snapshot.env_steps))
         if note := getattr(snapshot.env_state, "note", ""):
-            self._display.console.print(note, highlight=False, soft_wrap=True)
+            self._console.print(note, highlight=False, soft_wrap=True)
         if self._config.run.wandb:
             self._logs.append(tracking.Tracker(self._folder.path, self._config, versions()))
-        self._display.begin(snapshot.env_steps, total_steps)
+        self._total_steps = total_steps
+        self._bar(completed=snapshot.env_steps, total=total_steps)
 
     def on_update(self, env_steps: int) -> None:
         """Move the bar."""
-        self._display.update(env_steps)
+        self._bar(completed=env_steps)
 
     def on_log(self, env_steps: int, metrics: dict[str, float]) -> None:
         """Write a line of metrics.jsonl and a TensorBoard point for each value; show a status on the console."""
         append_metrics(self._folder.path, {"env_steps": env_steps, "wall_s": round(self._wall_s(), 3), **metrics})
         for log in self._logs:
             log.log(env_steps, metrics)
-        self._display.log(env_steps, metrics)
+        status, total = describe(metrics), self._total_steps
+        self._bar(completed=env_steps, status=status)
+        if not self._console.is_terminal:
+            left_s = (total - env_steps) / max(metrics["env_steps_per_s"], 1e-9)
+            share = 100.0 * env_steps / max(total, 1)
+            reached = f"training {share:3.0f} %  {env_steps:,} of {total:,} steps  {left_s:.0f} s left"
+            self._console.print(f"{reached}  {status}", highlight=False, soft_wrap=True)
 
     def on_checkpoint(self, snapshot: Snapshot) -> None:
         """Write a checkpoint; its score is the mean over the episodes of at least the time that one can take.
@@ -273,8 +283,9 @@ def _train_in(
     if each < limit:
         note = f"{each:,} steps for each environment, and an episode has up to {limit:,}: none that fails comes to its"
         console.print(f"{note} end; lower env.episode_steps or train longer", style="yellow", soft_wrap=True)
-    with stop_signals() as stops, TrainingDisplay(console) as display:
-        with contextlib.closing(FolderCallbacks(folder, config, env, display, stops, resume_from)) as callbacks:
+    with stop_signals() as stops, progress_bar(console, "training") as bar:
+        bar(status="compiling")
+        with contextlib.closing(FolderCallbacks(folder, config, env, console, bar, stops, resume_from)) as callbacks:
             result = ALGORITHMS[config.algorithm].train(AutoResetEnv(env), config, callbacks)
         last = (folder.read_metrics() or [{}])[-1]
         metrics = result.metrics or {k: v for k, v in last.items() if k not in ("env_steps", "wall_s")}

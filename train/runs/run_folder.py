@@ -20,7 +20,7 @@ from typing import Any
 from interactive_nav_common.config import Natural, NotNegative, flatten, replace
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import write_json, write_text, writing
-from interactive_nav_common.records import METRICS, RUNS, cut_metrics, read_metrics
+from interactive_nav_common.records import METRICS, RUNS, read_metrics
 from interactive_nav_common.rows import digest_of
 from interactive_nav_common.runs.folder import CONFIG, VERSIONS, refuse_changes
 from interactive_nav_common.versions import versions
@@ -110,10 +110,6 @@ class RunFolder:
     def read_metrics(self) -> list[dict[str, Any]]:
         """Return the lines of metrics.jsonl; none where nothing was logged."""
         return read_metrics(self.metrics) if self.metrics.is_file() else []
-
-    def cut_metrics(self, env_steps: int) -> None:
-        """Drop the lines after a checkpoint that a run continues from: their steps are taken again."""
-        cut_metrics(self.metrics, lambda line: line["env_steps"] <= env_steps)
 
 
 def claim(path: Path, needed_mb: float = 0.0) -> None:

@@ -1,10 +1,8 @@
-"""Show a run's metrics on the console; write them to TensorBoard, and with `run.wandb=true` to Weights & Biases too.
+"""Write a run's metrics to TensorBoard, and with `run.wandb=true` to Weights & Biases too.
 
 The latter's package is an optional extra. Its settings say where it writes: WANDB_MODE=offline keeps everything in the
 run folder until `wandb sync`, WANDB_API_KEY or `wandb login` sends it; WANDB_ENTITY and the like work as always.
 """
-
-from __future__ import annotations
 
 import contextlib
 import time
@@ -12,7 +10,6 @@ import uuid
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 from tensorboardX.record_writer import RecordWriter
 from tensorboardX.summary import scalar
@@ -21,7 +18,6 @@ from interactive_nav.robots import robot_name
 from interactive_nav_common.config import flatten
 from interactive_nav_common.errors import ConfigError, missing, optional
 from interactive_nav_common.files import write_text, writing
-from interactive_nav_common.jobs.progress import progress_bar
 from interactive_nav_common.runs.folder import GOES_ON
 from train.config import TrainConfig
 
@@ -98,38 +94,6 @@ class Tracker:
     def close(self) -> None:
         """Send or write what is left."""
         self._run.finish()
-
-
-class TrainingDisplay(contextlib.ExitStack):
-    """A live bar on a terminal; one line a log interval elsewhere."""
-
-    def __init__(self, console: Console):
-        super().__init__()
-        self.console, self._total = console, 0
-
-    def __enter__(self) -> TrainingDisplay:
-        self._bar = self.enter_context(progress_bar(self.console, "training"))
-        self._bar(status="compiling")
-        return self
-
-    def begin(self, env_steps: int, total_steps: int) -> None:
-        """Set the range of steps to show."""
-        self._total = total_steps
-        self._bar(completed=env_steps, total=total_steps)
-
-    def update(self, env_steps: int) -> None:
-        """Move the bar."""
-        self._bar(completed=env_steps)
-
-    def log(self, env_steps: int, metrics: dict[str, float]) -> None:
-        """Show a log interval's scores."""
-        status = describe(metrics)
-        self._bar(completed=env_steps, status=status)
-        if not self.console.is_terminal:
-            left = (self._total - env_steps) / max(metrics["env_steps_per_s"], 1e-9)
-            share = 100.0 * env_steps / max(self._total, 1)
-            reached = f"training {share:3.0f} %  {env_steps:,} of {self._total:,} steps  {left:.0f} s left"
-            self.console.print(f"{reached}  {status}", highlight=False, soft_wrap=True)
 
 
 def describe(metrics: dict[str, float]) -> str:

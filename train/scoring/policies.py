@@ -142,8 +142,10 @@ class Planner(HostPolicy):
         for i in np.flatnonzero(running):
             plan = self._plans.get(int(episode[i]))
             if plan is None or (step - plan.step >= REPLAN_STEPS and self._stale(plan, pos[i], objects[i])):
-                plan = self._plan(int(scene[i]), qpos[i], pos[i], goal[i], objects[i], step)
-                self._plans[int(episode[i])] = plan
+                path = self._ways.way(int(scene[i]), qpos[i], pos[i], goal[i])
+                self.plans += 1
+                self.no_path += not len(path)
+                plan = self._plans[int(episode[i])] = PlannedRoute(path, objects[i].copy(), step)
             if len(plan.path_w):
                 linear[i], angular[i] = self._steer(plan.path_w, pos[i], yaw[i])
         return np.asarray(self._env.robot.drive(linear, angular, np), np.float32)
@@ -153,12 +155,6 @@ class Planner(HostPolicy):
         moved = np.linalg.norm(objects - plan.object_pos_w, axis=-1).max(initial=0.0) > MOVED_M
         off = len(plan.path_w) > 0 and np.linalg.norm(plan.path_w - pos, axis=-1).min() > 0.15
         return bool(moved or off)
-
-    def _plan(self, scene: int, qpos, pos, goal, objects, step: int) -> PlannedRoute:
-        path = self._ways.way(scene, qpos, pos, goal)
-        self.plans += 1
-        self.no_path += not len(path)
-        return PlannedRoute(path, objects.copy(), step)
 
     def _steer(self, path: np.ndarray, pos: np.ndarray, yaw: float) -> tuple[float, float]:
         """Return linear (m/s) and angular (rad/s) velocity towards a point a little ahead on the path."""

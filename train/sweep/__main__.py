@@ -107,14 +107,10 @@ def main(argv: Sequence[str] | None = None, programs: Programs = PROGRAMS) -> in
     else:
         launcher = Machine(find_gpus(), sweep.config.launch.slots)
     stages = (arguments.only,) if arguments.only else STAGES
-    try:
-        with stop_signals(second_ends=False) as stops, SweepDisplay(console) as display:
-            display.event(f"{folder.root}: {len(sweep.runs)} runs")
-            outcome = Scheduler(folder, launcher, display, stages, arguments.redo, arguments.unfinished, programs).run(
-                stops, arguments.time_limit
-            )
-    finally:
-        launcher.close()
+    with stop_signals(second_ends=False) as stops, SweepDisplay(console) as display:
+        display.event(f"{folder.root}: {len(sweep.runs)} runs")
+        scheduler = Scheduler(folder, launcher, display, stages, arguments.redo, arguments.unfinished, programs)
+        outcome = scheduler.run(stops, arguments.time_limit)
     console.print(status_table(outcome.states))
     console.print(totals(outcome.states), highlight=False, soft_wrap=True)
     if outcome.elsewhere:

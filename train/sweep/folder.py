@@ -58,14 +58,6 @@ class RunState:
     """Nothing is left to train, whoever works on it now."""
 
 
-@dataclasses.dataclass(frozen=True)
-class _Failure:
-    """Content of failed/<run>.json."""
-
-    reason: str = ""
-    attempts: int = 0
-
-
 class SweepFolder:
     """Paths of a sweep, and the small files in it."""
 
@@ -122,7 +114,7 @@ class SweepFolder:
         """Return why a run was given up, or nothing. Read once: another sweep may try the run again meanwhile."""
         path = self.root / "failed" / f"{run}.json"
         try:
-            return RUNS.record(RUNS.json(path, {}), _Failure, str(path)).reason
+            return str(RUNS.typed(RUNS.json(path, {}), dict[str, str | int], str(path)).get("reason", ""))
         except FileError as error:
             return str(error)
 
@@ -167,8 +159,7 @@ class SweepFolder:
 
     def give_up(self, run: str, reason: str, attempts: int) -> None:
         """Note why a run was given up."""
-        kept = json.dumps(dataclasses.asdict(_Failure(reason, attempts)))
-        write_text(self.root / "failed" / f"{run}.json", kept + "\n")
+        write_text(self.root / "failed" / f"{run}.json", json.dumps({"reason": reason, "attempts": attempts}) + "\n")
 
     def try_again(self, run: str) -> None:
         """Forget that a run was given up."""

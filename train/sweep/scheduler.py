@@ -2,16 +2,18 @@
 
 import contextlib
 import dataclasses
+import functools
+import math
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from interactive_nav_common.config import replace
-from interactive_nav_common.jobs.processes import LOCKED, LOST, Job, Launcher, LocalLauncher, Share
+from interactive_nav_common.jobs.processes import LOCKED, LOST, Job, Launcher, LocalLauncher, Share, run_jobs
 from train.sweep.folder import RunState, SweepDisplay, SweepFolder, log_tail, words_of_evaluation
 from train.sweep.spec import LaunchConfig
 
@@ -137,7 +139,7 @@ class Outcome:
 
 
 class Scheduler:
-    """Decide what runs next."""
+    """Decide what runs next: training before evaluation, what failed once more, nothing past the time limit."""
 
     def __init__(
         self,
@@ -159,46 +161,56 @@ class Scheduler:
         self._given_up: set[tuple[str, str]] = set()
         self._alone: set[str] = set()
         self._not_before: dict[str, float] = {}
-        self._busy: dict[str, str] = {}
         self._redo = set(self._runs) if redo else set()
-        self._stopping = False
+        self._outcome = Outcome((), None, False, 0)
+        self._kill_at = math.inf
+        """Finite once what runs was requested to end; -inf once it was killed."""
 
     def run(self, stops: list[int], time_limit_s: float | None = None, poll_s: float = POLL_S) -> Outcome:
         """Work until nothing is left, the time is over, or a signal requests a stop; a second one does not wait.
 
         After the time limit, if any, all runs are stopped, with their checkpoints.
         """
-        began, deadline, killed, timed_out = self._clock(), None, False, False
-        while True:
-            for job, code in self._launcher.ended():
+        ready = functools.partial(self._ready, stops, math.inf if time_limit_s is None else time_limit_s, self._clock())
+        grace_s = self._folder.sweep.config.launch.grace_s
+        with contextlib.closing(run_jobs(self._launcher, ready, grace_s, poll_s)) as ended:
+            for job, code in ended:
                 self._over(job, code)
-            elapsed = self._clock() - began
-            timed_out = timed_out or (time_limit_s is not None and elapsed >= time_limit_s)
-            if (stops or timed_out) and not self._stopping:
-                self._stopping = True
-                deadline = self._clock() + self._folder.sweep.config.launch.grace_s
-                if self._busy:
-                    why = f"time limit of {time_limit_s:.0f} s" if timed_out else signal.Signals(stops[0]).name
-                    self._display.event(
-                        f"{why}: {len(self._busy)} run(s) are writing their checkpoints (a second Ctrl-C does not wait)"
-                    )
-                self._launcher.stop()
-            if deadline is not None and not killed and (len(stops) > 1 or self._clock() > deadline) and self._busy:
-                killed = True
-                self._display.event("not waiting any longer: what they did since the last checkpoint is lost", "red")
-                self._launcher.kill()
-            states = [self._folder.state(run) for run in self._runs.values()]
-            late = time_limit_s is not None and time_limit_s - elapsed < min(LAST_START_S, 0.1 * time_limit_s)
-            if not self._stopping and not late:
-                self._start(states)
-            self._display.update(states, self._busy)
-            needed = (s.name for stage in STAGES for s in states if self._needs(stage, s))
-            waiting = set() if self._stopping else set(needed)
-            elsewhere = {s.name for s in states if s.state == "running" and s.name in self._not_before}
-            if not self._busy and elsewhere >= waiting:
-                break
-            time.sleep(poll_s)
-        return Outcome(tuple(states), stops[0] if stops else None, timed_out, len(elsewhere & waiting))
+        return self._outcome
+
+    @property
+    def _busy(self) -> dict[str, str]:
+        """Return the runs that are worked on, and how."""
+        running = self._launcher.running
+        return {name: f"{job.kind}, {self._launcher.where(share)}" for job, _, share in running for name in job.runs}
+
+    def _ready(self, stops: list[int], limit_s: float, began: float) -> Iterator[RunJob] | None:
+        """Return the jobs that may start now, None if no more will come; end what runs where that is due."""
+        now, busy = self._clock(), self._busy
+        timed_out = self._outcome.timed_out or now - began >= limit_s
+        if (stops or timed_out) and self._kill_at == math.inf:
+            self._kill_at = now + self._folder.sweep.config.launch.grace_s
+            if busy:
+                why = f"time limit of {limit_s:.0f} s" if timed_out else signal.Signals(stops[0]).name
+                self._display.event(
+                    f"{why}: {len(busy)} run(s) are writing their checkpoints (a second Ctrl-C does not wait)"
+                )
+            self._launcher.send(signal.SIGTERM)
+        if busy and self._kill_at > -math.inf and (len(stops) > 1 or now > self._kill_at):
+            self._kill_at = -math.inf
+            self._display.event("not waiting any longer: what they did since the last checkpoint is lost", "red")
+            self._launcher.send(signal.SIGKILL)
+        states = [self._folder.state(run) for run in self._runs.values()]
+        self._display.update(states, busy)
+        needed = {s.name for stage in STAGES for s in states if self._needs(stage, s)}
+        elsewhere = {s.name for s in states if s.state == "running" and s.name in self._not_before}
+        stopping = self._kill_at < math.inf
+        left_to_others = 0 if stopping else len(elsewhere & needed)
+        self._outcome = Outcome(tuple(states), stops[0] if stops else None, timed_out, left_to_others)
+        if stopping or (not busy and elsewhere >= needed):
+            return None
+        late = limit_s - (now - began) < min(LAST_START_S, 0.1 * limit_s)
+        return iter(()) if late else self._jobs(states)
 
     def _needs(self, stage: str, state: RunState) -> bool:
         """Return whether a stage is to be run for a run as far as it is."""
@@ -215,19 +227,18 @@ class Scheduler:
         left = [s for s in states if self._needs(stage, s) and self._not_before.get(s.name, 0.0) <= now]
         return [s.name for s in (sorted(left, key=lambda s: s.env_steps == 0) if stage == "train" else left)]
 
-    def _start(self, states: list[RunState]) -> None:
-        """Start what there is room for: training first, then evaluation."""
-        for name in self._free("train", states):
-            run = self._runs[name]
-            command = [sys.executable, *self._programs["train"], "--config", str(self._folder.config(name))]
-            if run.launch.slots > 1 and not run.config.env.threads:
-                command += [f"env.threads={max(1, (os.cpu_count() or 1) // run.launch.slots)}"]
-            if not self._begin("train", [name], command):
-                return
-        for group in self._groups(self._free("evaluate", states)):
-            command = words_of_evaluation(self._folder, group, self._programs["evaluate"])
-            if not self._begin("evaluate", group, command):
-                return
+    def _jobs(self, states: list[RunState]) -> Iterator[RunJob]:
+        """Yield jobs, training first, then evaluation; one that has started is noted when the next one is drawn."""
+        for kind in STAGES:
+            free = self._free(kind, states)
+            for names in self._groups(free) if kind == "evaluate" else [[name] for name in free]:
+                job = self._job(kind, names)
+                yield job
+                for name in names:
+                    self._not_before.pop(name, None)
+                    self._folder.try_again(name)
+                where = self._busy[names[0]].removeprefix(f"{kind}, ")
+                self._display.event(f"{job.name}: started ({where}), log {job.log}")
 
     def _groups(self, names: list[str]) -> list[list[str]]:
         """Group the runs to evaluate by one process each: those of one environment (k_int is in no score)."""
@@ -238,35 +249,29 @@ class Scheduler:
         size = EVALUATED_TOGETHER
         return [group[i : i + size] for group in kinds.values() for i in range(0, len(group), size)]
 
-    def _begin(self, kind: str, names: list[str], command: list[str]) -> bool:
-        log = self._folder.log(names[0])
-        launch, others = self._runs[names[0]].launch, len(names) - 1
-        factor = max(self._factor.get((kind, name), 1.0) for name in names)
-        job = RunJob(
-            name=f"{kind} {names[0]}" + (f" and {others} more" if others else ""),
+    def _job(self, kind: str, names: list[str]) -> RunJob:
+        run, others, program = self._runs[names[0]], len(names) - 1, self._programs[kind]
+        launch, factor = run.launch, max(self._factor.get((kind, name), 1.0) for name in names)
+        if kind == "evaluate":
+            command = words_of_evaluation(self._folder, names, program)
+        else:
+            command = [sys.executable, *program, "--config", str(self._folder.config(run.name))]
+            if launch.slots > 1 and not run.config.env.threads:
+                command += [f"env.threads={max(1, (os.cpu_count() or 1) // launch.slots)}"]
+        return RunJob(
+            name=f"{kind} {run.name}" + (f" and {others} more" if others else ""),
             kind=kind,
             runs=tuple(names),
             command=tuple(command),
-            log=log,
+            log=self._folder.log(run.name),
             locks=tuple(self._folder.lock(name) for name in names),
             launch=launch,
             factor=factor,
             cpus=launch.cpus_per_run,
             gpus=min(1.0, factor / launch.runs_per_gpu),
         )
-        where = self._launcher.start(job)
-        if where is None:
-            return False
-        for name in names:
-            self._busy[name] = f"{kind}, {where}"
-            self._not_before.pop(name, None)
-            self._folder.try_again(name)
-        self._display.event(f"{job.name}: started ({where}), log {log}")
-        return True
 
     def _over(self, job: RunJob, code: int) -> None:
-        for name in job.runs:
-            self._busy.pop(name, None)
         if code == LOCKED:
             held = [name for name in job.runs if self._folder.state(self._runs[name]).state == "running"]
             for name in held or job.runs:  # the others go on without them
@@ -283,7 +288,7 @@ class Scheduler:
             left = [name for name in job.runs if not self._folder.state(self._runs[name]).over]
         if not left:
             self._display.event(f"{job.name}: done", "green")
-        elif self._stopping and code not in (1, REFUSED):
+        elif self._kill_at < math.inf and code not in (1, REFUSED):
             self._display.event(f"{job.name}: stopped")
         elif len(job.runs) > 1:
             # Which of them is to blame shows when each has a separate process.
