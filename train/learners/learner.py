@@ -166,10 +166,9 @@ def interval_metrics(updates: list[Update]) -> dict[str, float]:
     sums = {name: np.sum([float(u.episode_sums[name]) for u in updates]) for name in updates[0].episode_sums}
     episodes = sums.pop("episodes")
     means = {name: total / episodes for name, total in sums.items()} if episodes else {}
-    metrics = {"episodes": episodes}
-    metrics |= {f"episode/{name}": mean for name, mean in means.items()}
-    metrics |= {f"loss/{name}": mean for name, mean in losses.items()}
-    return {name: float(value) for name, value in metrics.items()}
+    named = {"episode": means, "loss": losses}
+    metrics = {f"{kind}/{name}": float(mean) for kind, each in named.items() for name, mean in each.items()}
+    return {"episodes": float(episodes), **metrics}
 
 
 def episode_sums(info: dict[str, Any]) -> dict[str, jax.Array]:

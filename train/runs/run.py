@@ -71,22 +71,20 @@ def config_to_play(
     return dataclasses.replace(config, env=env)
 
 
+@dataclasses.dataclass(eq=False)
 class FolderCallbacks:
     """Learner callbacks that write a run folder and show progress."""
 
-    def __init__(
-        self,
-        folder: RunFolder,
-        config: TrainConfig,
-        env: Any,
-        console: Console,
-        bar: Callable[..., None],
-        stops: list[int],
-        resume_from: str = "last",
-    ):
-        self._folder, self._config, self._env, self._resume_from = folder, config, env, resume_from
-        self._scenes = {scene.name: scene.task_digest for scene in getattr(env, "scenes", ())}
-        self._console, self._bar, self._stops = console, bar, stops
+    folder: RunFolder
+    config: TrainConfig
+    env: Any
+    console: Console
+    bar: Callable[..., None]
+    stops: list[int]
+    resume_from: str = "last"
+
+    def __post_init__(self) -> None:
+        self._scenes = {scene.name: scene.task_digest for scene in getattr(self.env, "scenes", ())}
         self._total_steps = 0
         self._wall_before_s = 0.0
         self._began_together = 0
@@ -98,27 +96,27 @@ class FolderCallbacks:
 
     def restore(self, template: Snapshot) -> Snapshot | None:
         """Return the newest intact checkpoint of the folder, or the one that was requested; None: there is none."""
-        checkpoint.remove_partial(self._folder.checkpoints)
-        if self._resume_from == "last" and not any(self._folder.checkpoints.glob("[0-9]*")):
+        checkpoint.remove_partial(self.folder.checkpoints)
+        if self.resume_from == "last" and not any(self.folder.checkpoints.glob("[0-9]*")):
             return None
         with warnings.catch_warnings(record=True) as passed_over:
-            path, meta = checkpoint.find(self._folder.checkpoints, self._resume_from)
+            path, meta = checkpoint.find(self.folder.checkpoints, self.resume_from)
         for warning in passed_over:
-            self._console.print(str(warning.message), style="yellow", markup=False, soft_wrap=True)
+            self.console.print(str(warning.message), style="yellow", markup=False, soft_wrap=True)
         if not checkpoint.is_whole(path):
             raise CheckpointError(
                 f"{path}: holds the policy alone, as `train.sweep --export` writes it, expected all of the learner to "
                 "go on from; train into another folder (run.out_dir, run.name)"
             )
-        check_fits(meta, path, self._config.env, self._env)
+        check_fits(meta, path, self.config.env, self.env)
         for name, digest in meta.scenes.items():
             if self._scenes.get(name, digest) != digest:
                 raise CheckpointError(
                     f"{path}: scene '{name}' has changed since: masses, places or maps differ; restore its folder, or "
                     "set run.name to begin another run"
                 )
-        for later in checkpoint.set_aside(self._folder.checkpoints, meta.env_steps):
-            self._console.print(f"{later}: renamed to aside-{later.name}", markup=False, soft_wrap=True)
+        for later in checkpoint.set_aside(self.folder.checkpoints, meta.env_steps):
+            self.console.print(f"{later}: renamed to aside-{later.name}", markup=False, soft_wrap=True)
         self._wall_before_s = meta.wall_s
         learner = checkpoint.load_learner(path, template.learner)
         env_state = checkpoint.load_env_state(path, template.env_state)
@@ -127,46 +125,46 @@ class FolderCallbacks:
 
     def should_stop(self) -> bool:
         """Return True once a signal has requested it."""
-        return bool(self._stops)
+        return bool(self.stops)
 
     def on_start(self, snapshot: Snapshot, total_steps: int) -> None:
         """Make room for checkpoints and cut what a killed run logged after its last one."""
         available = getattr(snapshot.env_state, "info", {}).get("episode_metrics", {})
-        if self._config.run.best_metric not in available:
+        if self.config.run.best_metric not in available:
             raise ConfigError(
-                f"run.best_metric is {self._config.run.best_metric!r}, expected one of {', '.join(sorted(available))}"
+                f"run.best_metric is {self.config.run.best_metric!r}, expected one of {', '.join(sorted(available))}"
             )
         one_mb, env_mb = map(checkpoint.megabytes, (snapshot.learner, snapshot.env_state))
-        env_mb = 2 * env_mb if env_mb <= self._config.run.env_state_limit_mb else 0.0
-        claim(self._folder.path, one_mb * (self._config.run.keep_checkpoints + 2) + env_mb)
-        cut_metrics(self._folder.metrics, lambda line: line["env_steps"] <= snapshot.env_steps)
+        env_mb = 2 * env_mb if env_mb <= self.config.run.env_state_limit_mb else 0.0
+        claim(self.folder.path, one_mb * (self.config.run.keep_checkpoints + 2) + env_mb)
+        cut_metrics(self.folder.metrics, lambda line: line["env_steps"] <= snapshot.env_steps)
         if snapshot.env_steps < total_steps:
-            self._folder.summary.unlink(missing_ok=True)  # of a shorter run, which this one goes on from
-        if self._config.run.tensorboard:
-            self._logs.append(tracking.Events(self._folder.tensorboard, snapshot.env_steps))
+            self.folder.summary.unlink(missing_ok=True)  # of a shorter run, which this one goes on from
+        if self.config.run.tensorboard:
+            self._logs.append(tracking.Events(self.folder.tensorboard, snapshot.env_steps))
         if note := getattr(snapshot.env_state, "note", ""):
-            self._console.print(note, highlight=False, soft_wrap=True)
-        if self._config.run.wandb:
-            self._logs.append(tracking.Tracker(self._folder.path, self._config, versions()))
+            self.console.print(note, highlight=False, soft_wrap=True)
+        if self.config.run.wandb:
+            self._logs.append(tracking.Tracker(self.folder.path, self.config, versions()))
         self._total_steps = total_steps
-        self._bar(completed=snapshot.env_steps, total=total_steps)
+        self.bar(completed=snapshot.env_steps, total=total_steps)
 
     def on_update(self, env_steps: int) -> None:
         """Move the bar."""
-        self._bar(completed=env_steps)
+        self.bar(completed=env_steps)
 
     def on_log(self, env_steps: int, metrics: dict[str, float]) -> None:
         """Write a line of metrics.jsonl and a TensorBoard point for each value; show a status on the console."""
-        append_metrics(self._folder.path, {"env_steps": env_steps, "wall_s": round(self._wall_s(), 3), **metrics})
+        append_metrics(self.folder.path, {"env_steps": env_steps, "wall_s": round(self._wall_s(), 3), **metrics})
         for log in self._logs:
             log.log(env_steps, metrics)
         status, total = describe(metrics), self._total_steps
-        self._bar(completed=env_steps, status=status)
-        if not self._console.is_terminal:
+        self.bar(completed=env_steps, status=status)
+        if not self.console.is_terminal:
             left_s = (total - env_steps) / max(metrics["env_steps_per_s"], 1e-9)
             share = 100.0 * env_steps / max(total, 1)
             reached = f"training {share:3.0f} %  {env_steps:,} of {total:,} steps  {left_s:.0f} s left"
-            self._console.print(f"{reached}  {status}", highlight=False, soft_wrap=True)
+            self.console.print(f"{reached}  {status}", highlight=False, soft_wrap=True)
 
     def on_checkpoint(self, snapshot: Snapshot) -> None:
         """Write a checkpoint; its score is the mean over the episodes of at least the time that one can take.
@@ -174,28 +172,28 @@ class FolderCallbacks:
         Where all environments began together, those that fail end together too, one time limit later, and what ends
         in between are the short episodes, which succeed: a score is of a whole limit, and of none before the first.
         """
-        run = self._config.run
-        limit = num_envs(self._config) * self._config.env.episode_steps
+        run = self.config.run
+        limit = num_envs(self.config) * self.config.env.episode_steps
         since = snapshot.env_steps - max(run.checkpoint_every_steps, limit)
         fair = since >= self._began_together + limit
-        lines = [line for line in self._folder.read_metrics() if fair and line["env_steps"] > since]
+        lines = [line for line in self.folder.read_metrics() if fair and line["env_steps"] > since]
         meta = CheckpointMeta(
             env_steps=snapshot.env_steps,
             wall_s=self._wall_s(),
             score=mean_over_episodes(lines, f"episode/{run.best_metric}"),
             began_together=self._began_together,
-            algorithm=self._config.algorithm,
-            robot=robot_name(self._config.env.robot),
-            observations=self._config.env.observations,
-            observation_size=checkpoint.plain_size(self._env.observation_size),
-            action_size=int(self._env.action_size),
+            algorithm=self.config.algorithm,
+            robot=robot_name(self.config.env.robot),
+            observations=self.config.env.observations,
+            observation_size=checkpoint.plain_size(self.env.observation_size),
+            action_size=int(self.env.action_size),
             scenes=self._scenes,
         )
-        checkpoint.save_snapshot(self._folder.checkpoints, snapshot, meta, run.keep_checkpoints, run.env_state_limit_mb)
+        checkpoint.save_snapshot(self.folder.checkpoints, snapshot, meta, run.keep_checkpoints, run.env_state_limit_mb)
 
     def on_diverged(self, before: Snapshot, update: Update) -> str:
         """Save the batch and the learner that met it."""
-        path = self._folder.path / f"diverged-{before.env_steps:012d}"
+        path = self.folder.path / f"diverged-{before.env_steps:012d}"
         with writing(path, "make room"):
             path.mkdir(exist_ok=True)
             write_state(path / checkpoint.LEARNER, before.learner)

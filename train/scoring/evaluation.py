@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,14 +61,10 @@ class BatchPlayer(Player):
         policy: PolicyFn | HostPolicy,
         keys: jax.Array,
         record: int = 0,
-        on_progress: Callable[[int, int], None] = lambda finished, step: None,
-        starts: Any = None,
-        scene_index: np.ndarray | None = None,
-        batch: int | None = None,
-        on_note: Callable[[str], None] = lambda note: None,
+        **how: Any,
     ) -> PlayedEpisodes:
-        """Play every episode to its end; see `Player.rollout`."""
-        played = self.rollout(policy, keys, starts, scene_index, record, batch, on_progress, on_note)
+        """Play every episode to its end; `how` and the rest are as `Player.rollout` takes them."""
+        played = self.rollout(policy, keys, record=record, **how)
         first, values, xy = played.first, played.values, played.values["robot_xy_w"]
         over = np.arange(xy.shape[1]) >= played.num_steps[:record, None]
         xy = np.where(over[..., None], np.float32(np.nan), xy)
@@ -187,7 +183,8 @@ def evaluate(
             def on_progress(over: int, step: int, update: Any = update) -> None:
                 update(completed=over, status=f"{over} of {request.episodes} episodes over, step {step}")
 
-            played[name] = player.play(policy, keys, record, on_progress, starts, turns, batch, console.print)
+            how = {"starts": starts, "scene_index": turns, "batch": batch, "on_note": console.print}
+            played[name] = player.play(policy, keys, record, on_progress=on_progress, **how)
         wall_s = time.perf_counter() - began
         constants = {**where, "policy": name, "evaluation_wall_s": wall_s}
         if meta:

@@ -138,30 +138,29 @@ class Outcome:
         return 1 if any(s.state != "running" for s in left) else 0
 
 
+@dataclasses.dataclass(eq=False)
 class Scheduler:
     """Decide what runs next: training before evaluation, what failed once more, nothing past the time limit."""
 
-    def __init__(
-        self,
-        folder: SweepFolder,
-        launcher: Launcher,
-        display: SweepDisplay,
-        stages: Sequence[str] = STAGES,
-        redo: bool = False,
-        unfinished: bool = False,
-        programs: Programs = PROGRAMS,
-        clock: Callable[[], float] = time.monotonic,
-    ):
-        self._folder, self._launcher, self._display = folder, launcher, display
-        self._stages, self._unfinished = stages, unfinished
-        self._programs, self._clock = programs, clock
-        self._runs = {run.name: run for run in folder.sweep.runs}
+    folder: SweepFolder
+    launcher: Launcher
+    display: SweepDisplay
+    stages: Sequence[str] = STAGES
+    redo: bool = False
+    """Evaluate again what is evaluated."""
+    unfinished: bool = False
+    """Evaluate unfinished runs too."""
+    programs: Programs = dataclasses.field(default_factory=lambda: PROGRAMS)
+    clock: Callable[[], float] = time.monotonic
+
+    def __post_init__(self) -> None:
+        self._runs = {run.name: run for run in self.folder.sweep.runs}
         self._attempts: dict[tuple[str, str], int] = {}
         self._factor: dict[tuple[str, str], float] = {}
         self._given_up: set[tuple[str, str]] = set()
         self._alone: set[str] = set()
         self._not_before: dict[str, float] = {}
-        self._redo = set(self._runs) if redo else set()
+        self._redo = set(self._runs) if self.redo else set()
         self._outcome = Outcome((), None, False, 0)
         self._kill_at = math.inf
         """Finite once what runs was requested to end; -inf once it was killed."""
@@ -171,9 +170,9 @@ class Scheduler:
 
         After the time limit, if any, all runs are stopped, with their checkpoints.
         """
-        ready = functools.partial(self._ready, stops, math.inf if time_limit_s is None else time_limit_s, self._clock())
-        grace_s = self._folder.sweep.config.launch.grace_s
-        with contextlib.closing(run_jobs(self._launcher, ready, grace_s, poll_s)) as ended:
+        ready = functools.partial(self._ready, stops, math.inf if time_limit_s is None else time_limit_s, self.clock())
+        grace_s = self.folder.sweep.config.launch.grace_s
+        with contextlib.closing(run_jobs(self.launcher, ready, grace_s, poll_s)) as ended:
             for job, code in ended:
                 self._over(job, code)
         return self._outcome
@@ -181,27 +180,27 @@ class Scheduler:
     @property
     def _busy(self) -> dict[str, str]:
         """Return the runs that are worked on, and how."""
-        running = self._launcher.running
-        return {name: f"{job.kind}, {self._launcher.where(share)}" for job, _, share in running for name in job.runs}
+        running = self.launcher.running
+        return {name: f"{job.kind}, {self.launcher.where(share)}" for job, _, share in running for name in job.runs}
 
     def _ready(self, stops: list[int], limit_s: float, began: float) -> Iterator[RunJob] | None:
         """Return the jobs that may start now, None if no more will come; end what runs where that is due."""
-        now, busy = self._clock(), self._busy
+        now, busy = self.clock(), self._busy
         timed_out = self._outcome.timed_out or now - began >= limit_s
         if (stops or timed_out) and self._kill_at == math.inf:
-            self._kill_at = now + self._folder.sweep.config.launch.grace_s
+            self._kill_at = now + self.folder.sweep.config.launch.grace_s
             if busy:
                 why = f"time limit of {limit_s:.0f} s" if timed_out else signal.Signals(stops[0]).name
-                self._display.event(
+                self.display.event(
                     f"{why}: {len(busy)} run(s) are writing their checkpoints (a second Ctrl-C does not wait)"
                 )
-            self._launcher.send(signal.SIGTERM)
+            self.launcher.send(signal.SIGTERM)
         if busy and self._kill_at > -math.inf and (len(stops) > 1 or now > self._kill_at):
             self._kill_at = -math.inf
-            self._display.event("not waiting any longer: what they did since the last checkpoint is lost", "red")
-            self._launcher.send(signal.SIGKILL)
-        states = [self._folder.state(run) for run in self._runs.values()]
-        self._display.update(states, busy)
+            self.display.event("not waiting any longer: what they did since the last checkpoint is lost", "red")
+            self.launcher.send(signal.SIGKILL)
+        states = [self.folder.state(run) for run in self._runs.values()]
+        self.display.update(states, busy)
         needed = {s.name for stage in STAGES for s in states if self._needs(stage, s)}
         elsewhere = {s.name for s in states if s.state == "running" and s.name in self._not_before}
         stopping = self._kill_at < math.inf
@@ -214,31 +213,28 @@ class Scheduler:
 
     def _needs(self, stage: str, state: RunState) -> bool:
         """Return whether a stage is to be run for a run as far as it is."""
-        if stage not in self._stages or state.name in self._busy or (stage, state.name) in self._given_up:
+        if stage not in self.stages or state.name in self._busy or (stage, state.name) in self._given_up:
             return False
         if stage == "train":
             return not state.over
-        far = state.over or (self._unfinished and state.env_steps > 0)
-        return far and (state.name in self._redo or not self._folder.evaluated(self._runs[state.name]))
-
-    def _free(self, stage: str, states: Sequence[RunState]) -> list[str]:
-        """Return runs that need a stage and that nobody else works on, as far as is visible, started ones first."""
-        now = self._clock()
-        left = [s for s in states if self._needs(stage, s) and self._not_before.get(s.name, 0.0) <= now]
-        return [s.name for s in (sorted(left, key=lambda s: s.env_steps == 0) if stage == "train" else left)]
+        far = state.over or (self.unfinished and state.env_steps > 0)
+        return far and (state.name in self._redo or not self.folder.evaluated(self._runs[state.name]))
 
     def _jobs(self, states: list[RunState]) -> Iterator[RunJob]:
-        """Yield jobs, training first, then evaluation; one that has started is noted when the next one is drawn."""
+        """Yield jobs for runs that nobody else works on, as far as is visible: training, first of runs that have begun,
+        then evaluation. A job that has started is noted when the next one is drawn."""
         for kind in STAGES:
-            free = self._free(kind, states)
-            for names in self._groups(free) if kind == "evaluate" else [[name] for name in free]:
+            now = self.clock()
+            free = [s for s in states if self._needs(kind, s) and self._not_before.get(s.name, 0.0) <= now]
+            begun_first = [[s.name] for s in sorted(free, key=lambda s: s.env_steps == 0)]
+            for names in begun_first if kind == "train" else self._groups([s.name for s in free]):
                 job = self._job(kind, names)
                 yield job
                 for name in names:
                     self._not_before.pop(name, None)
-                    self._folder.try_again(name)
+                    self.folder.try_again(name)
                 where = self._busy[names[0]].removeprefix(f"{kind}, ")
-                self._display.event(f"{job.name}: started ({where}), log {job.log}")
+                self.display.event(f"{job.name}: started ({where}), log {job.log}")
 
     def _groups(self, names: list[str]) -> list[list[str]]:
         """Group the runs to evaluate by one process each: those of one environment (k_int is in no score)."""
@@ -250,12 +246,12 @@ class Scheduler:
         return [group[i : i + size] for group in kinds.values() for i in range(0, len(group), size)]
 
     def _job(self, kind: str, names: list[str]) -> RunJob:
-        run, others, program = self._runs[names[0]], len(names) - 1, self._programs[kind]
+        run, others, program = self._runs[names[0]], len(names) - 1, self.programs[kind]
         launch, factor = run.launch, max(self._factor.get((kind, name), 1.0) for name in names)
         if kind == "evaluate":
-            command = words_of_evaluation(self._folder, names, program)
+            command = words_of_evaluation(self.folder, names, program)
         else:
-            command = [sys.executable, *program, "--config", str(self._folder.config(run.name))]
+            command = [sys.executable, *program, "--config", str(self.folder.config(run.name))]
             if launch.slots > 1 and not run.config.env.threads:
                 command += [f"env.threads={max(1, (os.cpu_count() or 1) // launch.slots)}"]
         return RunJob(
@@ -263,8 +259,8 @@ class Scheduler:
             kind=kind,
             runs=tuple(names),
             command=tuple(command),
-            log=self._folder.log(run.name),
-            locks=tuple(self._folder.lock(name) for name in names),
+            log=self.folder.log(run.name),
+            locks=tuple(self.folder.lock(name) for name in names),
             launch=launch,
             factor=factor,
             cpus=launch.cpus_per_run,
@@ -273,27 +269,27 @@ class Scheduler:
 
     def _over(self, job: RunJob, code: int) -> None:
         if code == LOCKED:
-            held = [name for name in job.runs if self._folder.state(self._runs[name]).state == "running"]
+            held = [name for name in job.runs if self.folder.state(self._runs[name]).state == "running"]
             for name in held or job.runs:  # the others go on without them
-                self._not_before[name] = self._clock() + ELSEWHERE_S
-            self._display.event(f"{job.name}: somebody else works on it, looking again later", "yellow")
+                self._not_before[name] = self.clock() + ELSEWHERE_S
+            self.display.event(f"{job.name}: somebody else works on it, looking again later", "yellow")
             return
         if job.kind == "evaluate":
-            left = [name for name in job.runs if not self._folder.evaluated(self._runs[name])]
+            left = [name for name in job.runs if not self.folder.evaluated(self._runs[name])]
             for name in set(job.runs) - set(left) if code == 0 or not self._redo else set():
                 self._redo.discard(name)
-                self._folder.drop_old_rows(self._runs[name])
+                self.folder.drop_old_rows(self._runs[name])
             left = left or ([name for name in job.runs if name in self._redo] if code else [])
         else:
-            left = [name for name in job.runs if not self._folder.state(self._runs[name]).over]
+            left = [name for name in job.runs if not self.folder.state(self._runs[name]).over]
         if not left:
-            self._display.event(f"{job.name}: done", "green")
+            self.display.event(f"{job.name}: done", "green")
         elif self._kill_at < math.inf and code not in (1, REFUSED):
-            self._display.event(f"{job.name}: stopped")
+            self.display.event(f"{job.name}: stopped")
         elif len(job.runs) > 1:
             # Which of them is to blame shows when each has a separate process.
             self._alone.update(left)
-            self._display.event(f"{job.name}: {_how(code)}; {len(left)} left, now one by one", "yellow")
+            self.display.event(f"{job.name}: {_how(code)}; {len(left)} left, now one by one", "yellow")
         else:
             self._failed(job, code)
 
@@ -307,16 +303,16 @@ class Scheduler:
         over = code == REFUSED or attempts > job.launch.retries
         if over:
             self._given_up.add(key)
-            self._folder.give_up(name, reason, attempts)
+            self.folder.give_up(name, reason, attempts)
             what = "another try cannot mend it" if code == REFUSED else f"given up after {attempts} tries"
         else:
             hungry = any(word in line.lower() for line in tail for word in OUT_OF_MEMORY)
             self._factor[key] = job.factor * 2.0 if hungry else job.factor
             more = " with twice the memory" if hungry else ""
             what = f"tried again{more} ({attempts} of {job.launch.retries})"
-        self._display.event(f"{job.name}: {_how(code)}, {what}; the end of {job.log}:", "red" if over else "yellow")
+        self.display.event(f"{job.name}: {_how(code)}, {what}; the end of {job.log}:", "red" if over else "yellow")
         for line in shown:
-            self._display.event(f"    {line}")
+            self.display.event(f"    {line}")
 
 
 def _how(code: int) -> str:
