@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import glob
 import os
 import signal
@@ -23,6 +24,7 @@ from converters.generating import (
     CORES,
     Build,
     Command,
+    Decomposing,
     Generate,
     GenerateScenes,
     Get,
@@ -30,6 +32,7 @@ from converters.generating import (
     ListScenes,
     MakeScenes,
     Models,
+    ObjectConfig,
     OnCluster,
 )
 from converters.records.errors import StageFailed
@@ -46,14 +49,13 @@ from converters.segmenting import (
     propose_unproposed,
 )
 from interactive_nav_common.commands import Flag, Words, option, parse, word
-from interactive_nav_common.config import AtLeastOne, Positive, read_words, refuse_unused
+from interactive_nav_common.config import AtLeastOne, read_words, refuse_unused
 from interactive_nav_common.errors import ConfigError, UserError, printable, readable, reports_errors
 from interactive_nav_common.jobs.progress import SafeConsole, stage_progress, warn_once
 from interactive_nav_common.signals import STOPS, interrupts_heard, number_of
 from scenes_mjcf.sets import installed
 
 if TYPE_CHECKING:
-    from converters.pipeline import ConvertConfig
     from converters.records.errors import Gate
 
 
@@ -89,25 +91,6 @@ def alignment_table(rows: tuple[dict[str, Any], ...]) -> Table:
         moved = f"{row['tilt_removed_deg']:.1f}", f"{100 * row['settle_shift_m']:.1f}"
         table.add_row(row["name"], str(row["n_keypoints"]), *solved, *moved)
     return table
-
-
-def _choices_of(config: type[Any], command: Command) -> dict[str, Any]:
-    """Return the fields of a dataclass of choices that the command has."""
-    return {f.name: getattr(command, f.name) for f in dataclasses.fields(config) if hasattr(command, f.name)}
-
-
-@dataclasses.dataclass(kw_only=True)
-class Decomposing(Command):
-    """Base of the commands that decompose models into hulls."""
-
-    seed: int = 0
-    """Of the decomposition's search."""
-    overwrite: Flag = False
-    """Replace OUT if it exists."""
-    strict: Flag = False
-    """Refuse what would be repaired with a warning."""
-    timeout_s: Annotated[Positive, option(name="timeout", metavar="S")] = 240.0
-    """Seconds for the decomposition of one model before its convex hull is taken."""
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -158,12 +141,22 @@ class Convert(OnCluster, MeshFile, WithLibrary, Decomposing):
 
         places = [line for place in self.places for line in _lines(place) if line.strip()]
         check_conversion(settings := read_words(self.settings, "object_faces=3000"), "settings")
-        words = _choices_of(ConvertConfig, self)
+        words = {f.name: getattr(self, f.name) for f in dataclasses.fields(ConvertConfig) if hasattr(self, f.name)}
         words["auto_align"] |= self.segment or bool(self.library and not self.annotations)
         config = ConvertConfig(**words | settings)
         if self.into:
+            from converters.many import convert_many, make_launcher
+
             refuse_unused(self, "--annotations", "with --into: a file is of one scan")
-            return _convert_many(self, places, config, console)
+            jobs = min(self.jobs, len(places))
+            launcher, side_by_side = make_launcher(self.launcher, self.ray_address, jobs, len(places))
+            log = functools.partial(console.print, soft_wrap=True, highlight=False)
+            sources = [Path(place) for place in places]
+            with stage_progress(console) as report:
+                failed = convert_many(sources, self.into, config, launcher, side_by_side, report, log)
+            if failed:
+                log(f"not converted, or with gates that fail: {', '.join(failed)}")
+            return 1 if failed else 0
         if len(places) != 2:
             raise ConfigError(f"convert: got {len(places)} folders, expected SRC OUT, or SRC... --into DIR")
         assert self.out is not None
@@ -199,51 +192,21 @@ class Convert(OnCluster, MeshFile, WithLibrary, Decomposing):
         return 0 if all(g.passed for result in results for g in result.gates) else 1
 
 
-def _convert_many(arguments: Convert, places: list[str], config: ConvertConfig, console: Console) -> int:
-    from converters.many import convert_many, make_launcher
-
-    launcher, side_by_side = make_launcher(
-        arguments.launcher, arguments.ray_address, min(arguments.jobs, len(places)), len(places)
-    )
-    assert arguments.into is not None
-    with stage_progress(console) as report:
-        failed = convert_many(
-            [Path(place) for place in places], arguments.into, config, launcher, side_by_side, report,
-            lambda line: console.print(line, soft_wrap=True, highlight=False),
-        )  # fmt: skip
-    if failed:
-        console.print(f"not converted, or with gates that fail: {', '.join(failed)}", soft_wrap=True, highlight=False)
-    return 1 if failed else 0
-
-
 @dataclasses.dataclass(kw_only=True)
-class Object(Decomposing):
+class Object(ObjectConfig):
     """Turn one mesh or URDF into a folder with a MuJoCo body."""
 
     source: Annotated[Path, *word("MESH_OR_URDF")]
     """OBJ, PLY, STL, GLB, ... in metres, or a URDF."""
     out: Annotated[Path, *word("OUT")]
     """Folder to write; its name becomes the body's."""
-    category: Annotated[str | None, option(metavar="NAME")] = None
-    """Category, a row of scenes_mjcf/categories.yaml (default: by the file's name, else other)."""
-    mass_kg: Annotated[Positive | None, option(name="mass", metavar="KG")] = None
-    """Mass (default: the URDF's, else density x volume)."""
-    friction: Annotated[Positive | None, option(metavar="MU")] = None
-    """Friction (default: the URDF's, else the category's)."""
-    scale: Positive = 1.0
-    """Of a mesh that is not in metres."""
-    up: Literal["z", "y"] = "z"
-    """Axis of the mesh that points up; DAE files say it themselves."""
-    within: Annotated[Path | None, option(metavar="DIR")] = None
-    """Folder that textures are read from (default: the model's folder)."""
 
     def run(self, console: Console) -> None:
         """Run the command."""
-        from converters.single_object import ObjectConfig, convert_object
+        from converters.single_object import convert_object
 
-        config = ObjectConfig(**{**_choices_of(ObjectConfig, self), "source": self.within})
         warn = warn_once(console)
-        about = convert_object(self.source, self.out, config, warn=warn)
+        about = convert_object(self.source, self.out, self, warn=warn)
         for warning in about["warnings"]:
             warn(warning)
         size = " x ".join(f"{100 * v:.1f}" for v in about["size_m"])

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from interactive_nav_common.commands import Command as AnyCommand
 from interactive_nav_common.commands import Flag, Words, option, word
-from interactive_nav_common.config import AtLeastOne, read_words, refuse_unused
+from interactive_nav_common.config import AtLeastOne, Positive, read_words, refuse_unused
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.jobs.progress import stage_progress
 from scenes_mjcf.sets import HERE, PACKAGED, in_cache, is_listed, packaged_set
@@ -47,6 +47,38 @@ class OnCluster(Command):
         super().__post_init__()
         if self.launcher != "ray":
             refuse_unused(self, "--ray-address", "without --launcher ray")
+
+
+@dataclasses.dataclass(kw_only=True)
+class Decomposing(Command):
+    """Base of the commands that decompose models into hulls."""
+
+    seed: int = 0
+    """Of the decomposition's search."""
+    overwrite: Flag = False
+    """Replace OUT if it exists."""
+    strict: Flag = False
+    """Refuse what would be repaired with a warning."""
+    timeout_s: Annotated[Positive, option(name="timeout", metavar="S")] = 240.0
+    """Seconds for the decomposition of one model before its convex hull is taken."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class ObjectConfig(Decomposing):
+    """Choices of one object."""
+
+    category: Annotated[str | None, option(metavar="NAME")] = None
+    """Category, a row of scenes_mjcf/categories.yaml (default: by the file's name, else other)."""
+    mass_kg: Annotated[Positive | None, option(name="mass", metavar="KG")] = None
+    """Mass (default: the URDF's, else density x volume)."""
+    friction: Annotated[Positive | None, option(metavar="MU")] = None
+    """Friction (default: the URDF's, else the category's)."""
+    scale: Positive = 1.0
+    """Of a mesh that is not in metres."""
+    up: Literal["z", "y"] = "z"
+    """Axis of the mesh that points up; DAE files say it themselves."""
+    within: Annotated[Path | None, option(metavar="DIR")] = None
+    """Folder that textures are read from (default: the model's folder)."""
 
 
 @dataclasses.dataclass(kw_only=True)

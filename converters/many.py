@@ -85,9 +85,15 @@ def convert_many(
 
     Return the names of the sources without a scene, or with a gate that fails, whether tried now or before.
     """
-    named = _named(sources)
+    named: dict[str, Path] = {}
+    for source in sources:
+        name = source.stem.removesuffix(".scene_instance") if source.is_file() else Path(os.path.abspath(source)).name
+        check_name(name, f"--into: the name of {source}", ConfigError)
+        if named.setdefault(name, source) is not source:
+            raise ConfigError(f"--into: two sources are named {name}, expected one; rename a folder")
     path = into / ROWS
-    rows = {row["name"]: row for row in _rows(path)}
+    with readable(path, FileError, "remove it to convert all again", " as Parquet"):
+        rows = {row["name"]: row for row in (pq.read_table(path).to_pylist() if path.is_file() else [])}
     jobs = max(1, config.jobs // side_by_side)
     commands, digests, bad = {}, {}, []
     into.mkdir(parents=True, exist_ok=True)
@@ -116,37 +122,17 @@ def convert_many(
                 new = [Path(into, scene) for scene in row.get("scenes") or ()]
                 rows[name]["digest"] = digest_of(named[name], config, new) if new else digests[name]
                 write_parquet(pa.Table.from_pylist(list(rows.values()), SCHEMA), path)
-                log(_line(rows[name]))
+                line = row.get("error")
+                if line is None:
+                    verdict = (
+                        f"gates that fail: {', '.join(row['gates_failed'])}"
+                        if row["gates_failed"]
+                        else "every gate passes"
+                    )
+                    line = f"{row['area_m2']:.1f} m² traversable in {row['seconds']:.0f} s, {verdict}"
+                log(f"{name}: {line}")
                 bad += [name] if code else []
     return bad
-
-
-def _line(row: Mapping[str, Any]) -> str:
-    """Return a conversion's row as one line."""
-    if row.get("error") is not None:
-        return f"{row['name']}: {row['error']}"
-    gates = ", ".join(row["gates_failed"])
-    verdict = f"gates that fail: {gates}" if gates else "every gate passes"
-    return f"{row['name']}: {row['area_m2']:.1f} m² traversable in {row['seconds']:.0f} s, {verdict}"
-
-
-def _named(sources: Sequence[Path]) -> dict[str, Path]:
-    names = [
-        source.stem.removesuffix(".scene_instance")
-        if source.is_file()
-        else os.path.abspath(source).rpartition(os.sep)[2]
-        for source in sources
-    ]
-    for name, source in zip(names, sources, strict=True):
-        check_name(name, f"--into: the name of {source}", ConfigError)
-        if names.count(name) > 1:
-            raise ConfigError(f"--into: two sources are named {name}, expected one; rename a folder")
-    return dict(zip(names, sources, strict=True))
-
-
-def _rows(path: Path) -> list[dict[str, Any]]:
-    with readable(path, FileError, "remove it to convert all again", " as Parquet"):
-        return pq.read_table(path).to_pylist() if path.is_file() else []
 
 
 def measured(results: Sequence[Converted], seconds: float) -> dict[str, Any]:
@@ -209,8 +195,8 @@ class Wanted:
     ray_address: str | None
 
 
-def tier_recipes(tier: str, count: int, seed: int = SEEDS) -> str:
-    """Return the YAML of a set's recipes: the last fifth of its scenes is to test in, with held-out CAD models."""
+def begin_set(out: Path, tier: str, count: int, seed: int = SEEDS) -> None:
+    """Write a set's recipes, unless they are there: the last fifth is to test in, with held-out CAD models."""
     if count < 1:
         raise GenerationError(f"count is {count}, expected at least 1")
     first_test = count - round(TEST_SHARE * count)
@@ -220,12 +206,7 @@ def tier_recipes(tier: str, count: int, seed: int = SEEDS) -> str:
     }
     data = {"conversion": CONVERSION, "scenes": scenes}
     parse_recipes(data, f"tier {tier}")
-    return yaml.safe_dump(data, sort_keys=False)
-
-
-def begin_set(out: Path, tier: str, count: int, seed: int = SEEDS) -> None:
-    """Write a set's recipes, unless they are there."""
-    text, path = tier_recipes(tier, count, seed), out / RECIPES
+    text, path = yaml.safe_dump(data, sort_keys=False), out / RECIPES
     if path.is_file() and path.read_text(encoding="utf-8") != text:
         raise GenerationError(
             f"{path} holds other recipes than {count} of tier {tier} from seed {seed}; name another folder, or leave "

@@ -283,19 +283,6 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
     return Converted(folder, manifest, gates, placed.settled, len(parts.walls), clock.seconds, memory_mib)
 
 
-def _read(source: Path, name: str, config: ConvertConfig, annotations: Path | None) -> RawScene:
-    """Read the source under its scene's name, with a file's annotations if one is given."""
-    about = config.up, config.unit, config.root, config.mirror
-    raw = read_source(source, config.format, config.strict, *about)
-    if annotations is not None:
-        raw = with_annotations(raw, annotations, config.library)
-    raw = at_origin(raw)
-    labelled = np.isin(raw.scan.labels, [label for labels in CATEGORY_LABELS.values() for label in labels]).any()
-    unfit = ("--auto-align: no label of furniture in the scan, so no model is fitted",)
-    warnings = raw.warnings if labelled or not config.auto_align else raw.warnings + unfit
-    return dataclasses.replace(raw, name=name, warnings=warnings)
-
-
 def convert_building(
     source: Path,
     target: Path,
@@ -332,7 +319,14 @@ def convert_building(
         # Before reading, which may take a while: an OUT that cannot be written is reported at once.
         first = stack.enter_context(part_folder(target, config.overwrite))
         with clock.stage("read"):
-            raw = _read(source, target.name, config, annotations)
+            about = config.up, config.unit, config.root, config.mirror
+            raw = read_source(source, config.format, config.strict, *about)
+            if annotations is not None:
+                raw = with_annotations(raw, annotations, config.library)
+            raw, furniture = at_origin(raw), [label for labels in CATEGORY_LABELS.values() for label in labels]
+            unfit = config.auto_align and not np.isin(raw.scan.labels, furniture).any()
+            warning = ("--auto-align: no label of furniture in the scan, so no model is fitted",) * unfit
+            raw = dataclasses.replace(raw, name=target.name, warnings=raw.warnings + warning)
             scenes = split_storeys(raw)
         for warning in raw.warnings:
             warn(warning)

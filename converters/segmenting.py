@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 import shlex
 import signal
 import threading
@@ -237,21 +236,12 @@ def proposal_tables(proposed: Any) -> Iterator[Table]:
     yield table
     if not proposed.comparisons:
         return
-    heads = ("class", "annotated", "chosen", "rank", "cm", "yaw °", "scale x y z", "IoU", "sure")
+    from converters.propose.retrieval import COMPARED
+
     caption = "cm, yaw and scale: the annotated model's best fit against its annotated pose"
-    table = Table(*heads, title="Retrieved models against the annotation", caption=caption)
+    table = Table(*COMPARED, title="Retrieved models against the annotation", caption=caption)
     for row in proposed.comparisons:
-        table.add_row(
-            row.category,
-            row.true_cad[:6],
-            row.chosen_cad[:6],
-            f"{row.rank}/{row.n_tried}",
-            f"{100 * row.difference.translation_m:.1f}",
-            f"{math.degrees(row.difference.yaw_rad):.1f}",
-            " ".join(f"{v:.2f}" for v in row.difference.scale_ratio),
-            f"{row.iou:.2f}",
-            f"{row.confidence:.2f}",
-        )
+        table.add_row(*row)
     yield table
 
 

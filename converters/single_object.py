@@ -20,6 +20,7 @@ from converters.bodies.decompose import DecomposeConfig, cache_folder, decompose
 from converters.bodies.objects import PlacedObject, physical_properties
 from converters.check.gates import collide_with, physical_values
 from converters.check.settle import settle
+from converters.generating import ObjectConfig
 from converters.geometry.boxes import Hull, convex_hull, fit_box
 from converters.geometry.faces import merge_vertices, simplify_to
 from converters.read.files import SourceFolder
@@ -43,26 +44,6 @@ TEXELS = 256
 FACES = 3000
 
 
-@dataclasses.dataclass(frozen=True)
-class ObjectConfig:
-    """Choices of one object."""
-
-    category: str | None = None
-    """One of `CATEGORIES`; None: guessed from the name, else `other`."""
-    mass_kg: float | None = None
-    friction: float | None = None
-    scale: float = 1.0
-    up: str = "z"
-    seed: int = 0
-    """Seed of coacd's search."""
-    overwrite: bool = False
-    source: Path | None = None
-    """Folder that the files which the model names must lie in; None: the model's."""
-    strict: bool = False
-    """Refuse what would be repaired with a warning."""
-    timeout_s: float = 240.0
-
-
 def guess_category(*names: str) -> str | None:
     """Return the category whose word stands in a name, the longest word first; None where there is none."""
     text = re.sub(r"[^a-z]", "", " ".join(names).lower())
@@ -71,7 +52,7 @@ def guess_category(*names: str) -> str | None:
 
 def read_object(path: Path, config: ObjectConfig) -> tuple[RigidObject, SourceFolder]:
     """Read a URDF or a mesh, in metres and z up."""
-    source = SourceFolder(config.source or path.parent, config.strict)
+    source = SourceFolder(config.within or path.parent, config.strict)
     relative = source.inside(path)
     if path.suffix.lower() == ".urdf":
         item = read_urdf(source, relative, "give a mesh or a URDF")

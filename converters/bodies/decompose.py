@@ -11,7 +11,7 @@ import dataclasses
 import errno
 import sys
 import tempfile
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -87,16 +87,21 @@ def decompose_all(
         for name, (v, f) in meshes.items()
     }
     done = {key: hulls for key in set(keys.values()) if (hulls := stored.load(key)) is not MISSING}
-    waiting = list({key: (key, name) for name, key in reversed(keys.items()) if key not in done}.values())
     worker_mib = 0.0
     failed: dict[str, str] = {}
+    waiting = {key: name for name, key in reversed(keys.items()) if key not in done}
     # The largest first: the tail of the stage is then short.
-    waiting.sort(key=lambda item: -len(meshes[item[1]][1]))
+    waiting = dict(sorted(waiting.items(), key=lambda item: -len(meshes[item[1]][1])))
     total = len(set(keys.values()))
     report = progress or (lambda share: None)
     report(len(done) / max(total, 1))
-    with contextlib.closing(_results(waiting, meshes, configs, max(jobs, 1))) as results:
-        for (key, name), (hulls, reason, peak_mib) in results:
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="hulls-")))
+        todo = (_job(key, *meshes[name], configs[name], folder) for key, name in waiting.items())
+        running = run_jobs(LocalLauncher(max(jobs, 1)), todo, grace_s=0.0)
+        for job, code in stack.enter_context(contextlib.closing(running)):
+            key, name = job.name, waiting[job.name]
+            hulls, reason, peak_mib = _result(job, code, name)
             worker_mib = max(worker_mib, peak_mib)
             if hulls is None:
                 if strict:
@@ -113,23 +118,7 @@ def decompose_all(
     )
 
 
-def _results(
-    waiting: list[tuple[str, str]],
-    meshes: dict[str, tuple[np.ndarray, np.ndarray]],
-    configs: Mapping[str, DecomposeConfig],
-    jobs: int,
-) -> Generator[tuple[tuple[str, str], tuple[tuple[Hull, ...] | None, str, float]], None, None]:
-    """Yield key and name, and what `_result` returns, of each that waits, as they end; closed early, end what runs."""
-    names = dict(waiting)
-    with tempfile.TemporaryDirectory(prefix="hulls-") as folder:
-        todo = (_job(key, name, *meshes[name], configs[name], Path(folder)) for key, name in waiting)
-        with contextlib.closing(run_jobs(LocalLauncher(jobs), todo, grace_s=0.0)) as ended:
-            for job, code in ended:
-                name = names[job.name]
-                yield (job.name, name), _result(job, code, name)
-
-
-def _job(key: str, name: str, vertices: np.ndarray, faces: np.ndarray, config: DecomposeConfig, scratch: Path) -> Job:
+def _job(key: str, vertices: np.ndarray, faces: np.ndarray, config: DecomposeConfig, scratch: Path) -> Job:
     """Write a mesh, and return the job that decomposes it."""
     source = scratch / f"{key}.in.npz"
     parameters = {k: v for k, v in dataclasses.asdict(config).items() if k != "timeout_s"}

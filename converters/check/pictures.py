@@ -4,7 +4,7 @@ of CAD models, each from the front, the right and above; in NumPy: neither displ
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -92,7 +92,11 @@ class Picture:
         low, high = np.ceil(pixels.min(axis=1) - 0.5), np.floor(pixels.max(axis=1) - 0.5) + 1
         low, high = (np.clip(v, 0, size).astype(int) for v in (low, high))
         inverse = np.linalg.inv(np.dstack([pixels, np.ones_like(depth)]) * depth[..., None])
-        for part, face, at in _fragments(low, np.maximum(high, low)):
+        high = np.maximum(high, low)
+        count = (high - low).prod(axis=1)
+        some = np.flatnonzero(count)
+        for part in np.split(some, np.flatnonzero(np.diff(np.cumsum(count[some]) // FRAGMENTS)) + 1):
+            face, at = box_pixels(low[part], high[part])
             share = np.einsum("nk,nkc->nc", np.column_stack([at + 0.5, np.ones(len(at))]), inverse[part][face])
             outside = share < -1e-6 * np.abs(share).sum(axis=1, keepdims=True)  # no gaps between neighbours
             inside = np.flatnonzero(~outside.any(axis=1))
@@ -113,14 +117,6 @@ def _areas(corners: np.ndarray) -> np.ndarray:
     """Return twice the areas (m,) of triangles (m, 3, 2)."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     return np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-
-
-def _fragments(low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield blocks of boxes: which boxes (p,), and of every pixel in them which of these (n,) and where (n, 2)."""
-    count = (high - low).prod(axis=1)
-    some = np.flatnonzero(count)
-    for part in np.split(some, np.flatnonzero(np.diff(np.cumsum(count[some]) // FRAGMENTS)) + 1):
-        yield part, *box_pixels(low[part], high[part])
 
 
 def _fitted(

@@ -6,8 +6,6 @@ from collections.abc import Iterable, Iterator
 import fast_simplification
 import numpy as np
 import trimesh
-from scipy import sparse
-from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 
 from converters.records.errors import SAMPLES, check_count
@@ -152,9 +150,8 @@ def loose_parts(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     triangles share no vertices, has the parts of the same mesh with shared vertices.
     """
     joined = weld(vertices)[1][faces]
-    edges, count = np.vstack([joined[:, :2], joined[:, 1:]]), len(vertices)
-    graph = sparse.coo_matrix((np.ones(len(edges), bool), edges.T), (count, count))
-    return csgraph.connected_components(graph, directed=False)[1][joined[:, 0]]
+    edges = np.vstack([joined[:, :2], joined[:, 1:]])
+    return trimesh.graph.connected_component_labels(edges, len(vertices))[joined[:, 0]]
 
 
 def compacted(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

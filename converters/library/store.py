@@ -102,23 +102,6 @@ def _faces(behind: np.ndarray) -> np.ndarray:
     return ((np.cumsum(new) - new) - flat).reshape(-1, 3)
 
 
-def _arrays(shape: Shape) -> bytes:
-    visual = shape.visual
-    points = np.vstack([visual.vertices, *(hull.vertices for hull in shape.hulls)])
-    low, span = points.min(axis=0), np.maximum(np.ptp(points, axis=0), 1e-6)
-    tables = (
-        *_by_use(_packed(visual.vertices, low, span), visual.faces),
-        *_by_use(_packed(np.clip(visual.uv, 0, 1), 0.0, 1.0), visual.uv_faces),
-        _packed(np.vstack([h.vertices for h in shape.hulls]), low, span),
-        np.vstack([h.faces for h in shape.hulls]).astype(np.uint16),
-        np.array([(len(h.vertices), len(h.faces)) for h in shape.hulls], np.uint16),
-    )
-    buffer = io.BytesIO()
-    for array in (np.stack([low, span]), *map(_planes, tables)):
-        np.lib.format.write_array(buffer, array, allow_pickle=False)
-    return buffer.getvalue()
-
-
 def write_library(path: Path, models: Sequence[tuple[Model, Shape]]) -> None:
     """Write the archive: the same models, the same bytes."""
     with zipfile.ZipFile(path, "w") as archive:
@@ -129,9 +112,20 @@ def write_library(path: Path, models: Sequence[tuple[Model, Shape]]) -> None:
         index = [dataclasses.asdict(model) for model, _ in models]
         put("index.json", json.dumps(index, indent=1, sort_keys=True).encode())
         for model, shape in models:
-            put(f"{model.name}.arrays", _arrays(shape))
-            image = io.BytesIO()
-            Image.fromarray(shape.visual.image).save(image, "WEBP", quality=QUALITY, method=6)
+            visual, hulls, buffer, image = shape.visual, shape.hulls, io.BytesIO(), io.BytesIO()
+            points = np.vstack([visual.vertices, *(hull.vertices for hull in hulls)])
+            low, span = points.min(axis=0), np.maximum(np.ptp(points, axis=0), 1e-6)
+            tables = (
+                *_by_use(_packed(visual.vertices, low, span), visual.faces),
+                *_by_use(_packed(np.clip(visual.uv, 0, 1), 0.0, 1.0), visual.uv_faces),
+                _packed(np.vstack([h.vertices for h in hulls]), low, span),
+                np.vstack([h.faces for h in hulls]).astype(np.uint16),
+                np.array([(len(h.vertices), len(h.faces)) for h in hulls], np.uint16),
+            )
+            for array in (np.stack([low, span]), *map(_planes, tables)):
+                np.lib.format.write_array(buffer, array, allow_pickle=False)
+            put(f"{model.name}.arrays", buffer.getvalue())
+            Image.fromarray(visual.image).save(image, "WEBP", quality=QUALITY, method=6)
             put(f"{model.name}.webp", image.getvalue())
 
 

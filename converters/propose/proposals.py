@@ -159,13 +159,6 @@ def scan2cad_list(scan_id: str, models: list[dict[str, Any]]) -> list[dict[str, 
     ]
 
 
-def box_corners(proposal: Proposal) -> np.ndarray:
-    """Return (4, 2) corners of the box from above, counter-clockwise, m."""
-    half = proposal.extent_m[:2] / 2
-    square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half
-    return square @ yaw_matrix(proposal.yaw)[:2, :2].T + proposal.centre[:2]
-
-
 SAME_OBJECT_SHARE = 0.3
 """Share of a proposal's points in an annotated model's box from which they are compared."""
 
@@ -176,8 +169,8 @@ class Proposed:
 
     proposals: tuple[Proposal, ...]
     retrieved: dict[int, retrieval.Retrieval]
-    comparisons: tuple[retrieval.Comparison, ...]
-    """Where the source has annotations and models were retrieved, one for each annotation that was proposed."""
+    comparisons: tuple[tuple[str, ...], ...]
+    """Where the source has annotations and models were retrieved, `retrieval.COMPARED` for each that was proposed."""
 
 
 def floor_of(raw: RawScene) -> float:
@@ -236,7 +229,9 @@ def _draw(raw: RawScene, proposed: Proposed, target: Path) -> None:
     axes.scatter(*vertices[low][:, :2].T, s=0.6, c=shade, alpha=0.5, linewidths=0)
     for k, proposal in enumerate(proposed.proposals):
         colour = CATEGORIES[proposal.category].preview_colour
-        axes.add_patch(Polygon(box_corners(proposal), fill=False, edgecolor=colour, linewidth=2))
+        square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * proposal.extent_m[:2] / 2
+        corners = square @ yaw_matrix(proposal.yaw)[:2, :2].T + proposal.centre[:2]
+        axes.add_patch(Polygon(corners, fill=False, edgecolor=colour, linewidth=2))
         text = f"{proposal.category} {proposal.confidence:.2f}"
         model = proposed.retrieved.get(k)
         if model is not None:
@@ -266,14 +261,13 @@ def propose(
     raw: RawScene,
     target: Path,
     library: Mapping[str, CadModel] | None = None,
-    report: Callable[[str, float], None] | None = None,
+    report: Callable[[str, float], None] = lambda stage, share: None,
 ) -> Proposed:
     """Find instances, with a library of models by id also their models, and write both files into a folder.
 
     The folder is created if absent; on failure older files in it stay as they were. `report`: stage and share.
     """
-    say = report or (lambda stage, share: None)
-    say("propose", 0.0)
+    report("propose", 0.0)
     proposals = propose_instances(raw.scan)
     if not proposals:
         raise SceneRejected(f"{raw.name}: no furniture label in the scan, expected NYU40 ids 5, 6, 7, 8, 14 or 39")
@@ -281,7 +275,7 @@ def propose(
     comparisons = []
     if library is not None:
         floor = floor_of(raw)
-        retrieved = retrieval.auto_align(proposals, library, floor, lambda share: say("retrieve", 0.1 + 0.8 * share))
+        retrieved = retrieval.auto_align(proposals, library, floor, lambda share: report("retrieve", 0.1 + 0.8 * share))
         for annotation in raw.annotations:
             low, high = box = bounds(retrieval.annotated_vertices(annotation, raw.cads))
             at = max(range(len(proposals)), key=lambda i, box=box: box_iou(box, bounds(proposals[i].points)))
@@ -291,10 +285,10 @@ def propose(
                     retrieval.compare_retrieval(annotation, raw.cads, proposals[at], retrieved[at], floor)
                 )
     proposed = Proposed(proposals, retrieved, tuple(comparisons))
-    say("draw", 0.95)
+    report("draw", 0.95)
     text = json.dumps(as_scan2cad(raw.name, proposals, retrieved), indent=1, allow_nan=False) + "\n"
     with whole_file(target / "proposals.json") as written, whole_file(target / "proposals.png") as picture:
         written.write_text(text, encoding="utf-8")
         _draw(raw, proposed, picture)
-    say("draw", 1.0)
+    report("draw", 1.0)
     return proposed

@@ -17,7 +17,7 @@ import trimesh
 from scipy.spatial import KDTree
 
 from converters.bodies.alignment import Alignment, AlignmentError, apply_alignment, least_squares
-from converters.bodies.objects import PoseDifference, pose_difference, upright
+from converters.bodies.objects import pose_difference, upright
 from converters.library.store import read_index, read_shape
 from converters.propose.pieces import SIZES_M, Proposal, bounds, box_iou
 from converters.read.annotations import read_cad
@@ -61,21 +61,6 @@ class Retrieval:
     """(cad_id, cost in m) of every model tried, best first."""
 
 
-def _packaged() -> dict[str, CadModel]:
-    """Return the packaged furniture of classes that are looked for, by id."""
-    library = {}
-    for name, model in read_index().items():
-        if model.category not in SIZES_M:
-            continue
-        visual, hulls = (shape := read_shape(name)).visual, shape.hulls
-        corner_uv, turned = visual.uv[visual.uv_faces], visual.vertices @ Y_UP_TO_Z_UP.T
-        look = turned, visual.faces, texels(visual.image, corner_uv.mean(axis=1))
-        solids = tuple((hull.vertices @ Y_UP_TO_Z_UP.T, hull.faces) for hull in hulls)
-        surface, cad_id = TexturedMesh(*look[:2], corner_uv, visual.image), re.sub("[^A-Za-z0-9_-]", "_", name)
-        library[cad_id] = CadModel(model.category, cad_id, *look, solids, surface=surface)
-    return library
-
-
 def read_library(root: Path | None, source: Path | None = None) -> dict[str, CadModel]:
     """Read every model under `root/cad/<synset>/<id>/models/model_normalized.obj` of a class that is looked for, by id.
 
@@ -83,10 +68,18 @@ def read_library(root: Path | None, source: Path | None = None) -> dict[str, Cad
     """
     if root is None and source is not None and (source / "cad").is_dir():
         root = source
-    if root is None:
-        return _packaged()
-    folder = SourceFolder(root)
     library = {}
+    for name, model in read_index().items() if root is None else ():
+        if model.category in SIZES_M:
+            visual, hulls = (shape := read_shape(name)).visual, shape.hulls
+            corner_uv, turned = visual.uv[visual.uv_faces], visual.vertices @ Y_UP_TO_Z_UP.T
+            look = turned, visual.faces, texels(visual.image, corner_uv.mean(axis=1))
+            solids = tuple((hull.vertices @ Y_UP_TO_Z_UP.T, hull.faces) for hull in hulls)
+            surface, cad_id = TexturedMesh(*look[:2], corner_uv, visual.image), re.sub("[^A-Za-z0-9_-]", "_", name)
+            library[cad_id] = CadModel(model.category, cad_id, *look, solids, surface=surface)
+    if root is None:
+        return library
+    folder = SourceFolder(root)
     for path in sorted((root / "cad").glob("*/*/models/model_normalized.obj")):
         synset, cad_id = path.parts[-4], path.parts[-3]
         if SYNSETS.get(synset) in SIZES_M:
@@ -281,27 +274,14 @@ def auto_align(
     return retrieved
 
 
-@dataclasses.dataclass(frozen=True)
-class Comparison:
-    """Compare one retrieval with a person's annotation of the same object."""
-
-    category: str
-    true_cad: str
-    chosen_cad: str
-    rank: int
-    """Of the annotated model among those tried, from 1; 0: it was not tried."""
-    n_tried: int
-    difference: PoseDifference
-    """Of the annotated model's best fit to its annotated pose: what `pose_difference` says."""
-    iou: float
-    """Of the axis-aligned boxes of the chosen and of the annotated model."""
-    confidence: float
+COMPARED = ("class", "annotated", "chosen", "rank", "cm", "yaw °", "scale x y z", "IoU", "sure")
+"""What `compare_retrieval` returns. Ranks count from 1, 0: not tried; the IoU is of axis-aligned boxes."""
 
 
 def compare_retrieval(
     annotation: Annotation, cads: Mapping[str, CadModel], proposal: Proposal, best: Retrieval, floor_m: float | None
-) -> Comparison:
-    """Compare a retrieval with the annotation.
+) -> tuple[str, ...]:
+    """Compare a retrieval with a person's annotation of the same object; return `COMPARED` in words.
 
     Yaw and scale can only be compared for the same model, so the annotated model's best fit stands for them
     where another one was chosen.
@@ -314,13 +294,13 @@ def compare_retrieval(
         pose = fit_model(proposal, cad, None if proposal.category == "door" else floor_m).pose
     ids = [cad_id for cad_id, _ in best.ranking]
     chosen = apply_alignment(best.pose, best.cad.vertices)
-    return Comparison(
-        annotation.category,
-        annotation.cad_id,
-        best.cad.cad_id,
-        ids.index(annotation.cad_id) + 1 if annotation.cad_id in ids else 0,
-        len(ids),
-        pose_difference(pose, reference, pivot, annotation.symmetry),
-        box_iou(bounds(chosen), bounds(annotated_vertices(annotation, cads))),
-        best.confidence,
+    rank = ids.index(annotation.cad_id) + 1 if annotation.cad_id in ids else 0
+    off = pose_difference(pose, reference, pivot, annotation.symmetry)
+    iou = box_iou(bounds(chosen), bounds(annotated_vertices(annotation, cads)))
+    names, numbers = (annotation.cad_id[:6], best.cad.cad_id[:6]), (f"{iou:.2f}", f"{best.confidence:.2f}")
+    pose_words = (
+        f"{100 * off.translation_m:.1f}",
+        f"{math.degrees(off.yaw_rad):.1f}",
+        " ".join(f"{v:.2f}" for v in off.scale_ratio),
     )
+    return (annotation.category, *names, f"{rank}/{len(ids)}", *pose_words, *numbers)

@@ -69,13 +69,6 @@ def _hinge(model: dict[str, Any], where: str) -> ScannedHinge | None:
     return ScannedHinge(origin, float(np.sign(axis[2])), (low, high))
 
 
-def _confidence(model: dict[str, Any]) -> float | None:
-    value = model.get("proposal", {}).get("retrieval_confidence")
-    if value is not None and not 0 <= float(value) <= 1:
-        raise ValueError(f"retrieval_confidence is {value}, not in [0, 1]")
-    return None if value is None else float(value)
-
-
 def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Annotation], ...]]:
     """Return the scan id of a decoded list of one scan, and for each object its synset id and annotation."""
     if not isinstance(data, list) or len(data) != 1:
@@ -99,6 +92,9 @@ def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Anno
             cad_points = transformed(_keypoints(model, "keypoints_cad"), np.linalg.inv(pose_y_up @ cad_to_y_up))
             scan_points = transformed(_keypoints(model, "keypoints_scan"), world_to_scan)
             count = min(len(cad_points), len(scan_points))
+            confidence = model.get("proposal", {}).get("retrieval_confidence")
+            if confidence is not None and not 0 <= float(confidence) <= 1:
+                raise ValueError(f"retrieval_confidence is {confidence}, not in [0, 1]")
             annotation = Annotation(
                 category=category,
                 cad_id=cad_id,
@@ -107,7 +103,7 @@ def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Anno
                 keypoints_cad=cad_points[:count],
                 keypoints_scan=scan_points[:count],
                 hinge=_hinge(model, where),
-                confidence=_confidence(model),
+                confidence=None if confidence is None else float(confidence),
             )
             records.append((synset, annotation))
     except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
@@ -217,7 +213,7 @@ def read_scan2cad(root: Path, strict: bool = False) -> RawScene:
         colours = np.asarray(painted, np.uint8)[:, :3]
     check_upright(f"{root / stem}.ply", vertices, faces, labels, 0.0)
     cads = {a.cad_id: read_cad(source, synset, a.cad_id) for synset, a in records}
-    scan = ScanMesh(vertices, faces, labels, colours)
+    scan = ScanMesh(vertices, faces, labels=labels, vertex_colours=colours)
     annotations = inside_scan(source, ANNOTATION, tuple(a for _, a in records), cads, scan)
     cads = {a.cad_id: cads[a.cad_id] for a in annotations}
     raw = source.scene("scan2cad", scan, cads=cads, annotations=annotations, licence=LICENCE)

@@ -266,37 +266,26 @@ def read_obj(path: Path) -> ObjMesh:
     check_mesh(path, vertices, index_of[corner] - 1)
     _unfold(vertices, index_of - 1, corner, face)
     of = np.array(material, np.int64)[face].T
-    corner_uv = None if uv_index is None else _corner_uv(path, uv, uv_index, corner)
+    corner_uv = None
+    if uv_index is not None and len(uv):
+        if uv_index.min() < 1 or uv_index.max() > len(uv):
+            raise SceneRejected(
+                f"{path}: a face names texture coordinate {int(uv_index.max())} of {len(uv)}; fetch the file again"
+            )
+        corner_uv = np.nan_to_num(uv[uv_index - 1][corner], posinf=0.0, neginf=0.0)
+    colours = None
+    if tints:  # 0 to 1, or bytes; white where a line has none
+        values = np.nan_to_num([[as_number(word) for word in words] for words in tints.values()])
+        colours = np.full((len(vertices), 3), 255, np.uint8)
+        colours[list(tints)] = np.clip(np.round(values if values.max() > 1 else 255 * values), 0, 255)
     named = of[0], tuple(names), tuple(libraries), of[1], tuple(groups)
-    return ObjMesh(vertices, index_of[corner] - 1, corner_uv, *named, _tinted(len(vertices), tints), dict(unused))
-
-
-def _corner_uv(path: Path, uv: np.ndarray, index: np.ndarray, corner: np.ndarray) -> np.ndarray | None:
-    """Return (m, 3, 2) of texture coordinates (n, 2) by the indices, from 1, of corners (m, 3)."""
-    if not len(uv):
-        return None
-    if index.min() < 1 or index.max() > len(uv):
-        raise SceneRejected(
-            f"{path}: a face names texture coordinate {int(index.max())} of {len(uv)}; fetch the file again"
-        )
-    return np.nan_to_num(uv[index - 1][corner], posinf=0.0, neginf=0.0)
+    return ObjMesh(vertices, index_of[corner] - 1, corner_uv, *named, colours, dict(unused))
 
 
 def _comma(text: str) -> str:
     """Return a hint where numbers are written with decimal commas."""
     hint = ": it has decimal commas, expected points, which exporters write under English number settings"
     return hint * bool(re.search(r"\d,\d", text))
-
-
-def _tinted(count: int, tints: dict[int, list[str]]) -> np.ndarray | None:
-    """Return (n, 3) uint8 colours of vertices, white where a line has none; None without any."""
-    if not tints:
-        return None
-    values = np.nan_to_num([[as_number(word) for word in words] for words in tints.values()])
-    colours = np.full((count, 3), 255, np.uint8)
-    # Files have 0 to 1, or bytes.
-    colours[list(tints)] = np.clip(np.round(values if values.max() > 1 else 255 * values), 0, 255)
-    return colours
 
 
 def _from_the_end(word: str, n_vertices: int, n_uv: int) -> str:

@@ -118,7 +118,15 @@ def _read_surface(source: SourceFolder, relative: str, remedy: str) -> obj.Textu
                 loaded = trimesh.load(file, path.suffix[1:].lower(), resolver=resolver, process=False, force="scene")
                 assert isinstance(loaded, trimesh.Scene)
                 meshes = [p for p in loaded.dump() if isinstance(p, trimesh.Trimesh) and len(p.faces)]
-                turn = _collada_turn(path) if path.suffix.lower() == ".dae" else np.eye(3)
+                turn = np.eye(3)
+                if path.suffix.lower() == ".dae":
+                    axis, unit = collada_frame(path)
+                    if not 0.0 < as_number(unit) < math.inf or axis not in UP_AXES:
+                        raise SceneRejected(
+                            f"{path}: its unit is '{unit}' m and its up axis '{axis}', expected a positive number and "
+                            f"one of {', '.join(UP_AXES)}; export it again"
+                        )
+                    turn = as_number(unit) * UP_AXES[axis]
                 parts = [_painted(path, mesh, turn) for mesh in meshes]
     except SceneRejected:
         if resolver.refusal is None:
@@ -231,17 +239,6 @@ def collada_frame(path: Path) -> tuple[str, str]:
     unit = root.find("{*}asset/{*}unit")
     axis = (root.findtext("{*}asset/{*}up_axis") or "Y_UP").strip()
     return axis, "1" if unit is None else unit.get("meter", "1")
-
-
-def _collada_turn(path: Path) -> np.ndarray:
-    """Return (3, 3) from a COLLADA file's frame to metres and z up."""
-    axis, unit = collada_frame(path)
-    if not 0.0 < as_number(unit) < math.inf or axis not in UP_AXES:
-        raise SceneRejected(
-            f"{path}: its unit is '{unit}' m and its up axis '{axis}', expected a positive number and one of "
-            f"{', '.join(UP_AXES)}; export it again"
-        )
-    return as_number(unit) * UP_AXES[axis]
 
 
 def colours_of_faces(mesh: obj.TexturedMesh) -> np.ndarray:

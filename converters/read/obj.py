@@ -264,7 +264,7 @@ def read_scan_obj(source: SourceFolder, relative: str, remedy: str) -> TexturedM
 def scan_of(mesh: TexturedMesh, labels: np.ndarray) -> ScanMesh:
     """Return a mesh with labels (n,) of its vertices; grey where it has no image."""
     grey = np.full((len(mesh.vertices), 3), GREY, np.uint8) if mesh.texture is None else None
-    return ScanMesh(mesh.vertices, mesh.faces, labels, grey, mesh.corner_uv, mesh.texture)
+    return ScanMesh(mesh.vertices, mesh.faces, mesh.corner_uv, mesh.texture, labels=labels, vertex_colours=grey)
 
 
 def texels(image: np.ndarray, uv: np.ndarray) -> np.ndarray:

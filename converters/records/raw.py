@@ -60,9 +60,9 @@ class TexturedMesh:
     """(n, 3) float64, m."""
     faces: np.ndarray
     """(m, 3) int64."""
-    corner_uv: np.ndarray | None
+    corner_uv: np.ndarray | None = None
     """(m, 3, 2) float64, origin at the lower left, or None without an image."""
-    texture: np.ndarray | None
+    texture: np.ndarray | None = None
     """(h, w, 3) uint8, or None."""
 
 
@@ -89,22 +89,14 @@ def joined_clouds(*clouds: ColourCloud) -> ColourCloud:
     return ColourCloud(*(np.vstack([getattr(c, f.name) for c in clouds]) for f in dataclasses.fields(ColourCloud)))
 
 
-@dataclasses.dataclass(frozen=True)
-class ScanMesh:
-    """A triangle mesh with a colour source and semantic labels."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ScanMesh(TexturedMesh):
+    """A mesh with semantic labels, and colours of its vertices where it has no texture."""
 
-    vertices: np.ndarray
-    """(n, 3) float64, m."""
-    faces: np.ndarray
-    """(m, 3) int64."""
     labels: np.ndarray
     """(n,) int64, NYU40 id of each vertex; 0 is unlabelled."""
-    vertex_colours: np.ndarray | None
+    vertex_colours: np.ndarray | None = None
     """(n, 3) uint8, or None where the scan has a texture."""
-    corner_uv: np.ndarray | None = None
-    """(m, 3, 2) float64, texture coordinates of each face corner (origin at the lower left), or None."""
-    texture: np.ndarray | None = None
-    """(h, w, 3) uint8, or None."""
     furnished: bool = True
     """False: it shows the structure alone, so that no face of it is an annotated object's."""
 

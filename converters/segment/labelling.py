@@ -109,19 +109,6 @@ Scores = Callable[[jax.Array, jax.Array, tuple[int, int]], jax.Array]
 """Index, features and shape of `dense` -> [N, X, Y, LAYERS, classes]."""
 
 
-def make_scores(net: VoxelNet, variables: Any) -> Scores:
-    """Return a network with weights, compiled once a shape."""
-
-    @signals_wait()  # a compilation that is left crashes the interpreter at its end
-    @functools.partial(jax.jit, static_argnums=2)
-    def scores(index: jax.Array, features: jax.Array, shape: tuple[int, int]) -> jax.Array:
-        out = net.apply(variables, dense(index, features, shape))
-        assert isinstance(out, jax.Array)
-        return jax.nn.log_softmax(out)
-
-    return scores
-
-
 def score_voxels(voxels: Voxels, scores: Scores, report: Callable[[float], None] = lambda share: None) -> np.ndarray:
     """Return (k, classes) scores of occupied voxels, tile by tile."""
     out = np.zeros((len(voxels.index), len(NAMES)), np.float32)
@@ -171,8 +158,17 @@ MATCH_IOU = 0.5
 
 
 def load_scores(weights: Path | None = None) -> Scores:
-    """Load the network for `label_scan`; None: with the packaged weights."""
-    return make_scores(*load_network(weights or WEIGHTS))
+    """Load the network for `label_scan`, compiled once a shape; None: with the packaged weights."""
+    net, variables = load_network(weights or WEIGHTS)
+
+    @signals_wait()  # a compilation that is left crashes the interpreter at its end
+    @functools.partial(jax.jit, static_argnums=2)
+    def scores(index: jax.Array, features: jax.Array, shape: tuple[int, int]) -> jax.Array:
+        out = net.apply(variables, dense(index, features, shape))
+        assert isinstance(out, jax.Array)
+        return jax.nn.log_softmax(out)
+
+    return scores
 
 
 def score_points(surface: Surface, floors_m: tuple[float, ...], scores: Scores, report: Report) -> np.ndarray:

@@ -14,7 +14,7 @@ from converters.generate.models.cad import MODELS, Instance
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.scan import NYU40 as LABELS
 from converters.generate.surface.scan import Volume, smooth_noise, visible_from
-from converters.records.raw import ScanMesh
+from converters.records.raw import TexturedMesh
 from converters.segment.voxels import LAYERS, NAMES, VOXEL_M, Surface, classes_of, joined, sample_surface, voxelise
 from interactive_nav_common.files import write_arrays
 
@@ -39,13 +39,11 @@ class Crop:
 def _of_item(item: Instance) -> list[Surface]:
     visual = item.model.surface
     if visual is not None:
-        v, none = item.to_floor(np.asarray(visual.vertices, float)), np.zeros(len(visual.vertices), np.int64)
-        uv = np.asarray(visual.uv, float)[visual.uv_faces]
-        return [sample_surface(ScanMesh(v, visual.faces, none, None, uv, np.asarray(visual.image)[..., :3]))]
+        v, uv = item.to_floor(np.asarray(visual.vertices, float)), np.asarray(visual.uv, float)[visual.uv_faces]
+        return [sample_surface(TexturedMesh(v, visual.faces, uv, np.asarray(visual.image)[..., :3]))]
     surfaces = []
     for part in item.model.parts:
-        v = item.to_floor(part.vertices)
-        bare = sample_surface(ScanMesh(v, part.faces, np.zeros(len(v), np.int64), None))
+        bare = sample_surface(TexturedMesh(item.to_floor(part.vertices), part.faces))
         colour = 255 * np.array(MATERIALS[part.material])
         surfaces.append(dataclasses.replace(bare, colours=np.tile(colour, (len(bare.points), 1))))
     return surfaces
@@ -61,8 +59,7 @@ def building_surface(seed: int, tier: str, split: str) -> tuple[Surface, np.ndar
     labels = scan.labels.astype(int)
     home = isinstance(config, HomeConfig)
     labels[np.isin(labels, OTHER) & home] = 40
-    shell = ScanMesh(scan.vertices, scan.faces, labels, None, atlas.uv[atlas.face_uv], atlas.image)
-    surfaces = [sample_surface(shell)]
+    surfaces = [sample_surface(TexturedMesh(scan.vertices, scan.faces, atlas.uv[atlas.face_uv], atlas.image))]
     classes = [classes_of(labels)[scan.faces[surfaces[0].face, 0]]]
     for item in building.items if home else ():
         category = item.model.category

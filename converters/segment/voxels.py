@@ -12,7 +12,7 @@ import numpy as np
 from converters.geometry.faces import face_areas, sum_at_vertices, unit_normals
 from converters.read.obj import texels
 from converters.records.errors import CLOUD
-from converters.records.raw import ScanMesh
+from converters.records.raw import ScanMesh, TexturedMesh
 
 VOXEL_M = 0.04
 BELOW_M = 4.5 * VOXEL_M
@@ -70,7 +70,7 @@ def classes_of(labels: np.ndarray) -> np.ndarray:
     return table[np.clip(labels, 0, 255)]
 
 
-def sample_surface(scan: ScanMesh, spacing_m: float = VOXEL_M / 2) -> Surface:
+def sample_surface(scan: TexturedMesh, spacing_m: float = VOXEL_M / 2) -> Surface:
     """Sample points all over a scan, at least one a face, evenly and without chance; a scan of one colour has none."""
     area = face_areas(scan.vertices, scan.faces)
     spacing_m = max(spacing_m, math.sqrt(area.sum() / CLOUD))
@@ -83,7 +83,7 @@ def sample_surface(scan: ScanMesh, spacing_m: float = VOXEL_M / 2) -> Surface:
     colours = None
     if scan.texture is not None and scan.corner_uv is not None:
         colours = texels(scan.texture, np.einsum("nc,ncd->nd", weight, scan.corner_uv[face])).astype(float)
-    elif scan.vertex_colours is not None:
+    elif isinstance(scan, ScanMesh) and scan.vertex_colours is not None:
         colours = np.einsum("nc,ncd->nd", weight, scan.vertex_colours[scan.faces[face]])
     if colours is not None and not np.ptp(colours, axis=0).any():
         colours = None

@@ -196,15 +196,6 @@ class Shown:
         return stacked(done)
 
 
-def whole_floor(plan: FloorPlan, objects: tuple[PlacedObject, ...]) -> np.ndarray:
-    """Return (rows, columns) bool: floor of the plan, and around what stands on it, which may be hidden."""
-    shadow = np.zeros(plan.grid.shape, bool)
-    for placed in objects:
-        plan.grid.add_below(shadow, to_world(placed, placed.vertices_b), SHADOW_M)
-    floor = np.asarray(ndimage.binary_propagation(plan.floor, mask=plan.floor | (shadow & ~plan.occupied)), bool)
-    return floor | ndimage.binary_closing(floor, np.ones((5, 5)))  # what the cut left of a leg stands on floor too
-
-
 def _beside(mask: np.ndarray, plan: FloorPlan, shown: Shown, above_m: float) -> np.ndarray:
     """Return (columns,) bool: a (rows, columns) mask of the plan, so far before the plane."""
     along = shown.low[0] + (np.arange(shown.visible.shape[1]) + 0.5) * shown.cell_m
@@ -279,7 +270,14 @@ def fill_holes(
         if plane is ground:
             # The scan's floor is level by now; what is drawn below it is a reflection.
             points = points[plane.distance(points) > -1e-6]
-            floor = whole_floor(plan, objects).repeat(2, axis=0).repeat(2, axis=1)
+            # Floor of the plan, and around what stands on it, which may be hidden.
+            shadow = np.zeros(plan.grid.shape, bool)
+            for placed in objects:
+                plan.grid.add_below(shadow, to_world(placed, placed.vertices_b), SHADOW_M)
+            around = plan.floor | (shadow & ~plan.occupied)
+            floor = np.asarray(ndimage.binary_propagation(plan.floor, mask=around), bool)
+            floor |= ndimage.binary_closing(floor, np.ones((5, 5)))  # what the cut left of a leg stands on floor too
+            floor = floor.repeat(2, axis=0).repeat(2, axis=1)
             shown = Shown.of(plane, points, np.zeros(2), floor.shape, cell_m)
             patch = shown.patches(floor & ~shown.visible)
         elif len(points):

@@ -88,16 +88,13 @@ def _runs(grid: np.ndarray, upright: int) -> Iterator[_Run]:
     blocked = np.cumsum(np.pad(~grid.T, ((1, 0), (0, 0))), axis=0)  # cells that are not allowed before each column
     for line, row in enumerate(grid):
         ends = np.flatnonzero(np.diff(row, prepend=False, append=False)).reshape(-1, 2)
-        yield from ((upright, line, s, e, *_grow(blocked, upright, line, s, e)) for s, e in ends.tolist())
-
-
-def _grow(blocked: np.ndarray, upright: int, line: int, start: int, stop: int) -> tuple[int, int, int, int]:
-    """Return the run from start to stop along a line, and as many equal runs beside it as are allowed."""
-    other = np.flatnonzero(blocked[stop] != blocked[start])
-    at = int(np.searchsorted(other, line))
-    low = int(other[at - 1]) + 1 if at > 0 else 0
-    high = int(other[at]) if at < len(other) else blocked.shape[1]
-    return (start, stop, low, high) if upright else (low, high, start, stop)
+        for start, stop in ends.tolist():  # with as many equal runs beside it as are allowed
+            other = np.flatnonzero(blocked[stop] != blocked[start])
+            at = int(np.searchsorted(other, line))
+            low = int(other[at - 1]) + 1 if at > 0 else 0
+            high = int(other[at]) if at < len(other) else blocked.shape[1]
+            r0, r1, c0, c1 = (start, stop, low, high) if upright else (low, high, start, stop)
+            yield upright, line, start, stop, r0, r1, c0, c1
 
 
 def wall_boxes(plan: FloorPlan) -> tuple[OrientedBox, ...]:

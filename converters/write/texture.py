@@ -30,7 +30,7 @@ PLAIN, MARGIN = 8, 4
 
 
 def colour_cloud(
-    scan: ScanMesh, vertices_w: np.ndarray, face_index: np.ndarray, spacing_m: float = TEXTURE_SPACING_M
+    scan: TexturedMesh, vertices_w: np.ndarray, face_index: np.ndarray, spacing_m: float = TEXTURE_SPACING_M
 ) -> ColourCloud:
     """Sample coloured points of some faces of the scan: their vertices, or a sampling of the texture.
 
@@ -39,7 +39,7 @@ def colour_cloud(
     """
     chosen = scan.faces[face_index]
     if scan.texture is None or scan.corner_uv is None:
-        assert scan.vertex_colours is not None
+        assert isinstance(scan, ScanMesh) and scan.vertex_colours is not None
         used = np.unique(chosen)
         normals = vertex_normals(vertices_w, chosen)[used]
         return ColourCloud(vertices_w[used], normals, scan.vertex_colours[used].astype(float))
@@ -54,9 +54,7 @@ def textured_cloud(mesh: TexturedMesh, spacing_m: float) -> ColourCloud:
     """Sample coloured points of a whole surface with an image; none without one."""
     if mesh.texture is None:
         return ColourCloud(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
-    none = np.zeros(len(mesh.vertices), np.int64)
-    scan = ScanMesh(mesh.vertices, mesh.faces, none, None, mesh.corner_uv, mesh.texture)
-    return colour_cloud(scan, mesh.vertices, np.arange(len(mesh.faces)), spacing_m)
+    return colour_cloud(mesh, mesh.vertices, np.arange(len(mesh.faces)), spacing_m)
 
 
 def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:

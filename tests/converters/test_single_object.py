@@ -194,7 +194,7 @@ def test_the_source_may_be_wider_than_the_models_folder(tmp_path, hull_cache):
     path = tmp_path / "models/toy.obj"
     about = convert_object(path, tmp_path / "narrow", ObjectConfig(), hull_cache)
     assert any("'../images/t.png', which lies outside of the source folder" in w for w in about["warnings"])
-    about = convert_object(path, tmp_path / "wide", ObjectConfig(source=tmp_path), hull_cache)
+    about = convert_object(path, tmp_path / "wide", ObjectConfig(within=tmp_path), hull_cache)
     assert about["warnings"] == [] and "images/t.png" in about["source"]["sha256"]
     colours = np.asarray(Image.open(tmp_path / "wide/assets/wide.png").convert("RGB")).reshape(-1, 3)
     np.testing.assert_allclose(np.median(colours, axis=0), (200, 30, 10), atol=4)

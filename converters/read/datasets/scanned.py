@@ -5,7 +5,6 @@ their classes. scenezoo may fetch a collection's tables of splits and classes, w
 """
 
 import dataclasses
-import importlib
 import re
 from pathlib import Path
 from typing import Any
@@ -55,7 +54,12 @@ def read_scan(name: str, root: Path, strict: bool = False) -> RawScene:
         mesh = dataset.get_mesh(scene.name)
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.triangles, np.int64)
         colours = np.asarray(mesh.vertex_colors, float) if mesh.has_vertex_colors() else None
-        given = _labels(source, dataset, scene.name, about)
+        given = None
+        try:
+            given = dataset.get_segmentation(scene.name, **about.options)
+        except (FileNotFoundError, library.UnsupportedOperationError) as error:  # the collection does not publish them
+            why = " ".join(str(error).split())[:200]
+            source.note(f"{scene.name}: has no labels ({why}); shape decides what is structure")
     if not len(faces) or not np.isfinite(vertices).all():
         raise SceneRejected(f"{root}: its mesh has {len(faces)} faces or vertices that are no numbers; fetch it again")
     root = scene
@@ -76,15 +80,6 @@ def read_scan(name: str, root: Path, strict: bool = False) -> RawScene:
         scan = dataclasses.replace(scan, vertex_colours=np.clip(np.round(255 * colours), 0, 255).astype(np.uint8))
     licence = read_licence(source)
     return dataclasses.replace(source.scene(name, scan, floor_height_m=floor_m, licence=licence), name=root.name)
-
-
-def _labels(source: SourceFolder, dataset: Any, scene: str, about: Collection) -> Any:
-    """Return scenezoo's segmentation; None where the collection does not publish this scene's."""
-    try:
-        return dataset.get_segmentation(scene, **about.options)
-    except (FileNotFoundError, importlib.import_module("scenezoo").UnsupportedOperationError) as error:
-        source.note(f"{scene}: has no labels ({' '.join(str(error).split())[:200]}); shape decides what is structure")
-        return None
 
 
 def label_of(name: str) -> int:

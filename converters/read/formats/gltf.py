@@ -145,21 +145,18 @@ class _File:
                 )
             mesh = self.tree["meshes"][nodes[k]["mesh"]]
             weights = nodes[k].get("weights", mesh.get("weights", []))
+            copies = [np.eye(4)]  # in the node's frame
+            given = nodes[k].get("extensions", {}).get("EXT_mesh_gpu_instancing", {}).get("attributes")
+            if given is not None:
+                keys = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}
+                values = {keys[name]: self._accessor(i) for name, i in given.items() if name in keys}
+                copies = [_pose(dict(zip(values, row, strict=True))) for row in zip(*values.values(), strict=True)]
             for part in mesh["primitives"]:
-                for copy in self._instances(nodes[k]):
+                for copy in copies:
                     meshes += self._primitive(part, pose @ copy, weights)
                     faces += len(meshes[-1].faces) if meshes else 0
                     check_count(self.path, faces, NUMBERS, "faces in its nodes", "simplify it")
         return meshes
-
-    def _instances(self, node: Any) -> list[np.ndarray]:
-        """Poses (4, 4) in a node's frame of the copies of its mesh."""
-        given = node.get("extensions", {}).get("EXT_mesh_gpu_instancing", {}).get("attributes")
-        if given is None:
-            return [np.eye(4)]
-        keys = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}
-        values = {keys[name]: self._accessor(k) for name, k in given.items() if name in keys}
-        return [_pose(dict(zip(values, row, strict=True))) for row in zip(*values.values(), strict=True)]
 
     def _bytes(self, item: Any, what: str) -> bytes:
         """Content of a buffer or image: a data URI, or a file beside the model."""

@@ -164,14 +164,13 @@ def built_in(raw: RawScene, beside: Mapping[int, str]) -> RawScene:
     rest = dataclasses.replace(raw, annotations=stay, cads=cads, warnings=(*raw.warnings, words))
     if not raw.picture:
         return rest
-    texture = raw.scan.texture
     shells = []
     for k in beside:
         surface = raw.cads[raw.annotations[k].cad_id].surface
         assert surface is not None
         shells.append(placed(_small(surface), raw.annotations[k].pose))
     mesh = with_split_corners(join_meshes(*shells))
-    whole = join_meshes(TexturedMesh(raw.scan.vertices, raw.scan.faces, raw.scan.corner_uv, texture), mesh)
+    whole = join_meshes(raw.scan, mesh)
     fresh = len(whole.vertices) - len(raw.scan.vertices)
     labels = np.concatenate([raw.scan.labels, np.full(fresh, OTHER_STRUCTURE)])
     return dataclasses.replace(

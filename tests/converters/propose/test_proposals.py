@@ -30,7 +30,8 @@ def scan_of(*parts: tuple[trimesh.Trimesh, int]) -> ScanMesh:
     offsets = np.cumsum([0] + [len(m.vertices) for m, _ in parts[:-1]])
     faces = np.vstack([m.faces + o for (m, _), o in zip(parts, offsets, strict=True)])
     labels = np.concatenate([np.full(len(m.vertices), label) for m, label in parts])
-    return ScanMesh(vertices, faces, labels, np.full((len(vertices), 3), 128, np.uint8))
+    grey = np.full((len(vertices), 3), 128, np.uint8)
+    return ScanMesh(vertices, faces, labels=labels, vertex_colours=grey)
 
 
 def box(size, centre) -> trimesh.Trimesh:

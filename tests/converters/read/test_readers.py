@@ -389,7 +389,8 @@ def read_room(root, strict=False, chosen=None):
     labels = np.where((heights == 0).all(1), FLOOR, np.where((heights == size[2]).all(1), CEILING, WALL))
     corners = triangles.reshape(-1, 3)  # labels are of vertices, and a corner would belong to three faces
     faces, grey = np.arange(len(corners)).reshape(-1, 3), np.full((len(corners), 3), 200, np.uint8)
-    return source.scene("room", ScanMesh(corners, faces, labels.repeat(3), grey), licence="CC0", floor_height_m=0.0)
+    scan = ScanMesh(corners, faces, labels=labels.repeat(3), vertex_colours=grey)
+    return source.scene("room", scan, licence="CC0", floor_height_m=0.0)
 
 
 def test_a_reader_of_a_new_layout(tmp_path, monkeypatch):

@@ -64,7 +64,7 @@ def test_any_difference_is_computed(tmp_path, arguments):
 
 
 def test_names_and_reports_do_not_count(tmp_path):
-    scan = ScanMesh(POINTS, np.array([[0, 1, 2]]), np.zeros(3, int), None)
+    scan = ScanMesh(POINTS, np.array([[0, 1, 2]]), labels=np.zeros(3, int))
     raw = RawScene("a", "gibson", scan, "mine", {"x": "y"}, floor_height_m=0.0)
     store = StageCache(tmp_path)
     store.call(stage, POINTS, 1.0, raw)

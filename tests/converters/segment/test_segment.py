@@ -44,7 +44,8 @@ def square(size_m: float = 1.0) -> ScanMesh:
     """A level square of two triangles, coloured from black to white along x."""
     vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]) * size_m
     colours = np.repeat([[0], [255], [255], [0]], 3, axis=1).astype(np.uint8)
-    return ScanMesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(4, int), colours)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    return ScanMesh(vertices, faces, labels=np.zeros(4, int), vertex_colours=colours)
 
 
 def test_ids_become_classes_and_what_is_not_known_stays_so():

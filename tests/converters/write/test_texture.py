@@ -53,7 +53,7 @@ def test_texture_of_a_scan_is_sampled_where_it_lies():
     texture[0, 0] = (255, 0, 0)  # upper left
     texture[1, 1] = (0, 0, 255)  # lower right
     uv = SQUARE[:, :2][TRIANGLES]
-    scan = ScanMesh(SQUARE, TRIANGLES, np.zeros(4, int), None, uv, texture)
+    scan = ScanMesh(SQUARE, TRIANGLES, uv, texture, labels=np.zeros(4, int))
     cloud = colour_cloud(scan, SQUARE, np.arange(2), 0.1)
     upper_left = (cloud.points[:, 0] < 0.5) & (cloud.points[:, 1] > 0.5)
     lower_right = (cloud.points[:, 0] > 0.5) & (cloud.points[:, 1] < 0.5)
@@ -64,7 +64,7 @@ def test_texture_of_a_scan_is_sampled_where_it_lies():
 
 def test_vertex_colours_come_with_the_chosen_faces_only():
     colours = np.array([[1, 1, 1], [2, 2, 2], [3, 3, 3], [4, 4, 4]], np.uint8)
-    scan = ScanMesh(SQUARE, TRIANGLES, np.zeros(4, int), colours)
+    scan = ScanMesh(SQUARE, TRIANGLES, labels=np.zeros(4, int), vertex_colours=colours)
     cloud = colour_cloud(scan, SQUARE, np.array([1]))
     np.testing.assert_array_equal(cloud.colours[:, 0], [1, 3, 4])
 
