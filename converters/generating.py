@@ -136,16 +136,16 @@ class GenerateScenes(OnCluster):
 
     def run(self, console: Console) -> int:
         """Run the command."""
-        from converters.many import SEEDS, Wanted, generate_scenes
+        from converters.many import SEEDS, generate_scenes
 
         if self.tier:
             refuse_unused(self, "--recipes", "with --tier, which writes them")
             self.count, self.seed = self.count or 10, SEEDS if self.seed is None else self.seed
         else:
             refuse_unused(self, "--count --seed", "without --tier")
-        wanted = Wanted(**{f.name: getattr(self, f.name) for f in dataclasses.fields(Wanted)})
+        log = functools.partial(console.print, soft_wrap=True, highlight=False)
         with stage_progress(console) as report:
-            failed = generate_scenes(wanted, report, lambda line: console.print(line, soft_wrap=True, highlight=False))
+            failed = generate_scenes(self, report, log)
         return 1 if failed else 0
 
 
@@ -164,7 +164,7 @@ class MakeScenes(Command):
 
         with stage_progress(console) as report:
             log = functools.partial(console.print, soft_wrap=True, highlight=False)
-            failed = make_packaged(self.names, self.jobs, report, log)
+            failed = make_packaged(self.names, functools.partial(GenerateScenes, jobs=self.jobs), report, log)
         return 1 if failed else 0
 
 

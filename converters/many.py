@@ -179,22 +179,6 @@ GRACE_S = 10.0
 """A process that is not wanted any more has this long to end itself."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Wanted:
-    """Hold the words of `python -m converters generate-scenes`."""
-
-    out: Path
-    recipes: Path | None
-    tier: str | None
-    count: int | None
-    seed: int | None
-    only: Sequence[str]
-    overwrite: bool
-    jobs: int
-    launcher: str
-    ray_address: str | None
-
-
 def begin_set(out: Path, tier: str, count: int, seed: int = SEEDS) -> None:
     """Write a set's recipes, unless they are there: the last fifth is to test in, with held-out CAD models."""
     if count < 1:
@@ -267,13 +251,16 @@ def run_commands(
                 report(f"{done}/{len(commands)} {what}", done / len(commands))
 
 
-def generate_scenes(wanted: Wanted, report: Report, log: Callable[[str], None]) -> list[str]:
-    """Generate and list the scenes that are not there yet; return the names of those that fail, or fail a gate."""
+def generate_scenes(wanted: Any, report: Report, log: Callable[[str], None]) -> list[str]:
+    """Generate and list the scenes that are not there yet; return the names of those that fail, or fail a gate.
+
+    `wanted`: the command `converters.generating.GenerateScenes`.
+    """
     if wanted.tier and wanted.count is not None and wanted.seed is not None:
         begin_set(wanted.out, wanted.tier, wanted.count, wanted.seed)
     path = wanted.recipes or wanted.out / RECIPES
     recipes = load_recipes(path)
-    todo = chosen(recipes, wanted.out, tuple(wanted.only), wanted.overwrite, log)
+    todo = chosen(recipes, wanted.out, wanted.only, wanted.overwrite, log)
     if len(todo) > 1 and (wanted.jobs > 1 or wanted.launcher == "ray"):
         launcher, _ = make_launcher(wanted.launcher, wanted.ray_address, wanted.jobs, len(todo))
         words = [sys.executable, "-m", "converters", "generate-scenes", str(wanted.out), "--recipes", str(path)]
@@ -292,8 +279,10 @@ def generate_scenes(wanted: Wanted, report: Report, log: Callable[[str], None]) 
     return failed
 
 
-def make_packaged(names: Sequence[str], jobs: int, report: Report, log: Callable[[str], None]) -> list[str]:
-    """Generate scenes of the package's sets in the cache folder, unless the package has them.
+def make_packaged(
+    names: Sequence[str], command: Callable[..., Any], report: Report, log: Callable[[str], None]
+) -> list[str]:
+    """Generate scenes of the package's sets in the cache folder by `command`s, unless the package has them.
 
     Replace cached folders that hold a scene other than the listed one. Return the names of scenes that fail, miss a
     gate, or differ from the set's list.
@@ -318,7 +307,7 @@ def make_packaged(names: Sequence[str], jobs: int, report: Report, log: Callable
             log(f"{scene}: in the cache is not the scene that the set {name} lists; made again")
         if not todo:
             continue
-        rest = Wanted(out, folder / RECIPES, None, None, None, todo, bool(others), jobs, "local", None)
+        rest = command(out=out, recipes=folder / RECIPES, only=todo, overwrite=bool(others))
         failed += generate_scenes(rest, report, log)
         for scene in (n for n in todo if n not in failed and not is_listed(out / n, wanted[n])):
             command = f"python -m converters generate-scenes FOLDER --recipes {folder / RECIPES} --only {scene}"

@@ -79,7 +79,7 @@ def _level_feet(points: np.ndarray, foot_m: float) -> Hull:
 
 def _visual(surface: TexturedMesh, where: str, source: SourceFolder) -> VisualMesh:
     """Return the surface (body frame) as it is where it is small, else simplified with a new texture."""
-    mesh = clean_surface(source, where, surface.vertices, surface.faces, colours_of_faces(surface))
+    mesh = clean_surface(source, where, surface)
     small = as_it_is(surface, FACES, TEXELS)
     if small is not None:
         return small

@@ -318,7 +318,16 @@ def fetch(given: Path | None, target: Path, overwrite: bool = False) -> tuple[Pa
     `given`: the Debian package, or a folder that holds the files somewhere; None: download the package.
     """
     with whole_folder(target, overwrite) as folder, tempfile.TemporaryDirectory(prefix="library-") as scratch:
-        place = given or _downloaded(Path(scratch))
+        if (place := given) is None:
+            if shutil.which("apt-get") is None:
+                raise FileError(f"{PACKAGE}: apt-get is not here to download it; {REMEDY}")
+            words = ["apt-get", "-qq", "download", PACKAGE]
+            done = subprocess.run(words, cwd=scratch, capture_output=True, text=True)
+            packages = sorted(Path(scratch).glob("*.deb"))
+            if done.returncode or not packages:
+                last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+                raise FileError(f"{PACKAGE}: apt-get cannot download it ({last}); run apt-get update, or {REMEDY}")
+            place = packages[0]
         files = {path.stem: path for path in sorted(place.rglob("*.sh3f")) if path.stem in FILES}
         libraries = {k: p.read_bytes() for k, p in files.items()} if place.is_dir() else _of_package(place)
         for name, digest in FILES.items():
@@ -329,17 +338,6 @@ def fetch(given: Path | None, target: Path, overwrite: bool = False) -> tuple[Pa
                 raise FileError(f"{place}: {name}.sh3f is not that of version {VERSION} (sha256 differs); {REMEDY}")
             (folder / f"{name}.sh3f").write_bytes(data)
     return tuple(target / f"{name}.sh3f" for name in FILES)
-
-
-def _downloaded(folder: Path) -> Path:
-    if shutil.which("apt-get") is None:
-        raise FileError(f"{PACKAGE}: apt-get is not here to download it; {REMEDY}")
-    done = subprocess.run(["apt-get", "-qq", "download", PACKAGE], cwd=folder, capture_output=True, text=True)
-    packages = sorted(folder.glob("*.deb"))
-    if done.returncode or not packages:
-        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise FileError(f"{PACKAGE}: apt-get cannot download it ({last}); run apt-get update, or {REMEDY}")
-    return packages[0]
 
 
 def _of_package(path: Path) -> dict[str, bytes]:

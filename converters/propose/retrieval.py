@@ -261,7 +261,7 @@ def auto_align(
     proposals: tuple[Proposal, ...],
     library: Mapping[str, CadModel],
     floor_m: float | None,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None],
 ) -> dict[int, Retrieval]:
     """Return index of a proposal -> what was retrieved for it, without proposals with no model of their class."""
     retrieved = {}
@@ -269,8 +269,7 @@ def auto_align(
         one = retrieve(proposal, library, floor_m)
         if one is not None:
             retrieved[k] = one
-        if progress is not None:
-            progress((k + 1) / len(proposals))
+        progress((k + 1) / len(proposals))
     return retrieved
 
 

@@ -172,8 +172,8 @@ def read_cad(source: SourceFolder, synset: str, cad_id: str) -> CadModel:
     # By material, the last first: decompositions depend on the order of the faces, and stored ones have this.
     order = np.argsort(-image, kind="stable")
     used, faces = np.unique(mesh.faces[order], return_inverse=True)
-    skin = mesh.vertices[used], faces.reshape(-1, 3), colours[order]
-    vertices, faces, colours = clean_surface(source, relative, *skin)
+    skin = TexturedMesh(mesh.vertices[used], faces.reshape(-1, 3))
+    vertices, faces, colours = clean_surface(source, relative, skin, colours[order])
     pieces, collision = None, f"cad/{synset}/{cad_id}/models/{COLLISION}"
     if source.has(collision):
         hard = read_obj(source.use(collision, ""))

@@ -17,7 +17,7 @@ from converters.geometry.boxes import upright_box
 from converters.geometry.faces import sample_faces
 from converters.read.annotations import inside_scan, parse_annotations, read_cad
 from converters.read.files import SourceFolder, read_image, read_json, read_labels, read_numbers
-from converters.read.meshes import clean_surface, colours_of_faces
+from converters.read.meshes import clean_surface
 from converters.read.obj import TexturedMesh, join_meshes, read_scan_obj, scan_of
 from converters.read.surfaces import check_extent, check_upright, label_storeys, labelled, with_split_corners
 from converters.read.urdf import read_urdf
@@ -237,8 +237,7 @@ def _furniture(source: SourceFolder, path: Path, structure: np.ndarray) -> tuple
     if len(position) != 3 or not np.isfinite(position).all():
         raise SceneRejected(f"{place}: holds {len(position)} numbers, expected x y z in metres, all finite")
     item = read_urdf(source, path.name, "")
-    surface = item.surface.vertices, item.surface.faces, colours_of_faces(item.surface)
-    vertices, faces, colours = clean_surface(source, path.name, *surface)
+    vertices, faces, colours = clean_surface(source, path.name, item.surface)
     turn, pieces = np.eye(3), item.pieces
     if category == "door":
         turn = leaf_turn(vertices)

@@ -249,17 +249,17 @@ def colours_of_faces(mesh: obj.TexturedMesh) -> np.ndarray:
 
 
 def clean_surface(
-    source: SourceFolder, where: str, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray
+    source: SourceFolder, where: str, mesh: obj.TexturedMesh, colours: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Join vertices, drop faces without area and report what else is wrong; open surfaces are left as they are.
 
     Decomposition rebuilds such surfaces as closed ones (coacd's manifold preprocessing), so that they need no repair
     here; their hulls are a voxel thicker.
 
-    `colours`: (m, 3) of the faces.
+    `colours`: (m, 3) of the faces; None: `colours_of_faces`.
     """
-    vertices, faces, keep = merge_vertices(vertices, faces)
-    colours = colours[keep]
+    vertices, faces, keep = merge_vertices(mesh.vertices, mesh.faces)
+    colours = (colours_of_faces(mesh) if colours is None else colours)[keep]
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     extent = np.ptp(vertices, axis=0)
     longest = np.max([np.linalg.norm(b - a, axis=1), np.linalg.norm(c - b, axis=1), np.linalg.norm(a - c, axis=1)], 0)

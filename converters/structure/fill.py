@@ -291,18 +291,12 @@ def fill_holes(
         near = np.abs(plane.distance(cloud.points)) < tolerance_m
         shows = np.flatnonzero(near & (np.abs(cloud.normals @ plane.normal) > 0.7))
         done.append(patch)
-        if len(patch[1]) and len(shows):
-            clouds.append(
-                _coloured(patch, plane, ColourCloud(cloud.points[shows], cloud.normals, cloud.colours[shows]))
-            )
+        if len(patch[1]) and len(shows):  # points on it, coloured as what is visible of its plane around them
+            spots, _ = sample_faces(*patch, SPACING_M)
+            count = min(48, len(shows))
+            distance, index = KDTree(cloud.points[shows]).query(spots, k=count)
+            weight = 1.0 / (distance.reshape(-1, count) + 0.05)
+            shade = (cloud.colours[shows][index.reshape(-1, count)] * weight[..., None]).sum(axis=1)
+            shade /= weight.sum(axis=1, keepdims=True)
+            clouds.append(ColourCloud(spots, np.tile(plane.normal, (len(spots), 1)), shade))
     return stacked(done), clouds
-
-
-def _coloured(patch: Mesh, plane: Plane, visible: ColourCloud) -> ColourCloud:
-    """Return points on a patch, coloured as what is visible of its plane around them."""
-    spots, _ = sample_faces(*patch, SPACING_M)
-    count = min(48, len(visible.points))
-    distance, index = KDTree(visible.points).query(spots, k=count)
-    weight = 1.0 / (distance.reshape(-1, count) + 0.05)
-    shade = (visible.colours[index.reshape(-1, count)] * weight[..., None]).sum(axis=1)
-    return ColourCloud(spots, np.tile(plane.normal, (len(spots), 1)), shade / weight.sum(axis=1, keepdims=True))

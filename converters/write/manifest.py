@@ -129,14 +129,13 @@ def make_manifest(
     alignment: list[dict[str, Any]],
     gates: tuple[Gate, ...],
     decompose: DecomposeConfig,
-    fallbacks: dict[str, str] | None = None,
-    maps: SceneMaps | None = None,
+    fallbacks: dict[str, str],
+    maps: SceneMaps,
 ) -> SceneManifest:
-    """Collect what a scene is, where it came from and which gates it passed; all paths are relative.
+    """Measure a scene; collect what it is, where it came from and which gates it passed; all paths are relative.
 
-    `fallbacks` names the models whose one convex hull stands for them, and why; with `maps`, it is measured too.
+    `fallbacks` names the models whose one convex hull stands for them, and why.
     """
-    fell = fallbacks or {}
     parameters = {k: v for k, v in dataclasses.asdict(decompose).items() if k != "timeout_s"}
     return SceneManifest(
         name=parts.name,
@@ -147,14 +146,14 @@ def make_manifest(
         objects=scene_objects(parts),
         collision={"method": "coacd", "boxes": "oriented box of each hull", "doors": DOOR_OVERRIDES}
         | parameters
-        | {"convex_hull_only": sorted(fell), "from_source": sorted(k for k, c in raw.cads.items() if c.pieces)},
+        | {"convex_hull_only": sorted(fallbacks), "from_source": sorted(k for k, c in raw.cads.items() if c.pieces)},
         gates={g.name: g.as_dict() for g in gates},
         versions={name: version(name) for name in PACKAGES},
         alignment=tuple(alignment),
-        measures=measure_scene(parts, maps) if maps is not None else {},
+        measures=measure_scene(parts, maps),
         warnings=(
             *raw.warnings,
-            *(f"{why}; its convex hull stands for it" for _, why in sorted(fell.items())),
+            *(f"{why}; its convex hull stands for it" for _, why in sorted(fallbacks.items())),
             *(warning for gate in gates for warning in gate.warnings),
         ),
     )

@@ -15,6 +15,7 @@ import yaml
 from converters import many
 from converters.__main__ import main
 from converters.generate.design.config import GenerationError
+from converters.generating import GenerateScenes
 from converters.recipes import load_recipes
 from interactive_nav_common.jobs.processes import Job, LocalLauncher
 from scenes_mjcf.schema import load_manifest, save_manifest
@@ -83,14 +84,14 @@ def test_scenes_are_made_side_by_side_listed_and_found_by_name(tmp_path: Path, m
     many.begin_set(out, "furnished", 5)
     runner = Copier(out)
     monkeypatch.setattr(many, "LocalLauncher", lambda jobs: runner)
-    wanted = many.Wanted(out, None, None, 10, 0, (), False, 2, "local", "auto")
+    wanted = GenerateScenes(out=out, jobs=2)
     assert many.generate_scenes(wanted, lambda _, share: shares.append(share), lines.append) == ["furnished_002"]
     assert runner.closed == 1 and len(runner.commands) == 5 and shares[-1] == 1.0
     assert runner.commands[0][:4] == [sys.executable, "-m", "converters", "generate-scenes"]
     assert "converters generate-scenes: furnished_002: no room" in lines
     assert not (out / "set.json").exists()
 
-    wanted = many.Wanted(out, None, "furnished", 5, many.SEEDS, (), False, 1, "local", "auto")
+    wanted = GenerateScenes(out=out, tier="furnished", count=5, seed=many.SEEDS, jobs=1)
     monkeypatch.setattr(many, "make_scenes", lambda todo, *_: {recipe.name: ["drift_boxes"] for recipe in todo})
     assert many.generate_scenes(wanted, lambda _, share: None, lines.append) == ["furnished_002"]
     assert lines[-4:] == [f"furnished_00{k}: is there, kept" for k in (0, 1, 3, 4)]

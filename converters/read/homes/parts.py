@@ -123,9 +123,7 @@ def home(source: SourceFolder, layout: str, parts: list[HomePart], floors_m: tup
     if not structure:
         raise SceneRejected(f"{source.root}: no part is built in; expected floor and walls")
     shells = [placed(_small(p.surface), p.pose) for p in structure]
-    mesh = joined(shells)
-    assert mesh is not None
-    mesh = with_split_corners(mesh)
+    mesh = with_split_corners(join_meshes(*shells))
     labels = label_storeys(mesh.vertices, mesh.faces, floors_m)
     labels[labels == UNLABELLED] = OTHER_STRUCTURE
     low = np.repeat([part.low for part in structure], [len(shell.faces) for shell in shells])
@@ -331,8 +329,7 @@ def _furniture(
         every.append(None if solid is None else convex_pieces(*merge_vertices(solid.vertices, solid.faces)[:2]))
     pieces = None if None in every else tuple(piece for some in every for piece in some or ())
     pieces = None if pieces is None or len(pieces) > MAX_PIECES else pieces
-    skin = surface.vertices, surface.faces, colours_of_faces(surface)
-    vertices, faces, colours = clean_surface(source, part.name, *skin)
+    vertices, faces, colours = clean_surface(source, part.name, surface)
     category = part.category
     name, pose, hinge = "other" if category is None else category.name, part.pose, None
     if name == "door":

@@ -25,7 +25,7 @@ from converters.read.files import SourceFolder, only_file
 from converters.read.homes import sh3d_walls
 from converters.read.homes.parts import HomePart, category_of, home
 from converters.read.homes.sh3d_archive import called, colour, metres, number, point, read_xml, unpack
-from converters.read.homes.sh3d_models import LEAF, WHITE, DrawnModels, mean_colour, yaw_pose
+from converters.read.homes.sh3d_models import LEAF, WHITE, DrawnModels, mean_colour
 from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh
 from converters.read.surfaces import check_extent, storey_of
@@ -33,7 +33,7 @@ from converters.read.urdf import count_unread, report_unread
 from converters.records.errors import DRAWN, UNPACKED, SceneRejected, check_count
 from converters.records.raw import Lamp, RawScene
 from interactive_nav_common.records import read_packaged
-from interactive_nav_common.rotations import transformed
+from interactive_nav_common.rotations import transform, transformed, yaw_matrix
 
 ENDING = ".sh3d"
 PIECES = ("pieceOfFurniture", "doorOrWindow", "light", "shelfUnit")
@@ -240,7 +240,7 @@ class _Drawing:
         if not len(surface.faces):
             return []
         at = np.array([*point(e), self._base(e) + number(e, "elevation", 0.0) / 100])
-        pose = yaw_pose(at, -number(e, "angle", 0.0))
+        pose = transform(yaw_matrix(-number(e, "angle", 0.0)), at)
         height = float(np.ptp(surface.vertices[:, 2]))
         name = " ".join((e.get("name") or e.get("catalogId") or "piece").split())[:60]
         self.named[name] += 1
@@ -293,7 +293,7 @@ def _lamp(e: ElementTree.Element, source: ElementTree.Element, pose: np.ndarray)
 
 def _footprint(e: ElementTree.Element) -> Any:
     width, depth = metres(e, "width", "depth") / 2
-    turn = yaw_pose(np.zeros(3), -number(e, "angle", 0.0))[:2, :2]
+    turn = yaw_matrix(-number(e, "angle", 0.0))[:2, :2]
     return shapely.Polygon(
         point(e) + np.array([(-width, -depth), (width, -depth), (width, depth), (-width, depth)]) @ turn.T
     )

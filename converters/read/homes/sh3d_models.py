@@ -24,7 +24,7 @@ from converters.read.obj import GREYS, TexturedMesh, distinct, join_textures, re
 from converters.read.urdf import placed, solid
 from converters.records.errors import EXTENT_M, GEOMS, SceneRejected, check_count
 from interactive_nav_common.records import read_packaged
-from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, yaw_matrix
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP
 
 WHITE = np.array([235, 235, 230], np.uint8).reshape(1, 1, 3)
 """Of sides and rooms that have no colour."""
@@ -240,11 +240,6 @@ def _by_place(model: DrawnModel, element: ElementTree.Element, faces: np.ndarray
     normal = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])).argmax(axis=1)
     pair = np.array([(2, 1), (0, 2), (0, 1)])[normal]
     return np.take_along_axis(corners, pair[:, None, :].repeat(3, axis=1), axis=2) / size
-
-
-def yaw_pose(at: np.ndarray, yaw: float) -> np.ndarray:
-    """Return the (4, 4) of an upright piece at (3,) m, turned by `yaw` rad."""
-    return transform(yaw_matrix(yaw), at)
 
 
 @dataclasses.dataclass
