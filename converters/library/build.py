@@ -6,6 +6,7 @@
 import concurrent.futures
 import concurrent.futures.process
 import dataclasses
+import functools
 import hashlib
 import io
 import math
@@ -64,8 +65,10 @@ _ESCAPE = re.compile(r"\\(?:u([0-9a-fA-F]{4})|(.))")
 class CatalogueModel:
     """One piece of furniture of a catalogue."""
 
-    library: str
-    """Name of the library's file, without its ending."""
+    library: Path
+    """The library's file."""
+    licence: str
+    """Of the library."""
     name: str
     """As people call it."""
     model: str
@@ -79,16 +82,7 @@ class CatalogueModel:
     @property
     def key(self) -> str:
         """Return its name among all libraries, such as `Scopia/armchair1`."""
-        return f"{self.library}/{PurePosixPath(self.model).stem}"
-
-
-@dataclasses.dataclass(frozen=True)
-class Catalogue:
-    """A furniture library."""
-
-    path: Path
-    licence: str
-    pieces: tuple[CatalogueModel, ...]
+        return f"{self.library.stem}/{PurePosixPath(self.model).stem}"
 
 
 def parse_properties(data: bytes) -> dict[str, str]:
@@ -110,7 +104,7 @@ def _number(of: dict[str, str], key: str, where: str) -> float:
     return value
 
 
-def _piece(library: str, of: dict[str, str], where: str, names: set[str]) -> CatalogueModel:
+def _piece(library: Path, licence: str, of: dict[str, str], where: str, names: set[str]) -> CatalogueModel:
     model = of.get("model", "").lstrip("/")
     if model not in names:
         raise SceneRejected(f"{where}: its model '{model}' is not in the archive; fetch the library again")
@@ -125,10 +119,10 @@ def _piece(library: str, of: dict[str, str], where: str, names: set[str]) -> Cat
     if turn.shape != (9,) or not np.allclose(turn.reshape(3, 3) @ turn.reshape(3, 3).T, np.eye(3), atol=1e-3):
         raise SceneRejected(f"{where}: modelRotation is {of['modelRotation']!r}, expected the 9 numbers of a rotation")
     name, creator = (of.get(key, "") for key in ("name", "creator"))
-    return CatalogueModel(library, name, model, (width, height, depth), turn.reshape(3, 3), creator)
+    return CatalogueModel(library, licence, name, model, (width, height, depth), turn.reshape(3, 3), creator)
 
 
-def read_catalogue(path: Path) -> Catalogue:
+def read_catalogue(path: Path) -> tuple[CatalogueModel, ...]:
     """Read the pieces of a `.sh3f` file."""
     if not path.is_file():
         raise SceneRejected(f"{path}: no such file; fetch it again")
@@ -140,20 +134,20 @@ def read_catalogue(path: Path) -> Catalogue:
         name, _, number = key.partition("#")
         if number.isdecimal() and len(number) < 9:
             of.setdefault(int(number), {})[name] = value
-    pieces = [_piece(path.stem, of[k], f"{path}: piece {k} ({of[k].get('name', '')})", names) for k in sorted(of)]
-    if not pieces:
+    if not of:
         raise SceneRejected(f"{path}: {PROPERTIES} lists no piece; fetch the library again")
-    return Catalogue(path, whole.get("license", ""), tuple(pieces))
+    licence, called = whole.get("license", ""), {k: f"{path}: piece {k} ({of[k].get('name', '')})" for k in sorted(of)}
+    return tuple(_piece(path, licence, of[k], where, names) for k, where in called.items())
 
 
-def unpack_model(catalogue: Catalogue, piece: CatalogueModel, folder: Path) -> Path:
+def unpack_model(piece: CatalogueModel, folder: Path) -> Path:
     """Write a piece's model with what lies beside it into an empty folder; return the model's path."""
     home = PurePosixPath(piece.model).parent
     remedy = f"fetch the library again ({piece.model} is damaged)"
-    with readable(catalogue.path, SceneRejected, remedy), zipfile.ZipFile(catalogue.path) as archive:
+    with readable(piece.library, SceneRejected, remedy), zipfile.ZipFile(piece.library) as archive:
         inside = [i for i in archive.infolist() if PurePosixPath(i.filename).parent == home and not i.is_dir()]
         if sum(i.file_size for i in inside) > MOST_BYTES:
-            raise SceneRejected(f"{catalogue.path}: {piece.model} unpacks to over {MOST_BYTES >> 20} MiB")
+            raise SceneRejected(f"{piece.library}: {piece.model} unpacks to over {MOST_BYTES >> 20} MiB")
         for item in inside:  # by its bare name: no path of the archive leads anywhere else
             (folder / PurePosixPath(item.filename).name).write_bytes(archive.read(item))
     return folder / PurePosixPath(piece.model).name
@@ -177,22 +171,16 @@ HULLS = DecomposeConfig()
 class Chosen:
     """A piece and what it is to be."""
 
-    catalogue: Catalogue
-    piece: CatalogueModel
+    key: str
+    """Keys of the piece and of what stands on it: `Scopia/desk+Scopia/lamp`."""
+    pieces: tuple[CatalogueModel, ...]
     category: str
     split: str
-    riders: tuple[tuple[Catalogue, CatalogueModel], ...] = ()
-    """What stands on it."""
-
-    @property
-    def key(self) -> str:
-        """Return the keys of the piece and of the models that stand on it: `Scopia/desk+Scopia/lamp`."""
-        return "+".join((self.piece.key, *(piece.key for _, piece in self.riders)))
 
 
-def read_selection(catalogues: Sequence[Catalogue], path: Path = SELECTION) -> tuple[Chosen, ...]:
-    """Return the pieces that a selection names, by category."""
-    pieces = {piece.key: (catalogue, piece) for catalogue in catalogues for piece in catalogue.pieces}
+def read_selection(pieces: Sequence[CatalogueModel], path: Path = SELECTION) -> tuple[Chosen, ...]:
+    """Return those of the pieces that a selection names, by category."""
+    named = {piece.key: piece for piece in pieces}
     data = Reader(ConfigError, "converters/library/selection.yaml shows the form").decoded(
         path.read_bytes(), "YAML", str(path)
     )
@@ -202,19 +190,19 @@ def read_selection(catalogues: Sequence[Catalogue], path: Path = SELECTION) -> t
             raise ConfigError(f"{path}: category is '{category}', expected one of {', '.join(CATEGORIES)}")
         for split in sorted(of):
             for key in of[split]:
-                several = [pieces.get(one) for one in key.split("+")]
-                if None in several:
+                keys = key.split("+")
+                if not named.keys() >= set(keys):
                     raise ConfigError(f"{path}: {category}: no piece '{key}' in the libraries")
-                (catalogue, piece), *riders = [of for of in several if of is not None]
-                for creator in (one.creator for _, one in ((catalogue, piece), *riders)):
+                chosen.append(Chosen(key, tuple(named[one] for one in keys), category, split))
+                for creator in (one.creator for one in chosen[-1].pieces):
                     if splits.setdefault(creator, split) != split:
                         raise ConfigError(f"{path}: {key}: its creator {creator} has models in both splits")
-                chosen.append(Chosen(catalogue, piece, category, split, tuple(riders)))
     return tuple(chosen)
 
 
-def as_catalogued(surface: TexturedMesh, piece: CatalogueModel, where: str) -> TexturedMesh:
+def as_catalogued(surface: TexturedMesh, piece: CatalogueModel) -> TexturedMesh:
     """Return the surface turned and scaled as its catalogue says, the middle of its base at the origin."""
+    where = f"{piece.library}: {piece.model}"
     if not len(surface.faces):
         raise SceneRejected(f"{where}: has no face; choose another model")
     vertices, faces = compacted(surface.vertices, surface.faces)
@@ -226,11 +214,10 @@ def as_catalogued(surface: TexturedMesh, piece: CatalogueModel, where: str) -> T
     return dataclasses.replace(surface, vertices=vertices, faces=faces)
 
 
-def _surface(catalogue: Catalogue, piece: CatalogueModel) -> TexturedMesh:
+def _surface(piece: CatalogueModel) -> TexturedMesh:
     with tempfile.TemporaryDirectory(prefix="library-") as folder:
-        path = unpack_model(catalogue, piece, Path(folder))
-        surface = read_surface(SourceFolder(path.parent), path.name, "")
-    return as_catalogued(surface, piece, f"{catalogue.path}: {piece.model}")
+        path = unpack_model(piece, Path(folder))
+        return as_catalogued(read_surface(SourceFolder(path.parent), path.name, ""), piece)
 
 
 def on_top(surface: TexturedMesh, rider: TexturedMesh) -> TexturedMesh:
@@ -245,10 +232,8 @@ def on_top(surface: TexturedMesh, rider: TexturedMesh) -> TexturedMesh:
 
 def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]:
     """Build one model, ready to be packaged."""
-    piece, where = chosen.piece, f"{chosen.catalogue.path}: {chosen.piece.model}"
-    surface = _surface(chosen.catalogue, piece)
-    for rider in chosen.riders:
-        surface = on_top(surface, _surface(*rider))
+    where = f"{chosen.pieces[0].library}: {chosen.pieces[0].model}"
+    surface = functools.reduce(on_top, map(_surface, chosen.pieces))
     vertices, faces, keep = merge_vertices(surface.vertices, surface.faces)
     colours = colours_of_faces(surface)[keep]
     solid = simplify_within(vertices, faces, SOLID_M)
@@ -274,8 +259,8 @@ def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]
     spacing_m = max(float(size_m.max()) / TEXELS, 1e-3)
     visual, _ = bake_object(vertices, faces, colours, textured_cloud(surface, spacing_m), low, TEXELS)
     credits = []
-    for catalogue, of in ((chosen.catalogue, piece), *chosen.riders):
-        by = re.search(r"Attribution 3.0( United States)?", text := catalogue.licence)
+    for of in chosen.pieces:
+        by = re.search(r"Attribution 3.0( United States)?", text := of.licence)
         named = "CC0 1.0" if text == "Public domain" else f"CC BY 3.0{' US' if by[1] else ''}" if by else text
         credits.append(Credit(of.name, of.creator, named, of.key))
     sides = tuple(float(side) for side in np.round(size_m, 4))
@@ -287,7 +272,7 @@ def build(
     files: Sequence[Path], target: Path, jobs: int, report: Callable[[str, float], None], selection: Path = SELECTION
 ) -> int:
     """Build `models.zip` and `ATTRIBUTION.md` from `.sh3f` libraries, whole or not at all; return how many models."""
-    chosen = read_selection([read_catalogue(path) for path in files], selection)
+    chosen = read_selection([piece for path in files for piece in read_catalogue(path)], selection)
     done: list[tuple[Model, Shape]] = []
     with concurrent.futures.ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
         running = [pool.submit(make_model, one) for one in chosen]

@@ -37,14 +37,13 @@ def test_properties_are_javas():
 
 
 def test_a_piece_is_read_in_metres(tmp_path):
-    catalogue = read_catalogue(write_library(tmp_path / "Small.sh3f"))
-    (piece,) = catalogue.pieces
-    assert catalogue.licence == "Public domain" and piece.key == "Small/chair"
+    (piece,) = read_catalogue(write_library(tmp_path / "Small.sh3f"))
+    assert piece.licence == "Public domain" and piece.key == "Small/chair"
     assert (piece.name, piece.creator) == ("Café chair", "Ada")
     assert piece.size_m == (0.5, 0.9, 0.605)
     np.testing.assert_array_equal(piece.rotation @ [0, 0, 1], [1, 0, 0])
     (tmp_path / "out").mkdir()
-    model = unpack_model(catalogue, piece, tmp_path / "out")
+    model = unpack_model(piece, tmp_path / "out")
     assert model.name == "chair.obj" and sorted(p.name for p in (tmp_path / "out").iterdir()) == [
         "chair.obj",
         "wood.png",
@@ -71,7 +70,7 @@ def test_a_piece_that_cannot_be_used_is_one_line(tmp_path, changes, message):
 
 def test_a_broken_archive_is_one_line(tmp_path):
     path = write_library(tmp_path / "Small.sh3f")
-    catalogue, data = read_catalogue(path), path.read_bytes()
+    (piece,), data = read_catalogue(path), path.read_bytes()
     for broken in (b"", data[:100], b"PK" + data[2:60]):
         (tmp_path / "broken.sh3f").write_bytes(broken)
         with pytest.raises(SceneRejected, match="not readable as a furniture library"):
@@ -79,7 +78,7 @@ def test_a_broken_archive_is_one_line(tmp_path):
     at = data.index(b"v 2 0 0")
     path.write_bytes(data[:at] + b"x" + data[at + 1 :])
     with pytest.raises(SceneRejected, match="chair.obj is damaged"):
-        unpack_model(catalogue, catalogue.pieces[0], tmp_path)
+        unpack_model(piece, tmp_path)
     with pytest.raises(SceneRejected, match="no such file"):
         read_catalogue(tmp_path / "absent.sh3f")
 

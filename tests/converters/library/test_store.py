@@ -102,21 +102,21 @@ def test_simplification_keeps_every_part_within_its_error():
 def test_a_piece_takes_its_catalogues_size():
     corners = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 4], [9, 9, 9]])  # the last is in no face
     faces = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3]])
-    piece = CatalogueModel("L", "n", "n.obj", (0.5, 0.9, 0.6), np.eye(3), "c")
-    mesh = as_catalogued(TexturedMesh(corners, faces, None, None), piece, "n")
+    piece = CatalogueModel(Path("L"), "free", "n", "n.obj", (0.5, 0.9, 0.6), np.eye(3), "c")
+    mesh = as_catalogued(TexturedMesh(corners, faces, None, None), piece)
     np.testing.assert_allclose(mesh.vertices.min(axis=0), [-0.25, 0.0, -0.3])
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [0.5, 0.9, 0.6])
-    with pytest.raises(SceneRejected, match="n: has no face"):
-        as_catalogued(TexturedMesh(corners, faces[:0], None, None), piece, "n")
+    with pytest.raises(SceneRejected, match="L: n.obj: has no face"):
+        as_catalogued(TexturedMesh(corners, faces[:0], None, None), piece)
     with pytest.raises(SceneRejected, match="expected one in each direction"):
-        as_catalogued(TexturedMesh(corners[:3], faces[:1], None, None), piece, "n")
+        as_catalogued(TexturedMesh(corners[:3], faces[:1], None, None), piece)
 
 
 def test_a_model_is_made_from_a_catalogue(tmp_path, hull_cache):
-    catalogue = read_catalogue(write_catalogue(tmp_path / "Small.sh3f", modelRotation=None))
+    pieces = read_catalogue(write_catalogue(tmp_path / "Small.sh3f", modelRotation=None))
     selection = tmp_path / "selection.yaml"
     selection.write_text("chair: {train: [Small/chair]}")
-    (chosen,) = read_selection([catalogue], selection)
+    (chosen,) = read_selection(pieces, selection)
     model, shape = make_model(chosen, hull_cache)
     assert model.category == "chair" and model.size_m == (0.5, 0.9, 0.605) and model.credits[0].licence == "CC0 1.0"
     points = np.vstack([hull.vertices for hull in shape.hulls])
@@ -144,7 +144,7 @@ def test_what_stands_on_a_model_is_part_of_it():
     ],
 )
 def test_a_selection_that_does_not_fit_is_one_line(tmp_path: Path, text, message):
-    catalogue = read_catalogue(write_catalogue(tmp_path / "Small.sh3f"))
+    pieces = read_catalogue(write_catalogue(tmp_path / "Small.sh3f"))
     (tmp_path / "selection.yaml").write_text(text)
     with pytest.raises(ConfigError, match=message):
-        read_selection([catalogue], tmp_path / "selection.yaml")
+        read_selection(pieces, tmp_path / "selection.yaml")
