@@ -182,11 +182,11 @@ def with_annotations(raw: RawScene, path: Path, library_root: Path | None) -> Ra
         raise SceneRejected(f"{path}: names model {missing[0]}, which {where} lacks; give its --library")
     source = SourceFolder(path.parent)
     source.use(path.name, "")
-    kept = inside_scan(source, path.name, annotations, library, raw.scan)
+    kept, cads = inside_scan(source, path.name, annotations, library, raw.scan)
     return dataclasses.replace(
         raw,
         annotations=kept,
-        cads={a.cad_id: library[a.cad_id] for a in kept},
+        cads=cads,
         sources=raw.sources | source.sha256,
         warnings=raw.warnings + tuple(source.warnings),
     )

@@ -4,7 +4,6 @@ Frames of the file (Avetisyan et al. 2019): an annotation world, y up; the scan'
 each model's `trs` CAD -> world, and both keypoint sets stand in that world (the CAD's after its `trs`).
 """
 
-import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -135,8 +134,8 @@ def gap_to_scan(annotation: Annotation, cad_vertices: np.ndarray, vertices: np.n
 
 def inside_scan(
     source: SourceFolder, where: str, annotations: tuple[Annotation, ...], cads: Mapping[str, CadModel], scan: Any
-) -> tuple[Annotation, ...]:
-    """Return the annotations whose objects stand in the scan; leave the others out with a warning each."""
+) -> tuple[tuple[Annotation, ...], dict[str, CadModel]]:
+    """Return the annotations whose objects stand in the scan, and their models; warn of each that is left out."""
     gaps = [gap_to_scan(a, cads[a.cad_id].vertices, scan.vertices, scan.faces) for a in annotations]
     outside = [i for i, gap in enumerate(gaps) if gap > OUTSIDE_M]
     if 2 * len(outside) > len(annotations):
@@ -149,7 +148,8 @@ def inside_scan(
             f"{where}: object {i} ({annotations[i].category}, {annotations[i].cad_id}) lies {gaps[i]:.1f} m outside "
             "the scan; it is left out"
         )
-    return tuple(a for i, a in enumerate(annotations) if i not in outside)
+    kept = tuple(a for i, a in enumerate(annotations) if i not in outside)
+    return kept, {a.cad_id: cads[a.cad_id] for a in kept}
 
 
 def read_cad(source: SourceFolder, synset: str, cad_id: str) -> CadModel:
@@ -214,7 +214,5 @@ def read_scan2cad(root: Path, strict: bool = False) -> RawScene:
     check_upright(f"{root / stem}.ply", vertices, faces, labels, 0.0)
     cads = {a.cad_id: read_cad(source, synset, a.cad_id) for synset, a in records}
     scan = ScanMesh(vertices, faces, labels=labels, vertex_colours=colours)
-    annotations = inside_scan(source, ANNOTATION, tuple(a for _, a in records), cads, scan)
-    cads = {a.cad_id: cads[a.cad_id] for a in annotations}
-    raw = source.scene("scan2cad", scan, cads=cads, annotations=annotations, licence=LICENCE)
-    return dataclasses.replace(raw, name=scan_id)
+    annotations, cads = inside_scan(source, ANNOTATION, tuple(a for _, a in records), cads, scan)
+    return source.scene("scan2cad", scan, name=scan_id, cads=cads, annotations=annotations, licence=LICENCE)

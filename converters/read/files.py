@@ -46,8 +46,8 @@ class SourceFolder:
 
     def scene(self, layout: str, scan: ScanMesh, **more: Any) -> RawScene:
         """Return the record of what was read, with the folder's name, hashes and warnings."""
-        about = {"name": self.root.resolve().name, "source_format": layout, "scan": scan}
-        return RawScene(**about, **more, sources=dict(sorted(self.sha256.items())), warnings=tuple(self.warnings))
+        about = {"name": self.root.resolve().name, "source_format": layout, "scan": scan} | more
+        return RawScene(**about, sources=dict(sorted(self.sha256.items())), warnings=tuple(self.warnings))
 
     def has(self, relative: str) -> bool:
         """Return True when the file exists."""

@@ -72,8 +72,7 @@ def read_gibson(root: Path, strict: bool = False) -> RawScene:
         path = source.use(ALIGNMENTS, "")
         _, records = parse_annotations(read_json(path), path)
         cads = {a.cad_id: read_cad(source, synset, a.cad_id) for synset, a in records}
-        annotations = inside_scan(source, ALIGNMENTS, tuple(a for _, a in records), cads, mesh)
-        cads = {a.cad_id: cads[a.cad_id] for a in annotations}
+        annotations, cads = inside_scan(source, ALIGNMENTS, tuple(a for _, a in records), cads, mesh)
     else:
         source.note(f"{ALIGNMENTS} is absent: structure only, all furniture stays part of it")
     raw = building(source, "gibson", mesh, labels, heights, cads, annotations)
@@ -223,9 +222,7 @@ def read_interactive_gibson(root: Path, strict: bool = False) -> RawScene:
     pairs = [_furniture(source, path, points) for path in sorted(root.glob(f"{PREFIX}*.urdf"))]
     cads = {a.cad_id: c for a, c in pairs}
     annotations = _without_doubles(source, tuple(a for a, _ in pairs), cads)
-    if annotations:
-        annotations = inside_scan(source, f"{PREFIX}_*.urdf", annotations, cads, mesh)
-    cads = {a.cad_id: cads[a.cad_id] for a in annotations}
+    annotations, cads = inside_scan(source, f"{PREFIX}_*.urdf", annotations, cads, mesh)
     return building(source, "interactive-gibson", mesh, labels, heights, cads, annotations)
 
 

@@ -206,8 +206,7 @@ def read_single_mesh(
         labels = label_storeys(mesh.vertices, mesh.faces, (floor_m,))
         source.note(f"{path.name}: has no labels: floor, walls and ceiling are told by shape, all else is part of them")
     licence = "unknown: a mesh file says none"
-    raw = source.scene("mesh", obj.scan_of(mesh, labels), floor_height_m=floor_m, licence=licence)
-    return dataclasses.replace(raw, name=path.stem)
+    return source.scene("mesh", obj.scan_of(mesh, labels), name=path.stem, floor_height_m=floor_m, licence=licence)
 
 
 def _painted(path: Path, part: trimesh.Trimesh, turn: np.ndarray) -> obj.TexturedMesh:

@@ -78,8 +78,7 @@ def read_scan(name: str, root: Path, strict: bool = False) -> RawScene:
     scan = scan_of(TexturedMesh(vertices, faces, None, None), labels)
     if colours is not None:
         scan = dataclasses.replace(scan, vertex_colours=np.clip(np.round(255 * colours), 0, 255).astype(np.uint8))
-    licence = read_licence(source)
-    return dataclasses.replace(source.scene(name, scan, floor_height_m=floor_m, licence=licence), name=root.name)
+    return source.scene(name, scan, name=root.name, floor_height_m=floor_m, licence=read_licence(source))
 
 
 def label_of(name: str) -> int:
