@@ -69,7 +69,7 @@ def decompose_all(
     config: DecomposeConfig,
     jobs: int,
     cache: Path,
-    progress: Callable[[float], None] | None = None,
+    report: Callable[[float], None] = lambda share: None,
     overrides: Mapping[str, Mapping[str, float]] | None = None,
     strict: bool = False,
 ) -> Decomposition:
@@ -93,7 +93,6 @@ def decompose_all(
     # The largest first: the tail of the stage is then short.
     waiting = dict(sorted(waiting.items(), key=lambda item: -len(meshes[item[1]][1])))
     total = len(set(keys.values()))
-    report = progress or (lambda share: None)
     report(len(done) / max(total, 1))
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="hulls-")))

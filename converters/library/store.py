@@ -11,7 +11,6 @@ import json
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -20,6 +19,7 @@ from converters.geometry.boxes import Hull
 from converters.records.raw import VisualMesh
 from converters.write.texture import quantise
 from interactive_nav_common.errors import FileError, readable
+from interactive_nav_common.records import Reader
 
 PACKED = Path(__file__).with_name("models.zip")
 ATTRIBUTION = Path(__file__).with_name("ATTRIBUTION.md")
@@ -154,12 +154,9 @@ def _member(path: Path, name: str) -> bytes:
 @functools.cache
 def read_index(path: Path = PACKED) -> dict[str, Model]:
     """Return name -> model, in the archive's order."""
-    models = {}
-    for row in json.loads(_member(path, "index.json")):
-        credits = tuple(Credit(**one) for one in row["credits"])
-        values: dict[str, Any] = {**row, "size_m": tuple(row["size_m"]), "credits": credits}
-        models[row["name"]] = Model(**values)
-    return models
+    reader = Reader(FileError, "install the package again")
+    rows = reader.decoded(_member(path, "index.json"), "JSON", str(path))
+    return {model.name: model for model in reader.typed(rows, tuple[Model, ...], str(path))}
 
 
 @functools.cache
