@@ -71,9 +71,9 @@ def hashed(value: Any) -> Any:
 
 
 class StageCache:
-    """Results by content in one folder; without a folder everything is computed."""
+    """Results by content in one folder."""
 
-    def __init__(self, folder: Path | None, limit_bytes: int = LIMIT_BYTES) -> None:
+    def __init__(self, folder: Path, limit_bytes: int = LIMIT_BYTES) -> None:
         self.folder, self._limit_bytes = folder, limit_bytes
 
     def call(self, function: Callable[..., T], *arguments: Any) -> T:
@@ -87,12 +87,10 @@ class StageCache:
 
     def key(self, name: str, module: str, *arguments: Any) -> str:
         """Return the name of the entry of a module's function of these arguments."""
-        return f"{name}-{joblib.hash((fingerprint(module), hashed(arguments)), 'sha1')}.pkl" if self.folder else ""
+        return f"{name}-{joblib.hash((fingerprint(module), hashed(arguments)), 'sha1')}.pkl"
 
     def load(self, key: str) -> Any:
         """Return an entry, and mark it as used; `MISSING` if there is none, or a damaged one."""
-        if self.folder is None:
-            return MISSING
         try:
             value = joblib.load(self.folder / key)
         except Exception:  # a damaged pickle fails in many ways
@@ -106,10 +104,9 @@ class StageCache:
 
         If the folder cannot be written (full disk, read-only home), the next run takes longer and this one goes on.
         """
-        if self.folder is not None:
-            with contextlib.suppress(FileError), whole_file(self.folder / key) as partial:
-                joblib.dump(value, partial)
-            prune(self.folder, self._limit_bytes, time.time())
+        with contextlib.suppress(FileError), whole_file(self.folder / key) as partial:
+            joblib.dump(value, partial)
+        prune(self.folder, self._limit_bytes, time.time())
 
 
 def prune(folder: Path, limit_bytes: int, now_s: float) -> None:

@@ -92,12 +92,6 @@ def test_a_damaged_entry_is_made_again(tmp_path, damage):
     assert entry.read_bytes() == good
 
 
-def test_without_a_folder_everything_is_computed():
-    for _ in range(2):
-        StageCache(None).call(stage, POINTS, 2.0)
-    assert len(CALLS) == 2
-
-
 def test_the_oldest_entries_go_first(tmp_path):
     for k in range(5):
         path = tmp_path / f"{k}.pkl"
