@@ -5,7 +5,6 @@ Every change is in the `Session`, and is saved before it is shown: closing the p
 
 import concurrent.futures
 import contextlib
-import dataclasses
 import functools
 import math
 import threading
@@ -32,18 +31,6 @@ THUMBNAIL = 116
 """Pixels a side."""
 
 
-@dataclasses.dataclass(frozen=True)
-class View:
-    """Hold where model and camera stand for one object."""
-
-    bench: Alignment
-    """CAD frame -> scan frame, where the model stands beside its object, facing the camera."""
-    eye: np.ndarray
-    """(3,) of the camera, scan frame, m."""
-    middle: np.ndarray
-    """(3,) between object and model: where it looks."""
-
-
 def painted(scan: ScanMesh) -> trimesh.Trimesh:
     """Return the scan with a colour at each vertex, without its ceiling."""
     colours = scan.vertex_colours
@@ -63,8 +50,12 @@ def around(mesh: trimesh.Trimesh, item: Item) -> trimesh.Trimesh:
     return part
 
 
-def view_of(item: Item, cad: CadModel | None, raw: RawScene) -> View:
-    """Show the object on the left, the model on the right, from the room's middle so that walls stand behind."""
+def view_of(item: Item, cad: CadModel | None, raw: RawScene) -> tuple[Alignment, np.ndarray, np.ndarray]:
+    """Show the object on the left, the model on the right, from the room's middle so that walls stand behind.
+
+    Return the pose of the model beside its object, facing the camera (CAD frame -> scan frame), where the camera
+    stands, and where it looks: between the two, (3,) m each, scan frame.
+    """
     inwards = raw.scan.vertices[:, :2].mean(axis=0) - item.centre[:2]
     far = float(np.linalg.norm(inwards))
     x, y = inwards / far if far > 0.3 else (0.0, -1.0)
@@ -76,7 +67,7 @@ def view_of(item: Item, cad: CadModel | None, raw: RawScene) -> View:
     at = np.array(item.centre) + gap * right
     bench = Alignment(np.full(3, size), at - size * (yaw_matrix(yaw) @ ((low + high) / 2)), yaw, math.nan)
     middle = np.array(item.centre) + gap / 2 * right
-    return View(bench, middle + 0.95 * (wide + gap) * np.array([0.8 * x, 0.8 * y, 0.5]), middle)
+    return bench, middle + 0.95 * (wide + gap) * np.array([0.8 * x, 0.8 * y, 0.5]), middle
 
 
 def coloured(cad: CadModel, pose: Alignment) -> trimesh.Trimesh:
@@ -214,7 +205,7 @@ class Page:
             elif side == "scan":
                 self.do(lambda s: s.clicked("scan", point))
             else:
-                bench = self._drawn["view"].bench
+                bench = self._drawn["bench"]
                 self.do(lambda s: s.clicked("model", (point - bench.translation) @ yaw_matrix(bench.yaw) / bench.scale))
 
     def _rank(self) -> None:
@@ -287,10 +278,15 @@ class Page:
         before = self._drawn.get("key", ())
         if before != key:
             shown = item or Item("", tuple(self._room.centroid), tuple(self._room.extents), 0.0, 0)
-            view = view_of(shown, cad, self.raw)
-            self._drawn = {"key": key, "view": view, "scan": self._room if whole else around(self._room, shown)}
+            bench, *camera = view_of(shown, cad, self.raw)
+            self._drawn = {
+                "key": key,
+                "bench": bench,
+                "camera": camera,
+                "scan": self._room if whole else around(self._room, shown),
+            }
             if cad is not None:
-                self._drawn["model"] = coloured(cad, view.bench)
+                self._drawn["model"] = coloured(cad, bench)
             for side in ("scan", "model"):
                 scene.remove_by_name(f"/{side}")
                 if side in self._drawn:
@@ -302,7 +298,7 @@ class Page:
         self._fit.content = ""
         if item is None:
             return
-        bench = self._drawn["view"].bench
+        bench = self._drawn["bench"]
         for side, points in (("scan", item.scan), ("model", item.model)):
             at = np.array(points).reshape(-1, 3)
             for k, point in enumerate(at if side == "scan" else apply_alignment(bench, at)):
@@ -322,7 +318,6 @@ class Page:
 
     def _look(self, clients: Any) -> None:
         """Turn the cameras to the object and its model."""
-        view = self._drawn["view"]
         for client in clients:
             with contextlib.suppress(Exception), client.atomic():  # one that has gone away meanwhile
-                client.camera.position, client.camera.look_at = view.eye, view.middle
+                client.camera.position, client.camera.look_at = self._drawn["camera"]

@@ -54,10 +54,13 @@ class Retrieval:
     cost_m: float
     residual_m: float
     """Mean distance of the scan's points to the model, each at most `FAR_M`."""
-    confidence: float
-    """In [0, 1]: share of the scan within 5 cm of the model, x share of the model within 10 cm of the scan,
-    x likelihood of this model among those tried."""
-    ranking: tuple[tuple[str, float], ...]
+    explained: float
+    """Share of the scan within 5 cm of the model."""
+    supported: float
+    """Share of the model within 10 cm of the scan."""
+    confidence: float = 0.0
+    """In [0, 1]: both shares, x likelihood of this model among those tried."""
+    ranking: tuple[tuple[str, float], ...] = ()
     """(cad_id, cost in m) of every model tried, best first."""
 
 
@@ -167,16 +170,7 @@ def _refine(
     return pose
 
 
-@dataclasses.dataclass(frozen=True)
-class _Fit:
-    pose: Alignment
-    cost_m: float
-    residual_m: float
-    explained: float
-    supported: float
-
-
-def _judge(pose: Alignment, surface: np.ndarray, points: np.ndarray, tree: KDTree) -> _Fit:
+def _judge(cad: CadModel, pose: Alignment, surface: np.ndarray, points: np.ndarray, tree: KDTree) -> Retrieval:
     moved = apply_alignment(pose, surface)
     to_cad = KDTree(moved).query(points)[0]
     to_scan = tree.query(moved)[0]
@@ -184,10 +178,10 @@ def _judge(pose: Alignment, surface: np.ndarray, points: np.ndarray, tree: KDTre
     unequal = float(np.std(np.log(pose.scale)))
     cost = residual + CAD_WEIGHT * float(np.minimum(to_scan, FAR_M).mean()) + SCALE_SPREAD_M * unequal
     explained, supported = float((to_cad < CLOSE_M).mean()), float((to_scan < 2 * CLOSE_M).mean())
-    return _Fit(dataclasses.replace(pose, rms_m=math.nan), cost, residual, explained, supported)
+    return Retrieval(cad, dataclasses.replace(pose, rms_m=math.nan), cost, residual, explained, supported)
 
 
-def fit_model(proposal: Proposal, cad: CadModel, floor_m: float | None) -> _Fit:
+def fit_model(proposal: Proposal, cad: CadModel, floor_m: float | None) -> Retrieval:
     """Return the best pose of one model: many coarse starts, the best few refined."""
     low, high = cad.vertices.min(axis=0), cad.vertices.max(axis=0)
     coarse = _thin(proposal.points, COARSE_POINTS)
@@ -196,17 +190,16 @@ def fit_model(proposal: Proposal, cad: CadModel, floor_m: float | None) -> _Fit:
     for k in range(N_YAWS):
         pose = _start(low, high, proposal.points, floor_m, proposal.yaw + 2 * math.pi * k / N_YAWS)
         pose = _refine(pose, coarse_surface, coarse, coarse_tree, COARSE_STEPS, floor_m)
-        starts.append(_judge(pose, coarse_surface, coarse, coarse_tree))
+        starts.append(_judge(cad, pose, coarse_surface, coarse, coarse_tree))
     starts.sort(key=lambda f: f.cost_m)
-    chosen: list[_Fit] = []
+    chosen: list[Retrieval] = []
     for start in starts:
         if all(abs(wrap_angle(start.pose.yaw - c.pose.yaw)) > math.radians(10) for c in chosen):
             chosen.append(start)
     fine = _thin(proposal.points, FINE_POINTS)
     tree, surface = KDTree(fine), _surface(cad, FINE_POINTS)
-    fits = [
-        _judge(_refine(s.pose, surface, fine, tree, FINE_STEPS, floor_m), surface, fine, tree) for s in chosen[:KEEP]
-    ]
+    poses = [_refine(s.pose, surface, fine, tree, FINE_STEPS, floor_m) for s in chosen[:KEEP]]
+    fits = [_judge(cad, pose, surface, fine, tree) for pose in poses]
     best = min(fits, key=lambda f: f.cost_m)
     return dataclasses.replace(best, pose=dataclasses.replace(best.pose, yaw=wrap_angle(best.pose.yaw)))
 
@@ -224,15 +217,13 @@ def retrieve(
     if not fits:
         return None
     ranking = sorted(fits.items(), key=lambda item: item[1].cost_m)
-    best_id, best = ranking[0]
+    best = ranking[0][1]
     likelihood = 1.0 / sum(math.exp(-(f.cost_m - best.cost_m) / LIKELY_M) for f in fits.values())
-    return Retrieval(
-        library[best_id],
-        best.pose,
-        best.cost_m,
-        round(best.residual_m, 5),
-        round(best.explained * best.supported * likelihood, 4),
-        tuple((k, f.cost_m) for k, f in ranking),
+    return dataclasses.replace(
+        best,
+        residual_m=round(best.residual_m, 5),
+        confidence=round(best.explained * best.supported * likelihood, 4),
+        ranking=tuple((k, f.cost_m) for k, f in ranking),
     )
 
 

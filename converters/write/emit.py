@@ -43,13 +43,8 @@ class Appearance:
     """Body after which the texture's file is named."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Assets:
-    """Names of the files that bodies, by name, are built from."""
-
-    looks: dict[str, Appearance]
-    hulls: dict[str, tuple[str, ...]]
-    """Mesh of each hull; its file has the same name."""
+Assets = tuple[dict[str, Appearance], dict[str, tuple[str, ...]]]
+"""By body: which files show it, and the mesh of each hull, whose file has the same name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,7 +151,7 @@ def share_assets(parts: SceneParts) -> Assets:
         for i, hull in enumerate(placed.hulls_b):
             key = (np.round(hull.vertices, HULL_DECIMALS) + 0.0).tobytes(), hull.faces.tobytes()
             hulls.setdefault(placed.name, []).append(solids.setdefault(key, f"{placed.name}_hull_{i}"))
-    return Assets(looks, {name: tuple(names) for name, names in hulls.items()})
+    return looks, {name: tuple(names) for name, names in hulls.items()}
 
 
 def build_spec(parts: SceneParts, assets: Assets | None = None) -> mujoco.MjSpec:
@@ -167,9 +162,9 @@ def build_spec(parts: SceneParts, assets: Assets | None = None) -> mujoco.MjSpec
     spec = _empty_spec(parts.name)
     lit = parts.structure_visual is not None and parts.structure_visual.exact
     _add_surroundings(spec, parts.walls, lit, parts.lamps)
-    assets = assets or Assets({}, {})
+    looks, hulls = assets or ({}, {})
     structure = spec.worldbody.add_body(name="structure")
-    if (look := assets.looks.get("structure")) is not None:
+    if (look := looks.get("structure")) is not None:
         _add_look(spec, structure, "structure", look)
     for i, wall in enumerate(parts.walls):
         _add_box(spec, structure, "structure", f"wall_{i}", wall, [0.6, 0.005, 0.0001])
@@ -181,7 +176,7 @@ def build_spec(parts: SceneParts, assets: Assets | None = None) -> mujoco.MjSpec
     for body, category in (("structure", "structure"), *((o.name, o.category) for o in parts.objects)):
         spec.add_text(name=f"class_{body}", data=category)
     for placed, physical in zip(parts.objects, parts.physical, strict=True):
-        _add_movable(spec, placed, physical, assets.looks.get(placed.name), assets.hulls.get(placed.name, ()))
+        _add_movable(spec, placed, physical, looks.get(placed.name), hulls.get(placed.name, ()))
     return spec
 
 
@@ -294,10 +289,10 @@ def write_obj(
 def write_scene(parts: SceneParts, folder: Path, palette: int = 96) -> None:
     """Write `scene.xml` and `assets/` into an existing folder, textures in `palette` colours."""
     parts = dataclasses.replace(parts, object_visuals=tuple(map(share_plain, parts.object_visuals)))
-    assets, shared = folder / "assets", share_assets(parts)
+    assets, (looks, hulls) = folder / "assets", share_assets(parts)
     assets.mkdir()
     drawn = dict(zip((o.name for o in parts.objects), parts.object_visuals, strict=True))
-    for name, look in shared.looks.items():
+    for name, look in looks.items():
         visual = parts.structure_visual if name == "structure" else drawn[name]
         assert visual is not None
         if look.mesh == name:
@@ -309,10 +304,10 @@ def write_scene(parts: SceneParts, folder: Path, palette: int = 96) -> None:
             image = as_png(visual.image) if visual.exact else quantise(visual.image, palette)
             image.save(assets / f"{name}.png", optimize=True)
     for placed in parts.objects:
-        for i, (hull, name) in enumerate(zip(placed.hulls_b, shared.hulls[placed.name], strict=True)):
+        for i, (hull, name) in enumerate(zip(placed.hulls_b, hulls[placed.name], strict=True)):
             if name == f"{placed.name}_hull_{i}":
                 write_obj(assets / f"{name}.obj", hull.vertices, hull.faces, decimals=HULL_DECIMALS)
-    spec = build_spec(parts, shared)
+    spec = build_spec(parts, (looks, hulls))
     spec.modelfiledir = str(folder)
     spec.compile()
     (folder / "scene.xml").write_text(_full_lengths(spec), encoding="utf-8")

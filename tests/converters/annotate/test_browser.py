@@ -76,7 +76,7 @@ def seen_pairs(page: Page, truth, cad, scan: trimesh.Trimesh, bench: trimesh.Tri
     surface = trimesh.Trimesh(cad.vertices, cad.faces, process=False)
     points, face = trimesh.sample.sample_surface(surface, 400, seed=0)[:2]
     normals = np.asarray(surface.face_normals)[face]
-    pose, found = page._drawn["view"].bench, []
+    pose, found = page._drawn["bench"], []
     for p, n in zip(np.asarray(points), normals, strict=True):
         q, b = truth[:3, :3] @ p + truth[:3, 3], apply_alignment(pose, p[None])[0]
         eyes = []
