@@ -85,8 +85,8 @@ def test_a_failing_and_a_slow_model_get_their_convex_hull(tmp_path):
 def test_a_crash_of_coacd_gets_the_convex_hull(tmp_path, monkeypatch):
     job_of = decompose._job
 
-    def crash(key, name, vertices, faces, *others):
-        return job_of(key, name, vertices, faces + 10**6 * (name == "broken"), *others)
+    def crash(key, vertices, faces, *others):
+        return job_of(key, vertices, faces + 10**6, *others)
 
     monkeypatch.setattr(decompose, "_job", crash)  # faces of vertices that are not there
     done = decompose_all({"broken": table(), "copy": table()}, CONFIG, 1, tmp_path)
