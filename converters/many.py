@@ -280,9 +280,11 @@ def generate_scenes(wanted: Any, report: Report, log: Callable[[str], None]) -> 
 
 
 def make_packaged(
-    names: Sequence[str], command: Callable[..., Any], report: Report, log: Callable[[str], None]
+    names: Sequence[str], wanted_set: Callable[..., Any], report: Report, log: Callable[[str], None]
 ) -> list[str]:
-    """Generate scenes of the package's sets in the cache folder by `command`s, unless the package has them.
+    """Generate scenes of the package's sets in the cache folder, unless the package has them.
+
+    `wanted_set`: the command `converters.generating.GenerateScenes`, with what its options have in common.
 
     Replace cached folders that hold a scene other than the listed one. Return the names of scenes that fail, miss a
     gate, or differ from the set's list.
@@ -307,7 +309,7 @@ def make_packaged(
             log(f"{scene}: in the cache is not the scene that the set {name} lists; made again")
         if not todo:
             continue
-        rest = command(out=out, recipes=folder / RECIPES, only=todo, overwrite=bool(others))
+        rest = wanted_set(out=out, recipes=folder / RECIPES, only=todo, overwrite=bool(others))
         failed += generate_scenes(rest, report, log)
         for scene in (n for n in todo if n not in failed and not is_listed(out / n, wanted[n])):
             command = f"python -m converters generate-scenes FOLDER --recipes {folder / RECIPES} --only {scene}"
