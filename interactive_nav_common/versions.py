@@ -10,8 +10,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import jax
-
 PACKAGES = (
     *("interactive-nav", "brax", "flax", "jax", "jaxlib", "jax-cuda13-plugin", "mujoco", "mujoco-mjx"),
     *("numpy", "optax", "warp-lang"),
@@ -20,6 +18,8 @@ PACKAGES = (
 
 def versions() -> dict[str, Any]:
     """Return the packages, Python, platform, device and commit that a result depends on."""
+    import jax  # what only asks for a commit starts without it
+
     device = jax.devices()[0]
     return {
         "packages": package_versions(PACKAGES),

@@ -26,7 +26,8 @@ from converters.segment.samples import Crop, generate_crops, read_crops
 from converters.segment.voxels import FEATURES, NAMES, UNKNOWN, intersection_over_union
 from interactive_nav_common.config import AtLeastOne, Count, Positive, Seed, Settings
 from interactive_nav_common.records import METRICS, cut_metrics
-from interactive_nav_common.runs.folder import CHECKPOINT, append_metrics, read_state, write_state
+from interactive_nav_common.runs.folder import CHECKPOINT, append_metrics
+from interactive_nav_common.runs.weights import read_state, write_state
 from interactive_nav_common.signals import signals_wait
 
 HELD_OUT_SEED = 900_000

@@ -1,24 +1,26 @@
 """Keep a run's folder: its settings, versions and metrics, and epochs that go on from a checkpoint."""
 
+from __future__ import annotations
+
 import contextlib
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-import flax.serialization
-import jax
 import numpy as np
 import yaml
 
 from interactive_nav_common.errors import FileError, readable
-from interactive_nav_common.files import alone_in, append_text, whole_file, write_json, write_text, writing
+from interactive_nav_common.files import alone_in, append_text, write_json, write_text, writing
 from interactive_nav_common.jobs.progress import Host, Stopped
 from interactive_nav_common.records import METRICS, cut_metrics
-from interactive_nav_common.runs.weights import fitting
 from interactive_nav_common.untrusted.reading import Loader
 from interactive_nav_common.versions import versions
+
+if TYPE_CHECKING:  # programs that only look at run folders start without JAX
+    import jax
 
 CONFIG, CHECKPOINT, VERSIONS = "config.yaml", "checkpoint.msgpack", "versions.json"
 GOES_ON = "make room and start again: the run continues from its last checkpoint"
@@ -59,29 +61,6 @@ def append_metrics(out: Path, line: Mapping[str, Any]) -> None:
         append_text(out / METRICS, json.dumps(line) + "\n")
 
 
-def write_state(path: Path, state: Any) -> None:
-    """Write a tree of arrays, strings and numbers as msgpack, whole or not at all."""
-    with whole_file(path) as partial:
-        partial.write_bytes(flax.serialization.to_bytes(jax.device_get(state)))
-
-
-def read_state(path: Path) -> dict[str, Any] | None:
-    """Return a tree as plain mappings, or None where there is no file."""
-    if not path.is_file():
-        return None
-    with readable(path, FileError, "delete it to start again"):
-        return flax.serialization.msgpack_restore(path.read_bytes())  # type: ignore[return-value]
-
-
-def restored(template: State, state: Any, path: Path) -> State:
-    """Return plain mappings of `read_state` in the structure and types of a template."""
-    try:
-        tree = flax.serialization.from_state_dict(template, state)
-    except (ValueError, KeyError) as error:
-        raise FileError(f"{path}: does not fit the network ({error}); delete it to start again") from None
-    return fitting(template, tree, path, FileError)
-
-
 def run_epochs(
     out: Path,
     phase: str,
@@ -97,6 +76,10 @@ def run_epochs(
     `epoch` takes the state, the epoch's number from 0 and its key to the state and means over the epoch, `loss` among
     them.
     """
+    import jax
+
+    from interactive_nav_common.runs.weights import read_state, restored, write_state
+
     saved, first = read_state(out / checkpoint), 0
     if saved and saved.get("phase", phase) == phase:
         first, state = saved["epoch"], restored(state, saved["learner"], out / checkpoint)

@@ -155,3 +155,26 @@ def fitting(template: Tree, tree: Any, path: Path, kind: type[UserError]) -> Tre
         return jnp.asarray(got, getattr(expected, "dtype", None))
 
     return jax.tree_util.tree_map_with_path(leaf, template, tree)
+
+
+def write_state(path: Path, state: Any) -> None:
+    """Write a tree of arrays, strings and numbers as msgpack, whole or not at all."""
+    with whole_file(path) as partial:
+        partial.write_bytes(flax.serialization.to_bytes(jax.device_get(state)))
+
+
+def read_state(path: Path) -> dict[str, Any] | None:
+    """Return a tree as plain mappings, or None where there is no file."""
+    if not path.is_file():
+        return None
+    with readable(path, FileError, "delete it to start again"):
+        return flax.serialization.msgpack_restore(path.read_bytes())  # type: ignore[return-value]
+
+
+def restored(template: Tree, state: Any, path: Path) -> Tree:
+    """Return plain mappings of `read_state` in the structure and types of a template."""
+    try:
+        tree = flax.serialization.from_state_dict(template, state)
+    except (ValueError, KeyError) as error:
+        raise FileError(f"{path}: does not fit the network ({error}); delete it to start again") from None
+    return fitting(template, tree, path, FileError)

@@ -24,7 +24,8 @@ from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import FileError, readable
 from interactive_nav_common.files import write_json
 from interactive_nav_common.jobs.progress import ALONE, Host
-from interactive_nav_common.runs.folder import CHECKPOINT, claimed, read_state, run_epochs
+from interactive_nav_common.runs.folder import CHECKPOINT, claimed, run_epochs
+from interactive_nav_common.runs.weights import read_state
 from topological_nav.config import PITCHES, DataConfig, NetworkTrainConfig
 from topological_nav.data.dataset import RoomImages, load_passages, load_rooms, logits_at, read_header
 from topological_nav.learn import learning

@@ -22,7 +22,8 @@ from interactive_nav_common.errors import UserError, regular
 from interactive_nav_common.files import check_name, remove_stale, whole_folder, write_text, writing
 from interactive_nav_common.records import Reader
 from interactive_nav_common.runs import weights
-from interactive_nav_common.runs.folder import GOES_ON, write_state
+from interactive_nav_common.runs.folder import GOES_ON
+from interactive_nav_common.runs.weights import write_state
 from interactive_nav_common.untrusted.reading import read_npz
 from train.runs.run_folder import RunFolder
 

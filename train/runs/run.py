@@ -23,7 +23,8 @@ from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import locked, write_json, writing
 from interactive_nav_common.jobs.progress import progress_bar
 from interactive_nav_common.records import cut_metrics, mean_over_episodes
-from interactive_nav_common.runs.folder import append_metrics, write_state
+from interactive_nav_common.runs.folder import append_metrics
+from interactive_nav_common.runs.weights import write_state
 from interactive_nav_common.signals import stop_signals
 from interactive_nav_common.versions import versions
 from scenes_mjcf.sets import scene_folders

@@ -14,12 +14,9 @@ import sys
 import time
 from pathlib import Path
 
-import pyarrow as pa
-import pyarrow.parquet as pq
 import yaml
 
 from interactive_nav_common.files import whole_file, write_text
-from train.runs.run_folder import EvaluationRequest
 
 
 def fates(run: Path) -> dict[str, list[str]]:
@@ -62,6 +59,11 @@ def train(path: str) -> int:
 
 
 def evaluate(words: list[str]) -> int:
+    import pyarrow as pa  # `train` starts without these: sweeps start it hundreds of times
+    import pyarrow.parquet as pq
+
+    from train.runs.run_folder import EvaluationRequest
+
     def after(flag: str) -> str:
         return words[words.index(flag) + 1]
 
