@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import importlib
 import re
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -14,6 +13,8 @@ import pytest
 
 from docs.package_map import read_sources
 from docs.program_help import help_of
+from interactive_nav.__main__ import PROGRAMS, main
+from interactive_nav_common.commands import TYPED
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "commands.md"
@@ -58,19 +59,21 @@ def test_help_is_that_of_the_parser_and_of_its_commands():
 
 
 @pytest.mark.parametrize("command", ["train", "evaluate", "convert"])
-def test_help_shows_what_was_typed(command):
-    done = subprocess.run(
-        [sys.executable, "-m", "interactive_nav", command, "--help"], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.startswith(f"usage: interactive-nav {command} ")
+def test_help_shows_what_was_typed(command, capsys, monkeypatch):
+    module, _ = PROGRAMS[command]
+    monkeypatch.setitem(TYPED, f"python -m {module}", "")  # set again by `main`, and removed after the test
+    monkeypatch.setattr(sys, "argv", ["interactive-nav", command, "--help"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert not ended.value.code and capsys.readouterr().out.startswith(f"usage: interactive-nav {command} ")
 
 
 @pytest.mark.parametrize("module", sorted(programs(ROOT)))
 def test_every_program_prints_its_version(module, capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", [module, "--version"])
     package = (ROOT / module.replace(".", "/")).is_dir()
-    main = importlib.import_module(f"{module}.__main__" if package else module).main
+    program = importlib.import_module(f"{module}.__main__" if package else module)
     with contextlib.suppress(SystemExit):
-        main()
+        program.main()
     number = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert capsys.readouterr().out == f"interactive-nav {number}\n"

@@ -137,6 +137,7 @@ def furnished(tmp_path_factory):
     return build_world(get_robot("turtlebot"), (load_scene(room),), NavConfig.of(num_objects=0))
 
 
+@pytest.mark.heavy
 def test_a_push_in_a_window_is_that_of_the_whole_building(furnished):
     """The robot pushes one chair into the next for 1.5 s: C MuJoCo with everything, MJX-JAX with two of four."""
     world = furnished
