@@ -13,12 +13,10 @@ from interactive_nav_common.runs.folder import (
     CONFIG,
     VERSIONS,
     claimed,
-    read_state,
     refuse_changes,
-    restored,
     run_epochs,
-    write_state,
 )
+from interactive_nav_common.runs.weights import read_state, restored, write_state
 
 
 def test_other_settings_are_refused_with_both_values(tmp_path):
