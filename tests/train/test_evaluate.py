@@ -188,11 +188,11 @@ def test_what_is_stopped_keeps_the_policies_that_have_played(run, tmp_path, monk
     played = evaluation.BatchPlayer.play
     count = []
 
-    def stopped(self, *arguments):
+    def stopped(self, *arguments, **keywords):
         count.append(1)
         if len(count) % 2 == 0:
             signal.raise_signal(number)
-        return played(self, *arguments)
+        return played(self, *arguments, **keywords)
 
     with monkeypatch.context() as patch:
         patch.setattr(evaluation.BatchPlayer, "play", stopped)
