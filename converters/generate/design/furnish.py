@@ -100,6 +100,8 @@ class _Room:
         self.taken = [fixture.rect.polygon for fixture in plan.fixtures]
         self.zones = [doorway_zone(d, 0.75).polygon for d in plan.doorways]
         self.sweeps: list[shapely.Polygon] = []
+        self.hung: set[int] = set()
+        """Doorways with a leaf."""
         self.placed: list[Instance] = []
         self.room_of: list[int] = []
         self.models = Models(cfg.models, cfg.scale_jitter)
@@ -231,6 +233,7 @@ def _hang_leaf(state: _Room, k: int, cfg: BuildingConfig, rng: np.random.Generat
         if cfg.leaves_at_walls and _meets(leaf.footprint, (z for j, z in enumerate(state.zones) if j != k)):
             continue
         state.sweeps.append(sweep)
+        state.hung.add(k)
         state.add(leaf, room)
         return leaf
     return None
@@ -240,25 +243,30 @@ def _hang_leaves(
     state: _Room, count: int, cfg: BuildingConfig, rng: np.random.Generator, first: Sequence[int] = ()
 ) -> bool:
     """Hang leaves into doorways, those of rooms `first` before others; return False where fewer than `count` fit."""
-    leaves = 0
     order = rng.permutation(len(state.plan.doorways))
     for k in sorted(order, key=lambda k: not set(first) & set(state.plan.doorways[k].rooms)):
-        if leaves == count:
+        if len(state.placed) == count:
             break
-        if state.plan.doorways[k].width_m <= 1.1:
-            leaves += _hang_leaf(state, int(k), cfg, rng) is not None
-    return leaves == count
+        if k not in state.hung and state.plan.doorways[k].width_m <= 1.1:
+            _hang_leaf(state, int(k), cfg, rng)
+    return len(state.placed) == count
 
 
 def hang_doors(
-    plan: Plan, cfg: BuildingConfig, rng: np.random.Generator, first: Sequence[int] = ()
+    plan: Plan, cfg: BuildingConfig, rng: np.random.Generator, first: Sequence[int] = (), always: Sequence[int] = ()
 ) -> tuple[list[tuple[Instance, int]], list[shapely.Polygon]] | None:
     """Hang as many leaves as a plan has doorways for, up to `cfg.n_doors`; doorways of the rooms `first` come first.
 
-    Return each leaf with the room that it opens into, and the floor that they sweep; None where too few fit.
+    Doorways of the rooms `always` all get one, at a side wall or not. Return each leaf with the room that it opens
+    into, and the floor that they sweep; None where too few fit.
     """
     state = _Room(plan, cfg, Effort())
     low, high = (min(n, len(plan.doorways)) for n in cfg.n_doors)
+    needed = [k for k, doorway in enumerate(plan.doorways) if set(always) & set(doorway.rooms)]
+    anywhere = dataclasses.replace(cfg, leaves_at_walls=False)
+    for k in needed:
+        if not (_hang_leaf(state, k, cfg, rng) or _hang_leaf(state, k, anywhere, rng)):
+            return None
     if not _hang_leaves(state, high, cfg, rng, first) and len(state.placed) < low:
         return None
     return list(zip(state.placed, state.room_of, strict=True)), state.sweeps

@@ -134,6 +134,21 @@ class Plan:
     wall_height_m: float
     built_in: tuple[Instance, ...] = dataclasses.field(default=(), compare=False)
     """Furniture that stays: part of the static structure as the fixtures are."""
+    entrance: Doorway | None = None
+    """The front door, which stays closed, in an outer wall; both of its rooms are the one behind it."""
+
+    def facades(self) -> list[tuple[int, int, float, float, float]]:
+        """Return the outer faces of the building: axis, sign of the way outwards, coordinate of the face, start, end."""
+        pieces = [r.polygon for r in (*self.rooms, *(w.rect for w in self.walls), *(d.rect for d in self.doorways))]
+        ring = shapely.get_coordinates(shapely.union_all(pieces).simplify(CM / 2).exterior).round(2)
+        faces = []
+        for a, b in itertools.pairwise(ring if shapely.is_ccw(shapely.LinearRing(ring)) else ring[::-1]):
+            axis = int(abs(b[1] - a[1]) < abs(b[0] - a[0]))
+            along = b[1 - axis] - a[1 - axis]
+            # Counter-clockwise the outside lies to the right: +x where one goes along +y, -y where along +x.
+            way = int(np.sign(along)) * (1 if axis == 0 else -1)
+            faces.append((axis, way, float(a[axis]), *sorted((float(a[1 - axis]), float(b[1 - axis])))))
+        return faces
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,21 +174,23 @@ def snap(value: float) -> float:
 
 Wall = tuple[int, Rect]
 """The axis along which a stretch of wall is thin, and its footprint."""
-Weights = Sequence[float] | None
-"""Areas of rooms against each other; None: equal."""
 
 
-def _cut(rect: Rect, axis: int, at: float, thick: float) -> tuple[Rect, Wall, Rect]:
+def cut(rect: Rect, axis: int, at: float, thick: float) -> tuple[Rect, Wall, Rect]:
     """Cut a rectangle across `axis` into what lies below `at`, a wall, and the rest."""
     (low, high), along = rect.span(axis), rect.span(1 - axis)
     wall = Rect.across(axis, at, at + thick, *along)
     return Rect.across(axis, low, at, *along), (axis, wall), Rect.across(axis, at + thick, high, *along)
 
 
-def _split(
+def split(
     rect: Rect, weights: Sequence[float], spread: float, cfg: BuildingConfig, rng: np.random.Generator
 ) -> tuple[list[Rect], list[Wall]]:
-    """Cut a rectangle into rooms, mostly across its longer side; `make_plan` describes weights and spread."""
+    """Cut a rectangle into rooms, mostly across its longer side.
+
+    `weights` are the rooms' areas against each other, in the order in which they lie; a cut is up to the share `spread`
+    of the side away from where they have it.
+    """
     n = len(weights)
     if n == 1:
         return [rect], []
@@ -182,18 +199,16 @@ def _split(
     n_low = n // 2 if rng.random() < 0.5 else n - n // 2
     share = sum(weights[:n_low]) / sum(weights) + rng.uniform(-spread, spread)
     thick = snap(rng.uniform(*cfg.wall_thickness_m))
-    low, wall, high = _cut(rect, axis, snap(rect.span(axis)[0] + share * rect.size[axis] - thick / 2), thick)
-    rooms_low, walls_low = _split(low, weights[:n_low], spread, cfg, rng)
-    rooms_high, walls_high = _split(high, weights[n_low:], spread, cfg, rng)
+    low, wall, high = cut(rect, axis, snap(rect.span(axis)[0] + share * rect.size[axis] - thick / 2), thick)
+    rooms_low, walls_low = split(low, weights[:n_low], spread, cfg, rng)
+    rooms_high, walls_high = split(high, weights[n_low:], spread, cfg, rng)
     return rooms_low + rooms_high, [wall, *walls_low, *walls_high]
 
 
-def _layout(
-    cfg: BuildingConfig, rng: np.random.Generator, weights: Weights, spread: float
-) -> tuple[Rect, list[Rect], list[Wall], int | None]:
+def _layout(cfg: BuildingConfig, rng: np.random.Generator) -> tuple[Rect, list[Rect], list[Wall], int | None]:
     """Draw rooms and inner walls once; the caller checks the rooms."""
-    weights = weights or (1.0,) * int(rng.integers(cfg.n_rooms[0], cfg.n_rooms[1] + 1))
-    n = len(weights)
+    n, spread = int(rng.integers(cfg.n_rooms[0], cfg.n_rooms[1] + 1)), 0.1
+    weights = (1.0,) * n
     area = rng.uniform(*cfg.floor_area_m2)
     aspect = rng.uniform(1.0, 1.6)
     width, depth = snap(np.sqrt(area * aspect)), snap(np.sqrt(area / aspect))
@@ -202,7 +217,7 @@ def _layout(
     x0, y0 = snap(-width / 2 + rng.uniform(-0.7, 0.7)), snap(-depth / 2 + rng.uniform(-0.7, 0.7))
     inside = Rect(x0, y0, snap(x0 + width), snap(y0 + depth))
     if n < cfg.corridor_from_rooms:
-        rooms, walls = _split(inside, weights, spread, cfg, rng)
+        rooms, walls = split(inside, weights, spread, cfg, rng)
         return inside, rooms, walls, None
     across = int(width >= depth)
     thick = snap(rng.uniform(*cfg.wall_thickness_m))
@@ -212,14 +227,14 @@ def _layout(
     few, many = weights[1 : 1 + n_low], weights[1 + n_low :]
     share = sum(few) / sum(weights[1:]) + rng.uniform(-spread / 2, spread / 2)
     at = snap(inside.span(across)[0] + span * share)
-    low, wall_low, rest = _cut(inside, across, at, thick)
-    corridor, wall_high, high = _cut(rest, across, snap(at + thick + clear), thick)
-    rooms_low, walls_low = _split(low, few, spread, cfg, rng)
-    rooms_high, walls_high = _split(high, many, spread, cfg, rng)
+    low, wall_low, rest = cut(inside, across, at, thick)
+    corridor, wall_high, high = cut(rest, across, snap(at + thick + clear), thick)
+    rooms_low, walls_low = split(low, few, spread, cfg, rng)
+    rooms_high, walls_high = split(high, many, spread, cfg, rng)
     return inside, [corridor, *rooms_low, *rooms_high], [wall_low, wall_high, *walls_low, *walls_high], 0
 
 
-def _shared(a: Rect, b: Rect, walls: Iterable[Wall]) -> Wall | None:
+def shared_wall(a: Rect, b: Rect, walls: Iterable[Wall]) -> Wall | None:
     """Return the stretch of wall between rooms a (low side) and b (high side)."""
     for axis, wall in walls:
         faces = a.span(axis)[1], b.span(axis)[0]
@@ -229,6 +244,21 @@ def _shared(a: Rect, b: Rect, walls: Iterable[Wall]) -> Wall | None:
         if min(ends) - max(starts) > 0:
             return axis, Rect.across(axis, *faces, max(starts), min(ends))
     return None
+
+
+def place_doorway(
+    stretch: tuple[float, float], width_m: float, cfg: BuildingConfig, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Draw where on a stretch of wall a doorway of this width starts; return that and the width that fits."""
+    start, end = stretch
+    width = snap(min(width_m, end - start - 2 * DOORWAY_MARGIN_M))
+    slack = end - start - 2 * DOORWAY_MARGIN_M - width
+    # Doorways sit near a corner more often than in the middle: it leaves wall for furniture.
+    at = snap(start + DOORWAY_MARGIN_M + slack * rng.beta(0.5, 0.5))
+    if cfg.corner_doorways and rng.random() < cfg.corner_doorways:
+        margin = min(cfg.corner_margin_m, (end - start - width) / 2)
+        at = snap(start + margin if rng.random() < 0.5 else end - margin - width)
+    return at, width
 
 
 def _doorways(
@@ -245,7 +275,7 @@ def _doorways(
     graph.add_nodes_from(range(len(rooms)))
     need = cfg.doorway_width_m[1] + 2 * DOORWAY_MARGIN_M
     for i, j in itertools.permutations(range(len(rooms)), 2):
-        shared = _shared(rooms[i], rooms[j], walls)
+        shared = shared_wall(rooms[i], rooms[j], walls)
         if shared is None:
             continue
         axis, rect = shared
@@ -264,18 +294,12 @@ def _doorways(
         width = rng.uniform(*cfg.doorway_width_m)
         if rng.random() < 0.4:
             width += rng.uniform(0, cfg.archway_extra_m)
-        width = snap(min(width, end - start - 2 * DOORWAY_MARGIN_M))
-        slack = end - start - 2 * DOORWAY_MARGIN_M - width
-        # Doorways sit near a corner more often than in the middle: it leaves wall for furniture.
-        at = snap(start + DOORWAY_MARGIN_M + slack * rng.beta(0.5, 0.5))
-        if cfg.corner_doorways and rng.random() < cfg.corner_doorways:
-            margin = min(cfg.corner_margin_m, (end - start - width) / 2)
-            at = snap(start + margin if rng.random() < 0.5 else end - margin - width)
+        at, width = place_doorway((start, end), width, cfg, rng)
         chosen.append(Doorway((i, j), axis, Rect.across(axis, *rect.span(axis), at, at + width), door_height))
     return chosen
 
 
-def _wall_boxes(wall: Wall, doorways: list[Doorway], height: float) -> list[PlanBox]:
+def wall_boxes(wall: Wall, doorways: list[Doorway], height: float) -> list[PlanBox]:
     """Return the pieces of one wall around its doorways, and the pieces above them."""
     axis, rect = wall
     deep, (at, last) = rect.span(axis), rect.span(1 - axis)
@@ -349,17 +373,10 @@ def _windows(
     return boxes
 
 
-def make_plan(
-    cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 2000, weights: Weights = None, spread: float = 0.1
-) -> Plan:
-    """Draw a plan whose rooms are all joined by doorways.
-
-    `weights` are the rooms' areas against each other, in the order in which they lie, the corridor's (if there is to be
-    one) first, which does not count; default: as many as `cfg` says, equal. A cut is up to the share `spread` of the
-    side away from where the weights have it.
-    """
+def make_plan(cfg: BuildingConfig, rng: np.random.Generator, max_tries: int = 2000) -> Plan:
+    """Draw a plan whose rooms are all joined by doorways."""
     for _ in range(max_tries):
-        inside, rooms, walls, corridor = _layout(cfg, rng, weights, spread)
+        inside, rooms, walls, corridor = _layout(cfg, rng)
         plain = [r for i, r in enumerate(rooms) if i != corridor]
         if min(min(r.size) for r in plain) < cfg.min_room_side_m or max(max(r.size) / min(r.size) for r in plain) > 2.3:
             continue
@@ -370,7 +387,7 @@ def make_plan(
         height = snap(rng.uniform(*cfg.wall_height_m))
         thick = snap(cfg.wall_thickness_m[1])
         outer = Rect(*map(snap, dataclasses.astuple(inside.grown(thick, thick))))
-        boxes = [b for w in walls for b in _wall_boxes(w, doorways, height)]
+        boxes = [b for w in walls for b in wall_boxes(w, doorways, height)]
         around = [Rect(x0, outer.y0, x1, outer.y1) for x0, x1 in ((outer.x0, inside.x0), (inside.x1, outer.x1))]
         around += [Rect(inside.x0, y0, inside.x1, y1) for y0, y1 in ((outer.y0, inside.y0), (inside.y1, outer.y1))]
         boxes += [PlanBox.over(rect, 0.0, height) for rect in around]

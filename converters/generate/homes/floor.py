@@ -13,6 +13,7 @@ import shapely
 
 from converters.generate.design.plan import Plan, Rect, doorway_zone
 from converters.generate.homes.arrange import LOW_M, Arrangement
+from converters.generate.homes.plans import entrance_zone
 from converters.generate.models.cad import Instance
 from converters.geometry.density import ROBOTS
 from interactive_nav_common.grids import clearance, label
@@ -89,6 +90,9 @@ class Floor:
         for sweep in sweeps:
             window, inside = self.raster([sweep])
             self.swept[window] |= inside
+        zone = entrance_zone(plan)
+        if zone is not None:  # the front door opens inwards
+            self.swept[self.cells(zone)] = True
         self.front = np.zeros(self.shape, bool)
         """Before furniture that one steps up to."""
         self.glass = np.zeros(self.shape, bool)
@@ -256,7 +260,7 @@ class Floor:
 
         inside = self.room[rows, columns] == room
         free = inside.copy()
-        doorways = [d for d in self.plan.doorways if room in d.rooms]
+        doorways = [d for d in (*self.plan.doorways, self.plan.entrance) if d is not None and room in d.rooms]
         for doorway in doorways:  # the floor behind a doorway counts as free
             free[here(doorway_zone(doorway, BEYOND_M, 0.0))] = True
         free &= ~inside | (self.covered[rows, columns] == 0)

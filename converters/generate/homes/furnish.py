@@ -271,9 +271,13 @@ def furnish_home(plan: Plan, uses: list[str], cfg: HomeConfig, rng: np.random.Ge
     """Furnish a plan, whose rooms have these uses."""
     lacking = ""
     for _ in range(MOST_BASES):
-        doors = hang_doors(plan, cfg.shell, rng, [k for k, use in enumerate(uses) if use in PRIVATE])
+        private, bathrooms = ([k for k, use in enumerate(uses) if use in some] for some in (PRIVATE, ("bathroom",)))
+        doors = hang_doors(plan, cfg.shell, rng, private, bathrooms)
         if doors is None:
-            raise GenerationError(f"n_doors is {cfg.shell.n_doors}: too few doorways have a wall for a leaf to rest at")
+            raise GenerationError(
+                f"n_doors is {cfg.shell.n_doors}: too few doorways have a wall for a leaf to rest at, or a bathroom has "
+                "no room for its door to open; ask for more area or fewer rooms"
+            )
         leaves, sweeps = doors
         home = Home(cfg, plan, uses, Floor(plan, sweeps), Models(cfg.shell.models, cfg.shell.scale_jitter), rng)
         for leaf, room in leaves:

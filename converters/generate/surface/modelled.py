@@ -147,9 +147,8 @@ def _shell(plan: Plan, sides: Sides, finish: list[Finish]) -> list[Chart]:
     for doorway in plan.doorways:
         charts += at_walls.lining(doorway, finish[doorway.rooms[0]].floor_colour)
     charts += [_flat(w.rect, w.high[2], 1, WALL, plain([0.62, 0.61, 0.59]), 2.0, True) for w in plan.walls]
-    for axis, way, face, start, end in plan.outer.sides():
-        near = [w for w in plan.windows if abs((w.low if way > 0 else w.high)[axis] - face) < 0.005]
-        outside = Side(axis, -way, face, start, end, (), tuple(near))
+    for axis, way, face, start, end in plan.facades():
+        outside = at_walls.windowed(Side(axis, way, face, start, end, (), ()), plan.windows)
         charts += at_walls.wall_face(outside, height, plain([0.80, 0.78, 0.73]), 8.0)
     return charts
 
@@ -225,15 +224,11 @@ def _fittings(
 ) -> list[Chart]:
     """Return front door, pictures, switches and sockets."""
     charts: list[Chart] = []
-    standing, tall = _standing(items, 0.05), _standing(items, 1.1)
-    order = sorted(range(len(uses)), key=lambda k: ({"hall": 0, "living": 1}.get(uses[k], 2), k))
-    walls = [s for k in order if k == plan.corridor or uses[k] in ("hall", "living", "dining") for s in sides[k]]
-    reach = {(axis, way): face for axis, way, face, *_ in plan.outer.sides()}
-    entrance = at_walls.entrance_place(walls, [abs(reach[s.axis, s.way] - s.face) < 0.5 for s in walls], standing)
-    colour = ENTRANCES[rng.integers(len(ENTRANCES))]
-    if entrance is not None:
-        side, middle = entrance
-        charts += at_walls.entrance(side, middle, colour)
+    tall = _standing(items, 1.1)
+    if plan.entrance is not None:
+        walls = sides[plan.entrance.rooms[0]]
+        side, middle = at_walls.entrance_place(walls, plan.entrance)
+        charts += at_walls.entrance(side, middle, ENTRANCES[rng.integers(len(ENTRANCES))])
         tall = shapely.union(tall, side.strip(middle - 0.6, middle + 0.6, 0.2))
     for k, use in enumerate(uses):
         left = PICTURES.get(use, 0)

@@ -10,6 +10,7 @@ import numpy as np
 import shapely
 
 from converters.generate.design.plan import Doorway, PlanBox, Rect
+from converters.generate.homes.plans import ENTRANCE_M
 from converters.generate.surface.finishes import SKIRTING_M, Colouring
 from converters.generate.surface.scan import NYU40
 from converters.generate.surface.texture import Chart, plain, polygon
@@ -23,8 +24,6 @@ CASING_M, PROUD_M = 0.07, 0.015
 """Width of the board around a doorway, and how far it stands out."""
 FLOOR_M = 0.004
 """Floors are drawn a little above the plane that things stand on, or the two would flicker."""
-ENTRANCE_M = (0.92, 2.04)
-"""Width and height of the front door's leaf."""
 CLOTHS = np.array([[0.86, 0.83, 0.76], [0.62, 0.66, 0.70], [0.70, 0.58, 0.48], [0.55, 0.60, 0.52], [0.80, 0.72, 0.66]])
 ENTRANCES = np.array([[0.36, 0.22, 0.15], [0.88, 0.88, 0.86], [0.24, 0.33, 0.36], [0.55, 0.38, 0.24]])
 
@@ -109,22 +108,25 @@ class Side:
         return charts
 
 
+def _opens(side: Side, rect: Rect) -> bool:
+    """Return whether an opening in a wall is in this side of it."""
+    low, high = side.along(rect)
+    face = rect.span(side.axis)[int(side.way > 0)]
+    return abs(face - side.face) < 0.005 and low > side.start - 0.005 and high < side.end + 0.005
+
+
+def windowed(side: Side, windows: Iterable[PlanBox]) -> Side:
+    """Return a wall with those of the windows that are in it."""
+    return dataclasses.replace(side, windows=tuple(w for w in windows if _opens(side, w.rect)))
+
+
 def sides_of(room: Rect, doorways: Iterable[Doorway], windows: Iterable[PlanBox]) -> list[Side]:
     """Return the four walls of a room, each with what opens in it."""
     out = []
     for wall in room.sides():
-        side = Side(*wall, (), ())
-
-        def here(rect: Rect, side: Side = side) -> bool:
-            low, high = side.along(rect)
-            return (
-                abs(rect.span(side.axis)[int(side.way > 0)] - side.face) < 0.005
-                and low > side.start - 0.005
-                and high < side.end + 0.005
-            )
-
-        through = tuple(d for d in doorways if d.axis == side.axis and here(d.rect))
-        out.append(dataclasses.replace(side, doorways=through, windows=tuple(w for w in windows if here(w.rect))))
+        side = windowed(Side(*wall, (), ()), windows)
+        through = tuple(d for d in doorways if d.axis == side.axis and _opens(side, d.rect))
+        out.append(dataclasses.replace(side, doorways=through))
     return out
 
 
@@ -268,20 +270,10 @@ def _leaf(side: Side, middle: float, colour: np.ndarray) -> Colouring:
     return paint
 
 
-def entrance_place(
-    sides: Iterable[Side], outer: Iterable[bool], standing: shapely.Geometry
-) -> tuple[Side, float] | None:
-    """Return a wall and the middle of a front door on it, with floor before it; None where no outer wall has room."""
-    half = ENTRANCE_M[0] / 2 + CASING_M + 0.03
-    for depth_m in (0.95, 0.5, 0.15):
-        for side, is_outer in zip(sides, outer, strict=True):
-            if not is_outer:
-                continue
-            for middle in np.arange(side.start + half + 0.1, side.end - half - 0.1, 0.05).round(3):
-                clear = all(h.end + 0.25 < middle - half or h.start - 0.25 > middle + half for h in side.holes())
-                if clear and not side.strip(middle - half, middle + half, depth_m).intersects(standing):
-                    return side, float(middle)
-    return None
+def entrance_place(sides: Iterable[Side], front_door: Doorway) -> tuple[Side, float]:
+    """Return the wall of a room that has the front door, and the door's middle along it."""
+    side = next(s for s in sides if s.axis == front_door.axis and _opens(s, front_door.rect))
+    return side, front_door.rect.centre[1 - side.axis]
 
 
 def entrance(side: Side, middle: float, colour: np.ndarray) -> list[Chart]:
