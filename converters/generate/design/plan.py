@@ -21,6 +21,8 @@ from converters.generate.models.cad import Instance
 CM = 0.01
 DOORWAY_MARGIN_M = 0.12
 """Least wall left between a doorway and the corner of a room."""
+ENTRANCE_FREE_M = 1.0
+"""Depth and width of the floor behind the front door that stays free."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,8 +139,19 @@ class Plan:
     entrance: Doorway | None = None
     """The front door, which stays closed, in an outer wall; both of its rooms are the one behind it."""
 
+    @property
+    def entrance_zone(self) -> Rect | None:
+        """Return the floor behind the front door that stays free."""
+        if self.entrance is None:
+            return None
+        axis, (low, high) = self.entrance.axis, self.rooms[self.entrance.rooms[0]].span(self.entrance.axis)
+        inwards = self.entrance.rect.span(axis)[1] <= low + CM / 2
+        deep = (low, low + ENTRANCE_FREE_M) if inwards else (high - ENTRANCE_FREE_M, high)
+        middle = self.entrance.rect.centre[1 - axis]
+        return Rect.across(axis, *deep, middle - ENTRANCE_FREE_M / 2, middle + ENTRANCE_FREE_M / 2)
+
     def facades(self) -> list[tuple[int, int, float, float, float]]:
-        """Return the outer faces of the building: axis, sign of the way outwards, coordinate of the face, start, end."""
+        """Return the building's outer faces: axis, sign of the way outwards, coordinate of the face, start and end."""
         pieces = [r.polygon for r in (*self.rooms, *(w.rect for w in self.walls), *(d.rect for d in self.doorways))]
         ring = shapely.get_coordinates(shapely.union_all(pieces).simplify(CM / 2).exterior).round(2)
         faces = []

@@ -13,7 +13,6 @@ import shapely
 
 from converters.generate.design.plan import Plan, Rect, doorway_zone
 from converters.generate.homes.arrange import LOW_M, Arrangement
-from converters.generate.homes.plans import entrance_zone
 from converters.generate.models.cad import Instance
 from converters.geometry.density import ROBOTS
 from interactive_nav_common.grids import clearance, label
@@ -90,9 +89,8 @@ class Floor:
         for sweep in sweeps:
             window, inside = self.raster([sweep])
             self.swept[window] |= inside
-        zone = entrance_zone(plan)
-        if zone is not None:  # the front door opens inwards
-            self.swept[self.cells(zone)] = True
+        if plan.entrance_zone is not None:  # the front door opens inwards
+            self.swept[self.cells(plan.entrance_zone)] = True
         self.front = np.zeros(self.shape, bool)
         """Before furniture that one steps up to."""
         self.glass = np.zeros(self.shape, bool)

@@ -17,6 +17,7 @@ from converters.generate.design.config import BuildingConfig, GenerationError
 from converters.generate.design.plan import (
     CM,
     DOORWAY_MARGIN_M,
+    ENTRANCE_FREE_M,
     Doorway,
     Plan,
     PlanBox,
@@ -73,8 +74,6 @@ FORBIDDEN = 100.0
 """Misfit of a plan in which a room cannot be reached as it should, or lacks the outer wall that it needs."""
 ENTRANCE_M = (0.92, 2.04)
 """Width and height of the front door's leaf."""
-ENTRANCE_FREE_M = 1.0
-"""Depth and width of the floor behind the front door that stays free."""
 WINDOW_M = 1.1
 """Least stretch of outer wall for a window."""
 WING_DEPTH_M = (2.2, 5.5)
@@ -245,7 +244,7 @@ def outer_stretches(room: Rect, walls: Sequence[Wall]) -> Iterator[tuple[int, in
 
 
 @dataclasses.dataclass(frozen=True)
-class _Relations:
+class Relations:
     """Hold what decides which uses suit the rooms of a layout."""
 
     rooms: list[Rect]
@@ -255,7 +254,7 @@ class _Relations:
     """(n,) longest stretch of outer wall."""
 
 
-def _relations(layout: Layout, need_m: float) -> tuple[_Relations, dict[tuple[int, int], Wall]]:
+def _relations(layout: Layout, need_m: float) -> tuple[Relations, dict[tuple[int, int], Wall]]:
     """Return a layout's relations, and the wall of each pair of rooms (low side first) that a doorway may join."""
     n = len(layout.rooms)
     shared, joined = {}, np.zeros((n, n), bool)
@@ -265,10 +264,10 @@ def _relations(layout: Layout, need_m: float) -> tuple[_Relations, dict[tuple[in
             shared[i, j] = wall
             joined[i, j] = joined[j, i] = True
     outer = [max((s[4] - s[3] for s in outer_stretches(r, layout.walls)), default=0.0) for r in layout.rooms]
-    return _Relations(layout.rooms, joined, np.array(outer)), shared
+    return Relations(layout.rooms, joined, np.array(outer)), shared
 
 
-def misfit(relations: _Relations, uses: Sequence[str]) -> float:
+def misfit(relations: Relations, uses: Sequence[str]) -> float:
     """Return how badly uses suit rooms, 0 being perfect; from `FORBIDDEN` on the plan is of no use.
 
     That counts areas off by a factor, sides too short, no neighbour of the right use, and rooms that people reach only
@@ -295,7 +294,7 @@ def misfit(relations: _Relations, uses: Sequence[str]) -> float:
     return cost + 3.0 * ("living" in uses and uses[largest] != "living")
 
 
-def assign_uses(relations: _Relations, corridor: int | None, wanted: list[str]) -> tuple[list[str], float]:
+def assign_uses(relations: Relations, corridor: int | None, wanted: list[str]) -> tuple[list[str], float]:
     """Return the use of each room, key of `USES`, and how badly they suit (see `misfit`)."""
     plain = [k for k in range(len(relations.rooms)) if k != corridor]
     uses = ["hall"] * len(relations.rooms)
@@ -378,18 +377,6 @@ def _entrance(layout: Layout, uses: Sequence[str], thick: float, rng: np.random.
             opening = Rect.across(axis, *span, snap(middle - ENTRANCE_M[0] / 2), snap(middle + ENTRANCE_M[0] / 2))
             return Doorway((k, k), axis, opening, ENTRANCE_M[1])
     return None
-
-
-def entrance_zone(plan: Plan) -> Rect | None:
-    """Return the floor behind the front door that stays free."""
-    if plan.entrance is None:
-        return None
-    axis, room = plan.entrance.axis, plan.rooms[plan.entrance.rooms[0]]
-    low, high = room.span(axis)
-    inside = plan.entrance.rect.span(axis)[1] <= low + CM / 2
-    deep = (low, low + ENTRANCE_FREE_M) if inside else (high - ENTRANCE_FREE_M, high)
-    middle = plan.entrance.rect.centre[1 - axis]
-    return Rect.across(axis, *deep, middle - ENTRANCE_FREE_M / 2, middle + ENTRANCE_FREE_M / 2)
 
 
 def _windows(
