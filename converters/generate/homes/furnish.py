@@ -275,8 +275,8 @@ def furnish_home(plan: Plan, uses: list[str], cfg: HomeConfig, rng: np.random.Ge
         doors = hang_doors(plan, cfg.shell, rng, private, bathrooms)
         if doors is None:
             raise GenerationError(
-                f"n_doors is {cfg.shell.n_doors}: too few doorways have a wall for a leaf to rest at, or a bathroom has "
-                "no room for its door to open; ask for more area or fewer rooms"
+                f"n_doors is {cfg.shell.n_doors}: too few doorways have a wall for a leaf to rest at, or a bathroom's "
+                "door has no room to open; ask for more area or fewer rooms"
             )
         leaves, sweeps = doors
         home = Home(cfg, plan, uses, Floor(plan, sweeps), Models(cfg.shell.models, cfg.shell.scale_jitter), rng)

@@ -21,7 +21,7 @@ from converters.generate.homes import design, furnish
 from converters.generate.homes.arrange import TABLES, apart, arrange, draw_set, stand
 from converters.generate.homes.floor import Floor
 from converters.generate.homes.furnish import Home, furnish_home
-from converters.generate.homes.plans import home_plan
+from converters.generate.homes.plans import USES, home_plan
 from converters.generate.models.cad import HOME_TRAIN_MODELS, LIBRARY, Instance, Models
 from converters.geometry.density import ROBOTS
 from interactive_nav_common.errors import ConfigError
