@@ -153,7 +153,7 @@ class Plan:
     def facades(self) -> list[tuple[int, int, float, float, float]]:
         """Return the building's outer faces: axis, sign of the way outwards, coordinate of the face, start and end."""
         pieces = [r.polygon for r in (*self.rooms, *(w.rect for w in self.walls), *(d.rect for d in self.doorways))]
-        ring = shapely.get_coordinates(shapely.union_all(pieces).simplify(CM / 2).exterior).round(2)
+        ring = shapely.get_coordinates(shapely.union_all(pieces, grid_size=CM / 10).simplify(CM / 2).exterior).round(2)
         faces = []
         for a, b in itertools.pairwise(ring if shapely.is_ccw(shapely.LinearRing(ring)) else ring[::-1]):
             axis = int(abs(b[1] - a[1]) < abs(b[0] - a[0]))

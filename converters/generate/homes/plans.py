@@ -416,7 +416,8 @@ def _windows(
 
 def _outer_walls(layout: Layout, thick: float) -> list[Rect]:
     """Return the pieces of the wall around all rooms."""
-    inside = shapely.union_all([r.polygon for r in (*layout.rooms, *(rect for _, rect in layout.walls))])
+    areas = [r.polygon for r in (*layout.rooms, *(rect for _, rect in layout.walls))]
+    inside = shapely.union_all(areas, grid_size=CM / 10)
     ring = inside.buffer(thick, join_style="mitre") - inside
     xs, ys = (np.unique(np.round(shapely.get_coordinates(ring)[:, k], 2)) for k in (0, 1))
     pieces = []
