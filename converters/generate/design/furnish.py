@@ -262,7 +262,7 @@ def hang_doors(
     """
     state = _Room(plan, cfg, Effort())
     low, high = (min(n, len(plan.doorways)) for n in cfg.n_doors)
-    needed = [k for k, doorway in enumerate(plan.doorways) if set(always) & set(doorway.rooms)]
+    needed = [k for k, doorway in enumerate(plan.doorways) if set(always) & set(doorway.rooms)][:high]
     anywhere = dataclasses.replace(cfg, leaves_at_walls=False)
     for k in needed:
         if not (_hang_leaf(state, k, cfg, rng) or _hang_leaf(state, k, anywhere, rng)):

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import shapely
 from PIL import Image
 
 from converters.generate import GENERATOR_VERSION, Building, GenerationError, design_building, render_building
@@ -19,7 +18,7 @@ from converters.generate.design.plan import Plan, Rect
 from converters.generate.models.cad import Instance
 from converters.generate.surface.modelled import model_building, space_of
 from converters.generate.surface.scan import NYU40, Scan
-from converters.generate.surface.sides import FLOOR_M, entrance_place, sides_of
+from converters.generate.surface.sides import FLOOR_M, OTHER, entrance_place, sides_of
 from converters.generate.surface.texture import Atlas, assemble, polygon
 from converters.generate.surface.write import annotate_items, write_npz, write_scan
 from converters.pipeline import ConvertConfig, _structure_visual
@@ -175,7 +174,7 @@ def test_every_patch_has_texels_of_its_own_and_the_sheet_stays_small():
 def test_corners_are_darker_than_the_middle_and_walls_cast_shadows():
     room = Rect(0.0, 0.0, 4.0, 3.0)
     plan = dataclasses.replace(home().plan, rooms=(room,), outer=Rect(-0.2, -0.2, 4.2, 3.2), walls=(), doorways=(),
-                               windows=(), fixtures=(), built_in=(), corridor=None)  # fmt: skip
+                               windows=(), fixtures=(), built_in=(), corridor=None, entrance=None)  # fmt: skip
     scan, atlas = model_building(_boxed(plan), [], ["bathroom"], np.random.default_rng(0))
     ceiling = np.flatnonzero(scan.labels == CEILING)
     uv = atlas.uv[ceiling]
@@ -203,16 +202,15 @@ def _boxed(plan: Plan) -> Plan:
     return dataclasses.replace(plan, walls=tuple(wall((a, b, 0.0), (c, d, height)) for a, b, c, d in boxes))
 
 
-def test_a_front_door_needs_an_outer_wall_with_free_floor():
-    room = Rect(0.0, 0.0, 3.0, 2.0)
-    walls = sides_of(room, (), ())
-    found = entrance_place(walls, [False, True, True, True], shapely.Point())
-    assert found is not None and found[0].face == 3.0 and 0.5 < found[1] < 1.5
-    blocked = shapely.box(2.0, 0.0, 3.0, 2.0)
-    found = entrance_place(walls, [False, True, True, True], blocked)
-    assert found is not None and (found[0].axis, found[0].face) == (1, 0.0)
-    assert entrance_place(walls, [False] * 4, shapely.Point()) is None
-    assert entrance_place(walls, [True] * 4, shapely.box(0, 0, 3, 2)) is None
+def test_the_front_door_is_where_the_plan_has_it():
+    door = home().plan.entrance
+    assert door is not None
+    side, middle = entrance_place(sides_of(home().plan.rooms[door.rooms[0]], (), ()), door)
+    assert abs(door.rect.centre[side.axis] - side.face) == pytest.approx(door.rect.size[side.axis] / 2)
+    points = made()[0].vertices[made()[0].labels == OTHER]
+    out, along = side.way * (points[:, side.axis] - side.face), points[:, 1 - side.axis] - middle
+    leaf = points[(out > 0.005) & (out < 0.007) & (abs(along) < 0.5)]
+    assert np.ptp(leaf, axis=0)[[1 - side.axis, 2]] == pytest.approx([0.92, 2.04], abs=0.001)
 
 
 def test_the_same_seed_paints_the_same_bytes():
