@@ -167,11 +167,12 @@ def missed(building: BuildingConfig | HomeConfig, result: Converted) -> str:
     return ""
 
 
-def _generated(recipe: SceneRecipe, config: ConvertConfig, work: Path, report: Report) -> Converted:
-    """Generate and convert the recipe's building.
+def _generated(recipe: SceneRecipe, config: ConvertConfig, work: Path, report: Report) -> tuple[Converted, str]:
+    """Generate and convert the recipe's building; return it, and its seed in words.
 
     A home takes the next of its seeds where one gives no plan that can be furnished so, or `missed` once converted.
     """
+    words = f"seed {recipe.seed}"
     tries = MOST_SEEDS if isinstance(recipe.building, HomeConfig) else 1
     for k in range(tries):
         raw, scene = work / "raw", work / recipe.name
@@ -186,25 +187,29 @@ def _generated(recipe: SceneRecipe, config: ConvertConfig, work: Path, report: R
         except GenerationError as error:
             if k == tries - 1:
                 raise GenerationError(f"{recipe.name}: none of {tries} seeds: {error}") from error
+            reason = str(error).removeprefix(f"seed {seed}: ")
+            words = f"seed {seed + NEXT_SEED} in place of {recipe.seed} ({reason})"
         else:
-            return result
+            return result, words
     raise AssertionError("unreachable: the last try returns or raises")
 
 
-def make_scene(recipe: SceneRecipe, conversion: dict[str, Any], folder: Path, jobs: int, report: Report) -> list[str]:
-    """Generate, convert and draw one scene; return the names of the gates that fail.
+def make_scene(
+    recipe: SceneRecipe, conversion: dict[str, Any], folder: Path, jobs: int, report: Report
+) -> tuple[list[str], str]:
+    """Generate, convert and draw one scene; return the names of the gates that fail, and its seed in words.
 
     `folder` is created or replaced, whole or not at all. `conversion` are settings of `ConvertConfig`, `jobs` is the
     number of decompositions side by side.
     """
     with part_folder(folder, overwrite=True) as work:
         config = ConvertConfig(format="gibson", split=recipe.split, jobs=jobs, **conversion)
-        result, scene = _generated(recipe, config, work, report), work / recipe.name
+        (result, seed), scene = _generated(recipe, config, work, report), work / recipe.name
         report("drawing", GENERATE + CONVERT)
         preview(scene, scene / "preview.png")
         publish({scene: folder})
     report("done", 1.0)
-    return [g.name for g in result.gates if not g.passed]
+    return [g.name for g in result.gates if not g.passed], seed
 
 
 def chosen(
@@ -246,7 +251,7 @@ def make_scenes(
         if not overwrite and (out / recipe.name).exists():  # another generator's, finished since
             log(f"{recipe.name}: is there, kept")
             continue
-        failed[recipe.name] = make_scene(recipe, conversion, out / recipe.name, jobs, inner)
+        failed[recipe.name], seed = make_scene(recipe, conversion, out / recipe.name, jobs, inner)
         verdict = f"gates that fail: {', '.join(failed[recipe.name])}" if failed[recipe.name] else "every gate passes"
-        log(f"{recipe.name}: {recipe.split}, seed {recipe.seed}, {verdict}")
+        log(f"{recipe.name}: {recipe.split}, {seed}, {verdict}")
     return failed

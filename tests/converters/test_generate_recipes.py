@@ -148,7 +148,7 @@ def test_a_home_without_a_plan_or_with_other_shares_takes_the_next_of_its_seeds(
     (home,) = parse_recipes({"scenes": {"a": {"split": "train", "seed": 3, "tier": "furnished"}}}, "r").scenes
     (plain,) = parse_recipes({"scenes": {"a": {"split": "train", "seed": 3}}}, "r").scenes
     given = 3
-    made(home)
+    assert made(home)[1] == "seed 2000003 in place of 3 (no)"
     assert tried == [3, 1_000_003, 2_000_003]
     given, shares = 0, {1: 0.7233, 2: 0.421, 3: 0.42}  # asked: at most 0.40, met to within 0.02
     made(home)
@@ -157,7 +157,7 @@ def test_a_home_without_a_plan_or_with_other_shares_takes_the_next_of_its_seeds(
     made(home)
     assert tried == [3, 1_000_003]
     shares, broken = dict.fromkeys(range(9), 0.9), set()
-    made(plain)  # a sparse building asks for no share
+    assert made(plain)[1] == "seed 3"  # a sparse building asks for no share
     with pytest.raises(
         GenerationError, match="a: none of 5 seeds: must_push_fetch is 0.9 once converted: expected 0.0"
     ):
