@@ -21,7 +21,7 @@ from interactive_nav_common.files import part_folder, publish, write_text
 
 __all__ = ["Building", "BuildingConfig", "GenerationError", "HomeConfig", "design_building", "generate_building"]
 
-GENERATOR_VERSION = 3
+GENERATOR_VERSION = 4
 """Raised whenever the same seed would give other bytes."""
 
 
