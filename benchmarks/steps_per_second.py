@@ -103,6 +103,7 @@ TIER_SHARES = ((0.7,), (0.7, 0.2), (0.5, 0.3, 0.15))
 SETTLED_STEPS = 10
 """Of an episode, after which objects that were laid out lie still."""
 SETTINGS = {"free": "active_furniture", "small": "active_small", "hinge": "active_doors", "walls": "active_walls"}
+SETTINGS |= {"slide": "active_doors"}
 """What a window holds -> the setting that says how many."""
 
 
@@ -256,20 +257,25 @@ def windows(
     proposed = widths_at(counts, 1 - LEFT_OUT_SHARE / len(counts))
     widths = {kind: width or np.inf for kind, width in window.widths.items()}
 
+    def settings(widths: Mapping[str, int]) -> dict[str, int]:
+        return {SETTINGS[k]: max(w for o, w in widths.items() if SETTINGS[o] == SETTINGS[k]) for k in widths}
+
     def left_out(widths: Mapping[str, float]) -> float:
         return float(np.mean([counts[kind] > width for kind, width in widths.items()], axis=0).astype(bool).mean())
 
     return {
         "env_steps": int(len(counts["walls"])),
         "needs": {k: {str(q): float(np.quantile(c, q)) for q in shares} for k, c in counts.items()},
-        "set": {SETTINGS[kind]: width for kind, width in window.widths.items()},
+        "set": settings(window.widths),
         "left_out_share": left_out(widths),
-        "proposed": {SETTINGS[kind]: width for kind, width in proposed.items()},
+        "proposed": settings(proposed),
         "proposed_left_out_share": left_out(proposed),
         "tiers": [
             {
                 "windows": [" ".join(map(str, tier)) for tier in tiers],
-                "too_small_shares": [left_out(dict(zip(KINDS, tier[1:], strict=True))) for tier in tiers],
+                "too_small_shares": [
+                    left_out(dict(zip(KINDS, tier[1:], strict=True)) | {"slide": tier.doors}) for tier in tiers
+                ],
             }
             for tiers in (propose_tiers(counts, shares) for shares in TIER_SHARES)
         ],

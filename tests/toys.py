@@ -15,6 +15,7 @@ def write_room(
     size_m: tuple[float, float] = (4.0, 3.0),
     blocks: tuple[tuple[str, float, float, float, float], ...] = (("chair", 0.7, 0.0, 5.0, 0.5),),
     door: bool = False,
+    kitchen: bool = False,
     partition: bool = False,
     resolution_m: float = 0.05,
     split: str = "train",
@@ -27,6 +28,7 @@ def write_room(
         size_m: inner length along x and y.
         blocks: (category, x, y, mass_kg, friction) of each cube.
         door: adds a hinged leaf of 0.8 m at x = -1, opening over the room.
+        kitchen: adds a drawer at x = 0 and a flap at x = 0.8, closed 0.4 m before the upper wall.
         partition: adds a wall along y at x = 0 with a gap of 1 m at its upper end.
         resolution_m: of the map.
         split: train or test.
@@ -53,19 +55,19 @@ def write_room(
         )
     objects, count = [], {}
 
-    def movable(category: str, pos, boxes, mass: float, friction: float, hinge=None) -> None:
+    def movable(category: str, pos, boxes, mass: float, friction: float, reach=None, axis=(0, 0, 1)) -> None:
         k = count.setdefault(category, 0)
         count[category] += 1
         name = f"{category}_{k}"
         body = spec.worldbody.add_body(name=name, pos=pos)
-        if hinge is None:
+        if reach is None:
             body.add_freejoint(name=f"{name}_free")
         else:
             body.add_joint(
                 name=f"{name}_hinge",
-                type=mujoco.mjtJoint.mjJNT_HINGE,
-                axis=[0, 0, 1],
-                range=hinge,
+                type=mujoco.mjtJoint.mjJNT_SLIDE if category == "drawer" else mujoco.mjtJoint.mjJNT_HINGE,
+                axis=axis,
+                range=reach,
                 limited=True,
                 damping=[0.5, 0, 0],
             )
@@ -88,7 +90,12 @@ def write_room(
         movable(category, [x, y, half_m[2]], [((0, 0, 0), half_m)], mass, friction)
     if door:
         leaf = [((0.4, 0, 0.5), (0.4, 0.02, 0.49))]
-        movable("door", [-1.0, -ly / 2 + 0.1, 0.0], leaf, 8.0, 0.4, hinge=(-1.5, 1.5))
+        movable("door", [-1.0, -ly / 2 + 0.1, 0.0], leaf, 8.0, 0.4, reach=(-1.5, 1.5))
+    if kitchen:
+        front = [((0, 0, 0), (0.25, 0.01, 0.1)), ((0, 0.2, 0), (0.22, 0.18, 0.08))]
+        movable("drawer", [0.0, ly / 2 - 0.39, 0.3], front, 5.0, 0.4, reach=(0, 0.35), axis=(0, -1, 0))
+        flap = [((0, 0, 0.2), (0.25, 0.015, 0.2))]
+        movable("cabinet_door", [0.8, ly / 2 - 0.39, 0.2], flap, 4.0, 0.4, reach=(0, 1.5), axis=(1, 0, 0))
     (folder / "scene.xml").write_text(_xml(spec), encoding="utf-8")
     rows, columns = round(ly / resolution_m) + 4, round(lx / resolution_m) + 4
     origin = (-columns * resolution_m / 2, -rows * resolution_m / 2)

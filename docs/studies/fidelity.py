@@ -102,7 +102,7 @@ def _world(scenario: Scenario, source: Scene, config: NavConfig) -> tuple[World,
         small: SmallObject = world.small_objects[0]
         return world, 0, small.radius_m
     movable = _movable(source, scenario.category)
-    if movable.hinge is None:
+    if movable.joint is None:
         movable = dataclasses.replace(movable, pos_w=np.array([0.0, 0.0, movable.pos_w[2]]))
     world = build_world(robot, (_lone(source, movable),), config)
     reach = np.linalg.norm(np.abs(movable.boxes[:, :2]) + movable.boxes[:, 7:9], axis=1).max()

@@ -76,7 +76,7 @@ class BulletScene:
                 collisionFrameOrientations=[_xyzw(b[3:7]) for b in boxes],
             )
             if kind == "hinge":
-                hinge = furniture[name].hinge
+                hinge = furniture[name].joint
                 body = bullet.createMultiBody(
                     0,
                     basePosition=list(pos),

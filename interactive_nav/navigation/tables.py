@@ -71,12 +71,12 @@ def friction_share(world: World, index: int) -> np.ndarray:
 
 def round_tables(world: World, tables: SceneTables, rules: TaskRules, limit: float) -> SceneTables:
     """Return the tables with shortest paths that also go round furniture at rest of more than this `friction_share`;
-    doors, which turn, are no obstacle."""
-    fine, kinds = rules.nav_cell_m / FINE_CELLS, world.layout.slot_kind
+    what hangs on a hinge or slides is no obstacle."""
+    fine, held = rules.nav_cell_m / FINE_CELLS, world.slots.held
 
     def graph(index: int) -> CornerGraph:
-        slots = zip(world.slots.names[index], kinds, friction_share(world, index), strict=True)
-        heavy = {name for name, kind, share in slots if kind != "hinge" and share > limit}
+        slots = zip(world.slots.names[index], held, friction_share(world, index), strict=True)
+        heavy = {name for name, is_held, share in slots if not is_held and share > limit}
         poses = {name: pose for name, pose in rest_poses(world, index).items() if name in heavy}
         maps = world.scenes[index].maps
         for open_ in (~furniture_map(world.scenes[index], poses, world.robot.height_m), True):

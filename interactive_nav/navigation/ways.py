@@ -106,7 +106,7 @@ class _SceneGrid:
         model = world.models[index]
         self.footprints = Footprints(model, bodies, env.robot.height_m, self.origin_w, self.shape)
         self.price = friction_share(world, index)[self.occupied]
-        self.stuck = ~world.slots.hinged[self.occupied] & (self.price > 1.0)  # its friction exceeds the robot's weight
+        self.stuck = ~world.slots.held[self.occupied] & (self.price > 1.0)  # its friction exceeds the robot's weight
 
     def middles_w(self, cells: np.ndarray) -> np.ndarray:
         """Return [p, 2] m of cells [p, 2] (row, column)."""

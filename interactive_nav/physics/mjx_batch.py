@@ -35,7 +35,7 @@ _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
 CCD_PER_ENV = 32
 """Pairs of boxes per environment that Warp's convex collider has room for at once; more are counted as overflow."""
 KINDS: tuple[str, ...] = ("free", "small", "hinge", "walls")
-"""Of what a `WindowTier` has room for, in its order."""
+"""Of what a `WindowTier` has room for, in its order; as many that slide as hang on hinges."""
 AUTO_SHARES = (0.7, 0.2)
 """Of a batch, in measured tiers."""
 HEAD_ROOM = 2.0
@@ -294,6 +294,7 @@ def propose_tiers(counts: Mapping[str, np.ndarray], shares: Sequence[float] = AU
 
     `counts` are [P] of each kind of slot, and of walls; `shares` of the batch, of all tiers but the last.
     """
+    counts = {**counts, "hinge": np.maximum(counts["hinge"], counts.get("slide", 0))}
     kinds = np.stack([counts[kind] for kind in KINDS])
     tiers = []
     for share, below in zip(shares, np.cumsum(shares), strict=True):
@@ -317,7 +318,7 @@ class TieredPhysics(Physics):
         words = config.windows
         proposed = propose_tiers(whole.window.needs_at_rest) if words is None else parse_window_tiers(words)
         self.shares = tuple(tier.share for tier in proposed)
-        wanted = (dict(zip(KINDS, tier[1:], strict=True)) for tier in proposed)
+        wanted = (dict(zip(KINDS, tier[1:], strict=True)) | {"slide": tier.doors} for tier in proposed)
         self.tiers = (*(make(world, config, whole.window.narrower(widths, config)) for widths in wanted), whole)
 
     def needed(self, counts: Mapping[str, jax.Array]) -> jax.Array:

@@ -72,13 +72,13 @@ class Nearness:
 
     def __init__(self, world: World):
         self.world, layout, slots = world, world.layout, world.slots
-        self.hinge = slots.hinged
-        self._qpos = layout.slot_qpos[:, None] + np.where(self.hinge[:, None], 0, np.arange(7))
-        self._qvel = layout.slot_qvel[:, None] + np.where(self.hinge[:, None], 0, np.arange(6))
+        self.held, self._slides = slots.held, slots.slides[:, None]
+        self._qpos = layout.slot_qpos[:, None] + np.where(self.held[:, None], 0, np.arange(7))
+        self._qvel = layout.slot_qvel[:, None] + np.where(self.held[:, None], 0, np.arange(6))
         self._robot = layout.robot_qpos + np.arange(2)
-        (offset, half), arm = _bounds(slots), slots.hinge_anchor_b_m
-        swung, arm, axis = ((slots.axes_w @ v[..., None])[..., 0] for v in (offset - arm, arm, slots.hinge_axis_b))
-        offset, anchor = np.where(self.hinge[:, None], swung, offset), slots.pos_w_m + arm
+        (offset, half), arm = _bounds(slots), slots.anchor_b_m
+        swung, arm, axis = ((slots.axes_w @ v[..., None])[..., 0] for v in (offset - arm, arm, slots.axis_b))
+        offset, anchor = np.where(self.held[:, None], swung, offset), slots.pos_w_m + arm
         self._tables = tuple(t.astype(np.float32) for t in (offset, half, slots.axes_w, anchor, axis))
         walls = slots.boxes_b[:, slots.box_slot == layout.num_slots]
         axes = matrix_from_quat(walls[..., 3:7])[..., :2, :2]
@@ -90,14 +90,17 @@ class Nearness:
         offset, half, frame, anchor, axis = (xp.asarray(t)[scene] for t in self._tables)
         qpos = state.qpos[..., self._qpos]
         angle = qpos[..., :1]
+        if self._slides.any():
+            anchor = anchor + xp.where(self._slides, angle, 0.0) * axis
+            angle = xp.where(self._slides, 0.0, angle)
         turn = matrix_from_quat(xp.concatenate([xp.cos(angle / 2), xp.sin(angle / 2) * axis], -1))
         hung = anchor + xp.einsum("...mij,mj->...mi", turn, offset)
         quat = qpos[..., 3:]
         free = matrix_from_quat(quat / xp.maximum(xp.linalg.norm(quat, axis=-1, keepdims=True), 1e-6))
         placed = qpos[..., :3] + xp.einsum("...mij,mj->...mi", free, offset)
-        hinge = xp.asarray(self.hinge)
-        axes = xp.where(hinge[:, None, None], turn @ frame, free)
-        centre = xp.where(hinge[:, None], hung, placed)
+        held = xp.asarray(self.held)
+        axes = xp.where(held[:, None, None], turn @ frame, free)
+        centre = xp.where(held[:, None], hung, placed)
         return Boxes(centre[..., :2], axes[..., :2, :], half)
 
     def _walls_gap_m(self, scene: Array, state: PhysicsState, reach_m: float, boxes: Boxes, push_m: Array) -> Array:
@@ -129,11 +132,11 @@ class Nearness:
         speed = jnp.where(occupied, jnp.abs(state.qvel[self._qvel]).max(-1), 0.0)
         moving = speed > MOVING_M_S
         push = jnp.where(moving, -FAR_M, gap + (REACH_M - _PUSH_M))
-        fastest, movers = jax.lax.top_k(speed, min(_MOVERS, len(self.hinge)))
+        fastest, movers = jax.lax.top_k(speed, min(_MOVERS, len(self.held)))
         for k in range(len(movers)):
             one = movers[k]
             behind = boxes.gap_m(boxes.centre[one], boxes.axes[one], boxes.half[one]) - TOUCH_M
-            behind = jnp.where(jnp.arange(len(self.hinge)) == one, FAR_M, behind)
+            behind = jnp.where(jnp.arange(len(self.held)) == one, FAR_M, behind)
             behind = jnp.where(fastest[k] > MOVING_M_S, behind, FAR_M)
             gap, push = jnp.minimum(gap, behind), jnp.minimum(push, behind)
         walls = self._walls_gap_m(scene, state, reach_m, boxes, jnp.where(occupied, push, FAR_M))
@@ -144,7 +147,7 @@ class Nearness:
         anywhere on free floor."""
         world, rng, kinds = self.world, np.random.default_rng(0), np.asarray(self.world.layout.slot_kind)
         small, most = np.flatnonzero(kinds == "small"), max(200, _PLACES // len(self.world.scenes))
-        counts: dict[str, list[np.ndarray]] = {kind: [] for kind in ("small", "free", "hinge", "walls")}
+        counts: dict[str, list[np.ndarray]] = {kind: [] for kind in ("small", "free", "hinge", "slide", "walls")}
         for scene, (source, rest) in enumerate(zip(world.scenes, world.rest_qpos, strict=True)):
             maps, cells, shape = source.maps, np.argwhere(source.maps.traversable)[:, ::-1], (1 + len(small), 2)
             for first in range(0, most, _AT_ONCE):

@@ -75,6 +75,7 @@ class PhysicsWindow:
         layout = world.layout
         kinds = np.asarray(layout.slot_kind)
         limits = {"small": config.active_small, "free": config.active_furniture, "hinge": config.active_doors}
+        limits["slide"] = config.active_doors
         self._slots = {kind: np.flatnonzero(kinds == kind) for kind in limits}
         self._nearness = Nearness(world)
         self._reach_m = world.robot.footprint_radius_m + REACH_M
@@ -237,7 +238,7 @@ def _rows(
     geoms = np.array(ids, int).reshape(len(body), len(names))
     padding = geoms < 0  # a body's first geom stands for it
     geoms = np.where(padding, geoms[:, :1], geoms)
-    n_q, n_v = (1, 1) if kind == "hinge" else (7, 6)
+    n_q, n_v = (1, 1) if kind in ("hinge", "slide") else (7, 6)
     rows: dict[str, np.ndarray] = {**dict.fromkeys(_BODY, body), **dict.fromkeys(_GEOM, geoms)}
     rows |= dict.fromkeys(_JOINT, model.body_jntadr[body])
     rows |= dict.fromkeys(_DOF, layout.slot_qvel[slots][:, None] + np.arange(n_v))

@@ -36,16 +36,20 @@ _DECIMALS = 9
 
 
 @dataclasses.dataclass(frozen=True)
-class Hinge:
-    """A door's joint, in the body's frame."""
+class Joint:
+    """What ties a body to the structure, a hinge or a slide, in the body's frame."""
 
     axis: np.ndarray
     """(3,)"""
     anchor_m: np.ndarray
-    """(3,)"""
-    range_rad: tuple[float, float] | None
+    """(3,) a point of a hinge's axis."""
+    range: tuple[float, float] | None
+    """rad, or m of a slide."""
     damping: float
+    """N m s/rad, or N s/m of a slide."""
     frictionloss: float
+    """N m, or N of a slide."""
+    slides: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,8 +74,13 @@ class Movable:
     """[n, 10]: centre (3), quaternion (4), half sizes (3)."""
     hulls: tuple[np.ndarray, ...]
     """Vertices [v, 3] of each convex hull."""
-    hinge: Hinge | None
+    joint: Joint | None
     """None: a free body."""
+
+    @property
+    def kind(self) -> str:
+        """Return `free`, `hinge` or `slide`."""
+        return "free" if self.joint is None else "slide" if self.joint.slides else "hinge"
 
     @property
     def rows(self) -> np.ndarray:
@@ -127,11 +136,12 @@ def _six_digits(rows: np.ndarray) -> np.ndarray:
 def body_task_parts(movable: Movable, hulls: list) -> list:
     """Return what of a body decides a task, to be hashed: all but its name; its hulls as `hull_sources` has them."""
     numbers = {f.name: getattr(movable, f.name) for f in dataclasses.fields(Movable)}
-    for name in ("name", "hulls", "hinge", "category"):
+    for name in ("name", "hulls", "joint", "category"):
         del numbers[name]
     numbers |= {"pos_w": _six_digits(movable.pos_w), "boxes": _six_digits(movable.boxes)}
-    hinge = movable.hinge and [_rounded(v) for v in dataclasses.astuple(movable.hinge) if v is not None]
-    return [movable.category, {name: _rounded(value) for name, value in numbers.items()}, hinge, hulls]
+    # A hinge's list is as it was before there were slides.
+    joint = movable.joint and [_rounded(v) for v in vars(movable.joint).values() if v is not None and v is not False]
+    return [movable.category, {name: _rounded(value) for name, value in numbers.items()}, joint, hulls]
 
 
 def hull_sources(xml: Path) -> dict[str, list]:
@@ -241,19 +251,20 @@ def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, fri
     box, solid = _geoms(model, body)
     if not len(box):
         raise SceneError(f"{xml}: body '{name}' has no box geom to collide with; convert it again")
-    hinge = None
-    if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
+    tie, slides = None, bool(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE)
+    if slides or model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
         dof = model.jnt_dofadr[joint]
         limits = tuple(float(v) for v in model.jnt_range[joint]) if model.jnt_limited[joint] else None
-        hinge = Hinge(
+        tie = Joint(
             axis=model.jnt_axis[joint].copy(),
             anchor_m=model.jnt_pos[joint].copy(),
-            range_rad=limits,  # type: ignore[arg-type]
+            range=limits,  # type: ignore[arg-type]
             damping=float(np.ravel(model.dof_damping[dof])[0]),
             frictionloss=float(model.dof_frictionloss[dof]),
+            slides=slides,
         )
     elif model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
-        raise SceneError(f"{xml}: joint of '{name}' is neither free nor a hinge")
+        raise SceneError(f"{xml}: joint of '{name}' is neither free nor a hinge or slide")
     return Movable(
         name=name,
         category=category,
@@ -266,7 +277,7 @@ def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, fri
         friction=friction,
         boxes=_boxes(model, box),
         hulls=tuple(geom_mesh(model, g)[0] for g in solid if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH),
-        hinge=hinge,
+        joint=tie,
     )
 
 

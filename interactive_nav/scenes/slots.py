@@ -32,16 +32,16 @@ class Slot:
 
     name: str
     kind: str
-    """small, free or hinge."""
+    """small, free, hinge or slide."""
     bodies: tuple[Body | None, ...]
     """[S] what each scene has there; None: nothing."""
 
 
 def find_slots(scenes: Sequence[Scene], small: Sequence[SmallObject]) -> list[Slot]:
-    """Return slots for the small objects, then for each scene's free bodies and its hinged ones, most boxes first."""
+    """Return slots for the small objects, then for each scene's bodies of each kind, most boxes first."""
     slots = [Slot(name, "small", (obj,) * len(scenes)) for name, obj in zip(body_names(small), small, strict=True)]
-    for kind in ("free", "hinge"):
-        movables = ([m for m in scene.movables if (m.hinge is None) == (kind == "free")] for scene in scenes)
+    for kind in ("free", "hinge", "slide"):
+        movables = ([m for m in scene.movables if m.kind == kind] for scene in scenes)
         columns = itertools.zip_longest(*(sorted(bodies, key=lambda m: -len(m.boxes)) for bodies in movables))
         slots += [Slot(f"{kind}_{i}", kind, column) for i, column in enumerate(columns)]
     return slots
@@ -63,9 +63,9 @@ class Layout:
     """Numbers of the robot in qpos, from its free joint on."""
     robot_nv: int
     slot_kind: tuple[str, ...]
-    """Per movable slot: 'small', 'free' or 'hinge'."""
+    """Per movable slot: 'small', 'free', 'hinge' or 'slide'."""
     slot_qpos: np.ndarray
-    """[M] address in qpos: 7 numbers, or 1 for a hinge."""
+    """[M] address in qpos: 7 numbers, or 1 for a hinge or slide."""
     slot_qvel: np.ndarray
     """[M] address in qvel: 6 numbers, or 1."""
     slot_body: np.ndarray
@@ -140,15 +140,17 @@ class SlotTables:
     """[B] slot of each box; M: a wall."""
     boxes_b: np.ndarray
     """[S, B, 10] centre (3) in the body's frame, m, quaternion (4), half sizes (3), m, which are -1 for padding."""
-    hinged: np.ndarray
-    """[M] bool."""
+    held: np.ndarray
+    """[M] bool: a hinge or a slide ties it to the structure."""
+    slides: np.ndarray
+    """[M] bool: a slide does."""
     pos_w_m: np.ndarray
     """[S, M, 3] the bodies' frames at rest."""
     axes_w: np.ndarray
     """[S, M, 3, 3] axes of the same, as columns."""
-    hinge_axis_b: np.ndarray
-    """[S, M, 3] unit vector about which a hinged body turns."""
-    hinge_anchor_b_m: np.ndarray
+    axis_b: np.ndarray
+    """[S, M, 3] unit vector about which a held body turns, or along which it slides."""
+    anchor_b_m: np.ndarray
     """[S, M, 3] a point of that axis."""
 
     def rows(self, scene: int, slot: int) -> np.ndarray:
@@ -196,9 +198,10 @@ def build_slot_tables(
         com_b_m=field("body_ipos", body),
         box_slot=box_slot,
         boxes_b=boxes_b,
-        hinged=np.array([slot.kind == "hinge" for slot in slots], bool),
+        held=np.array([slot.kind in ("hinge", "slide") for slot in slots], bool),
+        slides=np.array([slot.kind == "slide" for slot in slots], bool),
         pos_w_m=field("body_pos", body),
         axes_w=matrix_from_quat(field("body_quat", body)),
-        hinge_axis_b=field("jnt_axis", joint),
-        hinge_anchor_b_m=field("jnt_pos", joint),
+        axis_b=field("jnt_axis", joint),
+        anchor_b_m=field("jnt_pos", joint),
     )

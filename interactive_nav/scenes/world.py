@@ -17,7 +17,7 @@ from interactive_nav.config import NavConfig
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.contacts import add_contact_sensors, add_sensor
 from interactive_nav.scenes.objects import ConvertedObject, SmallObject, add_box, add_boxes, small_objects, solid
-from interactive_nav.scenes.scene import Hinge, Movable, Scene
+from interactive_nav.scenes.scene import Joint, Movable, Scene
 from interactive_nav.scenes.slots import (
     Layout,
     Slot,
@@ -33,6 +33,8 @@ from scenes_mjcf.schema import SceneError
 _SETTLE_TIME_S = 3.0
 _EMPTY_BOX = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1e-3, 1e-3, 1e-3])
 _TILTED = np.array([0.8, 0.36, 0.48, 0.0])
+_LEAST_FRICTION = 1e-6
+"""N m, or N: MJX-JAX makes a row of constraints for joints whose model has friction, and locks those where it is 0."""
 _FLOATS = 1.0
 """Share of its weight that an empty slot's body is relieved of."""
 FEET = 12
@@ -112,10 +114,10 @@ def _nothing(slot: int, kind: str) -> Movable:
     It is off-centre and turned: MuJoCo gives a body whose frame is its inertia's a sparser mass matrix, and the models'
     structure must be equal.
     """
-    # The friction is not 0: MJX-JAX makes a row of constraints only for joints whose model has friction.
-    hinge = Hinge(np.array([0, 0, 1]), np.zeros(3), None, damping=0.1, frictionloss=1e-6) if kind == "hinge" else None
+    joint = Joint(np.array([0, 0, 1]), np.zeros(3), None, 0.1, frictionloss=0.0, slides=kind == "slide")
+    joint = None if kind == "free" else joint
     inertia, pos, level = np.array([0.01, 0.012, 0.014]), np.array([*parking_spot(slot), 2.0]), np.array([1, 0, 0, 0])
-    return Movable("", "", 1.0, inertia, np.full(3, 1e-3), _TILTED, pos, level, 0.5, np.zeros((0, 10)), (), hinge)
+    return Movable("", "", 1.0, inertia, np.full(3, 1e-3), _TILTED, pos, level, 0.5, np.zeros((0, 10)), (), joint)
 
 
 def _add_movable(
@@ -127,11 +129,11 @@ def _add_movable(
         com = com + 1e-6
     body.explicitinertial = True
     body.mass, body.inertia, body.ipos, body.iquat = movable.mass_kg, movable.inertia, com, movable.inertia_quat
-    if hinge := movable.hinge:
-        joint = body.add_joint(name=f"{name}_joint", type=mujoco.mjtJoint.mjJNT_HINGE)
-        joint.axis, joint.pos, joint.frictionloss = hinge.axis, hinge.anchor_m, hinge.frictionloss
-        joint.limited, joint.range = True, hinge.range_rad or (-math.pi, math.pi)
-        joint.damping = [hinge.damping, 0, 0]
+    if tie := movable.joint:
+        joint = body.add_joint(name=f"{name}_joint", type=getattr(mujoco.mjtJoint, f"mjJNT_{movable.kind.upper()}"))
+        joint.axis, joint.pos, joint.frictionloss = tie.axis, tie.anchor_m, max(tie.frictionloss, _LEAST_FRICTION)
+        joint.limited, joint.range = True, tie.range or (-math.pi, math.pi)
+        joint.damping = [tie.damping, 0, 0]
     else:
         body.add_freejoint(name=f"{name}_joint")
     if collision == "hulls" and movable.hulls:
@@ -247,8 +249,8 @@ def _finish(
     numbers, subtree = (1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1), mujoco.mjtObj.mjOBJ_XBODY
     for i, (name, kind) in enumerate(slots):
         add_sensor(spec, f"force_{i}", subtree, robot.base_body, name, numbers)
-        if kind == "hinge":
-            # A door leaf hangs in its frame: they touch by design.
+        if kind in ("hinge", "slide"):
+            # A door leaf hangs in its frame, a drawer in its cabinet: they touch by design.
             spec.add_exclude(bodyname1=name, bodyname2="structure")
     add_sensor(spec, "force_structure", subtree, robot.base_body, "structure", numbers)
     if config.needs_contacts:

@@ -217,11 +217,14 @@ def body_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[ja
     robot's bodies follow, if it is visible.
     """
     lead, slots, address = qpos.shape[:-1], tables.world.slots, tables.world.layout.slot_qpos
-    hinged = slots.hinged  # which `find_slots` puts last
-    pose = qpos[..., address[~hinged][:, None] + np.arange(7)]
-    at_rest = slots.pos_w_m, slots.axes_w, slots.hinge_axis_b, slots.hinge_anchor_b_m
-    pos, rest, axis, anchor = (jnp.asarray(table[:, hinged], jnp.float32)[scene] for table in at_rest)
-    arm, turned = swing(axis, anchor, qpos[..., address[hinged]])
+    held = slots.held  # which `find_slots` puts last
+    pose = qpos[..., address[~held][:, None] + np.arange(7)]
+    at_rest = slots.pos_w_m, slots.axes_w, slots.axis_b, slots.anchor_b_m
+    pos, rest, axis, anchor = (jnp.asarray(table[:, held], jnp.float32)[scene] for table in at_rest)
+    reach, slides = qpos[..., address[held]], slots.slides[held]
+    arm, turned = swing(axis, anchor, jnp.where(slides, 0.0, reach) if slides.any() else reach)
+    if slides.any():
+        arm = arm + jnp.where(slides[:, None], axis * reach[..., None], 0.0)
     swung = pos + apply_axes(rest, arm)
     standing = jnp.broadcast_to(jnp.eye(3, dtype=qpos.dtype), (*lead, 1, 3, 3))
     pos = jnp.concatenate([pose[..., :3], swung, jnp.zeros((*lead, 1, 3), qpos.dtype)], -2)

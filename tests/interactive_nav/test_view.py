@@ -232,7 +232,7 @@ def test_places_keep_clear_of_walls_furniture_and_each_other(two_rooms):
     assert gaps.min() > 0.4
     assert (np.abs(places[:, 0]) < 2.5 - 0.2).all() and (np.abs(places[:, 1]) < 2.0 - 0.2).all()
     for movable in scene.movables:
-        if movable.hinge is None:
+        if movable.joint is None:
             half = movable.boxes[0, 7:9]
             outside = np.maximum(np.abs(places - movable.pos_w[:2]) - half, 0)
             assert np.linalg.norm(outside, axis=1).min() > 0.2

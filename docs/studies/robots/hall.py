@@ -50,7 +50,7 @@ def box(load: Load, x: float, y: float) -> Movable:
         friction=load.friction,
         boxes=np.array([[0, 0, 0, 1, 0, 0, 0, hx, hy, hz]]),
         hulls=(),
-        hinge=None,
+        joint=None,
     )
 
 

@@ -84,7 +84,7 @@ def test_boxes_hold_the_geoms_wherever_bodies_stand(world):
         data.qpos[:] = world.rest_qpos[0]
         for slot in np.flatnonzero(world.slots.occupied[0]):
             at = layout.slot_qpos[slot]
-            if near.hinge[slot]:
+            if near.held[slot]:
                 data.qpos[at] = rng.uniform(-1, 1)
             else:
                 quat = rng.normal(size=4)
@@ -142,6 +142,6 @@ def test_a_window_is_as_wide_as_what_stands_near_somewhere(tmp_path):
     blocks = (*(("chair", 3.0, y, 2.0, 0.4) for y in (0.9, 1.4, 1.9)), ("table", -3.0, -1.5, 9.0, 0.5))
     folder = write_room(tmp_path / "room", (8.0, 5.0), blocks)
     world = build_world(get_robot("turtlebot"), (load_scene(folder),), NavConfig.of(num_objects=2))
-    assert widths_at(Nearness(world).counts(0.78)) == {"small": 2, "free": 3, "hinge": 1, "walls": 2}
+    assert widths_at(Nearness(world).counts(0.78)) == {"small": 2, "free": 3, "hinge": 1, "slide": 1, "walls": 2}
     assert widths_at(Nearness(world).counts(0.1))["free"] == 2, "chairs 0.1 m apart"
-    assert widths_at(Nearness(world).counts(20.0)) == {"small": 2, "free": 4, "hinge": 1, "walls": 4}
+    assert widths_at(Nearness(world).counts(20.0)) == {"small": 2, "free": 4, "hinge": 1, "slide": 1, "walls": 4}

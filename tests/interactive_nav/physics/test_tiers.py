@@ -137,6 +137,7 @@ def test_those_without_room_are_counted(world, engines):
         "free": jnp.array([0, 1, 2, 1]),
         "small": jnp.array([0, 0, 0, 1]),
         "hinge": jnp.zeros(4, int),
+        "slide": jnp.zeros(4, int),
     }
     assert tiered.needed({**counts, "walls": jnp.array([2, 2, 0, 0])}).tolist() == [0, 0, 1, 1]
     assert new.qpos.shape == state.qpos.shape

@@ -96,7 +96,9 @@ def test_the_nearest_are_chosen_and_what_is_left_out_within_reach_is_told(world)
 
 def test_sizes_are_measured_where_none_are_set(world):
     auto = PhysicsWindow(world, NavConfig.of(num_objects=2, active_small=1))
-    assert auto.widths == {"small": 1, "free": 2, "hinge": 1, "walls": 2}, "two chairs or the table; a corner"
+    assert auto.widths == {"small": 1, "free": 2, "hinge": 1, "slide": 1, "walls": 2}, (
+        "two chairs or the table; a corner"
+    )
     kinds = [world.layout.slot_kind[group.slots[0]] for group in auto.groups]
     assert dict(zip(kinds, (g.width for g in auto.groups), strict=True)) == {"small": 1, "free": 2}
     assert auto.n_walls == 2 < PhysicsWindow(world, NavConfig.of(num_objects=2, **ALL)).n_walls

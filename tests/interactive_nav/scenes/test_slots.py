@@ -1,4 +1,4 @@
-"""The tables of what is in each slot are what the compiled models have, whatever axis a hinge turns about."""
+"""The tables of what is in each slot are what the compiled models have, whatever axis a hinge turns about, or a slide moves along."""
 
 import dataclasses
 
@@ -38,7 +38,7 @@ def _geoms(model, body, kind):
 
 def test_tables_of_packaged_scenes_are_the_compiled_models(world):
     slots, layout = world.slots, world.layout
-    assert slots.occupied.sum(1).tolist() == [len(s.movables) + 5 for s in world.scenes] and slots.hinged.sum() == 4
+    assert slots.occupied.sum(1).tolist() == [len(s.movables) + 5 for s in world.scenes] and slots.held.sum() == 4
     for s, (scene, model) in enumerate(zip(world.scenes, world.models, strict=True)):
         stored = mujoco.MjModel.from_xml_path(str(scene.path / "scene.xml"))
         assert {*slots.names[s][5:]} == {m.name for m in scene.movables} | {""}
@@ -49,9 +49,9 @@ def test_tables_of_packaged_scenes_are_the_compiled_models(world):
             np.testing.assert_array_equal(slots.com_b_m[s, m], model.body_ipos[body])
             np.testing.assert_array_equal(slots.pos_w_m[s, m], model.body_pos[body])
             np.testing.assert_array_equal(slots.axes_w[s, m], matrix_from_quat(model.body_quat[body]))
-            np.testing.assert_array_equal(slots.hinge_axis_b[s, m], model.jnt_axis[joint])
-            np.testing.assert_array_equal(slots.hinge_anchor_b_m[s, m], model.jnt_pos[joint])
-            assert slots.hinged[m] == (model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE)
+            np.testing.assert_array_equal(slots.axis_b[s, m], model.jnt_axis[joint])
+            np.testing.assert_array_equal(slots.anchor_b_m[s, m], model.jnt_pos[joint])
+            assert slots.held[m] == (model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE) and not slots.slides[m]
             if not slots.occupied[s, m]:
                 assert not len(rows) and slots.mass_kg[s, m] == 0 and slots.categories[s][m] == ""
                 continue
@@ -93,24 +93,30 @@ def test_a_window_finds_geoms_by_name_in_any_order(world):
 
 
 TILTED = ((0.8, 0.0, 0.6, 0.0), (0.5, 0.5, 0.5, 0.5))
-HINGES = (((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0)), ((1.0, 0.0, 0.0), TILTED[0]), ((0.6, 0.0, -0.8), TILTED[1]))
+JOINTS = (
+    ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), False),
+    ((1.0, 0.0, 0.0), TILTED[0], False),
+    ((0.6, 0.0, -0.8), TILTED[1], False),
+    ((0.6, 0.8, 0.0), (0.8, 0.0, 0.0, 0.6), True),
+    ((0.6, 0.0, -0.8), TILTED[1], True),
+)
 
 
-@pytest.fixture(scope="module", params=HINGES)
+@pytest.fixture(scope="module", params=JOINTS)
 def hatch(request, tmp_path_factory):
-    """A room whose door hangs from any axis, in a body that is turned."""
-    (axis, quat), pos = request.param, np.array([0.1, 0.02, 0.3])
+    """A room whose door hangs from any axis, or slides along it, in a body that is turned."""
+    (axis, quat, slides), pos = request.param, np.array([0.1, 0.02, 0.3])
     scene = load_scene(write_room(tmp_path_factory.mktemp("hatch") / "room", (5.0, 4.0), door=True))
-    door = next(m for m in scene.movables if m.hinge)
-    assert door.hinge is not None
-    hinge = dataclasses.replace(door.hinge, axis=np.array(axis), anchor_m=pos)
-    door = dataclasses.replace(door, quat_w=np.array(quat), pos_w=np.array([-1.0, 0.5, 1.0]), hinge=hinge)
-    movables = tuple(door if m.hinge else m for m in scene.movables)
+    door = next(m for m in scene.movables if m.joint)
+    assert door.joint is not None
+    joint = dataclasses.replace(door.joint, axis=np.array(axis), anchor_m=pos, slides=slides)
+    door = dataclasses.replace(door, quat_w=np.array(quat), pos_w=np.array([-1.0, 0.5, 1.0]), joint=joint)
+    movables = tuple(door if m.joint else m for m in scene.movables)
     scene = dataclasses.replace(scene, movables=movables)
     return build_world(get_robot("turtlebot"), (scene,), NavConfig.of(num_objects=1))
 
 
-def test_hinged_bodies_are_where_c_mujoco_has_them_whatever_their_axis(hatch):
+def test_held_bodies_are_where_c_mujoco_has_them_whatever_their_axis(hatch):
     model, slot = hatch.models[0], hatch.slots.names[0].index("door_0")
     data, body = mujoco.MjData(model), hatch.layout.slot_body[slot]
     near, tables = Nearness(hatch), build_boxes(hatch)
@@ -133,7 +139,8 @@ def test_a_hatch_that_fell_is_furniture_where_it_came_to_rest(hatch):
     slot, data = hatch.slots.names[0].index("door_0"), mujoco.MjData(hatch.models[0])
     data.qpos[:] = hatch.rest_qpos[0]
     mujoco.mj_kinematics(hatch.models[0], data)
-    upright = abs((hatch.slots.axes_w[0, slot] @ hatch.slots.hinge_axis_b[0, slot])[2]) == 1.0
+    up = abs((hatch.slots.axes_w[0, slot] @ hatch.slots.axis_b[0, slot])[2])
+    upright = up == (0.0 if hatch.slots.slides[slot] else 1.0)
     assert upright == (abs(hatch.rest_qpos[0, hatch.layout.slot_qpos[slot]]) < 1e-3)
     pos, quat = rest_poses(hatch, 0)["door_0"]
     np.testing.assert_array_equal(pos, data.body(hatch.layout.slot_body[slot]).xpos)
