@@ -25,13 +25,16 @@ MATERIALS = {category.name: category.material for category in TABLE if category.
 
 @dataclasses.dataclass(frozen=True)
 class BodyHinge:
-    """Describe a vertical hinge in the body frame."""
+    """Describe a hinge, or a slide, in the body frame."""
 
     origin_b: np.ndarray
     """(3,) m."""
     range_rad: tuple[float, float]
-    """Counter-clockwise from above; 0 is the pose as scanned."""
+    """About the axis, 0 is the pose as scanned; or m, of a slide."""
     assumed: bool
+    axis_b: np.ndarray = dataclasses.field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    """(3,) unit; a door's is the vertical."""
+    slides: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,16 +94,22 @@ def with_feet(hulls: tuple[Hull, ...], vertices: np.ndarray) -> tuple[Hull, ...]
     return (*hulls, *feet) if len(hulls) + len(feet) <= MAX_PIECES else hulls
 
 
-def _door_hinge(annotation: Annotation, scale: np.ndarray, base_cad: np.ndarray, extent: np.ndarray) -> BodyHinge:
-    """Return the door's hinge in the body frame; without an articulation, assume one at the leaf's edge."""
+def _body_hinge(
+    annotation: Annotation, scale: np.ndarray, base_cad: np.ndarray, extent: np.ndarray
+) -> BodyHinge | None:
+    """Return the body's hinge or slide in its frame; assume one at the edge of a door's leaf that has none."""
     hinge = annotation.hinge
+    if hinge is None and annotation.category != "door":
+        return None
     if hinge is None:
         along = int(np.argmax(extent[:2]))
         origin = np.zeros(3)
         origin[along] = -extent[along] / 2
         return BodyHinge(origin, (-math.pi / 2, math.pi / 2), True)
-    low, high = sorted(hinge.sign * v for v in hinge.range_rad)
     origin = scale * hinge.origin - base_cad
+    if annotation.category != "door":
+        return BodyHinge(origin, hinge.range_rad, hinge.assumed, hinge.axis, hinge.slides)
+    low, high = sorted(float(np.sign(hinge.axis[2])) * v for v in hinge.range_rad)
     origin[2] = 0.0
     return BodyHinge(origin, (low, high), hinge.assumed)
 
@@ -123,7 +132,7 @@ def place_object(
     base = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
     hulls = tuple(convex_hull(h.vertices * pose.scale - base) for h in hulls_cad)
     hulls = tuple(flatten_feet(h) for h in hulls)
-    if cad.pieces is None and annotation.category != "door":
+    if cad.pieces is None and annotation.hinge is None and annotation.category != "door":
         hulls = with_feet(hulls, vertices - base)
     # Exact pieces have exact boxes; coacd's hulls are rough, and stored scenes have theirs along the walls.
     round_fill = 1.0 if cad.pieces is None else ROUND_FILL
@@ -140,7 +149,7 @@ def place_object(
         boxes_b=tuple(fit_box(h, 0.0, walls_yaw - pose.yaw, round_fill) for h in hulls),
         position_w=position,
         quaternion_w=np.array([math.cos(pose.yaw / 2), 0.0, 0.0, math.sin(pose.yaw / 2)]),
-        hinge=_door_hinge(annotation, pose.scale, base, high - low) if annotation.category == "door" else None,
+        hinge=_body_hinge(annotation, pose.scale, base, high - low),
         surface_b=None if look is None else dataclasses.replace(look, vertices=look.vertices * pose.scale - base),
     )
 

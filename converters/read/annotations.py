@@ -18,7 +18,7 @@ from converters.read.meshes import clean_surface
 from converters.read.obj import GREY, TexturedMesh, join_textures, read_painted_obj, texels
 from converters.read.surfaces import check_upright
 from converters.records.errors import SceneRejected
-from converters.records.raw import Annotation, CadModel, RawScene, ScanMesh, ScannedHinge, category_of_id
+from converters.records.raw import UP, Annotation, CadModel, RawScene, ScanMesh, ScannedHinge, category_of_id
 from interactive_nav_common.files import check_name
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, transformed
 
@@ -52,20 +52,22 @@ def _keypoints(model: dict[str, Any], key: str) -> np.ndarray:
     return flat.reshape(-1, 3)
 
 
-def _hinge(model: dict[str, Any], where: str) -> ScannedHinge | None:
+def _hinge(model: dict[str, Any], category: str, where: str) -> ScannedHinge | None:
     raw = model.get("articulation")
     if raw is None:
         return None
-    if raw.get("type") != "hinge":
-        raise SceneRejected(f"{where}: articulation type is {raw.get('type')!r}, expected 'hinge'")
-    axis = Y_UP_TO_Z_UP @ np.asarray(raw["axis"], float)
-    if not abs(axis[2]) >= 0.9 * np.linalg.norm(axis) > 0:
-        raise SceneRejected(f"{where}: the hinge axis is {raw['axis']}, expected the vertical (0, 1, 0)")
-    low, high = sorted(float(v) for v in raw["range_rad"])
+    if raw.get("type") not in ("hinge", "slide"):
+        raise SceneRejected(f"{where}: articulation type is {raw.get('type')!r}, expected 'hinge' or 'slide'")
+    slides, axis = raw["type"] == "slide", Y_UP_TO_Z_UP @ np.asarray(raw["axis"], float)
+    low, high = sorted(float(v) for v in raw["range_m" if slides else "range_rad"])
     origin = Y_UP_TO_Z_UP @ np.asarray(raw["origin"], float)
-    if not np.isfinite([low, high, *origin]).all():
-        raise SceneRejected(f"{where}: the articulation has numbers that are not finite")
-    return ScannedHinge(origin, float(np.sign(axis[2])), (low, high))
+    if not np.isfinite([low, high, *origin, *axis]).all() or not axis.any():
+        raise SceneRejected(f"{where}: the articulation has numbers that are not finite, or no axis")
+    if category == "door":
+        if slides or not abs(axis[2]) >= 0.9 * np.linalg.norm(axis):
+            raise SceneRejected(f"{where}: a door's axis is {raw['axis']}, expected a hinge's, the vertical (0, 1, 0)")
+        axis = np.sign(axis[2]) * UP
+    return ScannedHinge(origin, axis / np.linalg.norm(axis), (low, high), slides=slides)
 
 
 def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Annotation], ...]]:
@@ -101,7 +103,7 @@ def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Anno
                 symmetry=str(model.get("sym", "__SYM_NONE")),
                 keypoints_cad=cad_points[:count],
                 keypoints_scan=scan_points[:count],
-                hinge=_hinge(model, where),
+                hinge=_hinge(model, category, where),
                 confidence=None if confidence is None else float(confidence),
             )
             records.append((synset, annotation))

@@ -26,6 +26,7 @@ from converters.records.raw import (
     ATTRIBUTION,
     FLOOR,
     SYNSETS,
+    UP,
     WINDOWS,
     Annotation,
     CadModel,
@@ -286,7 +287,7 @@ def assume_hinge(leaf: np.ndarray, pose: np.ndarray, structure: np.ndarray) -> S
         span = (-right, left) if inward > 0 else (-left, right)
         choices.append((int((radius < NEAR_HINGE_M + half).sum()), left + right, (end, span)))
     end, span = max(choices, key=lambda c: c[:2])[2]
-    return ScannedHinge(np.array([end, across, low[2]]), 1.0, (float(span[0]), float(span[1])), assumed=True)
+    return ScannedHinge(np.array([end, across, low[2]]), UP, (float(span[0]), float(span[1])), assumed=True)
 
 
 def _without_doubles(

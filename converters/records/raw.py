@@ -123,17 +123,22 @@ class CadModel:
     """What it looks like, CAD frame; None: nothing but the colours of the faces."""
 
 
+UP = np.array([0.0, 0.0, 1.0])
+
+
 @dataclasses.dataclass(frozen=True)
 class ScannedHinge:
-    """A door's vertical hinge in the CAD frame; angle 0 is the pose as scanned."""
+    """A hinge, or a slide, in the CAD frame; 0 is the pose as scanned."""
 
     origin: np.ndarray
     """(3,) a point on the axis."""
-    sign: float
-    """+1 when positive angles turn counter-clockwise from above, -1 otherwise."""
+    axis: np.ndarray
+    """(3,) unit, about which it turns or along which it slides."""
     range_rad: tuple[float, float]
+    """Or m, of a slide."""
     assumed: bool = False
     """True when the source had no articulation and a hinge at one edge was taken."""
+    slides: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

@@ -240,7 +240,7 @@ def hidden_wall(plan: FloorPlan, shown: Shown, objects: tuple[PlacedObject, ...]
         index = (shown.plane.flatten(points) - shown.low) / shown.cell_m
         margin = SHADOW_M / shown.cell_m
         left, right = int(max(index[:, 0].min() - margin, 0)), int(max(index[:, 0].max() + margin, 0))
-        mask = doors if placed.hinge is not None else shadow
+        mask = doors if placed.category == "door" else shadow
         mask[: int(max(index[:, 1].max() + margin, 0)) + 1, left : right + 1] = True
     hidden = shadow & ~doors & _extent(plan, shown) & ~shown.visible
     pieces, count = label(hidden)

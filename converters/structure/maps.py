@@ -226,7 +226,7 @@ def make_floor_plan(
     for placed in objects:
         for hull in placed.hulls_b:
             grid.add_below(under, to_world(placed, hull.vertices), resolution_m / 2)
-        if placed.hinge is not None:
+        if placed.category == "door":
             swept |= swept_by_door(grid, placed, LEAF_MARGIN_M + BOXED_M * exact)
     # What is left of the door's scan in its sweep goes, walls stay.
     occupied &= ~swept | (shown.solid_wall >= 3)

@@ -115,7 +115,7 @@ def _nothing(slot: int, kind: str) -> Movable:
     structure must be equal.
     """
     joint = Joint(np.array([0, 0, 1]), np.zeros(3), None, 0.1, frictionloss=0.0, slides=kind == "slide")
-    joint = None if kind == "free" else joint
+    joint = joint if kind in ("hinge", "slide") else None
     inertia, pos, level = np.array([0.01, 0.012, 0.014]), np.array([*parking_spot(slot), 2.0]), np.array([1, 0, 0, 0])
     return Movable("", "", 1.0, inertia, np.full(3, 1e-3), _TILTED, pos, level, 0.5, np.zeros((0, 10)), (), joint)
 

@@ -161,6 +161,8 @@ class HomeConfig(Settings):
     although there is one with them away; None: any."""
     must_push_fetch: Shares | None = (0.0, 0.40)
     """The same for Fetch's."""
+    opening: Literal["kitchen", "all", "none"] = "kitchen"
+    """Which built-in furniture has doors and drawers that open; each is one more body that moves."""
     artefacts: Literal["none", "phone"] = "none"
     """`none`: the exact structure, finely painted, without what moves; `phone`: a fused scan of everything, with the
     holes, noise and wrong labels that a phone's would have."""

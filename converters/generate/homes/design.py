@@ -16,6 +16,7 @@ from converters.generate.design.space import rooms_joined, static_grid
 from converters.generate.homes.arrange import TABLES, Arrangement, Group, GroupMember
 from converters.generate.homes.floor import CELL_M, Standing
 from converters.generate.homes.furnish import WIDE_M, Full, Home, clutter_category, furnish_home, settle
+from converters.generate.homes.opening import open_fronts
 from converters.generate.homes.plans import home_plan
 from converters.generate.models.cad import place
 from converters.geometry.density import ROBOTS, Ways, must_push_shares
@@ -258,8 +259,10 @@ def design_home(cfg: HomeConfig, rng: np.random.Generator) -> Building:
             refused = GenerationError("built-in furniture bars a room: ask for more area or fewer rooms")
             continue
         movable = tuple(item for item in items if not item.model.built_in)
+        built_in, fronts = open_fronts(plan, plan.built_in, movable, cfg.opening)
+        plan = dataclasses.replace(plan, built_in=built_in)
         must_push = {robot: round(share, 4) for robot, share in shares.items()}
         measured = {"furniture_share": round(home.floor.share, 4), "must_push_share": must_push}
-        return Building(plan, movable, floor_height_m, tuple(uses), measured)
+        return Building(plan, (*movable, *fronts), floor_height_m, tuple(uses), measured)
     assert refused is not None
     raise refused

@@ -82,6 +82,8 @@ class CadModel:
     """Metres per CAD unit at the model's designed size."""
     surface: VisualMesh | None = None
     """Of a library model, CAD frame: what is drawn; its parts are its hulls."""
+    solids: tuple[Part, ...] = ()
+    """What of it collides; none: its parts."""
 
     @functools.cached_property
     def bounds(self) -> np.ndarray:
@@ -199,11 +201,13 @@ class Models:
 
 @dataclasses.dataclass(frozen=True)
 class LeafHinge:
-    """Describe how a door leaf turns; CAD frame, angle 0 is the pose as placed."""
+    """Describe how a door leaf or front turns or slides; CAD frame, 0 is the pose as placed."""
 
     axis: tuple[float, float, float]
     origin: tuple[float, float, float]
     range_rad: tuple[float, float]
+    """Or m, of a slide."""
+    slides: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

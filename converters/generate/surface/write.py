@@ -92,7 +92,7 @@ def write_cad(library: Path, model: CadModel, pieces: bool = False) -> None:
 def _part_lines(model: CadModel, drawn: bool) -> str:
     """Return the OBJ lines of a model's parts: as they are drawn, in their materials, or closed."""
     lines, base = "", 1
-    for k, part in enumerate(model.parts):
+    for k, part in enumerate(model.parts if drawn else model.solids or model.parts):
         faces = part.faces
         if drawn and part.open:
             normal = face_vectors(part.vertices, faces)
@@ -163,7 +163,9 @@ def annotate_items(
     models = []
     for k, item in enumerate(items):
         true_t, true_r = pose_in_world(item, to_world_m, floor_height_m)
-        noise = cfg.annotation_noise_m
+        # A front hangs in its cabinet to the millimetre.
+        front = item.hinge is not None and item.model.category != "door"
+        noise = 0.0 if front else cfg.annotation_noise_m
         turn = Rotation.from_euler("yxz", rng.normal(0, np.radians([0.8, 0.3, 0.3])) * noise / 0.01)
         t = true_t + rng.normal(0, 0.6 * noise, 3)
         r = true_r * turn
@@ -183,10 +185,10 @@ def annotate_items(
         }
         if item.hinge is not None:
             entry["articulation"] = {
-                "type": "hinge",
+                "type": "slide" if item.hinge.slides else "hinge",
                 "axis": list(item.hinge.axis),
                 "origin": list(item.hinge.origin),
-                "range_rad": [float(v) for v in item.hinge.range_rad],
+                "range_m" if item.hinge.slides else "range_rad": [float(v) for v in item.hinge.range_rad],
             }
         models.append(entry)
     about = {

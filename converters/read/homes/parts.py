@@ -25,7 +25,7 @@ from converters.read.obj import TexturedMesh, at_most, join_meshes, scan_of, tex
 from converters.read.surfaces import check_extent, floor_level, label_storeys, storey_of, with_split_corners
 from converters.read.urdf import joined, placed
 from converters.records.errors import MOVABLES, SceneRejected, check_count
-from converters.records.raw import UNLABELLED, Annotation, CadModel, RawScene, ScannedHinge, Storey
+from converters.records.raw import UNLABELLED, UP, Annotation, CadModel, RawScene, ScannedHinge, Storey
 from interactive_nav_common.records import read_packaged
 from interactive_nav_common.rotations import transform, transformed
 from scenes_mjcf.categories import CATEGORIES, Category
@@ -343,7 +343,7 @@ def _furniture(
         if part.swing is None:
             hinge = assume_hinge(vertices, pose, structure)
         else:
-            hinge = ScannedHinge(part.swing[0] @ turn, 1.0, part.swing[1])
+            hinge = ScannedHinge(part.swing[0] @ turn, UP, part.swing[1])
     cad_id = re.sub(r"[^A-Za-z0-9_-]", "_", "-".join(p.name for p in (part, *riders)))[:100]
     material, mass_kg = CATEGORIES[name].material, part.mass_kg
     assert material is not None

@@ -97,7 +97,7 @@ def test_gibson_hinge_is_read_in_the_z_up_frame():
     _, ((_, door), _) = parse_annotations(data, tiny_raw.Path("alignments.json"))
     assert door.category == "door" and door.hinge is not None
     np.testing.assert_allclose(door.hinge.origin, (0.5, -0.2, 0.0))  # (x, y, z) -> (x, -z, y)
-    assert door.hinge.sign == 1.0 and door.hinge.range_rad == (-1.5, 0.2)
+    assert door.hinge.axis.tolist() == [0.0, 0.0, 1.0] and door.hinge.range_rad == (-1.5, 0.2)
     data[0]["aligned_models"][0]["articulation"]["axis"] = [1, 0, 0]
     with pytest.raises(SceneRejected, match="expected the vertical"):
         parse_annotations(data, tiny_raw.Path("alignments.json"))

@@ -25,7 +25,7 @@ def _door(x, y, handle_z=None):
         boxes.append([out, -BAR_Y_M, handle_z, 1, 0, 0, 0, BAR_HALF_M, BAR_HALF_M, 0.12])
         for end in (-0.11, 0.11):
             boxes.append([out / 2 - 0.01, -BAR_Y_M, handle_z + end, 1, 0, 0, 0, BAR_OUT_M / 2, 0.01, 0.01])
-    hinge = Joint(np.array([0.0, 0, 1]), np.zeros(3), (-2.0, 2.0), damping=0.5, frictionloss=0.5)
+    joint = Joint(np.array([0.0, 0, 1]), np.zeros(3), (-2.0, 2.0), damping=0.5, frictionloss=0.5)
     across = MASS_KG / 12 * LEAF_M**2
     return Movable(
         name="door_0",

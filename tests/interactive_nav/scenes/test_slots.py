@@ -1,4 +1,4 @@
-"""The tables of what is in each slot are what the compiled models have, whatever axis a hinge turns about, or a slide moves along."""
+"""The tables of what is in each slot are what the compiled models have, whatever axis a body turns or slides on."""
 
 import dataclasses
 

@@ -1,0 +1,227 @@
+"""Cut models at their doors and drawers: a carcass that stands fast, and fronts that turn or slide.
+
+A model's pieces are what its surface, or its drawing, consists of. A thin upright piece at its front is a panel, and
+what lies within a panel's outline (a handle, a window, a gasket, the box of a drawer) goes with it. A handle beside
+the middle makes it a door, hinged at the other side; else a low panel is a drawer's, and an oven's a flap.
+"""
+
+import dataclasses
+import functools
+import math
+
+import numpy as np
+
+from converters.generate.models.cad import CadModel, Instance, LeafHinge, cad_model
+from converters.generate.models.parts import Part, box
+from converters.geometry.faces import compacted, loose_parts
+from converters.records.raw import VisualMesh
+from scenes_mjcf.categories import CATEGORIES
+
+PANEL_M = (0.18, 0.11, 0.08)
+"""Least width and height, and greatest thickness of a panel."""
+FRONT_M = 0.13
+"""A panel begins no farther than this behind the foremost point of its model."""
+WITHIN_M = (0.008, 0.05)
+"""How far what belongs to a panel may reach beyond its outline, and behind its back."""
+ASIDE = 0.2
+"""From the middle of a panel to its handle, over its width: a door's is farther to the side."""
+DRAWER_M = 0.38
+"""Greatest height of a drawer's panel."""
+DEEP_M, PULLED = 0.45, 0.75
+"""Greatest depth of a drawer's box, and the share of it that a drawer is pulled out by."""
+SIDE_M, WALL_M, BEHIND_M = 0.03, 0.012, 0.06
+"""From a panel's edge to its drawer's box, how thick that is, and what is left behind it."""
+Bounds = np.ndarray
+"""(2, 3) lowest and highest corner."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Front:
+    """Describe one front of a model; CAD frame as the model's."""
+
+    model: CadModel
+    hinge: LeafHinge
+
+
+@dataclasses.dataclass(frozen=True)
+class Opening:
+    """Hold a model's carcass when some of its fronts are cut out, and these."""
+
+    pieces: tuple[int, ...]
+    """Of the model, which go with the front."""
+    front: Front
+
+
+def _pieces(model: CadModel) -> tuple[np.ndarray, list[Bounds]]:
+    """Return the piece of each face of the surface, or of each part, and each piece's bounds, m, front along +z."""
+    scale = model.unit_m * np.array([model.front, 1, model.front])
+    if model.surface is None:
+        groups, of = [part.vertices for part in model.parts], np.arange(len(model.parts))
+    else:
+        vertices, faces = np.asarray(model.surface.vertices), model.surface.faces
+        of = np.unique(loose_parts(vertices, faces), return_inverse=True)[1]
+        groups = [vertices[faces[of == k]].reshape(-1, 3) for k in range(of.max() + 1)]
+    ends = [np.sort(np.stack([(g * scale).min(axis=0), (g * scale).max(axis=0)]), axis=0) for g in groups]
+    return of, ends
+
+
+def _inside(piece: Bounds, panel: Bounds, slides: bool) -> bool:
+    """Return whether a piece goes with a panel: also one that reaches far back, if it slides."""
+    beyond, behind = WITHIN_M
+    fits = (piece[0, :2] > panel[0, :2] - beyond).all() and (piece[1, :2] < panel[1, :2] + beyond).all()
+    return bool(fits and piece[1, 2] > panel[0, 2] - behind and (slides or piece[0, 2] > panel[0, 2] - behind))
+
+
+def _handle(panel: Bounds, with_it: list[Bounds]) -> float:
+    """Return how far to the right of a panel's middle its handle is, over its width; 0 without one."""
+    out = [p for p in with_it if p[1, 2] > panel[1, 2] + 0.01]
+    if not out:
+        return 0.0
+    foremost = max(p[1, 2] for p in out)
+    middles = [p[:, 0].mean() for p in out if p[1, 2] > foremost - 0.02]
+    return float((np.mean(middles) - panel[:, 0].mean()) / np.ptp(panel[:, 0]))
+
+
+def _hinge(panel: Bounds, handle: float, flap: bool) -> LeafHinge | None:
+    """Return how a panel opens, in metres, front along +z; None: it does not."""
+    low, high = panel
+    if abs(handle) > ASIDE:
+        # About its front edge, so that it sweeps nothing but the room before it.
+        x, turn = (low[0], -1.0) if handle > 0 else (high[0], 1.0)
+        return LeafHinge((0.0, turn, 0.0), (x, low[1], high[2]), (0.0, math.pi / 2))
+    if high[1] - low[1] <= DRAWER_M:
+        return LeafHinge((0.0, 0.0, 1.0), tuple(panel.mean(axis=0)), (0.0, 0.0), slides=True)  # type: ignore[arg-type]
+    return LeafHinge((1.0, 0.0, 0.0), (0.0, low[1], high[2]), (0.0, math.pi / 2)) if flap else None
+
+
+@functools.cache
+def openings(name: str) -> tuple[Opening, ...]:
+    """Return what opens of a model."""
+    model = cad_model(name)
+    of, bounds = _pieces(model)
+    foremost, rear = max(b[1, 2] for b in bounds), min(b[0, 2] for b in bounds)
+    width, height, thick = PANEL_M
+    sizes = [np.ptp(b, axis=0) for b in bounds]
+    panels = [
+        k
+        for k, (b, (w, h, t)) in enumerate(zip(bounds, sizes, strict=True))
+        if w >= width and h >= height and t <= thick and b[0, 2] > foremost - FRONT_M
+    ]
+    panels.sort(key=lambda k: -sizes[k][0] * sizes[k][1])
+    taken: set[int] = set()
+    found: list[Opening] = []
+    for k in panels:
+        if k in taken:
+            continue
+        mine = [j for j in range(len(bounds)) if j not in taken | {k} and _inside(bounds[j], bounds[k], False)]
+        hinge = _hinge(bounds[k], _handle(bounds[k], [bounds[j] for j in mine]), model.category == "stove")
+        if hinge is None:
+            continue
+        if hinge.slides:
+            mine = [j for j in range(len(bounds)) if j not in taken | {k} and _inside(bounds[j], bounds[k], True)]
+        taken |= {k, *mine}
+        found.append(Opening((k, *mine), _front(model, len(found), of, bounds, (k, *mine), hinge, rear)))
+    return tuple(found)
+
+
+def _front(
+    model: CadModel,
+    k: int,
+    of: np.ndarray,
+    bounds: list[Bounds],
+    pieces: tuple[int, ...],
+    hinge: LeafHinge,
+    rear: float,
+) -> Front:
+    """Return a front: its pieces, and where it is a drawer a box behind its panel."""
+    panel = bounds[pieces[0]]
+    out = [bounds[j] for j in pieces[1:] if bounds[j][1, 2] > panel[1, 2] + 0.004]
+    solids = [_block(panel, "white")]
+    if out:
+        ends = np.stack([np.min([b[0] for b in out], axis=0), np.max([b[1] for b in out], axis=0)])
+        ends[0, 2] = panel[0, 2]
+        solids.append(_block(ends, "white"))
+    tray: list[Part] = []
+    if hinge.slides:
+        (x0, y0, z), (x1, y1, _) = panel
+        depth = min(DEEP_M, z - rear - BEHIND_M)
+        ends = np.array([(x0 + SIDE_M, y0 + SIDE_M, z - depth), (x1 - SIDE_M, y1 - SIDE_M, z)])
+        solids.append(_block(ends, "white"))
+        hinge = dataclasses.replace(hinge, range_rad=(0.0, round(PULLED * depth, 3)))
+        tray = [_block(side, "birch") for side in _sides(ends)]
+    name = f"{model.name}#{k}"
+    category = "drawer" if hinge.slides else "cabinet_door"
+    scale = np.array([model.front, 1.0, model.front]) / model.unit_m
+
+    def normalised(parts: list[Part]) -> tuple[Part, ...]:
+        return tuple(dataclasses.replace(p, vertices=np.round(p.vertices * scale, 6)) for p in parts)
+
+    surface, drawn = None, [model.parts[j] for j in pieces] if model.surface is None else []
+    if model.surface is not None:
+        surface = _with_tray(_cut(model.surface, np.isin(of, pieces)), normalised(tray))
+    about = {
+        "name": name,
+        "category": category,
+        "catid": CATEGORIES[category].synset,
+        "id_cad": f"{model.id_cad[:28]}{k:04d}",
+        "parts": (*drawn, *normalised(tray)) if surface is None else normalised(solids),
+        "solids": normalised(solids),
+        "surface": surface,
+    }
+    axis, origin = np.array(hinge.axis) * scale * model.unit_m, np.array(hinge.origin) * scale
+    hinge = dataclasses.replace(hinge, axis=tuple(axis.tolist()), origin=tuple(origin.tolist()))
+    return Front(dataclasses.replace(model, **about), hinge)
+
+
+def _block(ends: Bounds, material: str) -> Part:
+    return box(ends.mean(axis=0), np.ptp(ends, axis=0), material)
+
+
+def _sides(ends: Bounds) -> list[Bounds]:
+    """Return bottom, sides and back of a drawer's box that fills these bounds."""
+    walls = []
+    for axis, top in ((1, 0), (0, 0), (0, 1), (2, 0)):
+        wall = ends.copy()
+        wall[1 - top, axis] = wall[top, axis] + (WALL_M if top == 0 else -WALL_M)
+        walls.append(np.sort(wall, axis=0))
+    return walls
+
+
+def _cut(surface: VisualMesh, faces: np.ndarray) -> VisualMesh:
+    """Return some faces of a surface, with its image."""
+    vertices, kept = compacted(surface.vertices, surface.faces[faces])
+    uv, uv_kept = compacted(surface.uv, surface.uv_faces[faces])
+    return dataclasses.replace(surface, vertices=vertices, faces=kept, uv=uv, uv_faces=uv_kept)
+
+
+def _with_tray(surface: VisualMesh, tray: tuple[Part, ...]) -> VisualMesh:
+    """Return a surface and parts in the colour of its first corner."""
+    vertices, faces = [surface.vertices], [surface.faces]
+    for part in tray:
+        faces.append(part.faces + sum(map(len, vertices)))
+        vertices.append(part.vertices)
+    corners = np.zeros((sum(map(len, faces[1:])), 3), np.int64)
+    uv_faces = np.vstack([surface.uv_faces, corners])
+    return dataclasses.replace(surface, vertices=np.vstack(vertices), faces=np.vstack(faces), uv_faces=uv_faces)
+
+
+def carcass(model: CadModel, cut: tuple[Opening, ...]) -> CadModel:
+    """Return a model without these fronts; its outline stays."""
+    gone = {piece for opening in cut for piece in opening.pieces}
+    if model.surface is not None:
+        of, _ = _pieces(model)
+        return dataclasses.replace(model, surface=_cut(model.surface, ~np.isin(of, list(gone))))
+    return dataclasses.replace(model, parts=tuple(p for k, p in enumerate(model.parts) if k not in gone))
+
+
+def opened(item: Instance, front: Front, share: float) -> list[np.ndarray]:
+    """Return the corners (n, 3) of a front's solids, scan x, y and height, with it open by a share of its range."""
+    hinge, value = front.hinge, share * front.hinge.range_rad[1]
+    placed = [item.to_floor(part.vertices) for part in front.model.solids]
+    base, tip = item.to_floor(np.array([hinge.origin, np.array(hinge.origin) + hinge.axis]))
+    axis = (tip - base) / np.linalg.norm(tip - base)
+    if hinge.slides:
+        return [points + value * axis for points in placed]
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    turn = np.eye(3) + math.sin(value) * cross + (1 - math.cos(value)) * cross @ cross
+    return [(points - base) @ turn.T + base for points in placed]
