@@ -11,6 +11,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, KDTree, QhullError
 from scipy.spatial.distance import pdist
 
+from converters.check.opening import blocked_fronts, held_bodies
 from converters.geometry.faces import face_areas, sample_faces
 from converters.records.errors import Gate, Limit
 from converters.structure.walls import border_cells
@@ -208,6 +209,10 @@ def evaluate(
         "furniture_apart": len(apart) / max(len(bodies), 1),
     }
     values |= {name: share for name, share in (shares or {}).items() if share is not None}
+    for exclude in spec.excludes:
+        spec.delete(exclude)
+    blocked = blocked_fronts(collide_with(spec, "box"))
+    values |= {"blocked_fronts": float(len(blocked))} if held_bodies(model) else {}
     for quantity in ("drift", "turn", "penetration"):
         values |= {f"{quantity}_hulls": by_hull[quantity], f"{quantity}_boxes": by_box[quantity]}
     agreed, warnings = manifest_values(model, objects)
@@ -215,7 +220,7 @@ def evaluate(
     values |= free_space_values(maps) | wall_values(model, maps) | agreed | surface
     blamed = {f"{what}_{shape}": (body,) for shape, of in who.items() for what, body in of.items()} | worst
     warnings |= {name: words for name, words in blamed.items() if not judge(name, (values | surface)[name]).passed}
-    warnings["connected_share"] = free_space_warnings(maps)
+    warnings["blocked_fronts"], warnings["connected_share"] = blocked, free_space_warnings(maps)
     if 2 * len(apart) > len(bodies):
         warnings["furniture_apart"] = (
             f"{len(apart)} of {len(bodies)} movable objects stand more than {OFF_MAP_M:g} m from the largest piece of "
@@ -270,9 +275,11 @@ def wall_values(model: mujoco.MjModel, maps: SceneMaps) -> dict[str, float]:
             (c0, r0), (c1, r1) = np.clip(ends + [[0], [1]], 0, free.shape[::-1]).astype(int)
             beyond = np.abs((points[r0:r1, c0:c1] - middle) @ level) - size
             outside[r0:r1, c0:c1] = np.minimum(outside[r0:r1, c0:c1], beyond.max(axis=-1))
-    rim = border_cells(free)
+    rim, fronts = border_cells(free), held_bodies(model)
     for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE):
         body = model.jnt_bodyid[joint]
+        if body in fronts:
+            continue
         far = np.linalg.norm(points - model.body_pos[body, :2], axis=-1)
         geoms = np.flatnonzero(model.geom_bodyid == body)
         leaf = max((float(np.linalg.norm(model.geom_pos[g]) + model.geom_rbound[g]) for g in geoms), default=0.0)

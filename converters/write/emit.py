@@ -19,15 +19,12 @@ from interactive_nav_common.rotations import yaw_matrix
 from scenes_mjcf.agreement import LIT_AMBIENT
 
 TIMESTEP_S = 0.005
-GRAVITY = 9.81
 HINGED, SLIDING = (0.4, 0.25), (15.0, 3.0)
 """Damping, N m s/rad and N s/m, and dry friction, N m and N, of what opens: a drawer of 5 kg that is let go at 0.5 m/s
 goes 0.1 m on."""
 HINGES = {"door": (2.0, 0.4)}
 """The same of a category: a pushed interior door stops after about a second. No latch, only this dry friction keeps it
 where it was left, half a newton at the handle."""
-HOLDS = 1.1
-"""Of the torque of its own weight, the dry friction of a flap: it stays where it is put, as one on springs does."""
 ONE = (1.0, 1.0, 1.0)
 LAMP, LAMP_FALL = 0.8, (1.0, 0.0, 0.15)
 """Of a white lamp at full power: how bright it is, and by which powers of the distance (m) that falls."""
@@ -97,7 +94,7 @@ def _add_movable(
     if placed.hinge is None:
         body.add_freejoint(name=f"{placed.name}_free")
     else:
-        _add_hinge(spec, body, placed, placed.hinge, physical)
+        _add_hinge(spec, body, placed, placed.hinge)
     friction = [physical.friction, 0.005, 0.0001]
     if look is not None:
         _add_look(spec, body, placed.name, look)
@@ -115,19 +112,15 @@ def _add_movable(
         _add_box(spec, body, "box", f"{placed.name}_box_{i}", box, friction)
 
 
-def _add_hinge(
-    spec: mujoco.MjSpec, body: mujoco.MjsBody, placed: PlacedObject, hinge: BodyHinge, physical: Physical
-) -> None:
+def _add_hinge(spec: mujoco.MjSpec, body: mujoco.MjsBody, placed: PlacedObject, hinge: BodyHinge) -> None:
     """Add the joint of a body that opens; a door's leaf keeps clear of the walls, other fronts lie in their cabinet."""
     kind = "slide" if hinge.slides else "hinge"
     damping, friction = HINGES.get(placed.category, SLIDING if hinge.slides else HINGED)
-    if not hinge.slides:
-        level = math.hypot(hinge.axis_b[0], hinge.axis_b[1])
-        arm_m = float(np.linalg.norm(np.cross(hinge.axis_b, physical.com_b - hinge.origin_b)))
-        friction = max(friction, HOLDS * physical.mass_kg * GRAVITY * level * arm_m)
+    if not hinge.slides and abs(hinge.axis_b[2]) < 0.99:
+        body.gravcomp = 1.0  # a flap is balanced by springs: it stays where it is put
     joint = body.add_joint(name=f"{placed.name}_{kind}", type=getattr(mujoco.mjtJoint, f"mjJNT_{kind.upper()}"))
     joint.axis, joint.pos, joint.range = _tidy(hinge.axis_b), _tidy(hinge.origin_b), np.round(hinge.range_rad, 6)
-    joint.damping, joint.frictionloss, joint.armature = [damping, 0, 0], round(friction, 4), 0.01
+    joint.damping, joint.frictionloss, joint.armature = [damping, 0, 0], friction, 0.01
     if placed.category != "door":
         spec.add_exclude(bodyname1=placed.name, bodyname2="structure")
 

@@ -50,6 +50,8 @@ class Joint:
     frictionloss: float
     """N m, or N of a slide."""
     slides: bool = False
+    balanced: bool = False
+    """Springs carry the body's weight, as a flap's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,6 +264,7 @@ def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, fri
             damping=float(np.ravel(model.dof_damping[dof])[0]),
             frictionloss=float(model.dof_frictionloss[dof]),
             slides=slides,
+            balanced=bool(model.body_gravcomp[body] == 1.0),
         )
     elif model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
         raise SceneError(f"{xml}: joint of '{name}' is neither free nor a hinge or slide")

@@ -225,7 +225,8 @@ def build_spec(
             continue
         n_boxes = max(len(m.boxes) for m in slot.bodies if m is not None)
         # The tiny value keeps the models' structure equal.
-        gravcomp = _FLOATS if body is None else 1e-9 if None in slot.bodies else 0.0
+        floats = [m is None or bool(m.joint and m.joint.balanced) for m in slot.bodies]
+        gravcomp = _FLOATS if floats[scene_index] else 1e-9 if any(floats) else 0.0
         _add_movable(spec, slot.name, body or _nothing(i, slot.kind), n_boxes, collision, gravcomp)
     named, most = [(slot.name, slot.kind) for slot in slots], max(len(s.walls) for s in scenes)
     _finish(spec, robot, scenes[scene_index].walls, most, named, config)

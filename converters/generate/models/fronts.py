@@ -50,6 +50,8 @@ class Opening:
     pieces: tuple[int, ...]
     """Of the model, which go with the front."""
     front: Front
+    recess: Part
+    """A dark plate in the carcass where a drawn front was; models of the library are hollow."""
 
 
 def _pieces(model: CadModel) -> tuple[np.ndarray, list[Bounds]]:
@@ -120,7 +122,13 @@ def openings(name: str) -> tuple[Opening, ...]:
         if hinge.slides:
             mine = [j for j in range(len(bounds)) if j not in taken | {k} and _inside(bounds[j], bounds[k], True)]
         taken |= {k, *mine}
-        found.append(Opening((k, *mine), _front(model, len(found), of, bounds, (k, *mine), hinge, rear)))
+        front, recess = _front(model, len(found), of, bounds, (k, *mine), hinge, rear), bounds[k].copy()
+        if any(_overlap(p, q) for o in found for p in o.front.model.solids for q in front.model.solids):
+            taken -= {k, *mine}  # such as two leaves with one handle
+            continue
+        recess[:, 2] = recess[0, 2] + [-0.001, 0.001]
+        recess[:, :2] += np.outer([1, -1], [SIDE_M, SIDE_M])
+        found.append(Opening((k, *mine), front, _normalised([_block(recess, "charcoal")], model)[0]))
     return tuple(found)
 
 
@@ -152,20 +160,16 @@ def _front(
     name = f"{model.name}#{k}"
     category = "drawer" if hinge.slides else "cabinet_door"
     scale = np.array([model.front, 1.0, model.front]) / model.unit_m
-
-    def normalised(parts: list[Part]) -> tuple[Part, ...]:
-        return tuple(dataclasses.replace(p, vertices=np.round(p.vertices * scale, 6)) for p in parts)
-
     surface, drawn = None, [model.parts[j] for j in pieces] if model.surface is None else []
     if model.surface is not None:
-        surface = _with_tray(_cut(model.surface, np.isin(of, pieces)), normalised(tray))
+        surface = _with_tray(_cut(model.surface, np.isin(of, pieces)), _normalised(tray, model))
     about = {
         "name": name,
         "category": category,
         "catid": CATEGORIES[category].synset,
         "id_cad": f"{model.id_cad[:28]}{k:04d}",
-        "parts": (*drawn, *normalised(tray)) if surface is None else normalised(solids),
-        "solids": normalised(solids),
+        "parts": (*drawn, *_normalised(tray, model)) if surface is None else _normalised(solids, model),
+        "solids": _normalised(solids, model),
         "surface": surface,
     }
     axis, origin = np.array(hinge.axis) * scale * model.unit_m, np.array(hinge.origin) * scale
@@ -173,8 +177,20 @@ def _front(
     return Front(dataclasses.replace(model, **about), hinge)
 
 
+def _normalised(parts: list[Part], model: CadModel) -> tuple[Part, ...]:
+    """Return parts in the model's CAD frame."""
+    scale = np.array([model.front, 1.0, model.front]) / model.unit_m
+    return tuple(dataclasses.replace(p, vertices=np.round(p.vertices * scale, 6)) for p in parts)
+
+
 def _block(ends: Bounds, material: str) -> Part:
     return box(ends.mean(axis=0), np.ptp(ends, axis=0), material)
+
+
+def _overlap(one: Part, other: Part) -> bool:
+    """Return whether the bounds of two parts overlap."""
+    low = np.maximum(one.vertices.min(axis=0), other.vertices.min(axis=0))
+    return bool((np.minimum(one.vertices.max(axis=0), other.vertices.max(axis=0)) > low + 1e-3).all())
 
 
 def _sides(ends: Bounds) -> list[Bounds]:
@@ -211,7 +227,8 @@ def carcass(model: CadModel, cut: tuple[Opening, ...]) -> CadModel:
     if model.surface is not None:
         of, _ = _pieces(model)
         return dataclasses.replace(model, surface=_cut(model.surface, ~np.isin(of, list(gone))))
-    return dataclasses.replace(model, parts=tuple(p for k, p in enumerate(model.parts) if k not in gone))
+    parts = [p for k, p in enumerate(model.parts) if k not in gone]
+    return dataclasses.replace(model, parts=(*parts, *(opening.recess for opening in cut)))
 
 
 def opened(item: Instance, front: Front, share: float) -> list[np.ndarray]:

@@ -1,0 +1,93 @@
+"""Fronts that open are looked at over their range: walls and heavy furniture block them, light furniture does not."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from converters.bodies.objects import BodyHinge, PlacedObject, physical_properties
+from converters.check.opening import blocked_fronts, held_bodies
+from converters.geometry.boxes import OrientedBox, convex_hull
+from converters.write.emit import SceneParts, build_spec
+
+
+def _hull(low, high):
+    return convex_hull(np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (0, 0.2)]))
+
+
+def _box(centre, half):
+    return OrientedBox(np.array(centre, float), np.eye(3), np.array(half, float))
+
+
+def _front(name, category, hinge):
+    """A panel of 0.5 x 0.02 x 0.2 m whose face is at y = 0, shut in a cabinet behind it."""
+    hull = _hull((-0.25, 0.0), (0.25, 0.02))
+    grey = np.full((len(hull.faces), 3), 128, np.uint8)
+    box = _box((0, 0.01, 0.1), (0.25, 0.01, 0.1))
+    placed = PlacedObject(name, category, "c", hull.vertices, hull.faces, grey, (hull,), (box,), np.array([0, 0, 0.3]))
+    return placed.__class__(**{**vars(placed), "hinge": hinge})
+
+
+def _piece(y, kg):
+    hull = _hull((-0.1, -0.1), (0.1, 0.1))
+    grey = np.full((len(hull.faces), 3), 128, np.uint8)
+    box = _box((0, 0, 0.1), (0.1, 0.1, 0.1))
+    placed = PlacedObject("box_0", "box", "b", hull.vertices, hull.faces, grey, (hull,), (box,), np.array([0, y, 0.35]))
+    return placed, physical_properties("box", (hull,), kg)
+
+
+SLIDE = BodyHinge(np.zeros(3), (0.0, 0.3), False, np.array([0.0, -1.0, 0.0]), slides=True)
+DOOR = BodyHinge(np.array([-0.25, 0.0, 0.0]), (0.0, np.pi / 2), False, np.array([0.0, 0.0, -1.0]))
+FLAP = BodyHinge(np.zeros(3), (0.0, np.pi / 2), False, np.array([1.0, 0.0, 0.0]))
+CABINET = _box((0, 0.3, 0.4), (0.3, 0.295, 0.4))
+
+
+def _model(front, walls=(), pieces=()):
+    bodies = [(front, physical_properties(front.category, front.hulls_b)), *pieces]
+    objects, physical = zip(*bodies, strict=True)
+    spec = build_spec(SceneParts("test", objects, physical, (CABINET, *walls)))
+    model = spec.compile()
+    for exclude in spec.excludes:
+        spec.delete(exclude)
+    for geom in spec.geoms:
+        if "_hull_" in geom.name or "_box_" in geom.name:
+            geom.contype = geom.conaffinity = int("_box_" in geom.name)
+    return model, spec.compile()
+
+
+@pytest.mark.parametrize("hinge", [SLIDE, DOOR, FLAP])
+def test_a_front_before_free_floor_opens(hinge):
+    model, solid = _model(_front("front_0", "drawer" if hinge.slides else "cabinet_door", hinge))
+    assert blocked_fronts(solid) == () and len(held_bodies(model)) == 1
+    kind = mujoco.mjtJoint.mjJNT_SLIDE if hinge.slides else mujoco.mjtJoint.mjJNT_HINGE
+    assert model.jnt_type[0] == kind and model.jnt_range[0] == pytest.approx(hinge.range_rad, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("hinge", "line"),
+    [(SLIDE, "drawer_0 hits structure at 0.22 m"), (DOOR, "cabinet_door_0 hits structure at 0.59 rad")],
+)
+def test_a_wall_before_it_blocks_a_front(hinge, line):
+    """It stands 0.2 m before the panel's face."""
+    category = "drawer" if hinge.slides else "cabinet_door"
+    wall = _box((0, -0.25, 0.5), (1.0, 0.05, 0.5))
+    assert blocked_fronts(_model(_front(f"{category}_0", category, hinge), (wall,))[1]) == (line,)
+
+
+def test_light_furniture_is_pushed_and_heavy_furniture_blocks():
+    front = _front("drawer_0", "drawer", SLIDE)
+    assert blocked_fronts(_model(front, pieces=(_piece(-0.3, 5.0),))[1]) == ()
+    assert blocked_fronts(_model(front, pieces=(_piece(-0.3, 40.0),))[1]) == ("drawer_0 hits box_0 at 0.22 m",)
+
+
+def test_a_flap_stays_where_it_is_left_and_a_drawer_slows_down():
+    for hinge, category, start in ((FLAP, "cabinet_door", 0.8), (DOOR, "cabinet_door", 0.8), (SLIDE, "drawer", 0.2)):
+        model, _ = _model(_front("front_0", category, hinge))
+        data = mujoco.MjData(model)
+        data.qpos[0] = start
+        for _ in range(400):
+            mujoco.mj_step(model, data)
+        assert data.qpos[0] == pytest.approx(start, abs=0.01), category
+    data.qpos[0], data.qvel[0] = 0.0, 0.5  # the drawer, 2 kg
+    for _ in range(400):
+        mujoco.mj_step(model, data)
+    assert 0.01 < data.qpos[0] < 0.1
