@@ -257,7 +257,7 @@ def windows(
     proposed = widths_at(counts, 1 - LEFT_OUT_SHARE / len(counts))
     widths = {kind: width or np.inf for kind, width in window.widths.items()}
 
-    def settings(widths: Mapping[str, int]) -> dict[str, int]:
+    def by_setting(widths: Mapping[str, int]) -> dict[str, int]:
         return {SETTINGS[k]: max(w for o, w in widths.items() if SETTINGS[o] == SETTINGS[k]) for k in widths}
 
     def left_out(widths: Mapping[str, float]) -> float:
@@ -266,9 +266,9 @@ def windows(
     return {
         "env_steps": int(len(counts["walls"])),
         "needs": {k: {str(q): float(np.quantile(c, q)) for q in shares} for k, c in counts.items()},
-        "set": settings(window.widths),
+        "set": by_setting(window.widths),
         "left_out_share": left_out(widths),
-        "proposed": settings(proposed),
+        "proposed": by_setting(proposed),
         "proposed_left_out_share": left_out(proposed),
         "tiers": [
             {
