@@ -65,7 +65,7 @@ def _hinge(model: dict[str, Any], category: str, where: str) -> ScannedHinge | N
         raise SceneRejected(f"{where}: the articulation has numbers that are not finite, or no axis")
     if category == "door":
         if slides or not abs(axis[2]) >= 0.9 * np.linalg.norm(axis):
-            raise SceneRejected(f"{where}: a door's axis is {raw['axis']}, expected a hinge's, the vertical (0, 1, 0)")
+            raise SceneRejected(f"{where}: a door's axis is {raw['axis']}, expected the vertical (0, 1, 0) of a hinge")
         axis = np.sign(axis[2]) * UP
     return ScannedHinge(origin, axis / np.linalg.norm(axis), (low, high), slides=slides)
 

@@ -126,7 +126,7 @@ def openings(name: str) -> tuple[Opening, ...]:
         if any(_overlap(p, q) for o in found for p in o.front.model.solids for q in front.model.solids):
             taken -= {k, *mine}  # such as two leaves with one handle
             continue
-        recess[:, 2] = recess[0, 2] + [-0.001, 0.001]
+        recess[1, 2] = recess[0, 2] + 0.6 * np.ptp(recess[:, 2])  # hidden in the panel while it is shut
         recess[:, :2] += np.outer([1, -1], [SIDE_M, SIDE_M])
         found.append(Opening((k, *mine), front, _normalised([_block(recess, "charcoal")], model)[0]))
     return tuple(found)
