@@ -8,8 +8,9 @@ import numpy as np
 from converters.clock import Report
 from converters.generate.design.config import BuildingConfig, GenerationError, HomeConfig
 from converters.generate.design.furnish import Effort, furnish_plan, no_place
-from converters.generate.design.plan import Building, make_plan
+from converters.generate.design.plan import Building
 from converters.generate.design.space import floor_maps
+from converters.generate.design.sparse import make_plan
 from converters.generate.homes.design import design_home
 from converters.generate.surface.modelled import model_building
 from converters.generate.surface.scan import Scan, scan_building

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from converters.generate.design.config import BuildingConfig
-from converters.generate.design.plan import make_plan
+from converters.generate.design.sparse import make_plan
 from converters.generate.models.cad import (
     HOME_TEST_MODELS,
     HOME_TRAIN_MODELS,

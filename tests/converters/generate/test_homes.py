@@ -16,7 +16,7 @@ from scipy import ndimage
 from converters.generate import Building, BuildingConfig, GenerationError, HomeConfig, design_building
 from converters.generate.design.config import MOST_SHARE, TIERS, home_config, home_fields
 from converters.generate.design.furnish import Effort, furnish_plan
-from converters.generate.design.plan import make_plan
+from converters.generate.design.sparse import make_plan
 from converters.generate.homes import design, furnish
 from converters.generate.homes.arrange import TABLES, apart, arrange, draw_set, stand
 from converters.generate.homes.floor import Floor
