@@ -248,8 +248,9 @@ def _windows(
     first = {k: stretch for k, stretch in reversed(order) if USES[uses[k]].window}
     rest = [(k, s) for k, s in order if first.get(k) != s and uses[k] != "storage"]
     rest = [rest[i] for i in rng.permutation(len(rest))]
+    chosen: list[tuple[int, Stretch]] = [*first.items(), *rest[: max(wanted - len(first), 0)]]
     boxes = []
-    for k, s in [*first.items(), *rest[: max(wanted - len(first), 0)]]:
+    for k, s in chosen:
         widest = WIDEST_M.get(uses[k], 1.5)
         width = snap(rng.uniform(0.6 if widest < 1 else 0.8, max(min(widest, s.length_m - 0.3), 0.81)))
         at = snap(rng.uniform(s.start + 0.15, max(s.start + 0.15, s.end - 0.15 - width)))
