@@ -47,6 +47,19 @@ def block(base, size, material, open=False) -> Part:
     return box((x, y + size[1] / 2, z), size, material, open=open)
 
 
+SPINES = ("navy", "rust", "cream", "moss", "leather", "slate", "red", "mustard", "denim", "linen", "teal")
+
+
+def books(base, width, height, depth, first=0) -> list[Part]:
+    """Build a row of books of several sizes to the right of `base`; rows of another `first` differ."""
+    (x, y, z), parts, k = base, [], first
+    while x < base[0] + width - 0.05:
+        thick, tall = 0.025 + 0.007 * (5 * k % 4), height * (0.75 + 0.08 * (7 * k % 4))
+        parts.append(block((x + thick / 2, y, z), (thick - 0.002, tall, depth), SPINES[k % len(SPINES)]))
+        x, k = x + thick, k + 1
+    return parts
+
+
 def hull(points, material) -> Part:
     """Build the convex hull of points."""
     mesh = trimesh.convex.convex_hull(np.asarray(points, float))

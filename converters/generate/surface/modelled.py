@@ -16,6 +16,7 @@ from converters.generate.design.plan import Plan, Rect
 from converters.generate.models.cad import Instance
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface import sides as at_walls
+from converters.generate.surface.decor import decor
 from converters.generate.surface.finishes import FRAMES, Finish, finishes, framed
 from converters.generate.surface.scan import NYU40, Scan, building_solids, fuse, solid_from_box
 from converters.generate.surface.sides import CLOTHS, ENTRANCES, FLOOR_M, PICTURE, Side
@@ -37,7 +38,7 @@ BRIGHT = 0.8
 
 @dataclasses.dataclass(frozen=True)
 class Space:
-    """Hold the distance to the nearest surface, of the structure alone."""
+    """Hold the distance to the nearest surface."""
 
     distance: np.ndarray
     """(nx, ny, nz) m, negative inside."""
@@ -66,13 +67,13 @@ class Space:
         return out
 
 
-def space_of(plan: Plan) -> Space:
-    """Return the structure's distances, windows open."""
+def space_of(plan: Plan, items: Sequence[Instance] = ()) -> Space:
+    """Return the distances to the structure, windows open, and to furniture where it stands."""
     o, pad = plan.outer, 4 * VOXEL_M
     low = np.array([o.x0, o.y0, 0.0]) - pad
     top = plan.wall_height_m
     lid = solid_from_box((o.x0, o.y0, top), (o.x1, o.y1, top + 0.4), 0, "paint")
-    near = fuse([*building_solids(plan, []), lid], low, np.array([o.x1, o.y1, top]) + pad, VOXEL_M).sdf
+    near = fuse([*building_solids(plan, list(items)), lid], low, np.array([o.x1, o.y1, top]) + pad, VOXEL_M).sdf
     for w in plan.windows:
         i0 = np.maximum(np.floor((np.array(w.low) - 0.3 - low) / VOXEL_M).astype(int), 0)
         i1 = np.ceil((np.array(w.high) + 0.3 - low) / VOXEL_M).astype(int) + 1
@@ -220,11 +221,10 @@ def _pictures(side: Side, count: int, tall: shapely.Geometry, rng: np.random.Gen
 
 
 def _fittings(
-    plan: Plan, uses: Sequence[str], sides: Sides, items: Sequence[Instance], rng: np.random.Generator
+    plan: Plan, uses: Sequence[str], sides: Sides, tall: shapely.Geometry, rng: np.random.Generator
 ) -> list[Chart]:
-    """Return front door, pictures, switches and sockets."""
+    """Return front door, pictures, which nothing `tall` hides, switches and sockets."""
     charts: list[Chart] = []
-    tall = _standing(items, 1.1)
     if plan.entrance is not None:
         walls = sides[plan.entrance.rooms[0]]
         side, middle = at_walls.entrance_place(walls, plan.entrance)
@@ -277,7 +277,10 @@ def model_building(
     lamps = np.array([[*np.round(r.centre, 3), plan.wall_height_m] for r in plan.rooms])
     charts = _shell(plan, sides, finish)
     charts += _windows(uses, sides, everything, rng)
-    charts += _fittings(plan, uses, sides, everything, rng)
+    hung, boxes = decor(uses, sides, everything, plan.wall_height_m, rng)
+    charts += hung
+    tall = shapely.union_all([_standing(everything, 1.1), *(box.rect.polygon for box in boxes)])
+    charts += _fittings(plan, uses, sides, tall, rng)
     for room, lamp in zip(plan.rooms, lamps, strict=True):
         charts += _lamp(lamp, min(0.22, 0.11 * min(room.size)))
     cabinet = np.array(MATERIALS["white"] if rng.random() < 0.6 else MATERIALS["oak"])
@@ -286,5 +289,6 @@ def model_building(
     spans = [(side, *side.along(w.rect)) for walls in sides for side in walls for w in side.windows]
     places = [side.at(low + (high - low) * share, 0.0, 1.5) for side, low, high in spans for share in (0.25, 0.75)]
     inwards = np.repeat([side.inward for side, *_ in spans], 2, axis=0)
-    light = Daylight(space_of(plan), lamps - [0, 0, 0.3], np.reshape(places, (-1, 3)), inwards.reshape(-1, 3))
+    space = space_of(dataclasses.replace(plan, fixtures=(*plan.fixtures, *boxes)), items)
+    light = Daylight(space, lamps - [0, 0, 0.3], np.reshape(places, (-1, 3)), inwards.reshape(-1, 3))
     return assemble(charts, light)
