@@ -25,6 +25,8 @@ SKY_COLOUR = (0.93, 0.95, 0.97)
 """RGB in [0, 1] of pictures where nothing is met."""
 SKY = tuple(round(255 * c) for c in SKY_COLOUR)
 """Where nothing is hit; MuJoCo's would be black."""
+SUN, SHADOW_TEXELS, SHADOW_M = 0.2, 4096, 12.0
+"""Brightness of a light that casts shadows, side of the map that these are looked up in, how far that reaches."""
 
 
 class CameraPose(NamedTuple):
@@ -151,6 +153,15 @@ def mesh_of(model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray, n
     return model.mesh_vert[first : first + model.mesh_vertnum[mesh]], model.mesh_face[rows], uv
 
 
+def mesh_normals(model: mujoco.MjModel, mesh: int) -> np.ndarray | None:
+    """Return the normals [m, 3, 3] that a compiled mesh's file has at the corners of its faces; None: it has none."""
+    face, first = model.mesh_faceadr[mesh], model.mesh_normaladr[mesh]
+    rows = slice(face, face + model.mesh_facenum[mesh])
+    if (model.mesh_facenormal[rows] == model.mesh_face[rows]).all():  # MuJoCo's, one a vertex
+        return None
+    return model.mesh_normal[first + model.mesh_facenormal[rows]]
+
+
 def geom_mesh(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices [n, 3] f64 (m, in the body's frame) and faces [m, 3] i64 of a mesh geom."""
     (vertices, faces, _), turn = mesh_of(model, model.geom_dataid[geom]), np.zeros(9)
@@ -182,13 +193,22 @@ def geom_colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
 class GlPainter:
     """Draws one model, one camera after the other; it must stay in the thread that created it."""
 
-    def __init__(self, model: mujoco.MjModel, width: int, height: int, sky: tuple[int, ...] | None = SKY):
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        width: int,
+        height: int,
+        sky: tuple[int, ...] | None = SKY,
+        shadows: bool = False,
+    ):
         """Create a context.
 
         Args:
             width: of the pictures, pixels.
             height: pixels.
             sky: colour where nothing is hit; None: the model's.
+            shadows: what stands in a building casts some, by the lights that are neither lamps nor have ambient light,
+                which MuJoCo takes from shadows too; these lights become as even as the sun's, in the model.
         """
         buffer = model.vis.global_
         if width > buffer.offwidth or height > buffer.offheight:
@@ -196,7 +216,13 @@ class GlPainter:
                 f"engine 'gl' got pictures of {width} x {height} pixels, expected at most {buffer.offwidth} x "
                 f"{buffer.offheight}; ask for smaller ones, or for engine=rays"
             )
-        self._model, self._size, self._sky = model, (height, width), sky
+        self._model, self._size, self._sky, self._shadows = model, (height, width), sky, shadows
+        if shadows:
+            suns = ~model.light_ambient.any(axis=1) & (model.light_cutoff <= 90)
+            model.light_castshadow[:] = suns
+            model.light_type[suns] = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+            model.light_diffuse[suns], model.light_specular[suns] = SUN, 0.0
+            model.vis.quality.shadowsize, model.vis.map.shadowclip = SHADOW_TEXELS, SHADOW_M / model.stat.extent
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -235,6 +261,10 @@ class GlPainter:
         for pos_w, axes_w in zip(np.asarray(pose.pos_w, float), np.asarray(pose.axes_w), strict=True):
             camera = _free_camera(pos_w, axes_w[:, 0], axes_w[:, 2])
             mujoco.mjv_updateScene(self._model, data, option, None, camera, every, self._scene)
+            if self._shadows:  # MuJoCo's of walls and ceilings would fill the rooms; decoration casts none
+                for geom in self._scene.geoms[: self._scene.ngeom]:
+                    standing = geom.objid >= 0 and self._model.body_weldid[self._model.geom_bodyid[geom.objid]] == 0
+                    geom.category = mujoco.mjtCatBit.mjCAT_DECOR if standing else geom.category
             images.append(self._read(depth))
         return np.stack(images)
 

@@ -62,7 +62,7 @@ class Painter:
             key = (model, lens.width, lens.height)
             try:
                 if key not in self._painters:
-                    self._painters[key] = GlPainter(model.model, lens.width, lens.height, sky=None)
+                    self._painters[key] = GlPainter(model.model, lens.width, lens.height, sky=None, shadows=True)
                 picture = self._painters[key].draw(model.data, one, lens.fov_deg, groups)[0]
                 self.engine = "gl"
                 return picture

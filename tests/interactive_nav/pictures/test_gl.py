@@ -41,6 +41,31 @@ def test_a_box_is_as_far_and_as_large_as_by_hand(tmp_path):
     assert (colour[~shown] == SKY).all()
 
 
+SHADOW = """
+import mujoco, sys, numpy as np
+from scenes_mjcf.look import GlPainter, look_along
+model = mujoco.MjModel.from_xml_string('''<mujoco><visual><headlight ambient=".4 .4 .4" diffuse="0 0 0"/></visual>
+<worldbody><light pos="0 0 6" diffuse=".5 .5 .5"/><light pos="0 0 6" ambient=".1 .1 .1" diffuse="0 0 0"/>
+<geom type="plane" size="5 5 1" rgba="1 1 1 1"/><geom type="box" pos="-1 0 3" size=".5 .5 .1"/>
+<body pos="1 0 1"><freejoint/><geom type="box" size=".5 .5 .1"/></body></worldbody></mujoco>''')
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+painter = GlPainter(model, 60, 60, shadows=True)
+camera = look_along(np.array([[1.0, -3.0, 0.5], [-1.0, -3.0, 0.5]]), np.array([[0.0, 1.0, -0.17]] * 2))
+np.savez(sys.argv[1], seen=painter.draw(data, camera, 10.0, [0]), casts=model.light_castshadow)
+"""
+
+
+def test_what_moves_casts_shadows_and_what_stands_fast_casts_none(tmp_path):
+    """Under a body that is free, and under a block that is not; light comes from straight above."""
+    need_gl()
+    made = drawn(SHADOW, tmp_path)
+    assert made["casts"].tolist() == [True, False]  # that with ambient light leaves none
+    loose, fast = made["seen"][..., 0].astype(int)
+    assert loose[30, 30] < 0.8 * fast[30, 30]
+    assert abs(loose[59, 30] - fast[59, 30]) < 5  # nearer than the shadow
+
+
 def test_without_a_gl_it_says_what_to_install(monkeypatch):
     def none():
         raise ImportError("no library\nhere")
