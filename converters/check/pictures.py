@@ -17,7 +17,7 @@ from trimesh.intersections import slice_faces_plane
 
 from converters.generate.models.cad import LIBRARY, cad_model
 from converters.generate.models.parts import MATERIALS
-from converters.geometry.faces import face_vectors, unit_normals
+from converters.geometry.faces import corner_normals, face_vectors, unit_normals
 from converters.read.obj import in_colour, join_meshes
 from converters.records.raw import TexturedMesh
 from converters.write.texture import box_pixels
@@ -75,19 +75,21 @@ class Picture:
         """Draw a mesh."""
         assert mesh.corner_uv is not None and mesh.texture is not None
         lens, eye, axes_w = self._lens, self._pose.pos_w, self._pose.axes_w
-        points, uv = mesh.vertices[mesh.faces].reshape(-1, 3), mesh.corner_uv.reshape(-1, 2)
+        bright = EVEN + (1 - EVEN) * np.abs(corner_normals(mesh.vertices, mesh.faces) @ LAMP_W)
+        points, uv = mesh.vertices[mesh.faces].reshape(-1, 3), np.dstack([mesh.corner_uv, bright]).reshape(-1, 3)
         faces = np.arange(len(points)).reshape(-1, 3)
         if one_sided:
             faces = faces[(unit_normals(points, faces) * (eye - points[::3])).sum(axis=1) > 0]
         points, faces, uv = slice_faces_plane(points, faces, axes_w[:, 0], eye + NEAREST_M * axes_w[:, 0], uv)
         if np.isfinite(below_m):
             points, faces, uv = slice_faces_plane(points, faces, np.array([0, 0, -1]), np.array([0, 0, below_m]), uv)
+        if not len(faces):
+            return
         depth, x, y = np.moveaxis((points[faces] - eye) @ axes_w, -1, 0)
         size, uv = np.array([lens.width, lens.height]), np.asarray(uv)[faces]
         pixels = np.stack([x, -y], axis=-1) / lens.pixel / depth[..., None] + size / 2
         keep = np.flatnonzero(_areas(pixels) > 1e-9)
-        light = (EVEN + (1 - EVEN) * np.abs(unit_normals(points, faces) @ LAMP_W))[keep]
-        depth, pixels, uv = depth[keep], pixels[keep], uv[keep]
+        depth, pixels, uv, light = depth[keep], pixels[keep], uv[keep, :, :2], uv[keep, :, 2]
         texture, between = _fitted(mesh.texture, _areas(uv), _areas(pixels), depth.min(axis=1, initial=np.inf))
         low, high = np.ceil(pixels.min(axis=1) - 0.5), np.floor(pixels.max(axis=1) - 0.5) + 1
         low, high = (np.clip(v, 0, size).astype(int) for v in (low, high))
@@ -110,7 +112,7 @@ class Picture:
             u, v = np.einsum("nc,ncd->nd", share, uv[face]).T
             texel = (np.stack([1 - v % 1, u % 1], axis=1) * texture.shape[:2]).T - 0.5  # the nearest, or between four
             planes = [map_coordinates(texture[..., k], texel, order=int(between), mode="nearest") for k in range(3)]
-            self._colours[where] = np.stack(planes, -1) * light[face, None]
+            self._colours[where] = np.stack(planes, -1) * (share * light[face]).sum(axis=1)[:, None]
 
 
 def _areas(corners: np.ndarray) -> np.ndarray:

@@ -6,10 +6,13 @@ from collections.abc import Iterable, Iterator
 import fast_simplification
 import numpy as np
 import trimesh
+from scipy import sparse
 from scipy.spatial import KDTree
 
 from converters.records.errors import SAMPLES, check_count
 
+CREASE_DEG = 40.0
+"""Faces that meet at less than this are one smooth surface."""
 BLOCK, LARGE = 1_000_000, 10_000
 """Points that are sampled at a time; points on a face from which on it is a large one."""
 
@@ -47,6 +50,32 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     out = vertex_vectors(vertices, faces)
     length = np.linalg.norm(out, axis=1, keepdims=True)
     return np.where(length > 1e-12, out / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
+
+
+def corner_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return (m, 3, 3) unit normals at the corners of the faces, smooth over edges that are no creases.
+
+    Faces around a corner are weighted by area and angle there, so it does not matter how polygons are triangulated.
+    """
+    corners, count, at = vertices[faces], faces.size, weld(vertices)[1][faces]
+    after = np.roll(np.arange(count).reshape(-1, 3), -1, axis=1).ravel()
+    start, end = at.ravel(), at.ravel()[after]
+    _, edge = np.unique(np.hstack([start * count + end, end * count + start]), return_inverse=True)
+    there, back = (
+        sparse.csr_array((np.ones(count), (np.arange(count), e)), (count, 2 * count)) for e in np.split(edge, 2)
+    )
+    this, other = (there @ back.T).nonzero()
+    unit = unit_normals(vertices, faces)
+    smooth = (unit[this // 3] * unit[other // 3]).sum(axis=1) > math.cos(math.radians(CREASE_DEG))
+    pairs = np.column_stack([this, after[other]])[smooth]
+    group = trimesh.graph.connected_component_labels(pairs, count)
+    to_next, to_last = (np.roll(corners, k, axis=1) - corners for k in (-1, 1))
+    cosine = (to_next * to_last).sum(axis=2) / np.maximum(np.linalg.norm(to_next, axis=2), 1e-12)
+    angle = np.arccos(np.clip(cosine / np.maximum(np.linalg.norm(to_last, axis=2), 1e-12), -1, 1))
+    weighted = (angle[..., None] * face_vectors(vertices, faces)[:, None]).reshape(-1, 3)
+    total = np.stack([np.bincount(group, column) for column in weighted.T], axis=1)[group]
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(length > 1e-15, total / np.maximum(length, 1e-15), np.repeat(unit, 3, axis=0)).reshape(-1, 3, 3)
 
 
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 
 from converters.bodies.objects import BodyHinge, Physical, PlacedObject
 from converters.geometry.boxes import OrientedBox, least_turned
+from converters.geometry.faces import corner_normals, unit_normals
 from converters.records.raw import Lamp, VisualMesh, Window
 from converters.write.texture import as_png, quantise, share_plain
 from interactive_nav_common.rotations import yaw_matrix
@@ -31,6 +32,11 @@ LAMP, LAMP_FALL = 0.8, (1.0, 0.0, 0.15)
 SAME_M = 5e-5
 """Meshes no farther apart are one; half of what a file's last digit is."""
 HULL_DECIMALS = 5
+NORMAL_STEP, CURVED = 0.05, 0.998
+"""Of normals, in few digits; where a corner's has a cosine to its face's below that, a surface is curved.
+
+MuJoCo computes normals where there are none, one a vertex, which bend the light at the rims of lids and seats; they do
+for the structure, which is mostly flat."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -281,19 +287,32 @@ def write_obj(
     uv_faces: np.ndarray | None = None,
     decimals: int = 4,
     uv_decimals: int = 4,
+    smooth: bool = False,
 ) -> None:
-    """Write a triangle mesh as OBJ, 0.1 mm by default; with texture coordinates in as few bytes as possible."""
+    """Write a triangle mesh as OBJ, 0.1 mm by default; with texture coordinates in as few bytes as possible.
+
+    With normals if it is to be `smooth`, is textured and is curved somewhere.
+    """
     if uv is None or uv_faces is None:
         lines = [f"v {x:.{decimals}f} {y:.{decimals}f} {z:.{decimals}f}" for x, y, z in vertices + 0.0]
         lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]
     else:
         vertices, uv = np.round(vertices, decimals) + 0.0, np.round(uv, uv_decimals) + 0.0
-        pairs, of = np.unique(np.stack([faces, uv_faces], axis=2).reshape(-1, 2), axis=0, return_inverse=True)
+        normals, indices = np.zeros((0, 3)), [faces, uv_faces]
+        at_corners = corner_normals(vertices, faces)
+        if smooth and ((at_corners * unit_normals(vertices, faces)[:, None]).sum(axis=2) < CURVED).any():
+            rounded = np.round(at_corners.reshape(-1, 3) / NORMAL_STEP) * NORMAL_STEP + 0.0
+            normals, of, uses = np.unique(rounded, axis=0, return_inverse=True, return_counts=True)
+            order = np.argsort(-uses, kind="stable")  # the commonest has the shortest number
+            normals, indices = normals[order], [faces, uv_faces, np.argsort(order)[of].reshape(-1, 3)]
+        rows = np.stack(indices, axis=2).reshape(-1, len(indices))
+        rows, of = np.unique(rows, axis=0, return_inverse=True)
         lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices]
         lines += [f"vt {u:.9g} {v:.9g}" for u, v in uv]
+        lines += [f"vn {x:g} {y:g} {z:g}" for x, y, z in normals]
         lines = [re.sub(r"\b0\.", ".", line) for line in lines]  # -0.25: every reader takes -.25
-        names = [f"{v}/{t}" for v, t in pairs + 1]
-        steps = np.hstack([vertices[pairs[:, 0]] * 10**decimals, uv[pairs[:, 1]] * 10**uv_decimals])
+        names = ["/".join(map(str, row)) for row in (rows + 1).tolist()]
+        steps = np.hstack([vertices[rows[:, 0]] * 10**decimals, uv[rows[:, 1]] * 10**uv_decimals])
         for polygon in paired(of.reshape(-1, 3), steps):
             lines.append(" ".join(("f", *(names[k] for k in polygon))))
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
@@ -312,7 +331,7 @@ def write_scene(parts: SceneParts, folder: Path, palette: int = 96) -> None:
             mesh = visual.vertices, visual.faces, visual.uv, visual.uv_faces
             small = name != "structure" and max(visual.image.shape) <= 256
             digits = 3 if name == "structure" else 4, 3 if small else 4
-            write_obj(assets / f"{name}_visual.obj", *mesh, *digits)
+            write_obj(assets / f"{name}_visual.obj", *mesh, *digits, smooth=name != "structure")
         if look.image == name:
             image = as_png(visual.image) if visual.exact else quantise(visual.image, palette)
             image.save(assets / f"{name}.png", optimize=True)

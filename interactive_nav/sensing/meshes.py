@@ -34,7 +34,7 @@ from interactive_nav.sensing.boxes import (
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.agreement import is_lit
 from scenes_mjcf.categories import class_id
-from scenes_mjcf.look import SKY_COLOUR, Lens, geom_colour, geom_image, mesh_of
+from scenes_mjcf.look import SKY_COLOUR, Lens, geom_colour, geom_image, mesh_normals, mesh_of
 
 NEAR, FAR = wp.constant(NEAR_M), wp.constant(FAR_M)
 SKY, FLOOR = wp.constant(wp.vec3(*SKY_COLOUR)), wp.constant(wp.vec3(*FLOOR_COLOUR))
@@ -60,6 +60,8 @@ class _Surface:
     """(3,) in [0, 1] where there is no image."""
     lit: bool = False
     """In the image itself: it is drawn without shading."""
+    normals: np.ndarray | None = None
+    """[f, 3, 3] at the corners; None: the faces' own."""
 
 
 def _box_surface(slot: int, boxes: np.ndarray, colour: np.ndarray) -> _Surface:
@@ -74,7 +76,7 @@ def _geom_surface(model: mujoco.MjModel, geom: int, slot: int) -> _Surface:
     """Return the surface of a geom of the robot's: a mesh, a box, or what is round as its hull."""
     kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        return _mesh_surface(model, geom, slot, False)
+        return dataclasses.replace(_mesh_surface(model, geom, slot, False), normals=None)  # as robots always looked
     part = _box_surface(slot, geom_box(model, geom)[None], geom_colour(model, geom))
     turn, rise = np.meshgrid(np.arange(24) * np.pi / 12, np.linspace(-np.pi / 2, np.pi / 2, 13))
     ball = np.stack([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)], -1).reshape(-1, 3)
@@ -94,13 +96,16 @@ def _geom_surface(model: mujoco.MjModel, geom: int, slot: int) -> _Surface:
 
 def _mesh_surface(model: mujoco.MjModel, geom: int, slot: int, standing: bool) -> _Surface:
     (vertices, faces, uv), image = mesh_of(model, model.geom_dataid[geom]), geom_image(model, geom)
-    points = vertices @ matrix_from_quat(model.geom_quat[geom]).T + model.geom_pos[geom]
+    turn, normals = matrix_from_quat(model.geom_quat[geom]).T, mesh_normals(model, model.geom_dataid[geom])
+    points = vertices @ turn + model.geom_pos[geom]
+    normals = None if normals is None else normals @ turn
     if standing:
         points = points + model.body_pos[model.geom_bodyid[geom]]
     if uv is None or image is None:
         uv, image = np.zeros((len(faces), 3, 2)), None
     lit = standing and is_lit(model)
-    return _Surface(slot, points, faces, uv, image if image is None else image[..., :3], geom_colour(model, geom), lit)
+    image = image if image is None else image[..., :3]
+    return _Surface(slot, points, faces, uv, image, geom_colour(model, geom), lit, normals)
 
 
 def _surfaces(world: World, s: int, tables: BoxTables) -> tuple[list[_Surface], list[int]]:
@@ -130,6 +135,8 @@ class MeshTables:
     """[f] i32: the surface that a face is of."""
     uv: np.ndarray
     """[f, 3, 2] f32."""
+    normals: np.ndarray
+    """[f, 3, 3] f32 at the corners, in the body's frame; 0 where the face's own serves."""
     texels: np.ndarray
     """[t] u32: red, green, blue from the lowest byte on."""
     surface: np.ndarray
@@ -152,7 +159,7 @@ def build_meshes(world: World, tables: BoxTables) -> MeshTables:
     sphere, look, colour = np.full((*shape, 4), -1.0, np.float32), np.zeros((*shape, 5), np.int32), np.ones((*shape, 3))
     surfaces: dict[tuple, int] = {}
     images: dict[bytes, int] = {}
-    points, faces, uv, texels = [], [], [], [np.zeros(1, np.uint32)]
+    points, faces, uv, normals, texels = [], [], [], [], [np.zeros(1, np.uint32)]
     for s, (parts, ids) in enumerate(scenes):
         for k, part in enumerate(parts):
             key = np.round(part.points, 5).tobytes(), part.faces.tobytes(), part.uv.tobytes()
@@ -161,6 +168,7 @@ def build_meshes(world: World, tables: BoxTables) -> MeshTables:
                 faces.append(part.faces + sum(map(len, points)))
                 points.append(part.points)
                 uv.append(part.uv)
+                normals.append(np.zeros((len(part.faces), 3, 3)) if part.normals is None else part.normals)
             centre = (part.points.min(0) + part.points.max(0)) / 2
             radius = np.linalg.norm(part.points - centre, axis=1).max() + 1e-4
             surface[s, k], slot[s, k], sphere[s, k] = surfaces[key], part.slot, [*centre, radius]
@@ -177,6 +185,7 @@ def build_meshes(world: World, tables: BoxTables) -> MeshTables:
         faces=np.concatenate(faces).astype(np.int32),
         group=np.repeat(np.arange(len(faces), dtype=np.int32), [len(f) for f in faces]),
         uv=np.concatenate(uv).astype(np.float32),
+        normals=np.concatenate(normals).astype(np.float32),
         texels=np.concatenate(texels),
         surface=surface,
         slot=slot,
@@ -261,6 +270,7 @@ def _draw(
     look: wp.array3d[int],
     colour: wp.array2d[wp.vec3],
     uv: wp.array2d[wp.vec2],
+    normals: wp.array2d[wp.vec3],
     texels: wp.array[wp.uint32],
     depth: wp.array3d[float],
     ids: wp.array3d[wp.uint8],
@@ -299,8 +309,12 @@ def _draw(
     depth[n, y, x] = nearest
     ids[n, y, x] = wp.uint8(look[s, hit, 0])
     kind[n, y, x] = wp.uint8(1 + look[s, hit, 4])
+    side = -wp.sign(wp.dot(normal, ray))
+    smooth = u * normals[face, 0] + v * normals[face, 1] + (1.0 - u - v) * normals[face, 2]
+    if wp.length_sq(smooth) > 0.0:
+        normal = wp.normalize(axes_w[n, hit] * smooth)
     # Its back may show.
-    normal_w[n, y, x] = -wp.sign(wp.dot(normal, ray)) * normal
+    normal_w[n, y, x] = side * normal
     if look[s, hit, 2] == 0:
         base[n, y, x] = colour[s, hit]
         return
@@ -332,7 +346,10 @@ class MeshRenderer(Renderer):
         self._slot, self._sphere_b = built.slot, jnp.asarray(built.sphere_b)
         self._handle = jnp.asarray([self._mesh.id & 0xFFFFFFFF, self._mesh.id >> 32], jnp.uint32)
         self._constants = tuple(
-            map(jnp.asarray, (root.numpy()[built.surface], built.look, built.colour, built.uv, built.texels))
+            map(
+                jnp.asarray,
+                (root.numpy()[built.surface], built.look, built.colour, built.uv, built.normals, built.texels),
+            )
         )
         self._draw = wp.jax_kernel(_draw, num_outputs=5)
 

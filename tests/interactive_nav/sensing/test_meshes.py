@@ -100,15 +100,19 @@ def test_what_moves_is_elsewhere_in_the_next_picture(flats):
     np.testing.assert_array_equal(after["rgb"][1:], before["rgb"][1:])
 
 
-@pytest.mark.parametrize("baked", [True, False])
-def test_texels_are_where_the_faces_coordinates_put_them(tmp_path, baked):
+@pytest.mark.parametrize(("baked", "bent"), [(True, False), (False, False), (True, True)])
+def test_texels_are_where_the_faces_coordinates_put_them(tmp_path, baked, bent):
     # A square of 0.4 m at x = 1 that faces a camera at the origin; its image: red, green over blue, white.
     folder = write_room(tmp_path / "room", blocks=(("chair", 1.5, 1.0, 5.0, 0.5),))
     image = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
     Image.fromarray(image).save(folder / "assets" / "square.png")
     # Seen along x, +y is to the left: u grows to the right, v upwards.
     rows = ["v 0 0.2 -0.2", "v 0 -0.2 -0.2", "v 0 -0.2 0.2", "v 0 0.2 0.2", "vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
-    (folder / "assets" / "square.obj").write_text("\n".join([*rows, "f 1/1 3/3 2/2", "f 1/1 4/4 3/3", ""]))
+    faces = ["f 1/1 3/3 2/2", "f 1/1 4/4 3/3"]
+    if bent:  # as if it were round; its back shows: to the left on the left, to the right on the right
+        rows += ["vn 0.8 -0.6 0", "vn 0.8 0.6 0"]
+        faces = ["f 1/1/1 3/3/2 2/2/2", "f 1/1/1 4/4/1 3/3/2"]
+    (folder / "assets" / "square.obj").write_text("\n".join([*rows, *faces, ""]))
     spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
     spec.add_texture(name="square", type=mujoco.mjtTexture.mjTEXTURE_2D, file=str(folder / "assets" / "square.png"))
     material = spec.add_material(name="square")
@@ -131,7 +135,11 @@ def test_texels_are_where_the_faces_coordinates_put_them(tmp_path, baked):
     for (row, column), texel in zip(((16, 16), (16, 23), (23, 16), (23, 23)), image.reshape(4, 3), strict=True):
         np.testing.assert_allclose(rgb[row, column], light * texel / 255, atol=1e-5)
         assert depth[row, column] == pytest.approx(1.0, abs=1e-5)
-        np.testing.assert_allclose(seen["normals"][0, row, column], [0, 0, 1], atol=1e-5)
+        # The camera's frame: right is -y. In the middle of the half, half of the corner's slant.
+        slant = np.array([-0.3, 0, 0.8]) * [1 if column < 20 else -1, 1, 1] if bent else np.array([0, 0, 1])
+        np.testing.assert_allclose(
+            seen["normals"][0, row, column], slant / np.linalg.norm(slant), atol=0.02 if bent else 1e-5
+        )
 
 
 def test_rays_of_plain_jax_draw_no_meshes():
