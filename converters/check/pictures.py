@@ -15,7 +15,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import ConvexHull
 from trimesh.intersections import slice_faces_plane
 
-from converters.generate.models.cad import LIBRARY, cad_model
+from converters.generate.models.cad import LIBRARY, cad_model, tints
 from converters.generate.models.parts import MATERIALS
 from converters.geometry.faces import corner_normals, face_vectors, unit_normals
 from converters.read.obj import in_colour, join_meshes
@@ -271,7 +271,7 @@ def model_sheet(target: Path, names: Sequence[str] = ()) -> int:
         categories = ", ".join(sorted({d.category for d in LIBRARY.values()}))
         raise UserError(f"no model or category named {', '.join(unknown)}; categories: {categories}")
     wanted = [n for n, d in LIBRARY.items() if not names or n in names or d.category in names]
-    wanted.sort(key=lambda name: LIBRARY[name].category)
+    wanted = [tint for n in sorted(wanted, key=lambda name: LIBRARY[name].category) for tint in tints(n)]
     rows = -(-len(wanted) // COLUMNS)
     columns = min(COLUMNS, len(wanted))
     sheet = Image.new("RGB", (columns * PIXELS, rows * (PIXELS + LABEL_PIXELS)), "white")

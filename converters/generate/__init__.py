@@ -120,7 +120,7 @@ def _write(
     if building.uses:
         about |= {"rooms": list(building.uses), "measured": building.measured}
     write_json(folder / "generator.json", about)
-    names = {item.model.name for item in (*items, *building.plan.built_in)}
+    names = {item.model.name.partition("~")[0] for item in (*items, *building.plan.built_in)}
     used = [model for name, model in read_index().items() if name in names]
     if used:
         write_text(folder / ATTRIBUTION, attribution(used))

@@ -261,6 +261,7 @@ def hang_doors(
     into, and the floor that they sweep; None where too few fit.
     """
     state = _Room(plan, cfg, Effort())
+    state.models = Models(cfg.models, cfg.scale_jitter, home=True)
     low, high = (min(n, len(plan.doorways)) for n in cfg.n_doors)
     needed = [k for k, doorway in enumerate(plan.doorways) if set(always) & set(doorway.rooms)][:high]
     anywhere = dataclasses.replace(cfg, leaves_at_walls=False)

@@ -41,8 +41,10 @@ class Satellite:
     """Of the groups that have it."""
     host: str = ""
     """Category of the piece that it belongs to; empty: the anchor."""
-    needed: bool = False
-    """The group does not stand without it."""
+    least: int = 0
+    """The group does not stand without so many."""
+    role: str = ""
+    """Of the models that it is one of, see `Drawing.role`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +60,8 @@ class Group:
     """Depth of the floor before the anchor that stays free of other furniture, clutter excepted."""
     most: int = 1
     """Of these in one room."""
+    role: str = ""
+    """Of the anchor."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,6 +97,15 @@ class Tables:
 
 TABLES: Tables = read_packaged(Path(__file__).with_name("groups.yaml"), Tables)
 PLENTY_M2 = 110.0
+
+
+def least_of(standing: str) -> int:
+    """Return how many pieces of a kind a group needs, by what `Standing.group` says of them."""
+    name, _, category = standing.partition(": ")
+    satellites = TABLES.groups[name].satellites if category else ()
+    return sum(s.least for s in satellites if s.category == category)
+
+
 LOW_M = 0.95
 """Furniture up to this height may stand before a window."""
 
@@ -167,16 +180,16 @@ def stand(piece: GroupMember, origin: np.ndarray, facing_rad: float) -> Instance
     return place(piece.model, piece.scale, xy, facing_rad + piece.turn_rad)
 
 
-def draw_set(models: Models, rng: np.random.Generator) -> Callable[[str], GroupMember]:
-    """Return what draws a piece of a category at the origin, facing along v.
+def draw_set(models: Models, rng: np.random.Generator) -> Callable[..., GroupMember]:
+    """Return what draws a piece of a category and role at the origin, facing along v.
 
     Each category is of one model and size, as a table's chairs are; of boxes no two are alike.
     """
     drawn: dict[str, GroupMember] = {}
 
-    def piece(category: str) -> GroupMember:
+    def piece(category: str, role: str = "") -> GroupMember:
         if category not in drawn or category == "box":
-            drawn[category] = GroupMember(*models.draw(category, rng), 0.0, 0.0, 0.0)
+            drawn[category] = GroupMember(*models.draw(category, rng, role=role), 0.0, 0.0, 0.0)
         return drawn[category]
 
     return piece
@@ -226,21 +239,25 @@ def _facing(
     return None
 
 
-def _seats(host: GroupMember, count: int, at_wall: bool, rng: np.random.Generator) -> list[tuple[int, float]]:
-    """Return (side, slide along it) of seats round a table: long sides first, as many as fit beside each other."""
+def _seats(host: GroupMember, count: int, at_wall: bool) -> list[tuple[int, float]]:
+    """Return (side, slide along it) of up to so many seats round a table, spread evenly.
+
+    Opposite long sides are taken in turns, then the ends; a table at a wall has its ends first.
+    """
     width, _, depth = host.size_m
-    places: list[tuple[int, float]] = []
-    room = {side: max(1, int((width, depth)[side % 2] / SEAT_M)) for side in range(4)}
-    order = (0, 2, 1, 3) if width >= depth else (1, 3, 0, 2)
-    for side in (k for k in order if k != 2 or not at_wall):
-        length = (width, depth)[side % 2]
-        places += [(side, length * ((k + 0.5) / room[side] - 0.5)) for k in range(room[side])]
-    left = list(places[: max(count, 2)])
-    return [left[k] for k in rng.permutation(len(left))][:count]
+    order = [(1, 3), (0,)] if at_wall else [(0, 2), (1, 3)] if width >= depth else [(1, 3), (0, 2)]
+    places = [
+        side for pair in order for _ in range(max(1, int((width, depth)[pair[0] % 2] / SEAT_M))) for side in pair
+    ][:count]
+    sides = {side: places.count(side) for side in places}
+    return [
+        (side, (width, depth)[side % 2] * ((places[:k].count(side) + 0.5) / sides[side] - 0.5))
+        for k, side in enumerate(places)
+    ]
 
 
 def _satellites(
-    satellite: Satellite, count: int, host: GroupMember, row: list[GroupMember], draw: Callable[[str], GroupMember],
+    satellite: Satellite, count: int, host: GroupMember, row: list[GroupMember], draw: Callable[..., GroupMember],
     rng: np.random.Generator,
 ) -> list[GroupMember]:  # fmt: skip
     """Return the satellites of one kind, in the frame of the group."""
@@ -250,9 +267,9 @@ def _satellites(
 
     out: list[GroupMember] = []
     sides = list(rng.permutation([1, -1]))
-    seats = _seats(host, count, host.v > 0, rng) if satellite.relation == "around" else []
+    seats = _seats(host, count, host.v > 0) if satellite.relation == "around" else []
     for k in range(len(seats) or count):
-        piece, gap = draw(satellite.category), float(rng.uniform(*satellite.gap_m))
+        piece, gap = draw(satellite.category, satellite.role), float(rng.uniform(*satellite.gap_m))
         width, _, depth = piece.size_m
         if satellite.relation == "beside":
             sign = float(sides[k % 2])
@@ -285,12 +302,15 @@ def _shorter(group: Group, fewer: int) -> tuple[Satellite, ...]:
 
 
 def arrange(name: str, models: Models, rng: np.random.Generator, fewer: int = 0) -> Arrangement | None:
-    """Choose models for a group and stand them against each other; return None without a model of its anchor."""
+    """Choose models for a group and stand them against each other.
+
+    Return None without a model of its anchor, or where fewer pieces than it needs find a place beside each other.
+    """
     group = TABLES.groups.get(name) or Group(name, "anywhere", most=99)
-    if not models.has(group.anchor):
+    if not models.has(group.anchor, group.role):
         return None
     draw = draw_set(models, rng)
-    anchor = draw(group.anchor)
+    anchor = draw(group.anchor, group.role)
     gap = 0.005 if anchor.model.built_in else float(rng.uniform(*WALL_GAP_M))
     turn = 0.0 if anchor.model.built_in else float(rng.normal(0, 0.012))
     turn = float(rng.uniform(-math.pi, math.pi)) if group.at == "anywhere" else turn
@@ -301,10 +321,12 @@ def arrange(name: str, models: Models, rng: np.random.Generator, fewer: int = 0)
     for satellite in _shorter(group, fewer):
         hosts = [p for p in pieces if p.model.category == (satellite.host or group.anchor)]
         count = int(rng.integers(satellite.count[0], satellite.count[1] + 1))
-        if not (hosts and count and models.has(satellite.category) and rng.random() < satellite.share):
+        if not (hosts and count and models.has(satellite.category, satellite.role) and rng.random() < satellite.share):
             continue
         new = _satellites(satellite, count, hosts[0], row, draw, rng)
-        new = [dataclasses.replace(p, needed=satellite.needed) for p in new]
+        if len(new) < satellite.least:
+            return None
+        new = [dataclasses.replace(p, needed=k < satellite.least) for k, p in enumerate(new)]
         pieces += new
         row += new if satellite.relation == "next" else []
     ahead = anchor.v + anchor.half_m[1]

@@ -6,6 +6,7 @@ is then reached is measured, and the piece stays there where that is nearer to t
 
 import dataclasses
 import math
+from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from converters.generate.design.config import SHARE_TOLERANCE, GenerationError, HomeConfig, Range
 from converters.generate.design.plan import Building
 from converters.generate.design.space import rooms_joined, static_grid
-from converters.generate.homes.arrange import TABLES, Arrangement, Group, GroupMember
+from converters.generate.homes.arrange import TABLES, Arrangement, Group, GroupMember, least_of
 from converters.generate.homes.floor import CELL_M, Standing
 from converters.generate.homes.furnish import WIDE_M, Full, Home, clutter_category, furnish_home, settle
 from converters.generate.homes.opening import open_fronts
@@ -96,8 +97,12 @@ class Passages:
         return sum(shares[robot].miss(wanted) for robot, wanted in self.home.cfg.must_push.items())
 
     def light(self) -> list[Standing]:
-        """Return what can be moved: light pieces, seats round tables among them."""
-        return [s for s in self.home.floor.standing if s.item.model.category in TABLES.light]
+        """Return what can be moved: light pieces, but none that its group needs."""
+        standing = self.home.floor.standing
+        groups = Counter((s.group, s.room) for s in standing)
+        return [
+            s for s in standing if s.item.model.category in TABLES.light and groups[s.group, s.room] > least_of(s.group)
+        ]
 
     def trial(self, change: Callable[[], bool]) -> bool:
         """Keep a change of what stands where if it brings the shares nearer to the wanted ranges; undo it otherwise."""

@@ -96,6 +96,8 @@ class Floor:
         self.glass = np.zeros(self.shape, bool)
         for box in plan.windows:
             self.glass[self.cells(box.rect.grown(WINDOW_STRIP_M, WINDOW_STRIP_M))] = True
+        self.bare = self.glass.copy()
+        """Before windows without a radiator."""
         self.standing: list[Standing] = []
 
     def cells(self, rect: Rect) -> tuple[slice, slice]:
@@ -134,6 +136,10 @@ class Floor:
         piece = Standing(item, room, group, window, shadow, below)
         self.standing.append(piece)
         self.cover(piece, 1)
+        if item.model.category == "radiator":
+            for zone in (box.rect.grown(WINDOW_STRIP_M, WINDOW_STRIP_M) for box in self.plan.windows):
+                if item.footprint.intersects(zone.polygon):
+                    self.bare[self.cells(zone)] = False
         return piece
 
     def cover(self, piece: Standing, by: int) -> None:
@@ -176,7 +182,7 @@ class Floor:
         rows, columns = self.cells(self.plan.rooms[room])
         window = slice(max(rows.start - 8, 0), rows.stop + 8), slice(max(columns.start - 8, 0), columns.stop + 8)
         layers = {"wall": self.room[window] != room, "taken": self.covered[window] > 0}
-        layers |= {name: getattr(self, name)[window] for name in ("kept", "front", "glass", "swept")}
+        layers |= {name: getattr(self, name)[window] for name in ("kept", "front", "glass", "bare", "swept")}
         sums = {k: np.pad(layer.cumsum(0, dtype=np.int32).cumsum(1), ((1, 0), (1, 0))) for k, layer in layers.items()}
         return np.array([window[1].start, window[0].start]) * CELL_M + self.low, sums
 
@@ -234,11 +240,11 @@ class Floor:
         return fits
 
     def before_window(self, arrangement: Arrangement, places: Places, room: int) -> np.ndarray:
-        """Return (n,) the share of the anchor's width that stands before a window."""
+        """Return (n,) the share of the anchor's width that stands before a window without a radiator."""
         low, sums = self._room_sums(room)
         half = arrangement.pieces[0].half_m[0]
         strip = np.array([-half, 0.0, half, WINDOW_STRIP_M - 2 * CELL_M])
-        return self.hindered(strip, places, low, sums["glass"]) * CELL_M**2 / (2 * half * strip[3])
+        return self.hindered(strip, places, low, sums["bare"]) * CELL_M**2 / (2 * half * strip[3])
 
     # -- whether one still gets through ---------------------------------
 

@@ -30,6 +30,10 @@ REDRAWS = 3
 """Times that a group is drawn anew, with other models, before it is left out; rows get shorter too."""
 FEWEST = 4
 """Pieces that a row may do without."""
+ALIKE, IN_ROWS = 2, ("counter", "door", "radiator")
+"""A model that stands so often is not drawn again, of other categories than these; a group has several alike."""
+BATHS = ("tub", "shower")
+"""A home with a bathroom has one of these."""
 MOST_BASES = 3
 """Times that a plan's rooms are furnished until each has what it needs."""
 NEEDS_FROM = 0.2
@@ -64,6 +68,13 @@ class Home:
         """Return the radius of the disc that gets to every room with the furniture as it stands."""
         return self.cfg.shell.robot_radius_m + 0.02
 
+    def fresh(self) -> Models:
+        """Return the models, without those that stand in the home as often as people have the same thing."""
+        models = (s.item.model for s in self.floor.standing)
+        stand = Counter(m.name for m in models if m.category not in IN_ROWS)
+        self.models.spent = {name for name, count in stand.items() if count >= ALIKE}
+        return self.models
+
     def count(self, group: str, room: int) -> int:
         """Return how many anchors of a group stand in a room."""
         return sum(s.group == group and s.room == room for s in self.floor.standing)
@@ -79,12 +90,15 @@ class Home:
         return True
 
     def lacking(self) -> str:
-        """Return the first room without what it needs, and what that is; empty where there is none."""
+        """Return the first room without what it needs, or the lack of a bath; empty where all is there."""
         for room, use in enumerate(self.uses):
             have = {s.item.model.category for s in self.floor.standing if s.room == room}
             without = [c for c in TABLES.rooms[use].needs if self.models.has(c) and c not in have]
             if without:
                 return f"the {use} of {self.plan.rooms[room].area_m2:.1f} m2 has no place for: {', '.join(without)}"
+        baths = [c for c in BATHS if self.models.has(c)]
+        if baths and "bathroom" in self.uses and not any(s.item.model.category in baths for s in self.floor.standing):
+            return f"no bathroom has a place for: {' or '.join(baths)}"
         return ""
 
 
@@ -165,10 +179,10 @@ def try_group(home: Home, name: str, room: int, radius_m: float) -> bool:
     rows = any(s.relation == "next" for s in TABLES.groups[name].satellites) if name in TABLES.groups else False
     most = home.cfg.furniture_share + SHARE_TOLERANCE / 2
     for fewer in range(FEWEST + 1 if rows else REDRAWS if name in TABLES.groups else 1):
-        arrangement = arrange(name, home.models, home.rng, fewer if rows else 0)
+        arrangement = arrange(name, home.fresh(), home.rng, fewer if rows else 0)
         arrangement = arrangement and _few(home, arrangement, room)
         if arrangement is None:
-            return False
+            continue
         area_m2 = sum(p.size_m[0] * p.size_m[2] for p in arrangement.pieces)
         more = area_m2 / (home.floor.floor_cells * CELL_M**2)
         if home.floor.share + more <= most and settle(home, name, arrangement, room, radius_m):
@@ -181,7 +195,7 @@ def _room_set(home: Home, room: int) -> RoomSet:
     use = home.uses[room]
     chosen = TABLES.rooms[use]
     if use == "living" and "dining" not in home.uses:
-        return dataclasses.replace(chosen, base=(chosen.base[0], ("dining table", 0.7), *chosen.base[1:]))
+        return dataclasses.replace(chosen, base=(chosen.base[0], ("dining table", 0.9), *chosen.base[1:]))
     if use == "living" and len(home.uses) <= 2:
         return dataclasses.replace(chosen, base=(("bed", 1.0), *chosen.base))
     return chosen
@@ -197,10 +211,9 @@ def stand_base(home: Home) -> None:
                 name, share = sets[room].base[level]
                 if rng.random() < share:
                     _ = try_group(home, name, int(room), WIDE_M) or try_group(home, name, int(room), home.narrow_m)
-    for _ in home.plan.windows:
-        for room in range(len(sets)):
-            near = home.plan.rooms[room].grown(0.3, 0.3)
-            if home.count("radiator", room) < sum(w.rect.overlaps(near) for w in home.plan.windows):
+    for window in home.plan.windows:
+        for room, rect in enumerate(home.plan.rooms):
+            if home.uses[room] != "bathroom" and window.rect.overlaps(rect.grown(0.3, 0.3)):
                 try_group(home, "radiator", room, home.narrow_m)
 
 
@@ -215,7 +228,8 @@ def stand_clutter(home: Home) -> None:
 
 def clutter_category(home: Home, room: int) -> str | None:
     """Draw a category of what lies about in a room; return None where there are no models of any."""
-    odds = [(c, w) for c, w in TABLES.rooms[home.uses[room]].clutter if home.models.has(c) and home.takes([c], room)]
+    models, table = home.fresh(), TABLES.rooms[home.uses[room]].clutter
+    odds = [(c, w) for c, w in table if models.has(c) and home.takes([c], room)]
     if not odds:
         return None
     weights = np.array([w for _, w in odds])
@@ -279,7 +293,8 @@ def furnish_home(plan: Plan, uses: list[str], cfg: HomeConfig, rng: np.random.Ge
                 "door has no room to open; ask for more area or fewer rooms"
             )
         leaves, sweeps = doors
-        home = Home(cfg, plan, uses, Floor(plan, sweeps), Models(cfg.shell.models, cfg.shell.scale_jitter), rng)
+        models = Models(cfg.shell.models, cfg.shell.scale_jitter, home=True)
+        home = Home(cfg, plan, uses, Floor(plan, sweeps), models, rng)
         for leaf, room in leaves:
             home.floor.add(leaf, room, "door")
         stand_base(home)

@@ -3,7 +3,8 @@
 Frame of a CAD model: y up, front along +z (or -z where `front` says so), normalised so that the diagonal of
 the bounding box is 1. Each model is a union of overlapping convex parts, so most are not watertight as a
 whole; parts marked `open` lack their underside, as in many models that people draw. Homes take the packaged library's
-models, with a textured surface, and drawn ones of the kinds that it lacks.
+models, with a textured surface, and drawn ones; each also in other tints: `Scopia/puff~moss` is that pouf in the
+colour of the material moss.
 """
 
 import dataclasses
@@ -11,6 +12,7 @@ import functools
 import hashlib
 import math
 from collections import Counter
+from collections.abc import Set
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +22,10 @@ import shapely
 from converters.generate.models import parts as shapes
 from converters.generate.models.parts import MATERIALS, Part, on_floor
 from converters.geometry.boxes import convex_pieces
-from converters.geometry.faces import stacked
+from converters.geometry.faces import face_vectors, stacked
 from converters.library.store import read_index, read_shape
 from converters.read.annotations import MOST_PIECES, SLACK
+from converters.read.obj import texels
 from converters.records.raw import VisualMesh
 from interactive_nav_common.records import read_packaged
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, transformed, yaw_matrix
@@ -42,6 +45,8 @@ class Drawing:
     """+1: the model faces +z; -1: it faces -z, as some ShapeNet models do."""
     held_out: bool = False
     """Only homes to test in have it."""
+    role: str = ""
+    """What it is for, where that is special, see `looks.yaml`: homes have it only where a group asks for this role."""
 
     def draw(self) -> list[Part]:
         """Return its parts."""
@@ -60,10 +65,32 @@ def _shape(row: list[Any]) -> Any:
 
 
 _TABLES = read_packaged(Path(__file__).with_name("drawings.yaml"), dict[str, dict[str, Drawing]])
+FITTED = {
+    "counter": "kitchen",
+    "sink": "kitchen",
+    "door": "doors",
+    "toilet": "bath",
+    "washbasin": "bath",
+    "tub": "bath",
+}
+"""Category -> what of a home is in one tint."""
 SPARSE: dict[str, Drawing] = _TABLES["sparse"]
 """Model name -> how it is drawn, of what sparse homes have."""
 DRAWN: dict[str, Drawing] = SPARSE | _TABLES["furnished"]
 """The same of all homes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Looks:
+    """Hold the tables of `looks.yaml`."""
+
+    roles: dict[str, tuple[str, ...]]
+    """Role -> models that have it."""
+    tints: dict[str, tuple[str, ...]]
+    """Category -> materials in whose colour its models come too."""
+
+
+LOOKS: Looks = read_packaged(Path(__file__).with_name("looks.yaml"), Looks)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,8 +144,11 @@ def _library_parts(name: str) -> list[Part]:
     return [Part(v, f, material) for v, f in pieces]
 
 
+_ROLE = {name: role for role, names in LOOKS.roles.items() for name in names}
 _PACKAGED = {name: Drawing(model.category, held_out=model.split == "test") for name, model in read_index().items()}
-LIBRARY: dict[str, Drawing] = DRAWN | _PACKAGED
+LIBRARY: dict[str, Drawing] = {
+    name: dataclasses.replace(drawing, role=_ROLE.get(name, "")) for name, drawing in (DRAWN | _PACKAGED).items()
+}
 """Model name -> how it is drawn."""
 
 TEST_MODELS = (
@@ -132,13 +162,11 @@ TRAIN_MODELS = tuple(name for name in SPARSE if name not in TEST_MODELS)
 
 
 def _home_models(test: bool) -> tuple[str, ...]:
-    """Return the library's models of a split, and drawn ones of the kinds that it lacks there."""
+    """Return the library's models of a split and those drawn for homes, and sparse homes' of the kinds it lacks."""
     packaged = {name: d for name, d in _PACKAGED.items() if d.held_out == test}
     have = {d.category for d in packaged.values()}
-    return (
-        *packaged,
-        *(n for n, d in DRAWN.items() if d.category not in have and (d.held_out or n in TEST_MODELS) == test),
-    )
+    drawn = {n: d for n, d in DRAWN.items() if (d.held_out or n in TEST_MODELS) == test}
+    return (*packaged, *(n for n, d in drawn.items() if n not in SPARSE or d.category not in have))
 
 
 HOME_TEST_MODELS, HOME_TRAIN_MODELS = _home_models(test=True), _home_models(test=False)
@@ -153,6 +181,9 @@ def cad_model(name: str) -> CadModel:
 
     The CAD origin is a little off the box centre, by an amount that depends on the name: ShapeNet's models are so too.
     """
+    plain, _, tint = name.partition("~")
+    if tint:
+        return _tinted(cad_model(plain), tint)
     drawing = LIBRARY[name]
     parts = _library_parts(name) if name in _PACKAGED else drawing.draw()
     parts = parts if name in SPARSE or name in _PACKAGED else on_floor(parts)
@@ -162,7 +193,7 @@ def cad_model(name: str) -> CadModel:
     points = np.concatenate([p.vertices for p in parts])
     low, high = points.min(axis=0), points.max(axis=0)
     unit_m = float(np.linalg.norm(high - low))
-    digest = hashlib.sha256(f"interactive-nav generated CAD {name} 1".encode()).hexdigest()
+    digest = _digest(name)
     shift = (np.frombuffer(bytes.fromhex(digest)[:3], np.uint8) / 255 - 0.5) * 0.06
     move = -(low + high) / 2 / unit_m + np.round(shift, 4)
     scaled = tuple(dataclasses.replace(p, vertices=np.round(p.vertices / unit_m + move, 6)) for p in parts)
@@ -175,27 +206,87 @@ def cad_model(name: str) -> CadModel:
     )
 
 
+ALIKE = 0.25
+"""Colours whose channels, brightness aside, lie this near to a surface's main colour belong to what is tinted."""
+
+
+def _digest(name: str) -> str:
+    return hashlib.sha256(f"interactive-nav generated CAD {name} 1".encode()).hexdigest()
+
+
+def _tinted(model: CadModel, tint: str) -> CadModel:
+    """Return a model whose main material, or main colour of its texture, is another material; it is another model."""
+    name = f"{model.name}~{tint}"
+    if (surface := model.surface) is None:
+        area = dict.fromkeys((part.material for part in model.parts), 0.0)
+        for part in model.parts:
+            area[part.material] += float(np.linalg.norm(face_vectors(part.vertices, part.faces), axis=1).sum())
+        main = max(area, key=lambda material: area[material])
+        parts = tuple(dataclasses.replace(p, material=tint if p.material == main else p.material) for p in model.parts)
+        return dataclasses.replace(model, name=name, id_cad=_digest(name)[:32], parts=parts)
+    image = _painted(surface, np.array(MATERIALS[tint]))
+    return dataclasses.replace(
+        model, name=name, id_cad=_digest(name)[:32], surface=dataclasses.replace(surface, image=image)
+    )
+
+
+def _painted(surface: VisualMesh, colour: np.ndarray) -> np.ndarray:
+    """Return a surface's image with its main colour, in all its shades, turned into another (3,) in 0..1."""
+    area = np.linalg.norm(face_vectors(surface.vertices, surface.faces), axis=1)
+    shown, of = np.unique(texels(surface.image, surface.uv[surface.uv_faces].mean(axis=1)), axis=0, return_inverse=True)
+    shown, weight = shown / 255, np.bincount(of.ravel(), area)
+    near = np.linalg.norm(shown[:, None] - shown, axis=2) < ALIKE
+    near = near[np.argmax(near @ weight)]
+    main = np.average(shown[near], axis=0, weights=weight[near])
+    pixels = surface.image / 255
+    bright, usual = pixels.mean(axis=2, keepdims=True), main.mean()
+    shade = (bright - usual) / max(usual, 1 - usual)
+    painted = np.where(shade < 0, colour * (1 + shade), colour + (1 - colour) * shade)
+    off = np.linalg.norm(pixels - bright - (main - usual), axis=2, keepdims=True) + 0.4 * np.abs(bright - usual)
+    share = np.clip(2 - 2 * off / ALIKE, 0, 1)
+    return np.rint(255 * (share * painted + (1 - share) * pixels)).astype(np.uint8)
+
+
+def tints(name: str) -> tuple[str, ...]:
+    """Return a model of `LIBRARY` as it is and in all its tints."""
+    return (name, *(f"{name}~{tint}" for tint in LOOKS.tints.get(LIBRARY[name].category, ())))
+
+
 class Models:
     """Draw CAD models that a building may use, the least drawn first. Mutable, private to one building."""
 
-    def __init__(self, names: tuple[str, ...], jitter: float):
-        """Take keys of `LIBRARY`, each scaled per axis by up to a fraction."""
+    def __init__(self, names: tuple[str, ...], jitter: float, home: bool = False):
+        """Take keys of `LIBRARY`, each scaled per axis by up to a fraction; a `home` has roles and tints."""
         self._jitter, self._drawn = jitter, Counter[str]()
-        self._by_category: dict[str, list[str]] = {}
+        self._fitted: dict[str, str] = {}
+        self.spent: Set[str] = frozenset()
+        """Models that are not drawn any more."""
+        self._models: dict[tuple[str, str], list[str]] = {}
         for name in names:
-            self._by_category.setdefault(LIBRARY[name].category, []).append(name)
+            key = LIBRARY[name].category, LIBRARY[name].role if home else ""
+            self._models.setdefault(key, []).extend(tints(name) if home else [name])
 
-    def has(self, category: str) -> bool:
+    def _left(self, category: str, role: str) -> list[str]:
+        return [name for name in self._models.get((category, role), ()) if name not in self.spent]
+
+    def has(self, category: str, role: str = "") -> bool:
         """Return whether there is a model of it."""
-        return category in self._by_category
+        return bool(self._left(category, role))
 
-    def draw(self, category: str, rng: np.random.Generator, among: tuple[str, ...] = ()) -> tuple[CadModel, np.ndarray]:
+    def draw(
+        self, category: str, rng: np.random.Generator, among: tuple[str, ...] = (), role: str = ""
+    ) -> tuple[CadModel, np.ndarray]:
         """Draw a model of a category, or one of those `among` it, and its scale (CAD units -> metres)."""
-        names = among or self._by_category[category]
-        least = min(self._drawn[name] for name in names)
-        names = [name for name in names if self._drawn[name] == least]
+        names = among or self._left(category, role)
+        fitted = self._fitted.get(FITTED.get(category, ""))
+        names = [name for name in names if name.partition("~")[2] == fitted] or names
+        worn = {name: (self._drawn[name.partition("~")[0] + "~"], self._drawn[name]) for name in names}
+        names = [name for name in names if worn[name] == min(worn.values())]
         model = cad_model(names[rng.integers(len(names))])
-        self._drawn[model.name] += 1
+        plain, _, tint = model.name.partition("~")
+        self._drawn.update((plain + "~", model.name))
+        if category in FITTED:
+            self._fitted[FITTED[category]] = tint
         return model, model.unit_m * (1 + rng.uniform(-self._jitter, self._jitter, 3))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 
 from converters.__main__ import main
-from converters.check.pictures import LABEL_PIXELS, PIXELS, camera_axes, model_picture, model_sheet
+from converters.check.pictures import COLUMNS, LABEL_PIXELS, PIXELS, camera_axes, model_picture, model_sheet
 from converters.generate.models.cad import cad_model
 from converters.generate.models.parts import MATERIALS
 
@@ -42,11 +42,11 @@ def test_nearer_parts_hide_those_behind_them():
 
 
 def test_a_sheet_holds_whole_categories_and_single_models(tmp_path, capsys):
-    assert model_sheet(tmp_path / "sheet.png", ["shoe_rack", "fridge_american"]) == 5
+    assert model_sheet(tmp_path / "sheet.png", ["shoe_rack", "fridge_american"]) == 4 * 6 + 1  # racks in six tints
     with Image.open(tmp_path / "sheet.png") as image:
-        assert image.size == (5 * PIXELS, PIXELS + LABEL_PIXELS)
+        assert image.size == (COLUMNS * PIXELS, 4 * (PIXELS + LABEL_PIXELS))
     assert main(["models", "cart", "-o", str(tmp_path / "carts.png")]) == 0
-    assert "carts.png: picture of 4 models" in capsys.readouterr().out.replace("\n", "")
+    assert "carts.png: picture of 24 models" in capsys.readouterr().out.replace("\n", "")
 
 
 def test_a_wrong_name_is_one_line_and_nothing_is_written(tmp_path, capsys):

@@ -14,10 +14,14 @@ from converters.generate.models.cad import (
     HOME_TEST_MODELS,
     HOME_TRAIN_MODELS,
     LIBRARY,
+    LOOKS,
     TEST_MODELS,
     TRAIN_MODELS,
+    Models,
+    _painted,
     cad_model,
     place,
+    tints,
 )
 from converters.generate.models.parts import MATERIALS, bar, box
 from converters.generate.surface.scan import (
@@ -33,6 +37,7 @@ from converters.generate.surface.texture import pack_rows, paint
 from converters.generate.surface.write import write_cad
 from converters.read.annotations import read_cad
 from converters.read.files import SourceFolder
+from converters.records.raw import VisualMesh
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP
 from scenes_mjcf.categories import CATEGORIES
 
@@ -80,13 +85,77 @@ def test_held_out_models_are_apart_and_cover_all_categories_of_sparse_homes():
     assert len({cad_model(n).id_cad for n in LIBRARY}) == len(LIBRARY)
 
 
-def test_homes_take_drawn_models_only_of_kinds_that_the_library_lacks():
+def test_homes_take_what_sparse_homes_have_only_of_kinds_that_the_library_lacks():
     assert set(HOME_TRAIN_MODELS).isdisjoint(HOME_TEST_MODELS)
-    for names, lacking in ((HOME_TRAIN_MODELS, {"fridge_combined"}), (HOME_TEST_MODELS, {"stove_range"})):
+    for names, own in ((HOME_TRAIN_MODELS, "plant_snake"), (HOME_TEST_MODELS, "plant_monstera")):
         packaged = {LIBRARY[n].category for n in names if "/" in n}
-        drawn = {LIBRARY[n].category for n in names if "/" not in n}
-        assert packaged.isdisjoint(drawn) and "door" in drawn and {"chair", "sofa", "bed", "table"} <= packaged
-        assert lacking <= set(names)
+        sparse = {LIBRARY[n].category for n in names if n in (*TRAIN_MODELS, *TEST_MODELS)}
+        assert packaged.isdisjoint(sparse) and "door" in sparse and {"chair", "sofa", "bed", "table"} <= packaged
+        assert own in names
+
+
+@pytest.mark.parametrize("name", ["Scopia/puff", "Scopia/armchair2", "bag_tote", "plant_snake"])
+def test_a_tint_is_the_same_model_in_another_colour(name):
+    model, tinted = cad_model(name), cad_model(f"{name}~navy")
+    assert tinted.name == f"{name}~navy" and tinted.id_cad != model.id_cad and tinted.unit_m == model.unit_m
+    for part, other in zip(model.parts, tinted.parts, strict=True):
+        np.testing.assert_array_equal(part.vertices, other.vertices)
+    if tinted.surface is None:
+        changed = {(a.material, b.material) for a, b in zip(model.parts, tinted.parts, strict=True)}
+        main = {"bag_tote": "linen", "plant_snake": "ceramic"}[name]
+        assert (main, "navy") in changed and all(a == b for a, b in changed - {(main, "navy")})
+    else:
+        assert model.surface is not None
+        image = tinted.surface.image.reshape(-1, 3).astype(float)
+        hue = np.array(MATERIALS["navy"]) / np.linalg.norm(MATERIALS["navy"])
+        like = image @ hue / np.maximum(np.linalg.norm(image, axis=1), 1)
+        assert np.mean(like > 0.98) > 0.4  # its cloth; other parts stay as they are
+        assert cad_model(f"{name}~navy").surface is tinted.surface
+
+
+def test_a_tint_keeps_legs_and_shades():
+    # A grey square of two shades with a red leg, turned blue: light stays lighter than dark, red stays.
+    image = np.full((2, 4, 3), 120, np.uint8)
+    image[:, 1], image[:, 3] = 140, (200, 20, 20)
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    uv = np.array([[0.1, 0.5], [0.35, 0.5], [0.6, 0.5], [0.9, 0.5]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 1, 2], [0, 1, 1]])
+    surface = VisualMesh(corners, faces, uv, np.array([[0] * 3, [1] * 3, [2] * 3, [3] * 3]), image)
+    painted = _painted(surface, np.array([0.1, 0.2, 0.6]))
+    assert (painted[:, 3] == image[:, 3]).all() and (painted[:, 1] > painted[:, 0]).all()
+    np.testing.assert_allclose(painted[0, 0] / 255, [0.1, 0.2, 0.6], atol=0.06)
+
+
+def test_tints_and_roles_name_what_there_is():
+    assert {m for names in LOOKS.tints.values() for m in names} <= set(MATERIALS)
+    assert set(LOOKS.tints) <= set(CATEGORIES)
+    assert {n for names in LOOKS.roles.values() for n in names} <= set(LIBRARY)
+
+
+def test_homes_have_six_models_of_each_of_the_commonest_categories():
+    # Of 43 homes, commonest first.
+    common = (
+        *("radiator", "chair", "door", "counter", "plant", "bag", "bin", "stool", "laundry_basket", "nightstand"),
+        *("box", "bed", "bookcase", "suitcase", "wardrobe", "pouf", "armchair", "toilet", "washbasin", "dresser"),
+    )
+    for category in common:
+        assert sum(len(tints(n)) for n in HOME_TRAIN_MODELS if LIBRARY[n].category == category) >= 6, category
+
+
+def test_models_of_a_home_are_apart_by_role_and_what_is_spent_is_not_drawn():
+    rng, models = np.random.default_rng(0), Models(HOME_TRAIN_MODELS, 0.0, home=True)
+    drawn = [models.draw("chair", rng, role="office")[0].name for _ in range(24)]
+    assert {name.partition("~")[0] for name in drawn} == {"Scopia/office_chair", "Scopia/tubular_chair"}
+    assert len(set(drawn)) >= 10
+    plain = {models.draw("chair", rng)[0].name.partition("~")[0] for _ in range(60)}
+    assert len(plain) > 15 and not plain & {n for names in LOOKS.roles.values() for n in names}
+    models.spent = {"bag_tote", *tints("bag_backpack")}
+    bags = {models.draw("bag", rng)[0].name for _ in range(40)}
+    assert "bag_tote" not in bags and {n.partition("~")[0] for n in bags} == {"bag_tote", "BlendSwap-CC-0/handbag"}
+    assert models.has("table", "bar") and not Models(HOME_TRAIN_MODELS, 0.0).has("table", "bar")
+    tint = models.draw("counter", rng)[0].name.partition("~")[2]
+    assert {models.draw("counter", rng)[0].name.partition("~")[2] for _ in range(8)} == {tint}
+    assert models.draw("sink", rng)[0].name.partition("~")[2] == tint
 
 
 def test_a_library_model_is_written_with_its_texture_and_its_hulls(tmp_path):
