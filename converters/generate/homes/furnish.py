@@ -1,6 +1,7 @@
 """Furnish a home's plan: what each room's use demands first, then more until it is full enough."""
 
 import dataclasses
+import itertools
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ from converters.generate.homes.arrange import (
     Arrangement,
     GroupMember,
     RoomSet,
+    apart,
     arrange,
     on_floor,
     stand,
@@ -133,7 +135,11 @@ def settle(home: Home, name: str, arrangement: Arrangement, room: int, radius_m:
     """Stand a group in the best place where it fits and the disc still gets round; return whether there is one."""
     floor, rng = home.floor, home.rng
     ranked = []
-    for way in (arrangement, arrangement.mirrored()):
+    # Models are not quite alike on both sides: what just fits under a table may touch it where all is mirrored.
+    mirrored = arrangement.mirrored()
+    loose = [stand(p, np.zeros(2), math.pi / 2) for p in mirrored.pieces if not p.model.built_in]
+    both = all(apart(a, b) for a, b in itertools.combinations(loose, 2))
+    for way in (arrangement, mirrored) if both else (arrangement,):
         places = floor.places(way, room, rng)
         fits = floor.fitting(way, room, places)
         needed = np.array([k == 0 or p.needed for k, p in enumerate(way.pieces)])
