@@ -6,7 +6,6 @@ charts already. Faces are one-sided, counter-clockwise from their visible side.
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -17,7 +16,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import cKDTree
 
 from converters.generate.design.plan import Rect
-from converters.generate.models.cad import cad_model
+from converters.generate.models.cad import CadModel
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.finishes import Colouring, finishes
 from converters.generate.surface.scan import Scan, smooth_noise
@@ -132,10 +131,8 @@ def _light(points: np.ndarray, normals: np.ndarray, lamp: np.ndarray, rng: np.ra
     return light * (1 + 0.03 * smooth_noise(points, 0.8, rng))
 
 
-@functools.cache
-def _coloured(name: str) -> tuple[cKDTree, np.ndarray]:
+def _coloured(model: CadModel) -> tuple[cKDTree, np.ndarray]:
     """Return points of a library model's surface, CAD frame, and the colour (n, 3) of each in 0..1."""
-    model = cad_model(name)
     surface = model.surface
     assert surface is not None
     mesh = TexturedMesh(surface.vertices, surface.faces, surface.uv[surface.uv_faces], surface.image)
@@ -186,10 +183,12 @@ def paint(
     # Points of a library model take the colour of the model's nearest point.
     items = {id(s.item): s.item for s in scan.solids if s.item is not None and s.item.model.surface is not None}
     of = np.array([id(s.item) for s in scan.solids])[solid]
-    order = np.argsort(of, kind="stable")
+    order, coloured = np.argsort(of, kind="stable"), {}
     for key, item in items.items():
         here = order[np.searchsorted(of[order], key) : np.searchsorted(of[order], key, "right")]
-        tree, colours = _coloured(item.model.name)
+        if id(item.model) not in coloured:
+            coloured[id(item.model)] = _coloured(item.model)
+        tree, colours = coloured[id(item.model)]
         in_cad = (points[here] - item.matrix[:3, 3]) @ np.linalg.inv(item.matrix[:3, :3]).T
         colour[here] = colours[tree.query(in_cad)[1]]
     lamp = np.column_stack([centres, np.full(len(rooms), 2.2)])[room]
