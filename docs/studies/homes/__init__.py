@@ -71,9 +71,12 @@ def home_counts(plan: Plan, uses: Sequence[str], items: Sequence[Instance]) -> C
     of = {c: [i for i in items if i.model.category == c] for c in {i.model.category for i in items}}
     out = Counter({"homes": 1, "no bath or shower": not ({"tub", "shower"} & set(of))})
 
-    def use(item: Instance) -> str:
+    def room(item: Instance) -> int:
         at = shapely.Point(item.footprint.centroid)
-        return uses[min(range(len(uses)), key=lambda k: plan.rooms[k].polygon.distance(at))]
+        return min(range(len(uses)), key=lambda k: plan.rooms[k].polygon.distance(at))
+
+    def use(item: Instance) -> str:
+        return uses[room(item)]
 
     tables = [t for t in of.get("table", []) if role(t) != "bar"]
     chairs = seats_at(tables, (c for c in of.get("chair", []) if not role(c)))
@@ -91,7 +94,9 @@ def home_counts(plan: Plan, uses: Sequence[str], items: Sequence[Instance]) -> C
         out["roles misplaced"] += wrong
     heaters = of.get("radiator", [])
     out["radiator pairs"] = sum(
-        abs(math.sin(a.yaw_rad - b.yaw_rad)) < 0.5 and a.footprint.distance(b.footprint) < BESIDE_M
+        room(a) == room(b)
+        and abs(math.sin(a.yaw_rad - b.yaw_rad)) < 0.5
+        and a.footprint.distance(b.footprint) < BESIDE_M
         for k, a in enumerate(heaters)
         for b in heaters[:k]
     )

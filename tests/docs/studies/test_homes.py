@@ -1,22 +1,16 @@
 """Counts of homes: 0 in two homes and twenty plans, and not in what is put wrong by hand."""
 
 import dataclasses
-import functools
 import math
 
 import numpy as np
 
-from converters.generate import Building, design_building
 from converters.generate.design.config import home_config
 from converters.generate.design.plan import Doorway
 from converters.generate.homes.plans import home_plan
 from converters.generate.models.cad import Instance, cad_model, place
 from docs.studies.homes import WRONG, home_counts, plan_counts, seats_at
-
-
-@functools.cache
-def homes() -> tuple[Building, ...]:
-    return tuple(design_building(seed, home_config("furnished", {})) for seed in (720_001, 720_007))
+from tests.converters.generate.test_homes import several
 
 
 def at(name: str, xy, facing_rad: float = 0.0) -> Instance:
@@ -25,8 +19,8 @@ def at(name: str, xy, facing_rad: float = 0.0) -> Instance:
 
 
 def test_nothing_is_wrong_in_two_homes_and_twenty_plans():
-    for home in homes():
-        counts = home_counts(home.plan, home.uses, (*home.items, *home.plan.built_in))
+    for home in several()[:2]:
+        counts = home_counts(home.plan, home.uses, [s.item for s in home.floor.standing])
         assert {name: counts[name] for name in WRONG if counts[name]} == {}
         assert counts["homes"] == 1 and counts["cartons"] <= 4
     shell = home_config("furnished", {}).shell
@@ -36,7 +30,7 @@ def test_nothing_is_wrong_in_two_homes_and_twenty_plans():
 
 
 def test_what_is_put_wrong_in_a_home_is_counted():
-    plan, uses = homes()[0].plan, homes()[0].uses
+    plan, uses = several()[0].plan, several()[0].uses
     living, bath = (np.array(plan.rooms[uses.index(use)].centre) for use in ("living", "bathroom"))
     table, aside = at("Scopia/table4", living), at("BlendSwap-CC-0/oakTable", living + [0, 30])
     chairs = [at("Scopia/chair4", living + [0, way * 0.7], -way * math.pi / 2) for way in (1, -1)]
@@ -61,7 +55,7 @@ def test_what_is_put_wrong_in_a_home_is_counted():
 
 
 def test_what_is_put_wrong_in_a_plan_is_counted():
-    plan, uses = homes()[0].plan, homes()[0].uses
+    plan, uses = several()[0].plan, several()[0].uses
     blind = plan_counts(dataclasses.replace(plan, windows=(), entrance=None), uses)
     wanted = sum(use in ("living", "bedroom", "kitchen") for use in uses)
     assert blind["windowless"] == wanted and blind["no front door"] == 1
