@@ -123,7 +123,8 @@ def stance(name: str) -> tuple[float, float]:
 def test_a_model_stands_on_the_floor_has_its_categorys_size_and_few_parts(name):
     drawing = LIBRARY[name]
     drawn = on_floor(drawing.draw())
-    assert name.startswith(f"{drawing.category}_") and 2 < len(drawn) <= 40
+    most = 100 if name == "shelf_builtin" else 40  # with its books
+    assert name.startswith(f"{drawing.category}_") and 2 < len(drawn) <= most
     lowest = min(p.vertices[:, 1].min() for p in drawn)
     assert 0 <= lowest < 0.003
     size_m = np.ptp(np.concatenate([p.vertices for p in parts_m(name)]), axis=0)
@@ -133,7 +134,7 @@ def test_a_model_stands_on_the_floor_has_its_categorys_size_and_few_parts(name):
 
 def test_every_category_is_there_for_training_and_held_out():
     assert set(HOME_TRAIN_MODELS).isdisjoint(HOME_TEST_MODELS)
-    small = {"basket", "shoe", "pot", "toy", "other"}
+    small = {"basket", "shoe", "pot", "toy", "other", "cabinet_door", "drawer"}  # the last two are cut out of others
     built_in = {c.name for c in CATEGORIES.values() if not c.is_object} - {"structure", "robot"}
     assert len(built_in) == 12
     for names in (HOME_TRAIN_MODELS, HOME_TEST_MODELS):
