@@ -5,7 +5,7 @@ SHELL := /bin/bash
 
 PYTHON3 ?= python3
 PY := .venv/bin/python
-SEED ?= 5
+SEED ?= 6
 EPISODES ?= 200
 DEMO := demo
 say = @printf '\n\033[1m== %s\033[0m\n'

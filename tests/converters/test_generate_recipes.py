@@ -342,3 +342,24 @@ def test_a_blocker_leaves_a_doorway_too_narrow_for_a_robot():
         assert passes(clearance(empty & here, GRID_M), masks, width)
         blocked += any(not passes(clearance(without(empty, [c]) & here, GRID_M), masks, width) for c in chairs)
     assert blocked >= recipe.building.n_blockers == 1
+
+
+def test_a_home_of_a_seed_that_gives_none_is_another_seeds_and_says_so(tmp_path, monkeypatch, capsys):
+    from converters import generate
+
+    tried: list[int] = []
+
+    def refuse(folder, seed, report, config):
+        tried.append(seed)
+        if len(tried) < 3:
+            raise GenerationError(f"seed {seed}: no room" if tried[0] < 9 else "OUT is there")
+
+    monkeypatch.setattr(generate, "generate_building", refuse)
+    assert main(["generate", str(tmp_path / "a"), "--seed", "5", "--tier", "furnished"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert tried == [5, 1_000_005, 2_000_005] and "building of seed 2000005 in place of 5: no room; convert" in printed
+    tried.clear()
+    assert main(["generate", str(tmp_path / "a"), "--seed", "5"]) == 2 and tried == [5]  # of a sparse building
+    tried.clear()
+    assert main(["generate", str(tmp_path / "a"), "--seed", "9", "--tier", "furnished"]) == 2 and tried == [9]
+    assert "OUT is there" in capsys.readouterr().err
