@@ -53,7 +53,8 @@ def plan_counts(plan: Plan, uses: Sequence[str]) -> Counter[str]:
 
 def role(item: Instance) -> str:
     """Return the role of a piece's model, empty where it has none."""
-    return LIBRARY[item.model.name.partition("~")[0]].role
+    plain = item.model.name.partition("#")[0].partition("~")[0]  # of a front that opens, and of a tint
+    return LIBRARY[plain].role
 
 
 def seats_at(tables: Sequence[Instance], seats: Iterable[Instance]) -> list[list[Instance]]:
