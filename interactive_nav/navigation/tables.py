@@ -70,8 +70,10 @@ def friction_share(world: World, index: int) -> np.ndarray:
 
 
 def round_tables(world: World, tables: SceneTables, rules: TaskRules, limit: float) -> SceneTables:
-    """Return the tables with shortest paths that also go round furniture at rest of more than this `friction_share`;
-    what hangs on a hinge or slides is no obstacle."""
+    """Return the tables with shortest paths that also avoid furniture at rest of more than this `friction_share`.
+
+    Doors, drawers and other bodies on a hinge or slide are not obstacles.
+    """
     fine, held = rules.nav_cell_m / FINE_CELLS, world.slots.held
 
     def graph(index: int) -> CornerGraph:

@@ -184,6 +184,16 @@ def snap(value: float) -> float:
     return round(value / CM) * CM
 
 
+def draw_outline(area_m2: float, rng: np.random.Generator) -> Rect:
+    """Draw a rectangle of this area, up to 1.6 times as long as wide, whose middle is near the origin."""
+    aspect = rng.uniform(1.0, 1.6)
+    width, depth = snap(np.sqrt(area_m2 * aspect)), snap(np.sqrt(area_m2 / aspect))
+    if rng.random() < 0.5:
+        width, depth = depth, width
+    x0, y0 = snap(-width / 2 + rng.uniform(-0.7, 0.7)), snap(-depth / 2 + rng.uniform(-0.7, 0.7))
+    return Rect(x0, y0, snap(x0 + width), snap(y0 + depth))
+
+
 Wall = tuple[int, Rect]
 """The axis along which a stretch of wall is thin, and its footprint."""
 

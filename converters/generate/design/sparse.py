@@ -17,6 +17,7 @@ from converters.generate.design.plan import (
     Wall,
     cut,
     doorway_zone,
+    draw_outline,
     place_doorway,
     shared_wall,
     snap,
@@ -29,17 +30,11 @@ def _layout(cfg: BuildingConfig, rng: np.random.Generator) -> tuple[Rect, list[R
     """Draw rooms and inner walls once; the caller checks the rooms."""
     n, spread = int(rng.integers(cfg.n_rooms[0], cfg.n_rooms[1] + 1)), 0.1
     weights = (1.0,) * n
-    area = rng.uniform(*cfg.floor_area_m2)
-    aspect = rng.uniform(1.0, 1.6)
-    width, depth = snap(np.sqrt(area * aspect)), snap(np.sqrt(area / aspect))
-    if rng.random() < 0.5:
-        width, depth = depth, width
-    x0, y0 = snap(-width / 2 + rng.uniform(-0.7, 0.7)), snap(-depth / 2 + rng.uniform(-0.7, 0.7))
-    inside = Rect(x0, y0, snap(x0 + width), snap(y0 + depth))
+    inside = draw_outline(rng.uniform(*cfg.floor_area_m2), rng)
     if n < cfg.corridor_from_rooms:
         rooms, walls = split(inside, weights, spread, cfg, rng)
         return inside, rooms, walls, None
-    across = int(width >= depth)
+    across = int(inside.size[0] >= inside.size[1])
     thick = snap(rng.uniform(*cfg.wall_thickness_m))
     clear = snap(cfg.corridor_width_m)
     n_low = (n - 1) // 2

@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 
 from converters.generate.design.config import BuildingConfig
-from converters.generate.design.plan import CM, Rect, Wall, cut, snap, split
+from converters.generate.design.plan import CM, Rect, Wall, cut, draw_outline, snap, split
 
 SPREAD = 0.06
 """A cut is up to this share of the side away from where the weights have it."""
@@ -128,12 +128,7 @@ def lay_out(
     if form != "rectangle":
         wing = 1 if rng.random() < 0.6 else 2
     main_m2 = area_m2 * sum(weights[wing:]) / sum(weights)
-    aspect = rng.uniform(1.0, 1.6)
-    width, depth = snap(math.sqrt(main_m2 * aspect)), snap(math.sqrt(main_m2 / aspect))
-    if rng.random() < 0.5:
-        width, depth = depth, width
-    x0, y0 = snap(-width / 2 + rng.uniform(-0.7, 0.7)), snap(-depth / 2 + rng.uniform(-0.7, 0.7))
-    main = Rect(x0, y0, snap(x0 + width), snap(y0 + depth))
+    main = draw_outline(main_m2, rng)
     if wing:
         attached = _wing(main, area_m2 - main_m2, form, cutter.thick(), rng)
         if attached is None:

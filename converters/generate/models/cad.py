@@ -46,7 +46,7 @@ class Drawing:
     held_out: bool = False
     """Only homes to test in have it."""
     role: str = ""
-    """What it is for, where that is special, see `looks.yaml`: homes have it only where a group asks for this role."""
+    """Key of `roles` in `looks.yaml`, such as `office`: homes use the model only in groups that request the role."""
 
     def draw(self) -> list[Part]:
         """Return its parts."""
