@@ -281,7 +281,7 @@ def given() -> dict[str, Target]:
     from tests.train.toy_run import toy_config
     from train import config_io
     from train.figures import tables
-    from train.figures.cli import Results, chosen_split, figures_of
+    from train.figures.results import Results, chosen_split, figures_of
     from train.scoring.rows import BY_CATEGORY
     from train.sweep import spec
 

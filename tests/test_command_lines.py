@@ -8,6 +8,8 @@ import importlib
 import io
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -62,6 +64,18 @@ def test_help_is_that_of_the_snapshot(program):
     for part in re.split(r"^\$ ", text, flags=re.MULTILINE)[1:]:
         words, body = part.split("\n", 1)
         assert kept[words].rstrip() == body.rstrip(), words
+
+
+@pytest.mark.parametrize("program", ("train", "train.evaluate", "train.sweep", "train.figures", "converters"))
+def test_help_comes_without_what_takes_seconds_to_import(program):
+    script = (
+        f"import importlib.util, runpy, sys; sys.argv = [{program!r}, '--help']\n"
+        f"try: runpy.run_module({program!r}, run_name='__main__', alter_sys=True)\n"
+        "except SystemExit as end: assert not end.code\n"
+        "print('slow:', sorted({'jax', 'mujoco', 'brax', 'flax', 'matplotlib', 'scipy'} & set(sys.modules)))"
+    )
+    printed = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert printed.startswith("usage: ") and printed.endswith("slow: []\n")
 
 
 @pytest.mark.parametrize("command", recorded(ERRORS) if ERRORS.is_file() else [])

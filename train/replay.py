@@ -25,7 +25,8 @@ from scenes_mjcf.sets import installed
 from train.config import EnvConfig
 from train.runs.run import build_env, config_to_play
 from train.runs.run_folder import RunFolder, claim
-from train.scoring.evaluation import POLICIES, SEED, make_policies
+from train.scoring import POLICIES, SEED
+from train.scoring.evaluation import make_policies
 
 
 @dataclasses.dataclass(kw_only=True)

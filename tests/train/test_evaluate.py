@@ -21,11 +21,12 @@ from interactive_nav_common.rows import write_parquet
 from tests.train.toy_run import build_toy, toy_config
 from train import evaluate
 from train.config import RunConfig
-from train.figures import cli, curves
+from train.figures import __main__ as cli
+from train.figures import curves
 from train.runs import checkpoint
 from train.runs.run import train_run
 from train.runs.run_folder import RunFolder, paths_beside
-from train.scoring import evaluation
+from train.scoring import evaluation, session
 from train.scoring.rows import score_table
 
 SPARSE = str(Path(__file__).parents[2] / "scenes_mjcf" / "episodes" / "sparse-turtlebot-test.json.gz")
@@ -51,7 +52,7 @@ def test_nobody_is_asked_to_follow_waypoints_that_are_not_seen(run, tmp_path, mo
         heard.append(asked.policies)
         raise UserError("enough")
 
-    monkeypatch.setattr(evaluate, "evaluate", played)
+    monkeypatch.setattr(session, "evaluate", played)
     words = [str(run.path), "--out", str(tmp_path / "rows.parquet")]
     for more in ([], ["env.observations=[goal]"], ["env.observations=[goal]", "--policies", "follower"]):
         assert evaluate.main(words + more, build_env=build_toy) == 2
@@ -237,7 +238,7 @@ def test_rows_are_never_without_their_paths(run, tmp_path, monkeypatch):
         seen.append((path.is_file(), paths_beside(path).is_file() and paths_beside(path).read_bytes()))
         write_parquet(rows, path, *others)
 
-    monkeypatch.setattr(evaluate, "write_parquet", at_rows)
+    monkeypatch.setattr(session, "write_parquet", at_rows)
     words = [str(run.path), "--policies", "random", "--episodes", "2", "--dataset", str(tmp_path)]
     for record in ("1", "2"):
         assert evaluate.main([*words, "--record", record], build_env=build_toy) == 0

@@ -12,8 +12,10 @@ import pytest
 from interactive_nav_common.figures import BLUE, GREEN
 from interactive_nav_common.rows import write_parquet
 from tests.train.synthetic import baseline_rows, paper_like, run_rows, write_results
-from train.figures import cli, curves, paths, scores, style, tables
-from train.figures.cli import chosen_split
+from train.figures import __main__ as cli
+from train.figures import curves, paths, scores, style, tables
+from train.figures import results as figure_files
+from train.figures.results import chosen_split
 from train.runs.run_folder import paths_beside
 from train.scoring.rows import BY_CATEGORY, COLUMNS
 from train.scoring.statistics import claims
@@ -96,8 +98,8 @@ def test_every_figure_of_a_sweep_is_drawn(results, tmp_path, capsys):
 
 def test_trajectories_side_by_side_are_of_the_same_episodes(results, monkeypatch):
     drawn = []
-    monkeypatch.setattr(cli, "_by_k_int", lambda chosen: drawn.append(chosen))
-    dict(cli.figures_of(results))["trajectories_turtlebot_ppo"]()
+    monkeypatch.setattr(figure_files, "_by_k_int", lambda chosen: drawn.append(chosen))
+    dict(figure_files.figures_of(results))["trajectories_turtlebot_ppo"]()
     (chosen,) = drawn
     assert [path.stem[-8:] for path in chosen.values()] == ["0123abcd"] * 2 and sorted(chosen) == [0.0, 1.0]
 
@@ -105,7 +107,7 @@ def test_trajectories_side_by_side_are_of_the_same_episodes(results, monkeypatch
 def test_what_is_unfinished_is_passed_over(results):
     half = results / "rows" / "_paths" / ".partial-01234567-x.npz"
     half.touch()
-    assert half not in cli.Results(results).records
+    assert half not in figure_files.Results(results).records
     half.unlink()
 
 

@@ -1,8 +1,60 @@
-"""`python -m train.figures`; see `train.figures.cli`."""
+"""Run `python -m train.figures RESULTS_DIR -o figures/`: draw metrics, rows and recorded paths; print tables."""
 
+import dataclasses
 import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
 
-from train.figures.cli import main
+from interactive_nav_common.commands import Command, Flag, option, parse, word
+from interactive_nav_common.errors import FileError, reports_errors
+
+
+@dataclasses.dataclass(kw_only=True)
+class Draw(Command):
+    """Draw what runs have written."""
+
+    results: Annotated[Path, *word("RESULTS_DIR")]
+    """A run folder, a sweep's folder, or a folder of either."""
+    out: Annotated[Path, option("-o", metavar="DIR")] = Path("figures")
+    """Where to."""
+    format: Literal["png", "pdf", "svg"] = "png"
+    """Of the pictures."""
+    split: Literal["auto", "train", "test", "all"] = "auto"
+    """Scenes of a sweep's figures; auto takes test where there are rows of them."""
+    tables: Flag = False
+    """Print Markdown tables of a sweep instead of drawing."""
+
+
+@reports_errors("train.figures")
+def main(argv: Sequence[str] | None = None) -> int:
+    """Draw; return 0 when done, 2 on a user's error."""
+    arguments = parse(Draw, "python -m train.figures", argv)
+    from interactive_nav_common.figures import RC, plt, save  # Matplotlib takes a second: --help does without
+    from train.figures.results import SWEPT, Results, chosen_split, figures_of
+    from train.figures.tables import document
+
+    split = None if arguments.split == "all" else arguments.split
+    if arguments.tables:
+        rows = Results(arguments.results).rows
+        if not set(rows.column_names) >= SWEPT:
+            raise FileError(
+                f"{arguments.results}: no rows of policies; evaluate some first (python -m train.sweep FILE "
+                "--only evaluate, or python -m train.evaluate)"
+            )
+        print(document(rows, chosen_split(rows, split)), end="")
+        return 0
+    drawn = False
+    for name, draw in figures_of(arguments.results, split):
+        path = arguments.out / f"{name}.{arguments.format}"
+        with plt.rc_context(RC):
+            save(draw(), path, arguments.format)
+        print(path)
+        drawn = True
+    if not drawn:
+        raise FileError(f"{arguments.results}: nothing to draw (no rows and no recorded paths); expected a run folder")
+    return 0
+
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -25,13 +25,12 @@ from interactive_nav_common.runs import weights
 from interactive_nav_common.runs.folder import GOES_ON
 from interactive_nav_common.runs.weights import write_state
 from interactive_nav_common.untrusted.reading import read_npz
+from train.runs import STEP
 from train.runs.run_folder import RunFolder
 
 LEARNER, ENV_STATE, META = "learner.msgpack", "env_state.npz", "meta.json"
 POLICY = "policy.safetensors"
 """Holds the policy alone: it acts nearly as the original (docs/results.md says how nearly) and cannot be trained."""
-STEP = 0.5
-"""Step to which large weights are rounded, in standard deviations of an output's weights: about 3 bits a weight."""
 SHOWN = ("algorithm", "robot", "observations", "observation_size", "action_size", "env_steps")
 """Fields of `CheckpointMeta` that a policy's file repeats."""
 

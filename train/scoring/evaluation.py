@@ -23,21 +23,16 @@ from train.runs import checkpoint
 from train.runs.checkpoint import CheckpointMeta
 from train.runs.run import check_fits
 from train.runs.run_folder import EvaluationRequest, RunFolder
+from train.scoring import AUTO_BATCH, LEARNED
 from train.scoring.brought import BroughtPolicy
-from train.scoring.policies import BASELINES, make_baseline
+from train.scoring.policies import make_baseline
 from train.scoring.rows import Paths, PlayedEpisodes, episode_table
 
-LEARNED = "learned"
-POLICIES = (LEARNED, *BASELINES)
-SEED = 1_000_000
-"""Of the fixed episodes where none is given."""
 OF_LEARNED = (
     *("algorithm", "seed", "checkpoint_steps", "deterministic"),
     *("train_env_steps", "train_wall_s", "train_device", "train_commit"),
 )
 """Columns that are empty for a policy that never learned."""
-AUTO_BATCH = {"native": 4096, "jax": 1024, "warp": 4096}
-"""PlayedEpisodes played at a time, per physics backend."""
 
 
 RECORDERS = {

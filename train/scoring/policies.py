@@ -24,6 +24,7 @@ from interactive_nav.robots.spec import RobotSpec, TwistMap
 from interactive_nav.task.rollout import HostPolicy, PolicyFn
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.rotations import wrap_angle
+from train.scoring import PLANNERS, POLICIES
 
 Observation = jax.Array | Mapping[str, jax.Array]
 
@@ -168,7 +169,6 @@ class Planner(HostPolicy):
 
 
 BASELINES: dict[str, Callable[[Any], PolicyFn]] = {"random": make_random, "follower": make_follower}
-PLANNERS = ("avoider", "namo:W")
 """Planners on the host; W is the weight of pushing against detour, 0 to 1."""
 
 
@@ -185,5 +185,5 @@ def make_baseline(name: str, env: Any) -> PolicyFn | Planner:
         except ValueError:
             raise UserError(f"policy namo: got {name!r}, expected a weight, as in namo:0.5") from None
         return Planner(env, share)
-    choices = ", ".join(("learned", *BASELINES, *PLANNERS))
+    choices = ", ".join((*POLICIES, *PLANNERS))
     raise UserError(f"--policies: got {name!r}, expected a choice from {choices}")

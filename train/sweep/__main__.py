@@ -12,7 +12,7 @@ from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.signals import stop_signals
 from train.config_io import preset_names
-from train.runs.checkpoint import STEP
+from train.runs import STEP
 from train.runs.run_folder import claim
 from train.sweep import spec
 from train.sweep.folder import SweepDisplay, SweepFolder, status_table, totals

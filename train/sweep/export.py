@@ -15,8 +15,8 @@ from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import whole_file, writing
 from interactive_nav_common.records import METRICS, PACKED_METRICS, mean_over_episodes, read_metrics, write_metrics
 from interactive_nav_common.rows import read_notes, read_rows, write_parquet
-from train.runs import checkpoint
-from train.runs.checkpoint import STEP, CheckpointError
+from train.runs import STEP, checkpoint
+from train.runs.checkpoint import CheckpointError
 from train.runs.run_folder import PATHS, RunFolder, files_of_run, paths_beside
 from train.scoring.statistics import run_means
 from train.sweep.folder import SweepFolder

@@ -15,7 +15,8 @@ from rich.console import Console
 from interactive_nav.task.rollout import episode_keys, policy_key_of
 from train.runs.run import build_env, config_to_play
 from train.runs.run_folder import RunFolder
-from train.scoring.evaluation import SEED, load_policy
+from train.scoring import SEED
+from train.scoring.evaluation import load_policy
 
 _GAP_PX, _LABEL_PX, _FONT_PX = 4, 34, 13
 WIDTH_PX = 760

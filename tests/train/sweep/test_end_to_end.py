@@ -7,7 +7,7 @@ import yaml
 
 from interactive_nav_common.rows import read_rows
 from tests.toys import write_room
-from train.figures import cli
+from train.figures import __main__ as cli
 from train.sweep.__main__ import main
 
 pytestmark = pytest.mark.slow

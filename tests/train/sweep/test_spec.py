@@ -14,6 +14,7 @@ from interactive_nav_common.errors import ConfigError
 from scenes_mjcf import sets
 from train import evaluate
 from train.config_io import preset_names
+from train.scoring import session
 from train.sweep import spec
 from train.sweep.__main__ import main
 from train.sweep.folder import SweepFolder, words_of_evaluation
@@ -163,7 +164,7 @@ def test_fixed_episodes_of_each_run_s_robot_are_played(monkeypatch):
     given = [word for flag, word in itertools.pairwise(words) if flag == "--episode-file"]
     assert given == [name.replace("{robot}", "fetch") for name in files]
     understood = parse(evaluate.Evaluate, "tool", words[3:])
-    played, digest = evaluate._read_episodes(understood.episode_file, understood.episodes)
+    played, digest = session.read_episodes(understood.episode_file, understood.episodes)
     assert (len(played.episodes), digest) == (asked["fetch"].episodes, asked["fetch"].episode_file)
 
 

@@ -1,24 +1,21 @@
-"""Run `python -m train.figures RESULTS_DIR -o figures/`: draw metrics, rows and recorded paths; print tables."""
+"""Draw what the files under a folder of results give: metrics, rows and recorded paths."""
 
-import dataclasses
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from interactive_nav_common.commands import Command, Flag, option, parse, word
-from interactive_nav_common.errors import FileError, regular, reports_errors
-from interactive_nav_common.figures import RC, Figure, plt, save
+from interactive_nav_common.errors import FileError, regular
+from interactive_nav_common.figures import Figure
 from interactive_nav_common.records import METRICS, PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_rows
 from interactive_nav_common.untrusted.reading import read_npz
 from train.figures.curves import cell_curves, learning_curves
 from train.figures.paths import side_by_side, spread_episodes, trajectories
 from train.figures.scores import efficiency_plane, effort_terms, frontier, ins_over_alpha, robots_plane, seen_and_unseen
-from train.figures.tables import document
 from train.runs.run_folder import PATHS
 from train.scoring.rows import check_rows
 from train.scoring.statistics import run_means
@@ -135,45 +132,3 @@ def _paths(path: Path) -> dict[str, np.ndarray] | None:
 
 def _name(path: Path) -> str:
     return path.parent.parent.name if path.parent.name == "evaluation" else path.stem
-
-
-@dataclasses.dataclass(kw_only=True)
-class Draw(Command):
-    """Draw what runs have written."""
-
-    results: Annotated[Path, *word("RESULTS_DIR")]
-    """A run folder, a sweep's folder, or a folder of either."""
-    out: Annotated[Path, option("-o", metavar="DIR")] = Path("figures")
-    """Where to."""
-    format: Literal["png", "pdf", "svg"] = "png"
-    """Of the pictures."""
-    split: Literal["auto", "train", "test", "all"] = "auto"
-    """Scenes of a sweep's figures; auto takes test where there are rows of them."""
-    tables: Flag = False
-    """Print Markdown tables of a sweep instead of drawing."""
-
-
-@reports_errors("train.figures")
-def main(argv: Sequence[str] | None = None) -> int:
-    """Draw; return 0 when done, 2 on a user's error."""
-    arguments = parse(Draw, "python -m train.figures", argv)
-    split = None if arguments.split == "all" else arguments.split
-    if arguments.tables:
-        rows = Results(arguments.results).rows
-        if not set(rows.column_names) >= SWEPT:
-            raise FileError(
-                f"{arguments.results}: no rows of policies; evaluate some first (python -m train.sweep FILE "
-                "--only evaluate, or python -m train.evaluate)"
-            )
-        print(document(rows, chosen_split(rows, split)), end="")
-        return 0
-    drawn = False
-    for name, draw in figures_of(arguments.results, split):
-        path = arguments.out / f"{name}.{arguments.format}"
-        with plt.rc_context(RC):
-            save(draw(), path, arguments.format)
-        print(path)
-        drawn = True
-    if not drawn:
-        raise FileError(f"{arguments.results}: nothing to draw (no rows and no recorded paths); expected a run folder")
-    return 0
