@@ -19,7 +19,7 @@ from converters.check.gates import drawn_shares, evaluate, kept_share
 from converters.check.settle import Settled, settle
 from converters.clock import Clock, Report
 from converters.geometry.boxes import Hull
-from converters.geometry.faces import simplify_open, simplify_parts
+from converters.geometry.faces import sample_faces, simplify_open, simplify_parts
 from converters.propose.proposals import floor_of, with_retrieved
 from converters.read.homes.parts import built_in
 from converters.read.source import read_source
@@ -40,9 +40,11 @@ from converters.structure.fill import fill_holes, wall_planes
 from converters.structure.maps import FloorPlan, make_floor_plan, resample
 from converters.structure.walls import main_direction, wall_boxes
 from converters.write.emit import SceneParts, write_scene
+from converters.write.light import VOXEL_M, Daylight, daylight
 from converters.write.manifest import make_manifest, scene_objects
 from converters.write.texture import Drawn, as_it_is, bake_structure, colour_cloud, draw_objects
 from interactive_nav_common.files import check_name, part_folder, publish, write_text
+from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.schema import SceneManifest, SceneMaps, save_manifest, save_maps
 
 MODELLED = 10**6, 4096
@@ -127,13 +129,25 @@ def _structure_visual(
         drawn, faces = simplify_parts(raw.picture, config.structure_faces)
         drawn = drawn + (vertices_w[0] - raw.scan.vertices[0]) + lift
         # A home's parts touch, back to back and on top of one another: each face takes colours that look as it does.
-        turned_m = TURNED_M if raw.scan.furnished else 0.0
-        return bake_structure(drawn, faces, cloud, config.structure_texture, turned_m)
+        turned_m, light = TURNED_M if raw.scan.furnished else 0.0, None
+        if raw.lamps or raw.windows:
+            light = _light(raw, cloud.points, annotated, vertices_w[0] - raw.scan.vertices[0])
+        return bake_structure(drawn, faces, cloud, config.structure_texture, turned_m, light)
     scan = simplify_open(level, raw.scan.faces[kept], config.structure_faces)
     planes = wall_planes(level, raw.scan.faces[kept], raw.scan.labels)
     (points, faces), clouds = fill_holes(planes, plan, annotated, cloud, scan)
     whole = np.vstack([scan[0], points]), np.vstack([scan[1], faces + len(scan[0])])
     return bake_structure(*whole, joined_clouds(cloud, *clouds), config.structure_texture)
+
+
+def _light(raw: RawScene, points: np.ndarray, annotated: tuple[PlacedObject, ...], to_world_m: np.ndarray) -> Daylight:
+    """Return the light in a home among points (n, 3) of its structure and its furniture, world frame."""
+    solid = [o.vertices_b[o.faces] @ matrix_from_quat(o.quaternion_w).T + o.position_w for o in annotated]
+    corners = np.vstack(solid).reshape(-1, 3) if solid else np.zeros((0, 3))
+    furniture, _ = sample_faces(corners, np.arange(len(corners)).reshape(-1, 3), VOXEL_M / 2)
+    lamps = [dataclasses.replace(lamp, at=lamp.at + to_world_m) for lamp in raw.lamps]
+    windows = [dataclasses.replace(window, middle=window.middle + to_world_m) for window in raw.windows]
+    return daylight(np.vstack([points, furniture]), lamps, windows)
 
 
 def _object_visuals(
@@ -272,7 +286,6 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
             placed.settled.parts,
             structure_visual=structure,
             object_visuals=tuple(one.mesh for one in drawn),
-            lamps=tuple(dataclasses.replace(p, at=p.at - down) for p in placed.raw.lamps),
             windows=tuple(dataclasses.replace(w, middle=w.middle - down) for w in placed.raw.windows),
         )
         write_scene(parts, folder)

@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from converters.check.preview import preview
 from converters.clock import Report
-from converters.generate import generate_building
+from converters.generate import generate_building, write_look
 from converters.generate.design.config import (
     SHARE_TOLERANCE,
     TIERS,
@@ -205,6 +205,8 @@ def make_scene(
     with part_folder(folder, overwrite=True) as work:
         config = ConvertConfig(format="gibson", split=recipe.split, jobs=jobs, **conversion)
         (result, seed), scene = _generated(recipe, config, work, report), work / recipe.name
+        if isinstance(recipe.building, BuildingConfig):
+            write_look(scene, recipe.seed, recipe.building)
         report("drawing", GENERATE + CONVERT)
         preview(scene, scene / "preview.png")
         publish({scene: folder})

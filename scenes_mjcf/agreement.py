@@ -13,6 +13,13 @@ LIT_AMBIENT = 0.25
 """Ambient headlight of scenes whose structure is lit in its own image; others have MuJoCo's 0.1."""
 
 
+def light_evenly(spec: mujoco.MjSpec) -> None:
+    """Light a scene whose structure is lit in its own image."""
+    light = spec.light("light")
+    light.dir, light.diffuse, light.ambient = [0.25, 0.35, -0.9], [0.25] * 3, [0.5] * 3
+    spec.visual.headlight.diffuse, spec.visual.headlight.ambient = [0.15] * 3, [LIT_AMBIENT] * 3
+
+
 def is_lit(model: mujoco.MjModel) -> bool:
     """Return whether the structure is lit in its own image, so that it needs no shading.
 

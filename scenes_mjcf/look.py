@@ -8,23 +8,34 @@ where there is no display.
 import atexit
 import dataclasses
 import importlib
+import io
 import math
 import os
 import warnings
 import weakref
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from PIL import Image
 
 from interactive_nav_common.errors import UserError
+from interactive_nav_common.untrusted.reading import read_npz
+from scenes_mjcf.agreement import light_evenly
+from scenes_mjcf.schema import SceneError
 
 LIBRARIES = ("egl", "osmesa", "glfw")
 SKY_COLOUR = (0.93, 0.95, 0.97)
 """RGB in [0, 1] of pictures where nothing is met."""
 SKY = tuple(round(255 * c) for c in SKY_COLOUR)
 """Where nothing is hit; MuJoCo's would be black."""
+LOOK = "look.npz"
+UV_STEPS = 4096
+"""In `assets`: the structure that people look at, flat convex polygons. Arrays `corners` (p,) u8, how many each has;
+of these `vertices_mm` (3, n) i16, and `uv` (2, n) u16, which counts these steps from the upper left of `image`, the
+bytes of a WebP file."""
 SUN, SHADOW_TEXELS, SHADOW_M = 0.2, 4096, 12.0
 """Brightness of a light that casts shadows, side of the map that these are looked up in, how far that reaches."""
 
@@ -71,6 +82,28 @@ class Lens:
         """Return the rays [height, width, 3] of one camera's pixels, world frame; along its axis their length is 1."""
         right, up = np.meshgrid(self.columns.astype(float), self.rows.astype(float))
         return np.stack([np.ones_like(right), right, up], -1) @ np.asarray(pose.axes_w, float).T
+
+
+def spec_for_people(folder: Path) -> mujoco.MjSpec:
+    """Return the spec of a scene folder, its structure drawn as `LOOK` has it where the scene has that file.
+
+    Observations draw what `scene.xml` names, which learned policies know.
+    """
+    spec, path = mujoco.MjSpec.from_file(str(folder / "scene.xml")), folder / "assets" / LOOK
+    if not path.is_file():
+        return spec
+    mesh, texture = spec.mesh("structure_visual"), spec.texture("structure_texture")
+    with read_npz(path, SceneError, "make the scene again") as arrays:
+        first, count = np.cumsum(arrays["corners"], dtype=int) - arrays["corners"], arrays["corners"]
+        fans = [(k, k + i, k + i + 1) for k, n in zip(first, count, strict=True) for i in range(1, n - 1)]
+        mesh.uservert, mesh.usertexcoord = arrays["vertices_mm"].T.ravel() / 1000.0, arrays["uv"].T.ravel() / UV_STEPS
+        mesh.userface = mesh.userfacetexcoord = np.ravel(fans).astype(np.int32)
+        image = np.asarray(Image.open(io.BytesIO(arrays["image"])).convert("RGB"))
+    mesh.file = texture.file = ""
+    texture.height, texture.width, texture.nchannel = image.shape
+    texture.data = image.tobytes()
+    light_evenly(spec)
+    return spec
 
 
 def look_along(pos_w: Any, forward_w: Any) -> CameraPose:

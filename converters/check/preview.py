@@ -28,7 +28,7 @@ from converters.records.raw import RawScene, TexturedMesh
 from converters.structure.clean import cut_furniture
 from interactive_nav_common.files import check_name, whole_file
 from scenes_mjcf.categories import CATEGORIES
-from scenes_mjcf.look import geom_mesh, over
+from scenes_mjcf.look import geom_mesh, over, spec_for_people
 from scenes_mjcf.schema import SCENES, SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
 
 LEGEND_ENTRY_IN, LEGEND_LINE_IN = 1.25, 0.19
@@ -49,7 +49,7 @@ COLUMNS, PANEL_IN, LEAST_WIDTH_IN = 3, 3.3, 9.0
 """Panels beside each other, how high one is, and the page's least width."""
 SLANTWISE = 0.62
 """Of the page's width, the view from the south; that at eye height stands beside it."""
-DPI = 100
+DPI, COLOURS = 100, 128
 TRAVERSABLE = (0.85, 0.94, 0.85)
 WALL = (0.75, 0.75, 0.75)
 
@@ -322,7 +322,7 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
         return
     manifest, maps = load_manifest(folder), load_maps(folder)
     try:
-        model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
+        model = spec_for_people(folder).compile()
     except ValueError as error:
         raise SceneError(f"{folder / 'scene.xml'}: does not compile ({error}); convert the scene again") from error
     for item in manifest.objects:
@@ -341,6 +341,8 @@ def _save(figure: Figure, target: Path, few: bool = False) -> None:
         figure.savefig(picture, format="png", metadata={"Software": None})
         if few:
             with Image.open(picture) as image:
-                colours = image.convert("RGB").quantize(method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-                colours.save(picture, "PNG", optimize=True)
+                small = image.convert("RGB").quantize(
+                    COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
+                )
+                small.save(picture, "PNG", optimize=True)
     plt.close(figure)

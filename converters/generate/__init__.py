@@ -1,9 +1,12 @@
 """Generate a raw building folder from a seed: a synthetic apartment in the raw Gibson layout."""
 
 import dataclasses
+import io
+import zipfile
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from converters.clock import Report
 from converters.generate.design.config import BuildingConfig, GenerationError, HomeConfig
@@ -12,6 +15,7 @@ from converters.generate.design.plan import Building
 from converters.generate.design.space import floor_maps
 from converters.generate.design.sparse import make_plan
 from converters.generate.homes.design import design_home
+from converters.generate.surface import write as surface_files
 from converters.generate.surface.modelled import model_building
 from converters.generate.surface.scan import Scan, scan_building
 from converters.generate.surface.texture import Atlas, make_atlas
@@ -19,11 +23,14 @@ from converters.generate.surface.write import LICENCE, annotate_items, write_cad
 from converters.library.store import attribution, read_index
 from converters.records.raw import ATTRIBUTION, WINDOWS
 from interactive_nav_common.files import part_folder, publish, write_text
+from scenes_mjcf.look import LOOK, UV_STEPS
 
 __all__ = ["Building", "BuildingConfig", "GenerationError", "HomeConfig", "design_building", "generate_building"]
 
 GENERATOR_VERSION = 4
 """Raised whenever the same seed would give other bytes."""
+LOOK_TEXELS, LOOK_QUALITY = 1024, 30
+"""Side and quality of the image that `write_look` writes."""
 
 
 def _streams(seed: int) -> list[np.random.Generator]:
@@ -126,3 +133,21 @@ def _write(
         write_text(folder / ATTRIBUTION, attribution(used))
     of_others = f"Of others, under their licences: the furniture that {ATTRIBUTION} lists.\n\n" if used else ""
     (folder / "LICENCE").write_text(of_others + LICENCE, encoding="ascii")
+
+
+def write_look(folder: Path, seed: int, config: BuildingConfig) -> None:
+    """Write the exact structure of a building that was scanned into its scene folder, for pictures for people."""
+    building, image = design_building(seed, config), io.BytesIO()
+    uses = ("",) * len(building.plan.rooms)
+    scan, atlas = model_building(building.plan, building.items, uses, _streams(seed)[2], (LOOK_TEXELS,))
+    Image.fromarray(atlas.image).reduce(2).save(image, "WEBP", quality=LOOK_QUALITY, method=6)
+    corners = np.unique(scan.faces[:, 0], return_counts=True)[1] + 2  # each polygon is a fan
+    assert corners.sum() == len(scan.vertices) == len(atlas.uv)
+    surface_files.write_npz(
+        folder / "assets" / LOOK,
+        zipfile.ZIP_LZMA,
+        corners=corners.astype(np.uint8),
+        vertices_mm=np.round(1000 * scan.vertices.T).astype(np.int16),
+        uv=np.round(UV_STEPS * (atlas.uv * [1, -1] + [0, 1]).T).astype(np.uint16),
+        image=np.frombuffer(image.getvalue(), np.uint8),
+    )

@@ -32,6 +32,8 @@ NUMBERED = {"-o": 0.0, "-s": 1.0, "-t": 0.0, "-mm": 1.0}
 """Options of a texture that take one to three numbers (-mm: two), and the value of absent ones; others take a word."""
 UNUSED_OPTIONS = ("-cc", "-imfchan", "-t")
 """Options of a texture that change what viewers show."""
+BORDER = 2
+"""Texels around each joined image that repeat its edge: smoothed and smaller versions show no neighbour."""
 SMALL_IMAGE = 10_000
 """Numbers in an image that is compared with others to be kept once."""
 
@@ -293,7 +295,8 @@ def join_textures(corner_uv: np.ndarray, number: np.ndarray, images: list[np.nda
     while width * height > PIXELS:
         side //= 2
         tiles = [at_most(t, side) for t in tiles]
-        width, height = max(t.shape[1] for t in tiles), sum(t.shape[0] for t in tiles)
+        width = max(t.shape[1] for t in tiles) + 2 * BORDER
+        height = sum(t.shape[0] + 2 * BORDER for t in tiles)
     order = np.argsort(number, kind="stable")
     ends = np.searchsorted(number[order], np.arange(len(tiles) + 1))
     joint = np.zeros((height, width, 3), np.uint8)
@@ -301,16 +304,16 @@ def join_textures(corner_uv: np.ndarray, number: np.ndarray, images: list[np.nda
     top = 0
     for k, tile in enumerate(tiles):
         h, w = tile.shape[:2]
-        joint[top : top + h, :w] = tile
+        joint[top : top + h + 2 * BORDER, : w + 2 * BORDER] = np.pad(tile, (*[(BORDER, BORDER)] * 2, (0, 0)), "edge")
         of = order[ends[k] : ends[k + 1]]
         uv = corner_uv[of]
         # Repeats end at a face: it is moved to the first copy as a whole and cut off at the image's edge.
         uv = np.clip(uv - np.floor(uv.min(axis=1, keepdims=True) + 1e-9), 0.0, 1.0)
         if images[k].shape[:2] == (1, 1):
             uv = np.full_like(uv, 0.5)
-        result[of, :, 0] = uv[..., 0] * w / width
-        result[of, :, 1] = (height - top - h + uv[..., 1] * h) / height
-        top += h
+        result[of, :, 0] = (BORDER + uv[..., 0] * w) / width
+        result[of, :, 1] = (height - top - BORDER - h + uv[..., 1] * h) / height
+        top += h + 2 * BORDER
     return result, joint
 
 

@@ -226,8 +226,8 @@ class RawScene:
     """From the lowest up, where there are several; `converters.read.surfaces.split_storeys` takes them apart."""
     picture: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
     """Vertices (n, 3) and faces (m, 3) of the parts that a modelled structure is drawn with, in place of the scan."""
-    lamps: tuple[Lamp, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
-    windows: tuple[Window, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
+    lamps: tuple[Lamp, ...] = ()
+    windows: tuple[Window, ...] = ()
     """Where the source says so."""
     warnings: tuple[str, ...] = dataclasses.field(default=(), metadata=NOT_HASHED)
     """What the reader repaired or missed, for scene.json."""

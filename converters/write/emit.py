@@ -14,10 +14,10 @@ import numpy as np
 from converters.bodies.objects import BodyHinge, Physical, PlacedObject
 from converters.geometry.boxes import OrientedBox, least_turned
 from converters.geometry.faces import corner_normals, unit_normals
-from converters.records.raw import Lamp, VisualMesh, Window
+from converters.records.raw import VisualMesh, Window
 from converters.write.texture import as_png, quantise, share_plain
 from interactive_nav_common.rotations import yaw_matrix
-from scenes_mjcf.agreement import LIT_AMBIENT
+from scenes_mjcf.agreement import light_evenly
 
 TIMESTEP_S = 0.005
 HINGED, SLIDING = (0.4, 0.25), (15.0, 3.0)
@@ -27,8 +27,6 @@ HINGES = {"door": (2.0, 0.4)}
 """The same of a category: a pushed interior door stops after about a second. No latch, only this dry friction keeps it
 where it was left, half a newton at the handle."""
 ONE = (1.0, 1.0, 1.0)
-LAMP, LAMP_FALL = 0.8, (1.0, 0.0, 0.15)
-"""Of a white lamp at full power: how bright it is, and by which powers of the distance (m) that falls."""
 SAME_M = 5e-5
 """Meshes no farther apart are one; half of what a file's last digit is."""
 HULL_DECIMALS = 5
@@ -66,8 +64,6 @@ class SceneParts:
     structure_visual: VisualMesh | None = None
     object_visuals: tuple[VisualMesh, ...] = ()
     """Body frame, one an object; empty: no visuals (the settling model)."""
-    lamps: tuple[Lamp, ...] = ()
-    """World frame."""
     windows: tuple[Window, ...] = ()
     """World frame."""
 
@@ -180,7 +176,7 @@ def build_spec(parts: SceneParts, assets: Assets | None = None) -> mujoco.MjSpec
     """
     spec = _empty_spec(parts.name)
     lit = parts.structure_visual is not None and parts.structure_visual.exact
-    _add_surroundings(spec, parts.walls, lit, parts.lamps)
+    _add_surroundings(spec, parts.walls, lit)
     looks, hulls = assets or ({}, {})
     structure = spec.worldbody.add_body(name="structure")
     if (look := looks.get("structure")) is not None:
@@ -224,24 +220,16 @@ def _empty_spec(name: str) -> mujoco.MjSpec:
     return spec
 
 
-def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[OrientedBox, ...], lit: bool, lamps: tuple[Lamp, ...]) -> None:
-    """Add floor, lamps, and a light above the walls' middle: an even one where the structure's image is `lit`."""
+def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[OrientedBox, ...], lit: bool) -> None:
+    """Add floor, and a light above the walls' middle: an even one where the structure's image is `lit`."""
     floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1])
     floor.friction, floor.rgba = [1.0, 0.005, 0.0001], [0.6, 0.6, 0.6, 1.0]
     middle = np.mean([b.centre for b in walls], axis=0) if walls else np.zeros(3)
     light = spec.worldbody.add_light(name="light", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=False)
     light.pos = [round(float(middle[0]), 3), round(float(middle[1]), 3), 4.0]
-    light.dir = [0.25, 0.35, -0.9] if lit else [0, 0, -1]
-    light.diffuse = [0.25 if lit else 0.15 if lamps else 0.6] * 3
-    light.ambient = [0.5 if lit else 0.35 if lamps else 0.4] * 3
-    for k, lamp in enumerate(lamps):  # MuJoCo's renderer leaves out lights of type point
-        light = spec.worldbody.add_light(name=f"lamp_{k}", pos=_tidy(lamp.at), castshadow=False, cutoff=180.0)
-        light.exponent, light.attenuation, light.specular = 0.0, LAMP_FALL, [0.0] * 3
-        light.diffuse = np.round(LAMP * lamp.colour, 4)
-    if lit or lamps:
-        spec.visual.headlight.diffuse = [0.15] * 3
+    light.dir, light.diffuse, light.ambient = [0, 0, -1], [0.6] * 3, [0.4] * 3
     if lit:
-        spec.visual.headlight.ambient = [LIT_AMBIENT] * 3
+        light_evenly(spec)
 
 
 def paired(faces: np.ndarray, corners: np.ndarray) -> list[list[int]]:

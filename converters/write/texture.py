@@ -15,6 +15,7 @@ from converters.geometry.faces import face_areas, sample_faces, simplify_to, sur
 from converters.read.obj import texels
 from converters.records.errors import CLOUD
 from converters.records.raw import ColourCloud, ScanMesh, TexturedMesh, VisualMesh
+from converters.write.light import Daylight, light_on
 from interactive_nav_common.grids import nearest_cell
 from interactive_nav_common.rotations import matrix_from_quat
 
@@ -25,6 +26,10 @@ AGREE = 0.5
 and out)."""
 TEXTURE_SPACING_M = 0.025
 """Sampling of a textured scan's surface; a vertex-coloured scan is sampled at its vertices."""
+LEVELS = 63
+"""Steps of each channel, few enough for a small PNG."""
+APART = 4
+"""Texels between charts of all but small images: what lies between shows the nearer one, so none bleeds."""
 PLAIN, MARGIN = 8, 4
 """Levels of a channel that a face of one colour may differ by; texels that are kept around what is looked up."""
 
@@ -65,7 +70,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarr
     atlas = xatlas.Atlas()
     atlas.add_mesh(vertices.astype(np.float32), faces.astype(np.uint32))
     chart, pack = xatlas.ChartOptions(), xatlas.PackOptions()
-    pack.resolution, pack.padding, pack.bilinear = size, 1, True
+    pack.resolution, pack.padding, pack.bilinear = size, APART if size >= 64 * APART else 1, True
     atlas.generate(chart, pack)
     _, uv_faces, uv = atlas[0]
     return np.asarray(uv, float), np.asarray(uv_faces, np.int64)
@@ -181,6 +186,7 @@ def bake_structure(
     cloud: ColourCloud,
     size: int,
     turned_m: float = 0.0,
+    light: Daylight | None = None,
 ) -> VisualMesh:
     """Bake a texture of the simplified scan from coloured points (three nearest, by inverse distance).
 
@@ -189,6 +195,7 @@ def bake_structure(
     `size`: of the texture, pixels.
     `turned_m`: how much farther a point counts for each unit between its normal and the surface's: both sides of a
     thin wall keep their colours.
+    `light`: that falls on it; the image is exact then, with few levels a channel, which make a smaller file.
     """
     uv, uv_faces = unwrap(vertices, faces, size)
     texel, point, face = texel_surface(vertices, faces, uv, uv_faces, size)
@@ -200,7 +207,10 @@ def bake_structure(
     distance, index = distance.reshape(len(point), -1), index.reshape(len(point), -1)
     weight = 1.0 / (distance + 0.002)
     colours = (cloud.colours[index] * weight[..., None]).sum(axis=1) / weight.sum(axis=1, keepdims=True)
-    return VisualMesh(vertices, faces, uv, uv_faces, fill_image(texel, colours, size))
+    if light is not None:
+        colours = np.minimum(colours * light_on(point, unit_normals(vertices, faces)[face], light), 255.0)
+        colours = np.rint(np.rint(colours * (LEVELS / 255)) * (255 / LEVELS))
+    return VisualMesh(vertices, faces, uv, uv_faces, fill_image(texel, colours, size), light is not None)
 
 
 def bake_object(

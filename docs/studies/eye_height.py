@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 from converters.check.pictures import at_eye_height, from_the_south, world_surfaces
+from scenes_mjcf.look import spec_for_people
 from scenes_mjcf.schema import load_maps
 
 SHAPE = (360, 600)
@@ -23,7 +24,7 @@ SOUTH_PX = 1200
 
 def view(scene: Path, south: bool) -> np.ndarray:
     """(rows, columns, 3) uint8."""
-    model = mujoco.MjModel.from_xml_path(str(scene / "scene.xml"))
+    model = spec_for_people(scene).compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     surfaces, maps = world_surfaces(model, data), load_maps(scene)

@@ -195,6 +195,8 @@ class FloorPaint:
 class SceneView(SceneModel):
     """One scene with a robot and small objects, in the colours of their categories or with textures."""
 
+    for_people = True
+
     @functools.cached_property
     def _painter(self) -> Painter:
         return Painter()

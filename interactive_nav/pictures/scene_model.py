@@ -19,7 +19,7 @@ from interactive_nav.sensing.boxes import FLOOR_COLOUR, PALETTES
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.categories import MaskClasses, class_id
-from scenes_mjcf.look import cast, geom_colour
+from scenes_mjcf.look import cast, geom_colour, spec_for_people
 
 THINGS, BUILDING, CUT_WALLS, ROBOT, ROBOT_SOLIDS, HIDDEN = range(6)
 """Geom groups: the floor and what stands on it; walls at full height; walls cut low; the robot; the collision shapes
@@ -31,13 +31,18 @@ CUT_M = 0.55
 
 
 def furnished_spec(
-    scene: Scene, robot: RobotSpec | None, small: Sequence[SmallObject], cut_walls: bool = False
+    scene: Scene,
+    robot: RobotSpec | None,
+    small: Sequence[SmallObject],
+    cut_walls: bool = False,
+    for_people: bool = True,
 ) -> mujoco.MjSpec:
     """Return the scene of `scene.xml` with a robot and small objects added, which are boxes and stand at the origin.
 
-    With `cut_walls` the walls are there once more, cut low.
+    With `cut_walls` the walls are there once more, cut low. `for_people`: its structure is drawn as
+    `scenes_mjcf.look.spec_for_people` has it, and not as observations show it.
     """
-    spec = mujoco.MjSpec.from_file(str(scene.path / "scene.xml"))
+    spec = spec_for_people(scene.path) if for_people else mujoco.MjSpec.from_file(str(scene.path / "scene.xml"))
     if cut_walls:
         _add_cut_walls(spec, scene.walls)
     if robot is not None:
@@ -54,13 +59,14 @@ def picture_spec(
     robot: RobotSpec | None = None,
     small: Sequence[SmallObject] = (),
     classes: MaskClasses | None = None,
+    for_people: bool = False,
 ) -> mujoco.MjSpec:
-    """Return `furnished_spec` in the groups of pictures, lit by its lamps or one, with a camera named `view`.
+    """Return `furnished_spec` in the groups of pictures, lit by one more lamp, with a camera named `view`.
 
     Visual meshes are drawn, and the boxes of bodies that have none. `classes` is the setting `segmentation_classes` by
     which boxes are coloured; None leaves their colours as they are stored.
     """
-    spec = furnished_spec(scene, robot, small, cut_walls=robot is not None)
+    spec = furnished_spec(scene, robot, small, cut_walls=robot is not None, for_people=for_people)
     robot_bodies = {b.name for b in spec.body(robot.base_body).find_all("body")} | {robot.base_body} if robot else set()
     movable = bodies_by_name(scene, small)
     with_mesh = {g.parent.name for g in spec.geoms if g.group == VISUAL_GROUP}
@@ -85,8 +91,7 @@ def picture_spec(
     for camera in list(spec.cameras):  # MJX-Warp draws every camera that there is
         spec.delete(camera)
     spec.worldbody.add_camera(name="view", fovy=60.0)
-    if len(spec.lights) < 2:  # a home with lamps is lit by them
-        spec.worldbody.add_light(pos=[0, 0, 6], dir=[0.3, 0.2, -1], diffuse=[0.5] * 3, castshadow=False)
+    spec.worldbody.add_light(pos=[0, 0, 6], dir=[0.3, 0.2, -1], diffuse=[0.5] * 3, castshadow=False)
     # The clipping planes are given as shares of the extent.
     spec.stat.extent = 1.0
     spec.visual.map.znear, spec.visual.map.zfar = 0.01, 100.0
@@ -96,11 +101,14 @@ def picture_spec(
 class SceneModel:
     """One scene with a robot and small objects, whose bodies are put where a caller wants them."""
 
+    for_people = False
+    """As `furnished_spec` has it."""
+
     def __init__(self, robot: RobotSpec, scene: Scene, small: Sequence[SmallObject], classes: MaskClasses = 4):
         """Compile the model to look at; the robot's collision shapes are drawn, or its visual ones if it has any."""
         self.robot = robot
         rows = {n: (body.mask_id(classes), body.category) for n, body in bodies_by_name(scene, small).items()}
-        spec = picture_spec(scene, robot, small, classes)
+        spec = picture_spec(scene, robot, small, classes, self.for_people)
         spec.visual.global_.offwidth = spec.visual.global_.offheight = 2048
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)

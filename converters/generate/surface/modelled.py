@@ -20,51 +20,12 @@ from converters.generate.surface.decor import decor
 from converters.generate.surface.finishes import FRAMES, Finish, finishes, framed
 from converters.generate.surface.scan import NYU40, Scan, building_solids, fuse, solid_from_box
 from converters.generate.surface.sides import CLOTHS, ENTRANCES, FLOOR_M, PICTURE, Side
-from converters.generate.surface.texture import Atlas, Chart, assemble, piece_charts, plain, polygon
+from converters.generate.surface.texture import SHEETS, Atlas, Chart, assemble, piece_charts, plain, polygon
 from converters.records.raw import CEILING, FLOOR, WALL
+from converters.write.light import VOXEL_M, Daylight, Space
 
-VOXEL_M = 0.05
-AROUND_M = ((0.06, 0.2), (0.13, 0.25), (0.27, 0.25), (0.55, 0.2), (0.9, 0.1))
-"""How far from a surface it is looked whether something is near, and the weight of each."""
-AMBIENT, LAMP, DAY = (np.array(c) for c in ([0.65, 0.65, 0.66], [0.32, 0.30, 0.27], [0.50, 0.51, 0.53]))
-"""Brightness of each channel: of all around, of a lamp and of a window at one metre."""
-REACH_M = 7.0
-"""How far a lamp or window shines."""
 Sides = list[list[Side]]
 """Of each room its walls."""
-BRIGHT = 0.8
-"""From here on more light makes things less and less brighter."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Space:
-    """Hold the distance to the nearest surface."""
-
-    distance: np.ndarray
-    """(nx, ny, nz) m, negative inside."""
-    low: np.ndarray
-    """(3,) place of [0, 0, 0]."""
-
-    def at(self, points: np.ndarray) -> np.ndarray:
-        """Interpolate the distance at points: (n, 3) -> (n,)."""
-        return ndimage.map_coordinates(self.distance, ((points - self.low) / VOXEL_M).T, order=1, mode="nearest")
-
-    def visible(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Return (n,) 0..1: how much of a small lamp at `end` (n, 3) is visible; softer the nearer an obstacle is."""
-        way = end - start
-        length = np.linalg.norm(way, axis=1)
-        out, index = np.ones(len(start)), np.arange(len(start))
-        gone = np.full(len(start), 0.03)
-        for _ in range(40):
-            share = gone[index] / length[index]
-            near = self.at(start[index] + way[index] * share[:, None])
-            # Half shadows are widest half way: what is beside the lamp, or beside the place, hides all or nothing.
-            out[index] = np.minimum(out[index], np.clip(near / (0.08 * gone[index] * (1 - share) + 0.02), 0, 1))
-            gone[index] += np.maximum(near, 0.04)
-            index = index[(out[index] > 0) & (gone[index] < length[index] - 0.08)]
-            if not len(index):
-                break
-        return out
 
 
 def space_of(plan: Plan, items: Sequence[Instance] = ()) -> Space:
@@ -85,41 +46,6 @@ def space_of(plan: Plan, items: Sequence[Instance] = ()) -> Space:
     steps, nearest = ndimage.distance_transform_edt(near > 1.4 * VOXEL_M, return_indices=True)  # pyright: ignore
     far = np.asarray(steps) * VOXEL_M + near[tuple(nearest)]
     return Space(np.where(near < 2.8 * VOXEL_M, near, np.maximum(far, 2.8 * VOXEL_M)).astype(np.float32), low)
-
-
-@dataclasses.dataclass(frozen=True)
-class Daylight:
-    """Compute the light in a home."""
-
-    space: Space
-    lamps: np.ndarray
-    """(n, 3)."""
-    panes: np.ndarray
-    """(m, 3) places on panes."""
-    inwards: np.ndarray
-    """(m, 3) unit, from each into its room."""
-
-    def __call__(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return the brightness (n, 3) at places and normals (n, 3)."""
-        hidden = np.zeros(len(points))
-        for d, weight in AROUND_M:
-            hidden += weight * np.clip(1 - self.space.at(points + d * normals) / d, 0, 1)
-        light = AMBIENT * (1 - 0.5 * hidden)[:, None]
-        start = points + 0.05 * normals
-        sources = [(LAMP, lamp, None) for lamp in self.lamps]
-        sources += [(DAY / 2, pane, inward) for pane, inward in zip(self.panes, self.inwards, strict=True)]
-        for brightness, source, inward in sources:
-            away = source - start
-            far = np.linalg.norm(away, axis=1)
-            value = np.clip((normals * away).sum(axis=1) / far, 0, 1) / (0.55 + 0.3 * far**2)
-            if inward is not None:
-                value *= np.clip(-(away * inward).sum(axis=1) / far, 0, 1) * 2
-            index = np.flatnonzero((value > 0.004) & (far < REACH_M))
-            share = np.zeros(len(start))
-            ends = np.broadcast_to(source, (len(index), 3))
-            share[index] = value[index] * self.space.visible(start[index], ends)
-            light += brightness * share[:, None]
-        return np.where(light > BRIGHT, BRIGHT + 0.3 * (1 - np.exp((BRIGHT - light) / 0.3)), light)
 
 
 CEILING_WHITE, LAMP_LABEL = np.array([0.95, 0.95, 0.93]), 35
@@ -238,7 +164,7 @@ def _fittings(
             charts += hung
             left -= len(hung) // 4
         for side in sides[k]:
-            for d in side.doorways:
+            for d in side.doorways if use else ():
                 low, high = side.along(d.rect)
                 beside = high + 0.19 if high + 0.3 < side.end else low - 0.19
                 if side.start + 0.05 < beside < side.end - 0.05:
@@ -268,10 +194,17 @@ def _built_in(items: Sequence[Instance]) -> list[Chart]:
 
 
 def model_building(
-    plan: Plan, items: Sequence[Instance], uses: Sequence[str], rng: np.random.Generator
+    plan: Plan,
+    items: Sequence[Instance],
+    uses: Sequence[str],
+    rng: np.random.Generator,
+    sheets: Sequence[int] = SHEETS,
 ) -> tuple[Scan, Atlas]:
-    """Model and paint the structure; no vertex of the mesh is in faces of two labels."""
-    finish = finishes(plan.rooms, uses, rng, pictures=False)
+    """Model and paint the structure; no vertex of the mesh is in faces of two labels.
+
+    Rooms without a use, "", are finished as those of a scanned building are.
+    """
+    finish = finishes(plan.rooms, uses if any(uses) else (), rng, pictures=False)
     sides = [at_walls.sides_of(room, plan.doorways, plan.windows) for room in plan.rooms]
     everything = [*plan.built_in, *items]
     lamps = np.array([[*np.round(r.centre, 3), plan.wall_height_m] for r in plan.rooms])
@@ -291,4 +224,4 @@ def model_building(
     inwards = np.repeat([side.inward for side, *_ in spans], 2, axis=0)
     space = space_of(dataclasses.replace(plan, fixtures=(*plan.fixtures, *boxes)), items)
     light = Daylight(space, lamps - [0, 0, 0.3], np.reshape(places, (-1, 3)), inwards.reshape(-1, 3))
-    return assemble(charts, light)
+    return assemble(charts, light, sheets)

@@ -22,7 +22,7 @@ from converters.generate.surface.finishes import Colouring, finishes
 from converters.generate.surface.scan import Scan, smooth_noise
 from converters.geometry.faces import compacted, face_vectors, stacked, unit_normals
 from converters.records.raw import TexturedMesh
-from converters.write.texture import barycentric, textured_cloud
+from converters.write.texture import LEVELS, barycentric, textured_cloud
 from interactive_nav_common.grids import nearest_cell
 
 PAD = 2
@@ -221,8 +221,6 @@ MARGIN = 3
 """Texels around each patch that repeat its border, so that smaller versions of the sheet do not mix patches."""
 LIGHT_M = 0.06
 """Between the points of a patch at which light is worked out."""
-LEVELS = 63
-"""Steps of each channel, few enough for a small PNG."""
 
 Light = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(n, 3) places and (n, 3) normals -> (n, 3) brightness of each channel."""
@@ -327,7 +325,7 @@ def _texels(laid: _Laid, n: np.ndarray, density: np.ndarray, grid: np.ndarray | 
     return colour * RegularGridInterpolator(lattice, grid)(tuple(places))
 
 
-def _packed(laid: list[_Laid]) -> tuple[int, float, list[np.ndarray], np.ndarray]:
+def _packed(laid: list[_Laid], sheets: Sequence[int]) -> tuple[int, float, list[np.ndarray], np.ndarray]:
     """Return side of the sheet, factor on the resolution, texels (columns, rows) and corner of each patch."""
     finer, paints = 1.0, [q.chart.paint for q in laid]
     images = [np.array(paint.shape[1::-1]) if isinstance(paint, np.ndarray) else None for paint in paints]
@@ -335,7 +333,7 @@ def _packed(laid: list[_Laid]) -> tuple[int, float, list[np.ndarray], np.ndarray
         sizes = [np.ceil(np.round(q.size_m * q.chart.texels_per_m * finer, 6)).astype(int) for q in laid]
         sizes = [np.maximum(n, 1) if image is None else image for n, image in zip(sizes, images, strict=True)]
         wide = np.array(sizes) + 2 * MARGIN
-        for side in SHEETS:
+        for side in sheets:
             if wide.max() > side:
                 continue
             corner, used = pack_rows(wide, side)
@@ -344,13 +342,13 @@ def _packed(laid: list[_Laid]) -> tuple[int, float, list[np.ndarray], np.ndarray
         finer *= 0.95
 
 
-def assemble(charts: list[Chart], light: Light) -> tuple[Scan, Atlas]:
-    """Join patches into one mesh, no vertex in two of them, and paint its sheet."""
+def assemble(charts: list[Chart], light: Light, sheets: Sequence[int] = SHEETS) -> tuple[Scan, Atlas]:
+    """Join patches into one mesh, no vertex in two of them, and paint its sheet, whose side is one of `sheets`."""
     laid = [_Laid(c, *c.frame()) for c in charts]
     first: dict[int, int] = {}
     sheet_of = [first.setdefault(id(c.paint) if c.uv is not None else -1 - k, k) for k, c in enumerate(charts)]
     drawn = sorted(set(sheet_of))
-    side, finer, sizes, corners = _packed([laid[k] for k in drawn])
+    side, finer, sizes, corners = _packed([laid[k] for k in drawn], sheets)
     shaded = [k for k in drawn if not charts[k].glows and charts[k].uv is None]
     grids = dict(zip(shaded, _lit([laid[k] for k in shaded], light), strict=True))
     sheet = np.full((side, side, 3), 0.8)

@@ -28,7 +28,7 @@ from converters.read.homes.sh3d_archive import called, colour, metres, number, p
 from converters.read.homes.sh3d_models import LEAF, WHITE, DrawnModels, mean_colour
 from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh
-from converters.read.surfaces import check_extent, storey_of
+from converters.read.surfaces import check_extent
 from converters.read.urdf import count_unread, report_unread
 from converters.records.errors import DRAWN, UNPACKED, SceneRejected, check_count
 from converters.records.raw import Lamp, RawScene
@@ -54,8 +54,6 @@ TURN_MOST_RAD = math.radians(120)
 AJAR_RAD = math.radians(10)
 """A leaf that is drawn farther from both ends of its swing stands ajar."""
 LOW_TABLE_M = 0.5
-LAMPS = 6
-"""Of a storey: MuJoCo's renderer draws eight lights, the headlight and that of the scene among them."""
 OURS = "interactive_nav#"
 """Ids of drawings that `converters.write.sh3d` makes: their ids name categories."""
 BLOCKS = ("texturablebox", "texturablecylinder", "texturabletriangle", "texturablesphere", "texturablecone")
@@ -189,19 +187,8 @@ class _Drawing:
             storeys += (z,) if not storeys or z - storeys[-1] > STOREY_M else ()
         places = [transformed(p.surface.vertices, p.pose) for p in parts]
         check_extent(str(self.source.root), np.vstack(places))
-        lamps = self._brightest(storeys)
+        lamps = tuple(lamp for lamp in self.lamps if lamp.colour.any())
         return dataclasses.replace(home(self.source, "sh3d", parts, storeys), lamps=lamps, windows=windows)
-
-    def _brightest(self, floors_m: tuple[float, ...]) -> tuple[Lamp, ...]:
-        """Return the brightest lamps of each storey, as many as pictures have room for."""
-        ranked = sorted((lamp for lamp in self.lamps if lamp.colour.any()), key=lambda lamp: -float(lamp.colour.sum()))
-        of = [int(storey_of(lamp.at[2], floors_m, 0.0)) for lamp in ranked]
-        kept = [lamp for k, lamp in enumerate(ranked) if of[:k].count(of[k]) < LAMPS]
-        if len(kept) < len(ranked):
-            self.source.note(
-                f"{len(ranked) - len(kept)} lamps that are not among a floor's {LAMPS} brightest: no light"
-            )
-        return tuple(kept)
 
     def _visible(self, tag: str) -> Iterator[ElementTree.Element]:
         for e in self.root.findall(tag):

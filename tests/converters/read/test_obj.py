@@ -262,7 +262,7 @@ def test_several_materials_share_one_image(tmp_path):
     np.testing.assert_array_equal(sampled(mesh, 0), (255, 0, 0))
     np.testing.assert_array_equal(sampled(mesh, 1), (0, 0, 255))
     np.testing.assert_array_equal(sampled(mesh, 2), (170, 170, 170))
-    assert mesh.texture is not None and mesh.texture.shape == (8 + 4 + 4, 4, 3)
+    assert mesh.texture is not None and mesh.texture.shape == (8 + 4 + 4 + 3 * 4, 4 + 4, 3)
     assert source.warnings == ["mesh.obj: material 'none' is in no material file; it stays grey"]
     assert sorted(source.sha256) == ["m.mtl", "mesh.obj", "red.png"]
 

@@ -1,0 +1,100 @@
+"""Early scenes have whole walls, windows and ceilings for people; observations draw what was scanned."""
+
+from __future__ import annotations
+
+import shutil
+
+import mujoco
+import numpy as np
+import pytest
+
+from converters.generate import BuildingConfig, design_building, write_look
+from converters.generate.design.space import floor_maps
+from interactive_nav.pictures.scene_model import picture_spec
+from interactive_nav.scenes.scene import load_scene
+from interactive_nav_common.grids import cell_centres, clearance
+from scenes_mjcf.look import LOOK, spec_for_people
+from scenes_mjcf.schema import SceneError
+from tests.test_scenes import RECIPES, SCENES
+
+
+def structure(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and image of the mesh that is drawn as the structure."""
+    mesh, image = model.geom("structure_visual").dataid[0], model.texture("structure_texture")
+    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    start = model.tex_adr[image.id]
+    size = model.tex_height[image.id] * model.tex_width[image.id] * model.tex_nchannel[image.id]
+    return model.mesh_vert[first : first + count], model.tex_data[start : start + size]
+
+
+@pytest.mark.parametrize("name", sorted(RECIPES))
+def test_people_see_rooms_that_are_closed_above_and_at_the_sides(name):
+    scene = load_scene(SCENES / name)
+    model = spec_for_people(scene.path).compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    maps, only = scene.maps, model.geom("structure_visual").id
+    free = clearance(maps.traversable, maps.resolution_m) > 0.15
+    places = cell_centres(free, maps.resolution_m, maps.origin_w)[::211]
+    low, high = RECIPES[name].building.wall_height_m
+    group, geom = np.array([0, 0, 1, 0, 0, 0], np.uint8), np.zeros(1, np.int32)
+    for body in range(1, model.nbody):  # furniture out of the way
+        if model.body_jntnum[body]:
+            model.geom_group[model.geom_bodyid == body] = 3
+    heights = []
+    for x, y in places:
+        up = mujoco.mj_ray(model, data, np.array([x, y, 1.0]), np.array([0.0, 0.0, 1.0]), group, 1, -1, geom)
+        assert geom[0] == only
+        heights.append(up + 1.0)
+        for turn in np.arange(8) * np.pi / 4 + 0.1:
+            way = np.array([np.cos(turn), np.sin(turn), 0.0])
+            assert mujoco.mj_ray(model, data, np.array([x, y, 1.5]), way, group, 1, -1, geom) > 0.1
+    # Ceilings, and lintels of doorways 2.06 to 2.12 m high.
+    above = np.array(heights)
+    assert above.min() > 2.05 and above.max() < high + 0.01 and np.mean(above > low - 0.01) > 0.9
+
+
+def test_observations_draw_the_scan_and_nothing_else_differs():
+    scene = load_scene(SCENES / "alder")
+    stored = mujoco.MjModel.from_xml_path(str(scene.path / "scene.xml"))
+    people, watched = spec_for_people(scene.path).compile(), picture_spec(scene).compile()
+    for mine, other in zip(structure(watched), structure(stored), strict=True):
+        assert np.array_equal(mine, other)
+    assert len(structure(people)[0]) != len(structure(stored)[0])
+    for field in ("body_mass", "body_pos", "body_inertia", "jnt_range"):
+        assert np.array_equal(getattr(people, field), getattr(stored, field))
+    for field in ("geom_size", "geom_pos", "geom_contype", "geom_friction"):
+        mine, other = (np.delete(getattr(m, field), m.geom("structure_visual").id, 0) for m in (people, stored))
+        assert np.array_equal(mine, other)
+
+
+@pytest.mark.parametrize("name", ["apartment_0", "rowan"])
+def test_the_look_is_that_of_the_plan_that_was_scanned(name, tmp_path):
+    recipe, maps = RECIPES[name], load_scene(SCENES / name).maps
+    assert isinstance(recipe.building, BuildingConfig)
+    _, planned = floor_maps(design_building(recipe.seed, recipe.building).plan)  # 1 cm, its middle at the origin
+    places = cell_centres(np.ones_like(maps.traversable), maps.resolution_m, maps.origin_w)
+    column, row = np.floor(100 * places + len(planned) // 2).astype(int).T
+    inside = (np.stack([row, column]) >= 0).all(axis=0) & (np.stack([row, column]) < len(planned)).all(axis=0)
+    free = np.zeros(len(places), bool)
+    free[inside] = planned[row[inside], column[inside]] > 0
+    kept = maps.traversable.ravel()
+    assert (kept & ~free).sum() < 1e-3 * kept.sum() and (free & ~kept).sum() < 0.06 * kept.sum()  # borders are cut
+    (tmp_path / "assets").mkdir()
+    write_look(tmp_path, recipe.seed, recipe.building)
+    with np.load(tmp_path / "assets" / LOOK) as made, np.load(SCENES / name / "assets" / LOOK) as stored:
+        assert np.array_equal(made["corners"], stored["corners"])
+        assert np.array_equal(made["vertices_mm"], stored["vertices_mm"])
+
+
+@pytest.mark.parametrize("content", [b"", b"no archive", None])
+def test_a_damaged_look_is_refused_in_one_line(tmp_path, content):
+    folder = shutil.copytree(SCENES / "apartment_0", tmp_path / "flat")
+    path = folder / "assets" / LOOK
+    if content is None:
+        np.savez(path, corners=np.array([4], np.uint8))
+    else:
+        path.write_bytes(content)
+    with pytest.raises(SceneError, match=r"look\.npz: .*make the scene again") as caught:
+        spec_for_people(folder)
+    assert "\n" not in str(caught.value)
