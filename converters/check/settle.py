@@ -119,8 +119,8 @@ def push_apart(
         # A leaf that stands in a piece cannot turn; of two pieces the lighter one can be missed.
         worst = min({a, b} & among, key=lambda body: (body in free, model.body_mass[body]))
         held[number[worst]] = model.body(a + b - worst).name
+        among -= {worst, *({a, b} - free.keys())}  # of two that cannot be pushed one is enough
         free.pop(worst, None)
-        among.remove(worst)
         _push(model, data, free, most_m)
     return _with_poses(parts, model, data), held
 

@@ -5,10 +5,12 @@ from mass and hulls.
 """
 
 import dataclasses
+import math
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -18,6 +20,7 @@ from converters.read.files import SourceFolder, read_obj
 from converters.read.meshes import read_surface
 from converters.read.obj import TexturedMesh, find_file, in_colour, join_meshes
 from converters.records.errors import SceneRejected
+from converters.records.raw import ScannedHinge
 from interactive_nav_common.errors import readable
 from interactive_nav_common.rotations import transform, transformed
 
@@ -29,7 +32,8 @@ READ = {
     "visual": "origin geometry material",
     "collision": "origin geometry | @group verbose",
     "geometry": "mesh box sphere ellipsoid cylinder capsule cone",
-    "joint": "origin parent child | @type axis limit dynamics calibration safety_controller",
+    "joint": "origin parent child axis limit @type | dynamics calibration safety_controller",
+    "axis": "@xyz", "limit": "@lower @upper | @effort @velocity",
     "contact": "lateral_friction | rolling_friction spinning_friction stiffness damping inertia_scaling contact_cfm "
     "contact_erp",
     "material": "color",
@@ -56,16 +60,20 @@ class RigidObject:
     friction: float | None
 
 
-def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = False) -> RigidObject:
+def read_urdf(
+    source: SourceFolder, relative: str, remedy: str, hold: bool = False, only: Collection[str] | None = None
+) -> RigidObject:
     """Read a URDF whose links, if several, hang together by fixed joints.
 
     `hold`: take joints that move as fixed where they are at 0.
+    `only`: names of the links that are read; None: all.
     """
     path = source.use(relative, remedy)
     with readable(path, SceneRejected, "fetch the file again", " as URDF"):
         root = ElementTree.parse(path).getroot()
         links = {str(e.get("name")): e for e in root.findall("link")}
         places = _link_places(path, root, links, hold)
+        links = {name: link for name, link in links.items() if only is None or name in only}
         rgba = {m.get("name"): str(c.get("rgba")) for m in root.iter("material") for c in m.findall("color")}
         visual = [placed(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "visual", rgba)]
         hard = [placed(g, places[n]) for n, e in links.items() for g in _geometries(source, path, e, "collision", {})]
@@ -85,14 +93,74 @@ def read_urdf(source: SourceFolder, relative: str, remedy: str, hold: bool = Fal
     mass = sum(masses)
     if mass <= 0:
         source.note(f"{relative}: its mass is {mass:g} kg; mass comes from density and volume")
-    return RigidObject(
-        name=str(root.get("name") or path.stem),
-        surface=surface,
-        pieces=convex_pieces(body.vertices, body.faces) if hard else None,
-        collision=(body.vertices, body.faces),
-        mass_kg=mass if mass > 0 else None,
-        friction=max((f for f in frictions if f > 0), default=None),
-    )
+    pieces = convex_pieces(body.vertices, body.faces) if hard else None
+    mass_kg, friction = mass if mass > 0 else None, max((f for f in frictions if f > 0), default=None)
+    name = str(root.get("name") or path.stem)
+    return RigidObject(name, surface, pieces, (body.vertices, body.faces), mass_kg, friction)
+
+
+class Joint(NamedTuple):
+    """Describe the joint that a link of a piece hangs on; its hinge, in the piece's frame, is 0 as it stands."""
+
+    name: str
+    kind: str
+    parent: str
+    hinge: ScannedHinge | None
+
+
+def hinge_along(kind: str, at: np.ndarray, axis: np.ndarray, limits: Iterable[float]) -> ScannedHinge | None:
+    """Return a hinge or slide along an axis of a frame (4, 4); None of other kinds, and without an axis."""
+    (low, high), length = limits, float(np.linalg.norm(axis))
+    if kind not in ("revolute", "prismatic") or not length:
+        return None
+    return ScannedHinge(np.zeros(3), axis / length, (low, high), slides=kind == "prismatic").moved(at)
+
+
+def trouble(hinge: ScannedHinge) -> str:
+    """Return why a hinge or slide cannot be kept, to 1e-3 rad or m; empty if it can."""
+    low, high = hinge.range_rad
+    fits = 1e-3 < high - low <= math.tau and low - 1e-3 <= 0 <= high + 1e-3
+    return "" if fits else f"stands outside of its limits, or has none ({low:g} to {high:g})"
+
+
+def by_front(
+    source: SourceFolder, where: str, links: Iterable[str], joints: Mapping[str, Joint], dropped: Counter[str]
+) -> dict[str, list[str]]:
+    """Return the links that move with each that opens, and under "" those that stand fast; name or count the rest."""
+    groups: dict[str, list[str]] = {}
+    opens = {link for link, joint in joints.items() if joint.hinge and not trouble(joint.hinge)}
+    for link in links:
+        path = [link]
+        while path[-1] in joints and len(path) <= len(joints):
+            path.append(joints[path[-1]].parent)
+        groups.setdefault(next((at for at in reversed(path) if at in opens), ""), []).append(link)
+    for link, joint in joints.items():
+        if joint.hinge and (why := trouble(joint.hinge)):
+            source.note(f"{where}: joint '{joint.name}' of '{link}' {why}; welded shut")
+        elif link not in groups and joint.kind != "fixed":
+            dropped[f"{joint.kind} joint (its links are one part)"] += 1
+    return groups
+
+
+def urdf_fronts(
+    source: SourceFolder, relative: str, dropped: Counter[str]
+) -> list[tuple[str, ScannedHinge | None, list[str]]]:
+    """Return the links of a URDF that open, on what in the root link's frame, each with those that move with it."""
+    path = source.use(relative, "")
+    with readable(path, SceneRejected, "fetch the file again", " as URDF"):
+        root, joints = ElementTree.parse(path).getroot(), {}
+        links = {str(e.get("name")): e for e in root.findall("link")}
+        places = _link_places(path, root, links, hold=True)
+        for e in root.findall("joint"):
+            parent, child = (str(end.get("link")) for tag in ("parent", "child") for end in e.findall(tag)[:1])
+            axis, limit = (next(e.iter(tag), ElementTree.Element(tag)) for tag in ("axis", "limit"))
+            limits = numbers(f"{limit.get('lower', 0)} {limit.get('upper', 0)}", (0.0, 0.0)).tolist()
+            along, kind = numbers(axis.get("xyz"), (1.0, 0.0, 0.0)), str(e.get("type"))
+            hinge = hinge_along(kind, places.get(child, np.eye(4)), along, limits)
+            joints[child] = Joint(str(e.get("name")), kind, parent, hinge)
+    shown = [name for name, link in links.items() if {"visual", "collision"} & {e.tag for e in link}]
+    groups = by_front(source, relative, shown, joints, dropped)
+    return [(front, joints[front].hinge if front else None, some) for front, some in groups.items()]
 
 
 def numbers(text: str | None, default: tuple[float, ...]) -> np.ndarray:

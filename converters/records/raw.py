@@ -12,7 +12,7 @@ import numpy as np
 
 from converters.records.cache import NOT_HASHED
 from converters.records.errors import SceneRejected
-from interactive_nav_common.rotations import transform
+from interactive_nav_common.rotations import transform, transformed
 from scenes_mjcf.categories import TABLE
 
 ATTRIBUTION = "ATTRIBUTION.md"
@@ -139,6 +139,14 @@ class ScannedHinge:
     assumed: bool = False
     """True when the source had no articulation and a hinge at one edge was taken."""
     slides: bool = False
+
+    def moved(self, matrix: np.ndarray) -> "ScannedHinge":
+        """Return it in another frame, which a (4, 4) matrix leads to; a mirror turns hinges the other way round."""
+        axis = matrix[:3, :3] @ self.axis
+        length = float(np.linalg.norm(axis))
+        grows, side = (length, 1.0) if self.slides else (1.0, np.sign(np.linalg.det(matrix[:3, :3])))
+        span, origin = (self.range_rad[0] * grows, self.range_rad[1] * grows), transformed(self.origin[None], matrix)[0]
+        return dataclasses.replace(self, origin=origin, axis=side * axis / length, range_rad=span)
 
 
 @dataclasses.dataclass(frozen=True)

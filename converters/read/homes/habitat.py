@@ -19,7 +19,7 @@ from converters.read.files import SourceFolder, only_file, read_json
 from converters.read.homes.parts import HomePart, home
 from converters.read.meshes import SUFFIXES, read_surface
 from converters.read.obj import TexturedMesh
-from converters.read.urdf import placed, read_urdf
+from converters.read.urdf import placed, read_urdf, urdf_fronts
 from converters.records.errors import PARTS, SceneRejected, check_count
 from converters.records.raw import RawScene
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, matrix_from_quat, transform
@@ -75,7 +75,7 @@ class _Reader:
             if path.suffix.lower() in (*SUFFIXES, ".json", ".urdf"):
                 self._files[path.name].append(path)
         self._classes = self._lexicon()
-        self._assets: dict[tuple[str, str], HomePart] = {}
+        self._assets: dict[tuple[str, str, bool], list[HomePart]] = {}
 
     def parts(self, path: Path) -> Iterator[HomePart]:
         """Yield the stage, rigid and articulated objects of a scene."""
@@ -95,21 +95,21 @@ class _Reader:
         check_count(path, len(instances), PARTS, "instances")
         self._count(scene, "scene")
         for instance, kind in instances:
-            yield self._part(instance, kind, local, path)
+            yield from self._parts(instance, kind, local, path)
 
     def _count(self, about: dict[str, Any], kind: str) -> None:
         """Count the keys that are not read."""
         self.dropped.update(f"{_short(key)[1:-1]} (not read)" for key in about if key not in KEYS[kind].split())
 
-    def _part(self, instance: dict[str, Any], kind: str, local: bool, path: Path) -> HomePart:
+    def _parts(self, instance: dict[str, Any], kind: str, local: bool, path: Path) -> Iterator[HomePart]:
         self._count(instance, "instance")
         name = _value(instance, "template_name", "", path)
         if not name:
             raise SceneRejected(f"{path}: an instance has no template_name, expected the name of a stage or an object")
-        if (name, kind) not in self._assets:
-            read = self._articulated if kind == ARTICULATED else self._rigid
-            self._assets[name, kind] = read(name, kind, path)
-        asset = self._assets[name, kind]  # with y up, at its centre of mass: the file's, or the middle of its box
+        key = name, kind, instance.get("fixed_base") is True
+        if key not in self._assets:
+            self._assets[key] = (self._articulated if kind == ARTICULATED else self._rigid)(path, *key)
+        asset, *_ = assets = self._assets[key]  # with y up, at its centre of mass: the file's, or the middle of its box
         scale = _value(instance, "non_uniform_scale", (1.0, 1.0, 1.0), path)
         scale = scale * _value(instance, "uniform_scale", 1.0, path)
         quat = _value(instance, "rotation", (1.0, 0.0, 0.0, 0.0), path)
@@ -123,13 +123,14 @@ class _Reader:
         turn = transform(Y_UP_TO_Z_UP)
         upright = turn @ np.diag([*scale, 1.0])  # The part's frame has z up as well.
         motion = _value(instance, "motion_type", "", path).lower() or ("static" if kind != OBJECT else "dynamic")
-        solid = None if asset.collision is None else placed(asset.collision, upright)
-        static = kind == STAGE or motion == "static" or instance.get("fixed_base") is True
-        return dataclasses.replace(
-            asset, pose=turn @ pose @ turn.T, surface=placed(asset.surface, upright), collision=solid, static=static
-        )
+        about = {"pose": turn @ pose @ turn.T, "static": kind == STAGE or motion == "static" or key[2]}
+        for asset in assets:
+            solid = None if asset.collision is None else placed(asset.collision, upright)
+            hinge = None if asset.hinge is None else asset.hinge.moved(upright)
+            surface = placed(asset.surface, upright)
+            yield dataclasses.replace(asset, surface=surface, collision=solid, hinge=hinge, **about)
 
-    def _rigid(self, name: str, kind: str, path: Path) -> HomePart:
+    def _rigid(self, path: Path, name: str, kind: str, fixed: bool) -> list[HomePart]:
         config = self._find(name, (kind,))
         if config is None:
             model = self._find(name, SUFFIXES)
@@ -155,21 +156,26 @@ class _Reader:
         label = self._classes.get(number, "")
         title = Path(name).name + (f"_{label}" if label else "")
         friction = friction if 0 < friction <= 2 else None
-        return HomePart(title, transform(np.eye(3), origin), render, collision, False, mass, friction)
+        return [HomePart(title, transform(np.eye(3), origin), render, collision, False, mass, friction)]
 
-    def _articulated(self, name: str, kind: str, path: Path) -> HomePart:
-        """Read a URDF with its joints where they are at 0."""
+    def _articulated(self, path: Path, name: str, kind: str, fixed: bool) -> list[HomePart]:
+        """Read a URDF, joints at 0; if its base is `fixed`, each front is a part."""
         urdf = self._find(name, (".urdf",))
         config = self._find(name, (kind,))
         if urdf is None and config is not None:
             urdf = config.parent / _value(self._table(config), "urdf_filepath", "", config)
         if urdf is None or not urdf.is_file():
             raise SceneRejected(f"{path}: names '{name}', whose URDF is not in {self.source.root}; copy it there")
-        self.dropped["articulated object (its joints are held at 0)"] += 1
-        body = read_urdf(self.source, self.source.inside(urdf), "", hold=True)
-        solid = TexturedMesh(*body.collision, None, None)
-        # read_urdf keeps the file's frame, and Habitat's URDFs have y up as its other assets have.
-        return HomePart(Path(name).name, np.eye(4), body.surface, solid, False, body.mass_kg, body.friction)
+        self.dropped["articulated object (its joints are held at 0)"] += not fixed
+        file, piece, parts = self.source.inside(urdf), Path(name).name, []
+        fronts = urdf_fronts(self.source, file, self.dropped) if fixed else []
+        for front, hinge, links in fronts or [("", None, None)]:
+            body = read_urdf(self.source, file, "", hold=True, only=links)
+            solid = TexturedMesh(*body.collision, None, None)
+            # read_urdf keeps the file's frame, and Habitat's URDFs have y up as its other assets have.
+            about = body.surface, solid, False, body.mass_kg, body.friction, len(fronts) > 1, "", hinge
+            parts.append(HomePart(f"{front}_of_" * bool(front) + piece, np.eye(4), *about))
+        return parts
 
     def _mesh(self, about: dict[str, Any], key: str, config: Path) -> TexturedMesh | None:
         name = _value(about, key, "", config)

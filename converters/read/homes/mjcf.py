@@ -1,8 +1,8 @@
 """Read any MJCF home: RoboCasa, MolmoSpaces, a scene of this project.
 
 MuJoCo itself reads and compiles it, after a check that every file that it names lies in the source's folder. What hangs
-on a free joint is a part; what no joint lets move is structure, body by body; what hinges and slides carry is fixed to
-its piece, but for doors.
+on a free joint is a part; what no joint lets move is structure, body by body; what a hinge or slide with limits carries
+opens, if its piece stands fast.
 """
 
 import collections
@@ -19,9 +19,9 @@ import numpy as np
 from converters.read.files import SourceFolder, only_file
 from converters.read.homes.parts import LEVEL, HomePart, category_of, home
 from converters.read.obj import TexturedMesh, in_colour
-from converters.read.urdf import SHAPES, height_field, joined, parse_xml, placed, rectangle, solid
+from converters.read.urdf import SHAPES, height_field, joined, parse_xml, placed, rectangle, solid, trouble
 from converters.records.errors import FILES, GEOMS, PIXELS, SceneRejected, check_count, check_image
-from converters.records.raw import RawScene
+from converters.records.raw import RawScene, ScannedHinge
 from interactive_nav_common.rotations import matrix_from_quat, transform
 from scenes_mjcf.categories import CATEGORIES, Category
 from scenes_mjcf.look import geom_image, mesh_of
@@ -134,12 +134,7 @@ class _Files:
         self.heaviest = max(self.heaviest, total)
 
     def _include(
-        self,
-        root: ElementTree.Element,
-        at: Path,
-        main: Path,
-        done: set[Path],
-        folder: dict[ElementTree.Element, Path],
+        self, root: ElementTree.Element, at: Path, main: Path, done: set[Path], folder: dict[ElementTree.Element, Path]
     ) -> None:
         """Put includes in their places: files below the main file's folder, or else below the including file's."""
         for parent in list(root.iter()):
@@ -182,11 +177,13 @@ def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Home
     if not (np.abs(data.geom_xpos) < FARTHEST_M).all():  # NaN too
         raise SceneRejected(f"{path}: a geom stands at no usable place, expected all within {FARTHEST_M:g} m")
     categories = [category_of(model.body(body).name) for body in range(model.nbody)]
-    top, planes = _tops(model, categories), _planes(model, data)
+    dropped, planes = _unread(model), _planes(model, data)
+    opens = _openings(model, data, categories, source, dropped)
+    top = _tops(model, categories, opens)
+    pieces = {int(top[model.body_parentid[body]]) for body in opens}
     built_in = [category is not None and not category.is_object for category in categories]
     for body in range(model.nbody - 1, 0, -1):
         built_in[model.body_parentid[body]] |= built_in[body]
-    dropped = _unread(model, top, categories)
     span = float(2.0 * max(np.abs(data.geom_xpos).max(initial=0.0), 2.0))
     parts = list(planes.values())
     for body in range(model.nbody):
@@ -218,11 +215,14 @@ def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Home
         # A body on a hinge or slide is held, and one that has a counter, a sink or the like within it. What MJCF calls
         # a box is more often a shape than a carton.
         jointed = model.body_jntnum[body] > 0 and categories[body] is not DOOR
-        held = not free and bool(built_in[body] or jointed or categories[body] is CATEGORIES["box"])
+        held = not free and bool(built_in[body] or jointed or categories[body] is CATEGORIES["box"] or body in pieces)
         friction = max((f for _, f in solid), default=0.0)
         name, mass = model.body(body).name or f"body_{body}", float(model.body_mass[members].sum()) or None
         friction = friction if 0 < friction <= 2 else None
-        parts.append(HomePart(name, pose, surface, joined([m for m, _ in solid]), not free, mass, friction, held))
+        piece = model.body(top[model.body_parentid[body]]).name if body in opens else "world"
+        name = name if piece == "world" else f"{name}_of_{piece}"
+        about = not free, mass, friction, held, "", opens[body].moved(back) if body in opens else None
+        parts.append(HomePart(name, pose, surface, joined([m for m, _ in solid]), *about))
     source.note_counts(f"{path.name}:", +dropped)
     return parts
 
@@ -240,36 +240,49 @@ def _planes(model: mujoco.MjModel, data: mujoco.MjData) -> dict[int, HomePart]:
     return planes
 
 
-def _unread(model: mujoco.MjModel, top: np.ndarray, categories: list[Category | None]) -> collections.Counter[str]:
-    """Count what is not read as it is."""
+def _unread(model: mujoco.MjModel) -> collections.Counter[str]:
+    """Count what is not read as it is, but for joints."""
     dropped = collections.Counter({f"{word}: dropped": int(getattr(model, count)) for word, count in UNREAD.items()})
-    for joint, body in enumerate(model.jnt_bodyid):
-        kind = _JOINT(model.jnt_type[joint])
-        if kind != _JOINT.mjJNT_FREE:
-            door = top[body] == body and categories[body] is DOOR
-            what = "a door's: swings at its edge if it stands on the floor" if door else "fixed, as part of its piece"
-            dropped[f"{kind.name[6:].lower()} joint ({what})"] += 1
     for geom in np.flatnonzero((model.geom_matid >= 0) & (model.geom_type != int(_GEOM.mjGEOM_MESH))):
         if model.mat_texid[model.geom_matid[geom]].max() >= 0:
             dropped["texture of a geom that is no mesh: dropped"] += 1
     return dropped
 
 
-def _tops(model: mujoco.MjModel, categories: list[Category | None]) -> np.ndarray:
-    """Return (nbody,) the body that each is a part of: the world's children, and what is free or has a name in them.
+def _openings(
+    model: mujoco.MjModel, data: mujoco.MjData, categories: list, source: SourceFolder, dropped: dict[str, int]
+) -> dict[int, ScannedHinge]:
+    """Return the bodies that open with their joints in the home, 0 as they stand; name or count all other joints."""
+    driven = model.actuator_trnid[model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT), 0]
+    opens: dict[int, ScannedHinge] = {}
+    for joint, body in enumerate(model.jnt_bodyid.tolist()):
+        kind, still = _JOINT(model.jnt_type[joint]), model.body_weldid[model.body_parentid[body]] == 0
+        limits = model.jnt_range[joint] if model.jnt_limited[joint] else np.array([-np.inf, np.inf])
+        low, high = (limits - data.qpos[model.jnt_qposadr[joint]]).tolist()
+        at, slides = data.xanchor[joint].copy(), kind == _JOINT.mjJNT_SLIDE
+        hinge = ScannedHinge(at, data.xaxis[joint].copy(), (low, high), slides=slides)
+        kept = still and model.body_jntnum[body] == 1 and (slides or kind == _JOINT.mjJNT_HINGE) and joint not in driven
+        if kept and not (why := trouble(hinge)):
+            opens[body] = hinge
+        elif kept:
+            door = not slides and categories[body] is DOOR and categories[model.body_parentid[body]] is None
+            end = "swings at its edge if it stands on the floor" if door else "welded shut"
+            source.note(f"joint '{model.joint(joint).name}' of '{model.body(body).name}' {why}; {end}")
+        elif kind != _JOINT.mjJNT_FREE:
+            dropped[f"{kind.name[6:].lower()} joint (fixed, as part of its piece)"] += 1
+    return opens
 
-    Drawers, lids, knobs and the doors of furniture are parts of what they hang on.
-    """
-    top = np.arange(model.nbody)
+
+def _tops(model: mujoco.MjModel, categories: list[Category | None], opens: dict[int, ScannedHinge]) -> np.ndarray:
+    """Return (nbody,) the body that each is a part of: the world's children, and what opens, is free or has a name."""
+    top, hinged = np.arange(model.nbody), model.jnt_bodyid[model.jnt_type == int(_JOINT.mjJNT_HINGE)]
     for body in range(1, model.nbody):
         parent, category = int(model.body_parentid[body]), categories[body]
         apart = category is not None and not model.body_jntnum[body]
         if category is DOOR:
-            first = model.body_jntadr[body]
-            hinged = first >= 0 and model.jnt_type[first] == _JOINT.mjJNT_HINGE
-            apart = hinged and categories[top[parent]] is None
+            apart = body in hinged and categories[top[parent]] is None
         still = model.body_weldid[parent] == 0
-        top[body] = body if parent == 0 or (still and apart) else top[parent]
+        top[body] = body if parent == 0 or body in opens or (still and apart) else top[parent]
     return top
 
 

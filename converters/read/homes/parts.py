@@ -25,14 +25,16 @@ from converters.read.obj import TexturedMesh, at_most, join_meshes, scan_of, tex
 from converters.read.surfaces import check_extent, floor_level, label_storeys, storey_of, with_split_corners
 from converters.read.urdf import joined, placed
 from converters.records.errors import MOVABLES, SceneRejected, check_count
-from converters.records.raw import UNLABELLED, UP, Annotation, CadModel, RawScene, ScannedHinge, Storey
+from converters.records.raw import UNLABELLED, Annotation, CadModel, RawScene, ScannedHinge, Storey
 from interactive_nav_common.records import read_packaged
-from interactive_nav_common.rotations import transform, transformed
+from interactive_nav_common.rotations import transform, transformed, yaw_matrix
 from scenes_mjcf.categories import CATEGORIES, Category
 
 ALIASES = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, str])
 """Names that others give to our categories."""
-BY_NAME = {c.name.replace("_", ""): c for c in CATEGORIES.values() if c.name not in ("robot", "other")}
+FRONTS = ("cabinet_door", "drawer")
+"""Categories of what opens of furniture; no name says them, but a joint."""
+BY_NAME = {c.name.replace("_", ""): c for c in CATEGORIES.values() if c.name not in ("robot", "other", *FRONTS)}
 BY_NAME |= {word: CATEGORIES[of] for word, of in ALIASES.items()}
 OTHER_STRUCTURE, OTHER_FURNITURE = 38, 39
 """NYU40's words for what is built in and nothing else, and for what need not reach the ceiling."""
@@ -43,8 +45,8 @@ RAISED_M = 0.03
 """What begins lower lies on the floor, and on nothing else."""
 RESTS_M = 0.10
 """What stands on a part may begin so far above the part's top."""
-DOOR_MOST_M = 1.3
-"""Wider leaves fold or slide: they stay where they are."""
+DOOR_MOST_M, DOOR_LEAST_M = 1.3, 1.5
+"""Wider leaves fold or slide: they stay where they are. Lower ones on a joint are furniture's."""
 SLAB_M, TOUCH_M, HIDDEN_SHARE = 0.3, 0.005, 0.8
 """A level face is hidden if so much lies below another one that is higher by up to the first."""
 COLUMN_M, SHOWN = 0.1, 100_000
@@ -78,9 +80,8 @@ class HomePart:
     """It stays where it is whatever its name says."""
     category_name: str = ""
     """Name of its category; empty: the one that `name` says."""
-    swing: tuple[np.ndarray, tuple[float, float]] | None = None
-    """Of a door's leaf: (3,) point of its upright hinge, local frame, and the angles (rad) that it turns by; None:
-    they are assumed."""
+    hinge: ScannedHinge | None = None
+    """What it opens on, local frame; None: nothing, or where its category is a door an assumed one."""
     low: bool = False
     """Built in, and no higher than it shows."""
     endless: bool = False
@@ -112,13 +113,15 @@ def by_last_words(words: list[str], table: Mapping[str, Any]) -> Any:
 def home(source: SourceFolder, layout: str, parts: list[HomePart], floors_m: tuple[float, ...] = ()) -> RawScene:
     """Return the record of a home from its parts."""
     parts, floors_m = _on_floors(source, parts, floors_m)
+    parts = [p if p.hinge is None or p.category_name else _front(source, p, p.hinge) for p in parts]
     parts = _by_size(source, parts, weighed=layout == "sdf")
     bounds = [_bounds(part) for part in parts]
     floor_m = np.array(floors_m)[storey_of(np.array([low[2] for low, _ in bounds]), floors_m)]
     moves = [_moves(part, low, high, z) for part, (low, high), z in zip(parts, bounds, floor_m, strict=True)]
     check_count(source.root, sum(moves), MOVABLES, "pieces of furniture on its floor")
     fast = [moving or part.held for moving, part in zip(moves, parts, strict=True)]
-    carried = _carriers(bounds, moves, fast, floor_m)
+    carry = [moving and part.category_name not in FRONTS for moving, part in zip(moves, parts, strict=True)]
+    carried = _carriers(bounds, carry, fast, floor_m)
     structure = [p for p, moving, by in zip(parts, moves, carried, strict=True) if not moving and by is None]
     if not structure:
         raise SceneRejected(f"{source.root}: no part is built in; expected floor and walls")
@@ -155,11 +158,11 @@ def home(source: SourceFolder, layout: str, parts: list[HomePart], floors_m: tup
 
 def built_in(raw: RawScene, beside: Mapping[int, str]) -> RawScene:
     """Return a source in which some pieces are structure, as they stand; a scan shows them already."""
-    places = [f"{raw.annotations[k].cad_id} (from {other})" for k, other in beside.items()]
-    words = f"{len(places)} pieces cannot be parted from what they stand in, and are built in: {', '.join(places)}"
+    end = {k: "its joint is welded shut" if raw.annotations[k].category in FRONTS else "is built in" for k in beside}
+    words = [f"{raw.annotations[k].cad_id} cannot be parted from {other}, and {end[k]}" for k, other in beside.items()]
     stay = tuple(a for k, a in enumerate(raw.annotations) if k not in beside)
     cads = {a.cad_id: raw.cads[a.cad_id] for a in stay}
-    rest = dataclasses.replace(raw, annotations=stay, cads=cads, warnings=(*raw.warnings, words))
+    rest = dataclasses.replace(raw, annotations=stay, cads=cads, warnings=(*raw.warnings, *words))
     if not raw.picture:
         return rest
     shells = []
@@ -176,6 +179,20 @@ def built_in(raw: RawScene, beside: Mapping[int, str]) -> RawScene:
         scan=dataclasses.replace(scan_of(whole, labels), furnished=raw.scan.furnished),
         picture=raw.picture + tuple((shell.vertices, shell.faces) for shell in shells),
     )
+
+
+def _front(source: SourceFolder, part: HomePart, hinge: ScannedHinge) -> HomePart:
+    """Return what opens upright, as a room door, a door of furniture or a drawer, and a knob as built in."""
+    sides, turn, said = np.ptp(_bounds(part), axis=0), part.pose[:3, :3], category_of(part.name)
+    tall = sides[2] >= DOOR_LEAST_M and not hinge.slides and abs(turn[2] @ hinge.axis) > 0.99
+    room = tall and (said is CATEGORIES["door"] or (said is None and "door" in part.name.lower()))
+    if knob := bool(np.sort(sides)[1] < 0.1):
+        source.note(f"joint of {part.name}: carries a knob or handle of less than 0.1 m; welded")
+    pose = transform(yaw_matrix(math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])), part.pose[:3, 3])
+    by, kind = np.linalg.inv(pose) @ part.pose, "structure" if knob else "door" if room else FRONTS[hinge.slides]
+    solid, place = part.collision and placed(part.collision, by), {"pose": pose, "surface": placed(part.surface, by)}
+    about = {"collision": solid, "hinge": hinge.moved(by), "static": not room, "held": knob, "category_name": kind}
+    return dataclasses.replace(part, **place, **about)
 
 
 def _bounds(part: HomePart) -> tuple[np.ndarray, np.ndarray]:
@@ -297,7 +314,7 @@ def _moves(part: HomePart, low: np.ndarray, high: np.ndarray, floor_m: float) ->
     category = part.category
     movable = not part.static if category is None else category.is_object
     folds = category is not None and category.name == "door" and max((high - low)[:2]) > DOOR_MOST_M
-    return movable and not part.held and not folds and abs(low[2] - floor_m) < STANDS_M
+    return movable and not (part.held or folds) and (part.category_name in FRONTS or abs(low[2] - floor_m) < STANDS_M)
 
 
 def _carriers(
@@ -331,19 +348,16 @@ def _furniture(
     pieces = None if pieces is None or len(pieces) > MAX_PIECES else pieces
     vertices, faces, colours = clean_surface(source, part.name, surface)
     category = part.category
-    name, pose, hinge = "other" if category is None else category.name, part.pose, None
+    name, pose, hinge = "other" if category is None else category.name, part.pose, part.hinge
     if name == "door":
         turn = leaf_turn(vertices)
-        if part.swing is not None and ((vertices.mean(axis=0) - part.swing[0]) @ turn)[0] < 0:
+        if hinge is not None and ((vertices.mean(axis=0) - hinge.origin) @ turn)[0] < 0:
             turn = turn * [-1.0, -1.0, 1.0]  # one of its two frames: a leaf lies along x from its hinge
         vertices, pose = vertices @ turn, pose.copy()
         surface = dataclasses.replace(surface, vertices=surface.vertices @ turn)
         pose[:3, :3] = pose[:3, :3] @ turn
         pieces = None if pieces is None else tuple((v @ turn, f) for v, f in pieces)
-        if part.swing is None:
-            hinge = assume_hinge(vertices, pose, structure)
-        else:
-            hinge = ScannedHinge(part.swing[0] @ turn, UP, part.swing[1])
+        hinge = assume_hinge(vertices, pose, structure) if hinge is None else hinge.moved(transform(turn.T))
     cad_id = re.sub(r"[^A-Za-z0-9_-]", "_", "-".join(p.name for p in (part, *riders)))[:100]
     material, mass_kg = CATEGORIES[name].material, part.mass_kg
     assert material is not None

@@ -1,12 +1,13 @@
 """Read a Gazebo world (SDF 1.4 to 1.12) with its models.
 
 Layout: `worlds/<name>.world` (or `.sdf`, there or in the folder itself) and `models/<name>/` with `model.config` and
-the SDF that it names. Links of a model are one rigid part, but for level planes, which have no end. `sdf.yaml` lists
-the elements that are read.
+the SDF that it names. Links of a model are one rigid part, but for level planes, which have no end, and for what opens
+of one that stands fast. `sdf.yaml` lists the elements that are read.
 """
 
 import collections
 import dataclasses
+import itertools
 import math
 import re
 import xml.etree.ElementTree as ElementTree
@@ -148,7 +149,7 @@ def read_sdf(root: Path, strict: bool = False, chosen: Path | None = None, withi
     source = SourceFolder(within or root, strict)
     file = chosen or only_file(root, worlds_of(root), "worlds")
     reader = _Reader(source, root)
-    world = urdf.parse_xml(source.use(source.inside(file), "expected SDF"), "SDF").find("world")
+    world = reader.root_of(file).find("world")
     if world is None:
         raise SceneRejected(f"{file}: has no <world>; give a world, not a model")
     urdf.count_unread(world, TABLES["read"], reader.unread)
@@ -213,7 +214,7 @@ class _Reader:
         root = BUILTIN.get(_key(fuel[1] if fuel else uri.removeprefix("model://")))
         if root is None:
             path = self._model_file(self._find(uri, path))
-            root = urdf.parse_xml(self.source.use(self.source.inside(path), "expected SDF"), "SDF")
+            root = self.root_of(path)
         model = root.find("model")
         if model is None and root.find("light") is None:
             raise SceneRejected(f"{path}: has no <model>")
@@ -222,6 +223,13 @@ class _Reader:
             return None
         urdf.count_unread(model, TABLES["read"], self.unread)
         return model, path
+
+    def root_of(self, path: Path) -> ElementTree.Element:
+        """Return the root of an SDF file; up to SDF 1.4 the axes of joints are the model's."""
+        root = urdf.parse_xml(self.source.use(self.source.inside(path), "expected SDF"), "SDF")
+        for axis in root.iter("axis") if root.get("version") in ("1.0", "1.2", "1.3", "1.4") else ():
+            ElementTree.SubElement(axis, "use_parent_model_frame").text = "1"
+        return root
 
     def _model_file(self, folder: Path) -> Path:
         """Return the SDF of a model's folder, or of its newest version where Fuel's layout has several."""
@@ -237,40 +245,63 @@ class _Reader:
         return folder / (names[-1].strip() if names else "model.sdf")
 
     def _of_links(self, model: SdfModel, pose: np.ndarray, state: ElementTree.Element) -> Iterator[HomePart]:
-        """Return the part that a model's links make, and its level planes, which have no end."""
-        for joint in model.element.findall("joint"):
-            if joint.get("type") != "fixed":
-                self.unread[f"{joint.get('type')} joint (its links are one part)"] += 1
+        """Return the part that a model's links make, what opens of it, and its level planes, which have no end."""
         scale = urdf.numbers(state.findtext("scale"), (1.0, 1.0, 1.0))
         if not (scale > 1e-6).all():
             raise ValueError(f"<state> scales it by {scale.tolist()}, expected numbers above 0")
-        grow, links = np.diag([*scale, 1.0]), model.element.findall("link")
+        grow, links = np.diag([*scale, 1.0]), {link.get("name") or "": link for link in model.element.findall("link")}
         moved = {e.get("name"): e.find("pose") for e in state.findall("link")}
-        shapes: dict[str, list[tuple[TexturedMesh, np.ndarray | None]]] = {"visual": [], "collision": []}
-        for link in links:
-            at = model.place(link.find("pose"), np.eye(4))
-            if (place := moved.get(link.get("name"))) is not None:
-                at = np.linalg.inv(pose @ grow) @ model.matrix(place) @ grow
-            for kind, meshes in shapes.items():
+        places = {"world": np.eye(4)}
+        for name, link in links.items():
+            places[name] = model.place(link.find("pose"), np.eye(4))
+            if (place := moved.get(name)) is not None:
+                places[name] = np.linalg.inv(pose @ grow) @ model.matrix(place) @ grow
+        every = [self._joint(model, element, places) for element in model.element.findall("joint")]
+        joints = dict(every)
+        self.unread["joint of a link that has another (its links are one part)"] += len(every) - len(joints)
+        fast = model.static or any(joint.parent == "world" for joint in joints.values())
+        joints = joints if fast else {link: joint._replace(hinge=None) for link, joint in joints.items()}
+        groups = urdf.by_front(self.source, model.name, links, joints, self.unread)
+        for front, with_it in groups.items():
+            some = [links[name] for name in with_it]
+            shapes: dict[str, list[tuple[TexturedMesh, np.ndarray | None]]] = {"visual": [], "collision": []}
+            for link, (kind, meshes) in itertools.product(some, shapes.items()):
                 for element, mesh in self._shapes(model, link, kind):
-                    matrix = grow @ model.place(element.find("pose"), at)
+                    matrix = grow @ model.place(element.find("pose"), places[link.get("name") or ""])
                     level = element.find("geometry/plane") is not None and (
                         unit_normals(transformed(mesh.vertices, pose @ matrix), mesh.faces)[0, 2] > LEVEL
                     )
                     meshes.append((urdf.placed(mesh, matrix), pose @ matrix if level else None))
-        planes = [at for _, at in shapes["collision"] if at is not None]
-        for at in planes:
-            look = next(mesh for mesh, at in shapes["visual"] + shapes["collision"] if at is not None)
-            at[:3, :3] = np.eye(3)
-            yield HomePart(model.name, at, look, None, True, held=True, endless=True)
-        visual = urdf.joined([mesh for mesh, at in shapes["visual"] if at is None or not planes])
-        solid = urdf.joined([mesh for mesh, at in shapes["collision"] if at is None])
-        masses = [float(urdf.numbers(text, (0.0,))[0]) for link in links if (text := link.findtext("inertial/mass"))]
-        mus = [c.findtext("surface/friction/ode/mu") for link in links for c in link.findall("collision")]
-        friction = [mu for text in mus if text and 0 < (mu := float(urdf.numbers(text, (0.0,))[0])) <= 2]
-        surface, mass = visual or solid, sum(masses) if masses else None
-        if surface is not None:
-            yield HomePart(model.name, pose, surface, solid, model.static, mass, max(friction, default=None))
+            planes = [at for _, at in shapes["collision"] if at is not None]
+            for at in planes:
+                look = next(mesh for mesh, at in shapes["visual"] + shapes["collision"] if at is not None)
+                at[:3, :3] = np.eye(3)
+                yield HomePart(model.name, at, look, None, True, held=True, endless=True)
+            visual = urdf.joined([mesh for mesh, at in shapes["visual"] if at is None or not planes])
+            solid = urdf.joined([mesh for mesh, at in shapes["collision"] if at is None])
+            masses = [float(urdf.numbers(text, (0.0,))[0]) for link in some if (text := link.findtext("inertial/mass"))]
+            mus = [c.findtext("surface/friction/ode/mu") for link in some for c in link.findall("collision")]
+            friction = [mu for text in mus if text and 0 < (mu := float(urdf.numbers(text, (0.0,))[0])) <= 2]
+            surface, mass, held = visual or solid, sum(masses) if masses else None, len(groups) > 1
+            if surface is not None:
+                hinge = joints[front].hinge if front else None
+                about = fast, mass, max(friction, default=None), held, "", hinge and hinge.moved(grow)
+                yield HomePart(f"{front}_of_" * bool(front) + model.name, pose, surface, solid, *about)
+
+    def _joint(self, model: SdfModel, e: ElementTree.Element, places: dict[str, np.ndarray]) -> tuple[str, urdf.Joint]:
+        """Return the child and the joint that it hangs on, in the model's frame where the links are at `places`."""
+        name, kind, axis, hinge = e.get("name") or "", e.get("type") or "", e.find("axis"), None
+        parent, child = ((e.findtext(key) or "").strip() for key in ("parent", "child"))
+        if axis is not None and {parent, child} <= places.keys():
+            # What a saved state has moved, and whether that opens the joint: then it stays as it is.
+            by, of_parent = (places[link] @ np.linalg.inv(model.frame(link)) for link in (child, parent))
+            xyz, whole = next(axis.iter("xyz"), axis), axis.findtext("use_parent_model_frame") in ("1", "true")
+            frame = xyz.get("expressed_in") or ("__model__" if whole else name)
+            at = by @ transform(model.frame(frame)[:3, :3], model.frame(name)[:3, 3])
+            limits = float(axis.findtext("limit/lower") or "-inf"), float(axis.findtext("limit/upper") or "inf")
+            hinge = urdf.hinge_along(kind, at, urdf.numbers(xyz.text, (0.0, 0.0, 1.0)), limits)
+            hinge = hinge if np.allclose(by, of_parent, atol=1e-3) else None
+        return child, urdf.Joint(name, kind, parent, hinge)
 
     def _shapes(
         self, model: SdfModel, link: ElementTree.Element, kind: str

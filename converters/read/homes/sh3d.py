@@ -31,7 +31,7 @@ from converters.read.obj import TexturedMesh
 from converters.read.surfaces import check_extent
 from converters.read.urdf import count_unread, report_unread
 from converters.records.errors import DRAWN, UNPACKED, SceneRejected, check_count
-from converters.records.raw import Lamp, RawScene
+from converters.records.raw import UP, Lamp, RawScene, ScannedHinge
 from interactive_nav_common.records import read_packaged
 from interactive_nav_common.rotations import transform, transformed, yaw_matrix
 
@@ -258,9 +258,10 @@ class _Drawing:
             faces = np.flatnonzero(leaf == k)
             flat = _part_of(door.surface, faces) if len(faces) else _plain_leaf(e, sash, door.surface)
             flat = _beside(flat, _axis(e, sash)[0], [_axis(e, s)[0] for s in sashes if s is not sash])
-            swing, hulls = _swing(e, sash, flat.vertices), door.collision if len(sashes) == 1 else None
-            name = f"{door.name} leaf {k}"
-            leaves.append(HomePart(name, door.pose, flat, hulls, False, category_name="door", swing=swing))
+            pin, hulls = _hinge(e, sash, flat.vertices), door.collision if len(sashes) == 1 else None
+            leaves.append(
+                HomePart(f"{door.name} leaf {k}", door.pose, flat, hulls, False, None, None, False, "door", pin)
+            )
         if not leaf.any():
             self.source.note(f"{called(e)}: its model has no leaf of its own; flat leaves take its place")
             return leaves
@@ -315,17 +316,15 @@ def _beside(leaf: TexturedMesh, hinge: np.ndarray, others: list[np.ndarray]) -> 
     return dataclasses.replace(leaf, vertices=leaf.vertices - np.outer(beyond, along))
 
 
-def _swing(
-    e: ElementTree.Element, sash: ElementTree.Element, leaf: np.ndarray
-) -> tuple[np.ndarray, tuple[float, float]]:
-    """Return the hinge of a leaf, and the angles that it turns by from where it is drawn."""
+def _hinge(e: ElementTree.Element, sash: ElementTree.Element, leaf: np.ndarray) -> ScannedHinge:
+    """Return the hinge of a leaf; 0 is where it is drawn."""
     at, angles, _ = _axis(e, sash)
     middle = (leaf.min(axis=0) + leaf.max(axis=0))[:2] / 2 - at
     drawn = math.atan2(middle[1], middle[0])
     gaps = [abs(math.remainder(a - drawn, math.tau)) for a in angles]
     at_rest = drawn if min(gaps) > AJAR_RAD else angles[int(np.argmin(gaps))]
     turns = np.clip([math.remainder(a - at_rest, math.tau) for a in angles], -TURN_MOST_RAD, TURN_MOST_RAD)
-    return np.array([*at, leaf[:, 2].min()]), (float(turns.min()), float(turns.max()))
+    return ScannedHinge(np.array([*at, leaf[:, 2].min()]), UP, (float(turns.min()), float(turns.max())))
 
 
 def _plain_leaf(e: ElementTree.Element, sash: ElementTree.Element, like: TexturedMesh) -> TexturedMesh:

@@ -100,7 +100,7 @@ def test_where_things_stand_and_what_they_are(source):
     assert raw.cads[found["table"].cad_id].mass_kg is None, "9 t are no table"
     assert raw.cads[found["dresser"].cad_id].mass_kg == 40.0
     told = "".join(raw.warnings)
-    assert "1 x default_lighting" in told and "1 x articulated object" in told and "placeholder" in told
+    assert "1 x default_lighting" in told and "joint 'hinge' of 'leaf' stands" in told and "placeholder" in told
 
 
 def test_keys_that_are_not_read_are_counted(tmp_path):
