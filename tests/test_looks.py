@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import json
 import shutil
 
 import mujoco
@@ -98,3 +100,10 @@ def test_a_damaged_look_is_refused_in_one_line(tmp_path, content):
     with pytest.raises(SceneError, match=r"look\.npz: .*make the scene again") as caught:
         spec_for_people(folder)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_the_committed_episodes_are_of_these_scenes(split):
+    """Files of hulls are part of a task's digest, byte by byte."""
+    stored = json.loads(gzip.decompress((SCENES / "episodes" / f"sparse-turtlebot-{split}.json.gz").read_bytes()))
+    assert [[n, load_scene(SCENES / n).task_digest] for n, _ in stored["scenes"]] == stored["scenes"]
