@@ -19,7 +19,7 @@ from converters.check.gates import drawn_shares, evaluate, kept_share
 from converters.check.settle import Settled, settle
 from converters.clock import Clock, Report
 from converters.geometry.boxes import Hull
-from converters.geometry.faces import sample_faces, simplify_open, simplify_parts
+from converters.geometry.faces import face_labels, sample_faces, simplify_open, simplify_parts
 from converters.propose.proposals import floor_of, with_retrieved
 from converters.read.homes.parts import built_in
 from converters.read.source import read_source
@@ -29,6 +29,7 @@ from converters.records.errors import Gate, SceneRejected
 from converters.records.raw import (
     ATTRIBUTION,
     CATEGORY_LABELS,
+    OTHER_PROP,
     RawScene,
     TexturedMesh,
     VisualMesh,
@@ -222,7 +223,8 @@ def _place(raw: RawScene, config: ConvertConfig, clock: Clock, stages: StageCach
     with clock.stage("cut"):
         cut = stages.call(cut_furniture, vertices_w, raw.scan.faces, raw.scan.labels, annotated, raw.scan.furnished)
     with clock.stage("map"):
-        kept = vertices_w, raw.scan.faces[cut.keep], raw.scan.labels
+        small = (not raw.scan.furnished) & (face_labels(raw.scan.labels, raw.scan.faces) == OTHER_PROP)
+        kept = vertices_w, raw.scan.faces[cut.keep & ~small], raw.scan.labels
         plan = stages.call(make_floor_plan, *kept, annotated, raw.given_map, yaw, bool(raw.picture))
         walls = stages.call(wall_boxes, plan)
         traversable, origin = resample(plan.grid, plan.traversable, plan.grid.resolution_m)

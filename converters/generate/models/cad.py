@@ -12,12 +12,13 @@ import functools
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Set
+from collections.abc import Iterable, Set
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import shapely
+from PIL import Image
 
 from converters.generate.models import parts as shapes
 from converters.generate.models.parts import MATERIALS, Part, on_floor
@@ -50,8 +51,12 @@ class Drawing:
 
     def draw(self) -> list[Part]:
         """Return its parts."""
-        shapes_of = [_shape(row) for row in self.parts]
-        return [part for shape in shapes_of for part in (shape if isinstance(shape, list) else [shape])]
+        return drawn_parts(self.parts)
+
+
+def drawn_parts(rows: Iterable[list[Any]]) -> list[Part]:
+    """Return the parts of rows as `Drawing.parts` has them."""
+    return [part for shape in map(_shape, rows) for part in (shape if isinstance(shape, list) else [shape])]
 
 
 def _shape(row: list[Any]) -> Any:
@@ -88,6 +93,10 @@ class Looks:
     """Role -> models that have it."""
     tints: dict[str, tuple[str, ...]]
     """Category -> materials in whose colour its models come too."""
+    holds: dict[str, tuple[list[Any], ...]]
+    """Model of the library -> what is drawn in it and nothing else, as `Drawing.parts`, in the library's frame."""
+    worktops: tuple[tuple[list[Any], ...], ...]
+    """Groups of what stands on counters, as `Drawing.parts`; y = 0 is the counter's top."""
 
 
 LOOKS: Looks = read_packaged(Path(__file__).with_name("looks.yaml"), Looks)
@@ -182,8 +191,17 @@ def cad_model(name: str) -> CadModel:
     The CAD origin is a little off the box centre, by an amount that depends on the name: ShapeNet's models are so too.
     """
     plain, _, tint = name.partition("~")
-    if tint:
-        return _tinted(cad_model(plain), tint)
+    model = _tinted(_empty(plain), tint) if tint else _empty(plain)
+    if plain not in LOOKS.holds or model.surface is None:
+        return model
+    move = model.surface.vertices.min(axis=0) - read_shape(plain).visual.vertices.min(axis=0) / model.unit_m
+    things = drawn_parts(LOOKS.holds[plain])
+    return dataclasses.replace(model, surface=_holding(model.surface, things, model.unit_m, move))
+
+
+@functools.cache
+def _empty(name: str) -> CadModel:
+    """Return a model that holds nothing, without a tint."""
     drawing = LIBRARY[name]
     parts = _library_parts(name) if name in _PACKAGED else drawing.draw()
     parts = parts if name in SPARSE or name in _PACKAGED else on_floor(parts)
@@ -206,6 +224,8 @@ def cad_model(name: str) -> CadModel:
     )
 
 
+SWATCH = 8
+"""Rows of an image that show plain colours."""
 ALIKE = 0.25
 """Colours whose channels, brightness aside, lie this near to a surface's main colour belong to what is tinted."""
 
@@ -228,6 +248,26 @@ def _tinted(model: CadModel, tint: str) -> CadModel:
     return dataclasses.replace(
         model, name=name, id_cad=_digest(name)[:32], surface=dataclasses.replace(surface, image=image)
     )
+
+
+def _holding(surface: VisualMesh, things: list[Part], unit_m: float, move: np.ndarray) -> VisualMesh:
+    """Return a surface with parts, m, in their materials' colours, which the lowest rows of its image then show."""
+    names, (high, wide) = sorted({part.material for part in things}), surface.image.shape[:2]
+    kept = np.asarray(Image.fromarray(surface.image).resize((wide, high - SWATCH), Image.Resampling.NEAREST))
+    colours = np.rint(255 * np.array([MATERIALS[n] for n in names])).astype(np.uint8)
+    swatches = np.broadcast_to(colours[np.arange(wide) * len(names) // wide], (SWATCH, wide, 3))
+    uv = surface.uv * [1, 1 - SWATCH / high] + [0, SWATCH / high]
+    places = np.array([((k + 0.5) / len(names), SWATCH / 2 / high) for k in range(len(names))])
+    vertices, faces = stacked((part.vertices / unit_m + move, part.faces) for part in things)
+    of = np.repeat([len(uv) + names.index(part.material) for part in things], [len(part.faces) for part in things])
+    normals = face_vectors(vertices, faces)
+    shown = (normals[:, 1:] > -0.99 * np.linalg.norm(normals, axis=1, keepdims=True)).all(
+        axis=1
+    )  # no back, no underside
+    faces, of = faces[shown], of[shown]
+    vertices, faces = stacked(((surface.vertices, surface.faces), (vertices, faces)))
+    uv_faces = np.vstack([surface.uv_faces, np.tile(of[:, None], 3)])
+    return VisualMesh(vertices, faces, np.vstack([uv, places]), uv_faces, np.vstack([kept, swatches]), surface.exact)
 
 
 def _painted(surface: VisualMesh, colour: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
-"""Model what hangs on the walls of kitchens and bathrooms: cupboards, hoods, mirrors and towels.
+"""Model what hangs on the walls of kitchens and bathrooms (cupboards, hoods, mirrors, towels) and stands on counters.
 
-What stands out by more than a towel begins above all robots: it needs no collision.
+What stands out of walls by more than a towel begins above all robots: it needs no collision.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -9,11 +9,13 @@ import numpy as np
 import shapely
 
 from converters.generate.design.plan import PlanBox
-from converters.generate.models.cad import Instance
+from converters.generate.models.cad import LOOKS, Instance, drawn_parts
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.finishes import Colouring
 from converters.generate.surface.sides import OTHER, Side, Span
-from converters.generate.surface.texture import Chart, plain
+from converters.generate.surface.texture import Chart, piece_charts, plain
+from converters.records.raw import OTHER_PROP
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP, yaw_matrix
 
 CUPBOARD_M, CUPBOARD_DEEP_M, DOOR_M = (1.45, 2.1), 0.33, 0.5
 HOOD_M, HOOD_DEEP_M, CHIMNEY_M = (1.6, 1.67), 0.48, 0.26
@@ -21,6 +23,8 @@ MIRROR_M, TOWEL_M, RAIL_M = (1.25, 1.95), (0.5, 0.65), 1.3
 FRONTS = np.array([[0.93, 0.93, 0.91], [0.88, 0.83, 0.74], [0.72, 0.55, 0.38], [0.55, 0.62, 0.58], [0.36, 0.40, 0.45]])
 TOWELS = np.array([[0.93, 0.92, 0.88], [0.55, 0.68, 0.72], [0.80, 0.62, 0.56], [0.62, 0.68, 0.52], [0.36, 0.42, 0.52]])
 TRIES = 12
+BARE = 0.35
+"""Share of counters with nothing on them."""
 Slab = tuple[Side, Span, Span, Span, Colouring]
 """Wall, along it, out of it, heights, paint."""
 
@@ -109,6 +113,24 @@ def _towel(
             return
 
 
+def _on_worktops(items: Sequence[Instance], rng: np.random.Generator) -> Iterator[Chart]:
+    """Yield what stands on most counters that do not come with anything on top."""
+    for item in (i for i in items if i.model.category == "counter" and "+" not in i.model.name):
+        if rng.random() < BARE:
+            continue
+        solid = item.model.surface or item.model.parts[-1]
+        corners = solid.vertices[solid.faces]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        level, of = np.unique(np.round(corners[:, :, 1].mean(axis=1), 3), return_inverse=True)
+        area = np.bincount(of, np.where(normal[:, 1] > 0.99 * np.linalg.norm(normal, axis=1), normal[:, 1], 0.0))
+        foot = item.to_floor(np.array([item.model.center * [1, 0, 1] + [0, level[np.argmax(area)], 0]]))[0]
+        turn = yaw_matrix(item.yaw_rad + rng.uniform(-0.3, 0.3)) @ Y_UP_TO_Z_UP
+        for part in drawn_parts(LOOKS.worktops[rng.integers(len(LOOKS.worktops))]):
+            yield from piece_charts(
+                part.vertices @ turn.T + foot, part.faces, OTHER_PROP, plain(MATERIALS[part.material])
+            )
+
+
 def decor(
     uses: Sequence[str],
     sides: Sequence[Sequence[Side]],
@@ -125,7 +147,9 @@ def decor(
         elif use == "bathroom":
             mirrors = [slab for side in walls for slab in _mirrors(side, items)]
             slabs += [*mirrors, *_towel(walls, items, mirrors, rng)]
-    charts, boxes = [], []
+    # From a stream beside it: pictures, which are drawn next, reach into the band of the map.
+    charts = list(_on_worktops(items, rng.spawn(1)[0])) if "kitchen" in uses else []
+    boxes = []
     for side, run, out, heights, paint in slabs:
         charts += side.slab(run, out, heights, OTHER, paint, 80.0, "b", thin=out[1] < 0.1)
         ends = [side.at(a, o, z) for a, o, z in zip(run, out, heights, strict=True)]

@@ -6,12 +6,18 @@ import dataclasses
 
 import numpy as np
 import pytest
+import shapely
 
 from converters.generate.design.plan import Plan, PlanBox, Rect
-from converters.generate.models.cad import LIBRARY, Instance, cad_model, place
+from converters.generate.models.cad import LIBRARY, LOOKS, Instance, cad_model, drawn_parts, place
+from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.decor import CUPBOARD_DEEP_M, CUPBOARD_M, HOOD_M, MIRROR_M, RAIL_M, decor
 from converters.generate.surface.modelled import Daylight, space_of
 from converters.generate.surface.sides import OTHER, sides_of
+from converters.library.store import read_shape
+from converters.pipeline import ConvertConfig
+from converters.read.obj import texels
+from converters.records.raw import OTHER_PROP
 
 ROOM, HEIGHT_M = Rect(0.0, 0.0, 4.0, 3.0), 2.5
 WINDOW = PlanBox((0.5, 3.0, 0.9), (1.5, 3.2, 2.1))
@@ -27,7 +33,7 @@ def at_north_wall(category: str, x: float, model: str = "") -> Instance:
 
 def boxes_of(use: str, items: list[Instance], windows: tuple[PlanBox, ...] = ()) -> list[PlanBox]:
     charts, boxes = decor([use], [sides_of(ROOM, (), windows)], items, HEIGHT_M, np.random.default_rng(0))
-    assert {chart.label for chart in charts} <= {OTHER}
+    assert {chart.label for chart in charts} <= {OTHER, OTHER_PROP}
     return boxes
 
 
@@ -57,6 +63,44 @@ def test_a_bathroom_has_a_mirror_above_its_washbasin_and_a_towel_where_nothing_s
         deep = max(box.low[0] - 0.0, box.low[1] - 0.0, 4.0 - box.high[0], 3.0 - box.high[1], 0.0)
         assert deep > 0.0 and min(box.low[0], box.low[1], 4.0 - box.high[0], 3.0 - box.high[1]) < 0.06
     assert [b.low[2] for b in boxes_of("bathroom", [basin], (WINDOW,))][0] == RAIL_M  # no mirror in a window
+
+
+@pytest.mark.parametrize("model", ["lowerCabinet", "lowerCabinet+Scopia/coffee_machine"])
+def test_things_stand_on_most_counters_that_come_bare_and_no_later_look_depends_on_them(model):
+    counter, rng, stood = at_north_wall("counter", 2.0, f"BlendSwap-CC-0/{model}"), np.random.default_rng(0), 0
+    assert counter.model.surface is not None
+    top_m = counter.to_floor(counter.model.surface.vertices)[:, 2].max()
+    for _ in range(20):
+        state, twin = rng.bit_generator.state, np.random.default_rng()
+        charts, _ = decor(["kitchen"], [sides_of(ROOM, (), ())], [counter], HEIGHT_M, rng)
+        twin.bit_generator.state = state
+        twin.integers(5)  # the colour of the cupboards
+        assert rng.bit_generator.state == twin.bit_generator.state
+        things = [chart.vertices for chart in charts if chart.label == OTHER_PROP]
+        stood += bool(things)
+        for points in [np.vstack(things)] if things else []:
+            assert points[:, 2].min() == pytest.approx(top_m, abs=1e-3) and points[:, 2].max() < top_m + 0.3
+            assert (shapely.distance(counter.footprint, shapely.points(points[:, :2])) == 0).all()
+    assert not stood if "+" in model else 8 <= stood < 20
+
+
+@pytest.mark.parametrize("name", LOOKS.holds)
+def test_books_are_drawn_inside_of_a_shelf_in_their_colours_and_nothing_else_of_it_changes(name):
+    full, tinted, bare = cad_model(name), cad_model(f"{name}~walnut"), read_shape(name).visual
+    assert full.surface is not None and tinted.surface is not None
+    held = {part.material for part in drawn_parts(LOOKS.holds[name])}
+    corners = full.surface.vertices[full.surface.faces] * full.unit_m
+    bounds = np.ptp(bare.vertices, axis=0), np.ptp(corners.reshape(-1, 3), axis=0)
+    np.testing.assert_allclose(*bounds, atol=1e-9)
+    assert len(bare.faces) < len(corners) <= ConvertConfig().object_faces
+    assert full.surface.image.shape == bare.image.shape
+    for surface in (full.surface, tinted.surface):
+        uv = surface.uv[surface.uv_faces[len(bare.faces) :]].mean(axis=1)
+        shown = {tuple(colour) for colour in texels(surface.image, uv).tolist()}
+        assert shown == {tuple(round(255 * c) for c in MATERIALS[m]) for m in held}
+        old = texels(surface.image, surface.uv[surface.uv_faces[: len(bare.faces)]].mean(axis=1)).astype(int)
+        if surface is full.surface:
+            assert np.abs(old - texels(bare.image, bare.uv[bare.uv_faces].mean(axis=1))).mean() < 2
 
 
 def test_the_floor_beneath_a_table_is_darker_and_the_far_corner_is_not():

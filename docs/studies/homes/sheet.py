@@ -1,0 +1,43 @@
+"""Draw homes from where most of them is visible, at 1.5 m on the left and at 0.4 m on the right, one a row.
+
+python -m docs.studies.homes.sheet GENERATED... DRAWN... -o sheet.png
+"""
+
+import argparse
+from pathlib import Path
+from unittest import mock
+
+import mujoco
+import numpy as np
+from PIL import Image
+
+from converters.check import pictures
+from scenes_mjcf.look import spec_for_people
+from scenes_mjcf.schema import load_maps
+
+SHAPE, HEIGHTS_M = (360, 600), (1.5, 0.4)
+"""Rows and columns of one view, and where the eyes are."""
+
+
+def main() -> None:
+    """Write the sheet."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenes", nargs="+", type=Path, help="scene folders")
+    parser.add_argument("-o", "--output", type=Path, required=True)
+    args = parser.parse_args()
+    rows = []
+    for folder in args.scenes:
+        model = spec_for_people(folder).compile()
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        about = model, data, pictures.world_surfaces(model, data), load_maps(folder), SHAPE
+        views = []
+        for height_m in HEIGHTS_M:
+            with mock.patch.object(pictures, "EYE_M", height_m):
+                views.append(pictures.at_eye_height(*about))
+        rows.append(np.hstack(views))
+    Image.fromarray(np.vstack(rows)).save(args.output)
+
+
+if __name__ == "__main__":
+    main()
