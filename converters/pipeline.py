@@ -272,11 +272,16 @@ def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock
     """Run every stage after reading on one floor; write into `folder`, which exists and is empty."""
     stages = StageCache(cache)
     placed = _place(raw, config, clock, stages, cache)
-    while placed.settled.held:
+    limits: list[str] = []
+    while held := placed.settled.held:
         # Structure that is new changes the map and the walls, and with them where everything else comes to rest.
         config, names = dataclasses.replace(config, auto_align=False), {o.name: o.cad_id for o in placed.annotated}
-        beside = {k: names.get(name, "a wall, or what is built in") for k, name in placed.settled.held.items()}
-        placed = _place(built_in(placed.raw, beside), config, clock, stages, cache)
+        beside = {k: names.get(name, "a wall, or what is built in") for k, name in held.items()}
+        limits += [words for k, words in placed.settled.limits.items() if k in held]
+        placed = _place(built_in(placed.raw, beside, placed.settled.limits), config, clock, stages, cache)
+    if limits := [*limits, *placed.settled.limits.values()]:
+        line = f"fronts that open less far than their joints, for what they would hit: {', '.join(limits)}"
+        placed = dataclasses.replace(placed, raw=dataclasses.replace(placed.raw, warnings=(*placed.raw.warnings, line)))
     raw, vertices_w, cut = placed.raw, placed.vertices_w, placed.cut
     with clock.stage("texture") as progress:
         structure = stages.call(_structure_visual, raw, vertices_w, cut.keep, placed.plan, placed.annotated, config)

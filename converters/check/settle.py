@@ -1,12 +1,14 @@
 """Settle objects at their annotated poses among wall boxes until they rest."""
 
 import dataclasses
+import re
 from collections.abc import Collection, Mapping
 
 import mujoco
 import numpy as np
 
 from converters.check.gates import collide_with, run, started_over
+from converters.check.opening import STEPS, blocked_fronts
 from converters.records.errors import StageFailed
 from converters.write.emit import SceneParts, build_spec
 
@@ -36,6 +38,8 @@ class Settled:
     """Per object, change of height (positive: up)."""
     held: Mapping[int, str] = dataclasses.field(default_factory=dict)
     """Objects that could not be parted from what is named, by number."""
+    limits: Mapping[int, str] = dataclasses.field(default_factory=dict)
+    """How far fronts open that hit something, by number; those that are `held` hardly do."""
 
 
 def _on_floor(parts: SceneParts) -> SceneParts:
@@ -159,6 +163,33 @@ def _simulate(parts: SceneParts, shape: str, seconds: float) -> SceneParts:
     return _with_poses(parts, model, data)
 
 
+def _within_reach(parts: SceneParts) -> tuple[SceneParts, dict[int, str], dict[int, str]]:
+    """Cut ranges of fronts to what is free; return what those hit that open by less than a third, and words on all."""
+    whole, names = parts.objects, [o.name for o in parts.objects]
+    held, words = dict[int, str](), dict[int, str]()
+    while True:
+        spec = build_spec(parts)
+        for exclude in spec.excludes:
+            spec.delete(exclude)
+        lines = [re.split(" hits | at | ", line) for line in blocked_fronts(collide_with(spec, "box"))]
+        hits = [(k, *hit) for name, *hit in lines if (k := names.index(name)) not in held]
+        if not hits:
+            return parts, held, words
+        objects = list(parts.objects)
+        for k, other, at, unit in hits:
+            hinge, drawn, cad_id = objects[k].hinge, whole[k].hinge, whole[k].cad_id
+            assert hinge is not None and drawn is not None
+            (low, high), most = hinge.range_rad, drawn.range_rad[1]
+            free = low + (high - low) * (min(round((float(at) - low) / (high - low) * STEPS), STEPS) - 1) / STEPS
+            other = whole[names.index(other)].cad_id if other in names else other
+            words[k] = f"{cad_id} to {free:.2f} of {most:.2f} {unit} ({other})"
+            if free < max(low + (most - low) / 3, 0.0):
+                held[k], words[k] = other, f"{cad_id} not at all ({other})"
+            else:
+                objects[k] = dataclasses.replace(objects[k], hinge=dataclasses.replace(hinge, range_rad=(low, free)))
+        parts = dataclasses.replace(parts, objects=tuple(objects))
+
+
 def settle(parts: SceneParts, drawn: bool = False, fitted: Collection[int] = ()) -> Settled:
     """Set objects on the floor, push them apart, then let boxes and after them hulls come to rest."""
     hold = range(len(parts.objects)) if drawn else fitted
@@ -166,12 +197,7 @@ def settle(parts: SceneParts, drawn: bool = False, fitted: Collection[int] = ())
     if not held:
         result = _simulate(result, "box", SETTLE_S)
         result = _simulate(result, "hull", SETTLE_S)
-    before = np.array([o.position_w for o in parts.objects])
-    after = np.array([o.position_w for o in result.objects])
-    horizontal = np.linalg.norm((after - before)[:, :2], axis=1)
-    return Settled(
-        result,
-        tuple(round(float(v), 4) for v in horizontal),
-        tuple(round(float(v), 4) for v in (after - before)[:, 2]),
-        held,
-    )
+    result, held, limits = _within_reach(result) if drawn and not held else (result, held, {})
+    off = np.array([o.position_w for o in result.objects]) - np.array([o.position_w for o in parts.objects])
+    shift, drop = (tuple(round(float(v), 4) for v in by) for by in (np.linalg.norm(off[:, :2], axis=1), off[:, 2]))
+    return Settled(result, shift, drop, held, limits)

@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from converters.records.cache import NOT_HASHED
 from converters.records.errors import SceneRejected
@@ -149,6 +150,15 @@ class ScannedHinge:
         grows, side = (length, 1.0) if self.slides else (1.0, np.sign(np.linalg.det(matrix[:3, :3])))
         span, origin = (self.range_rad[0] * grows, self.range_rad[1] * grows), transformed(self.origin[None], matrix)[0]
         return dataclasses.replace(self, origin=origin, axis=side * axis / length, range_rad=span)
+
+    def motion(self, value: float) -> np.ndarray:
+        """Return the (4, 4) of what hangs on it from 0 to a value."""
+        turn = np.eye(3) if self.slides else Rotation.from_rotvec(value * self.axis).as_matrix()
+        return transform(turn, value * self.axis if self.slides else self.origin - turn @ self.origin)
+
+    def value(self, motion: np.ndarray) -> float:
+        """Return how far a (4, 4) opens it."""
+        return float(self.axis @ (motion[:3, 3] if self.slides else Rotation.from_matrix(motion[:3, :3]).as_rotvec()))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,7 +9,7 @@ import collections
 import dataclasses
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -156,10 +156,11 @@ def home(source: SourceFolder, layout: str, parts: list[HomePart], floors_m: tup
     )
 
 
-def built_in(raw: RawScene, beside: Mapping[int, str]) -> RawScene:
-    """Return a source in which some pieces are structure, as they stand; a scan shows them already."""
+def built_in(raw: RawScene, beside: Mapping[int, str], named: Collection[int] = ()) -> RawScene:
+    """Return a source in which some pieces are structure; warnings say what those stand beside that are not `named`."""
     end = {k: "its joint is welded shut" if raw.annotations[k].category in FRONTS else "is built in" for k in beside}
-    words = [f"{raw.annotations[k].cad_id} cannot be parted from {other}, and {end[k]}" for k, other in beside.items()]
+    rows = [(raw.annotations[k].cad_id, other, end[k]) for k, other in beside.items() if k not in named]
+    words = [f"{cad_id} cannot be parted from {other}, and {what}" for cad_id, other, what in rows]
     stay = tuple(a for k, a in enumerate(raw.annotations) if k not in beside)
     cads = {a.cad_id: raw.cads[a.cad_id] for a in stay}
     rest = dataclasses.replace(raw, annotations=stay, cads=cads, warnings=(*raw.warnings, *words))
@@ -189,6 +190,8 @@ def _front(source: SourceFolder, part: HomePart, hinge: ScannedHinge) -> HomePar
     if knob := bool(np.sort(sides)[1] < 0.1):
         source.note(f"joint of {part.name}: carries a knob or handle of less than 0.1 m; welded")
     pose = transform(yaw_matrix(math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])), part.pose[:3, 3])
+    if sum(hinge.range_rad) < 0:  # the lower end is where it is shut
+        hinge = dataclasses.replace(hinge, axis=-hinge.axis, range_rad=(-hinge.range_rad[1], -hinge.range_rad[0]))
     by, kind = np.linalg.inv(pose) @ part.pose, "structure" if knob else "door" if room else FRONTS[hinge.slides]
     solid, place = part.collision and placed(part.collision, by), {"pose": pose, "surface": placed(part.surface, by)}
     about = {"collision": solid, "hinge": hinge.moved(by), "static": not room, "held": knob, "category_name": kind}

@@ -293,14 +293,17 @@ class _Reader:
         name, kind, axis, hinge = e.get("name") or "", e.get("type") or "", e.find("axis"), None
         parent, child = ((e.findtext(key) or "").strip() for key in ("parent", "child"))
         if axis is not None and {parent, child} <= places.keys():
-            # What a saved state has moved, and whether that opens the joint: then it stays as it is.
+            # What a saved state has moved: it opens the joint, or takes the link off it.
             by, of_parent = (places[link] @ np.linalg.inv(model.frame(link)) for link in (child, parent))
             xyz, whole = next(axis.iter("xyz"), axis), axis.findtext("use_parent_model_frame") in ("1", "true")
             frame = xyz.get("expressed_in") or ("__model__" if whole else name)
-            at = by @ transform(model.frame(frame)[:3, :3], model.frame(name)[:3, 3])
+            at = of_parent @ transform(model.frame(frame)[:3, :3], model.frame(name)[:3, 3])
             limits = float(axis.findtext("limit/lower") or "-inf"), float(axis.findtext("limit/upper") or "inf")
             hinge = urdf.hinge_along(kind, at, urdf.numbers(xyz.text, (0.0, 0.0, 1.0)), limits)
-            hinge = hinge if np.allclose(by, of_parent, atol=1e-3) else None
+            if hinge is not None:
+                value = hinge.value(by @ np.linalg.inv(of_parent))
+                on = np.allclose(by, hinge.motion(value) @ of_parent, atol=1e-3)
+                hinge = dataclasses.replace(hinge, range_rad=(limits[0] - value, limits[1] - value)) if on else None
         return child, urdf.Joint(name, kind, parent, hinge)
 
     def _shapes(

@@ -20,12 +20,11 @@ import numpy as np
 import shapely
 
 from converters.geometry.boxes import convex_hull
-from converters.geometry.faces import compacted
 from converters.read.files import SourceFolder, only_file
 from converters.read.homes import sh3d_walls
 from converters.read.homes.parts import HomePart, category_of, home
 from converters.read.homes.sh3d_archive import called, colour, metres, number, point, read_xml, unpack
-from converters.read.homes.sh3d_models import LEAF, WHITE, DrawnModels, mean_colour
+from converters.read.homes.sh3d_models import LEAF, WHITE, DrawnModels, mean_colour, part_of
 from converters.read.meshes import colours_of_faces
 from converters.read.obj import TexturedMesh
 from converters.read.surfaces import check_extent
@@ -34,6 +33,7 @@ from converters.records.errors import DRAWN, UNPACKED, SceneRejected, check_coun
 from converters.records.raw import UP, Lamp, RawScene, ScannedHinge
 from interactive_nav_common.records import read_packaged
 from interactive_nav_common.rotations import transform, transformed, yaw_matrix
+from scenes_mjcf.categories import CATEGORIES
 
 ENDING = ".sh3d"
 PIECES = ("pieceOfFurniture", "doorOrWindow", "light", "shelfUnit")
@@ -59,7 +59,7 @@ OURS = "interactive_nav#"
 BLOCKS = ("texturablebox", "texturablecylinder", "texturabletriangle", "texturablesphere", "texturablecone")
 """Ids, less what stands before #, of shapes that people build all kinds of things from."""
 _TABLES: dict[str, dict[str, Any]] = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, dict[str, Any]])
-FOREIGN = {word: category for category, words in _TABLES["words"].items() for word in words}
+FOREIGN = dict(sorted(((w, c) for c, words in _TABLES["words"].items() for w in words), key=lambda p: -len(p[0])))
 
 
 def read_sh3d(root: Path, strict: bool = False, chosen: Path | None = None) -> RawScene:
@@ -93,11 +93,7 @@ def kind_of(catalogue_id: str, name: str, height_m: float = 1.0) -> str:
     plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode().lower()
     for word in re.findall("[a-z]{3,}", plain) if kind is None else ():
         # In compounds of German and Dutch the last part says what it is.
-        ends = (
-            key
-            for key in sorted(FOREIGN, key=len, reverse=True)
-            if word == key or (len(key) > 4 and word.endswith(key))
-        )
+        ends = (key for key in FOREIGN if word == key or (len(key) > 4 and word.endswith(key)))
         kind = kind or FOREIGN.get(next(ends, ""))
     if kind == "table" and height_m < LOW_TABLE_M and not catalogue_id.startswith(OURS):
         return "coffee_table"
@@ -232,17 +228,23 @@ class _Drawing:
         name = " ".join((e.get("name") or e.get("catalogId") or "piece").split())[:60]
         self.named[name] += 1
         name = f"{name} {self.named[name]}"
-        if SLIDES.search(" ".join([e.get("catalogId") or "", name, *np.unique(group)])):
+        kind = kind_of(e.get("catalogId") or "", e.get("name") or "", height)
+        held = e.get("movable") == "false" or kind == "structure"
+        stays = kind != "structure" and (held or not CATEGORIES[kind].is_object)
+        fronts = [*self.models.fronts(e, surface, group)] if stays and e.tag not in ("doorOrWindow", "light") else []
+        if SLIDES.search(" ".join([e.get("catalogId") or "", name, *np.unique(group)])) and not fronts:
             self.source.note(f"{name}: its sliding or folding parts stay as drawn")
         solid = self.models.solid(e, surface) if (e.get("catalogId") or "").startswith(OURS) else None
         if e.tag == "doorOrWindow":
             return self._door(e, HomePart(name, pose, surface, solid, False), group)
-        kind = kind_of(e.get("catalogId") or "", e.get("name") or "", height)
         if e.tag == "light":
             kind = kind if kind == "floor_lamp" else "other"
             self.lamps += [_lamp(e, source, pose) for source in e.findall("lightSource")]
-        held = e.get("movable") == "false" or kind == "structure"
-        return [HomePart(name, pose, surface, solid, False, held=held, category_name=kind)]
+        if fronts:
+            rest = np.setdiff1d(np.arange(len(surface.faces)), np.concatenate([faces for faces, _ in fronts]))
+            held, solid, surface = True, None, part_of(surface, rest)
+        whole = HomePart(name, pose, surface, solid, False, held=held, category_name=kind)
+        return [whole, *(dataclasses.replace(f, name=f"{f.name} of {name}", pose=pose) for _, f in fronts)]
 
     def _door(self, e: ElementTree.Element, door: HomePart, group: np.ndarray) -> list[HomePart]:
         """Return the frame and leaves of a door, whose faces are in a `group` each; a window in one piece."""
@@ -256,7 +258,7 @@ class _Drawing:
         leaves = []
         for k, sash in enumerate(sashes, 1):
             faces = np.flatnonzero(leaf == k)
-            flat = _part_of(door.surface, faces) if len(faces) else _plain_leaf(e, sash, door.surface)
+            flat = part_of(door.surface, faces) if len(faces) else _plain_leaf(e, sash, door.surface)
             flat = _beside(flat, _axis(e, sash)[0], [_axis(e, s)[0] for s in sashes if s is not sash])
             pin, hulls = _hinge(e, sash, flat.vertices), door.collision if len(sashes) == 1 else None
             leaves.append(
@@ -266,7 +268,7 @@ class _Drawing:
             self.source.note(f"{called(e)}: its model has no leaf of its own; flat leaves take its place")
             return leaves
         frame = np.flatnonzero(leaf == 0)
-        rest = dataclasses.replace(fixed, surface=_part_of(door.surface, frame)) if len(frame) else None
+        rest = dataclasses.replace(fixed, surface=part_of(door.surface, frame)) if len(frame) else None
         return leaves if rest is None else [rest, *leaves]
 
 
@@ -280,16 +282,8 @@ def _lamp(e: ElementTree.Element, source: ElementTree.Element, pose: np.ndarray)
 
 
 def _footprint(e: ElementTree.Element) -> Any:
-    width, depth = metres(e, "width", "depth") / 2
-    turn = yaw_matrix(-number(e, "angle", 0.0))[:2, :2]
-    return shapely.Polygon(
-        point(e) + np.array([(-width, -depth), (width, -depth), (width, depth), (-width, depth)]) @ turn.T
-    )
-
-
-def _part_of(mesh: TexturedMesh, faces: np.ndarray) -> TexturedMesh:
-    uv = None if mesh.corner_uv is None else mesh.corner_uv[faces]
-    return TexturedMesh(*compacted(mesh.vertices, mesh.faces[faces]), uv, mesh.texture)
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * metres(e, "width", "depth") / 2
+    return shapely.Polygon(point(e) + corners @ yaw_matrix(-number(e, "angle", 0.0))[:2, :2].T)
 
 
 def _axis(e: ElementTree.Element, sash: ElementTree.Element) -> tuple[np.ndarray, np.ndarray, float]:

@@ -14,17 +14,20 @@ from typing import Any
 import numpy as np
 import shapely
 import trimesh
+from scipy.spatial.transform import Rotation
 
+from converters.geometry.boxes import convex_hull
 from converters.geometry.faces import compacted
 from converters.read.files import SourceFolder, read_image, read_obj
 from converters.read.homes.parts import HomePart, triangles
 from converters.read.homes.sh3d_archive import called, colour, metres, model_path, number, parsed
 from converters.read.meshes import read_surface
 from converters.read.obj import GREYS, TexturedMesh, distinct, join_textures, read_painted_obj
-from converters.read.urdf import placed, solid
+from converters.read.urdf import joined, placed, solid
 from converters.records.errors import EXTENT_M, GEOMS, SceneRejected, check_count
+from converters.records.raw import ScannedHinge
 from interactive_nav_common.records import read_packaged
-from interactive_nav_common.rotations import Y_UP_TO_Z_UP
+from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, transformed
 
 WHITE = np.array([235, 235, 230], np.uint8).reshape(1, 1, 3)
 """Of sides and rooms that have no colour."""
@@ -39,6 +42,8 @@ PANE = "sweethome3d_window_pane"
 """Groups that begin so are glass: a piece's one colour leaves them."""
 GLASS = np.array([176, 200, 214], np.uint8).reshape(1, 1, 3)
 LEAF = re.compile(r"sweethome3d_(?:opening|window_pane)_on_hinge_(\d{1,2})")
+OPENS = re.compile(r"sweethome3d_[a-z_]+_on_((?:hinge|rail)_\d{1,2})(?!\d)")
+"""Groups that open on the one that is called so, or on `sweethome3d_unique_rail`."""
 HULLS = "hulls.obj"
 """Beside a model in its folder: convex pieces to collide with, each a group that shares no vertex."""
 APART = 1e-4
@@ -190,6 +195,54 @@ class DrawnModels:
             vertices[of] += APART * (vertices[of].mean(axis=0) - vertices[of])
         return TexturedMesh(vertices, mesh.faces, None, None)
 
+    def fronts(
+        self, e: ElementTree.Element, mesh: TexturedMesh, group: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, HomePart]]:
+        """Yield what opens of a piece: its faces, and the part in the piece's frame, its joint 0 as drawn."""
+        words = np.array([m[1] if (m := OPENS.match(str(g))) else "" for g in group])
+        model = self.models.get(e.get("model") or "")
+        if model is None or not words.any():
+            return
+        body = np.flatnonzero(~np.char.startswith(model.group.astype(str), "sweethome3d_"))
+        flat = np.column_stack([model.vertices[model.faces[body]].mean(axis=1), np.ones(len(body))])
+        there = mesh.vertices[mesh.faces[body]].mean(axis=1)
+        placing, _, rank, _ = np.linalg.lstsq(flat, there, rcond=None)
+        place = transform(placing[:3].T, placing[3])
+        for word in sorted({*words.tolist()} - {""}) if rank == 4 else ():
+            pin = re.compile(rf"sweethome3d_(?:{word}(?!\d)|unique_{word.partition('_')[0]})")
+            pins, faces = [pin.match(str(g)) is not None for g in model.group], np.flatnonzero(words == word)
+            if not any(pins):
+                continue
+            on, once = model.vertices[model.faces[pins]].reshape(-1, 3), faces[faces < len(model.faces)]
+            part = model.vertices[model.faces[once]].reshape(-1, 3)
+            low, high, first, last = (side(of, axis=0) for of in (on, part) for side in (np.min, np.max))
+            k, slides, most = int(np.argmax(high - low)), word.startswith("rail"), math.pi / 2
+            joint = ScannedHinge((low + high) / 2, np.eye(3)[k], (0.0, most), slides=slides)
+            # It opens away from the body's middle, a drawer to the front, what is shorter than its rail along it.
+            shut, at = joint.moved(place), transformed((first + last)[None] / 2, place)[0]
+            out = at - (there.min(axis=0) + there.max(axis=0)) / 2
+            way = float(np.cross(shut.axis, at - shut.origin) @ out)
+            if slides:
+                ahead, behind, most = (high - last)[k], (first - low)[k], (high - low)[k]
+                along = (last - first)[k] < 0.9 * most
+                way, most = (ahead - behind, max(ahead, behind)) if along else (shut.axis @ (out - [0, 10, 0]), most)
+            # How somebody has opened it, by its corners in the model's frame.
+            corners = mesh.vertices[mesh.faces[once]][:, :: int(np.sign(np.linalg.det(place)))].reshape(-1, 3)
+            corners = transformed(corners, np.linalg.inv(place))
+            turn = Rotation.align_vectors(corners - corners.mean(axis=0), part - part.mean(axis=0))[0].as_matrix()
+            drawn = transform(turn, corners.mean(axis=0) - turn @ part.mean(axis=0))
+            value = joint.value(drawn)
+            if (value if abs(value) > 1e-3 else way) < 0:
+                joint, value = dataclasses.replace(joint, axis=-joint.axis), -value
+            hinge = dataclasses.replace(joint, range_rad=(0.0 - value, float(max(value, most) - value))).moved(place)
+            # What is stretched along one axis shears as it turns in the drawing: it turns as a rigid body instead.
+            rigid = joint.moved(place).motion(-hinge.range_rad[0]) @ place @ np.linalg.inv(place @ drawn)
+            groups = [mesh.vertices[mesh.faces[faces[group[faces] == g]]] for g in np.unique(group[faces])]
+            hulls = [convex_hull(transformed(points.reshape(-1, 3), rigid)) for points in groups]  # exact: doors touch
+            collision = joined([TexturedMesh(hull.vertices, hull.faces, None, None) for hull in hulls])
+            shown = placed(part_of(mesh, faces), rigid)
+            yield faces, HomePart(word, np.eye(4), shown, collision, True, hinge=hinge)
+
     def _deformed(self, element: ElementTree.Element, model: DrawnModel) -> tuple[np.ndarray, np.ndarray]:
         """Return the vertices and faces of a model whose parts are opened, turned or slid as drawn."""
         vertices, faces = model.vertices, model.faces
@@ -231,6 +284,12 @@ class DrawnModels:
                     uv[chosen] = _by_place(model, element, chosen, size)
         numbers[pane] = len(images)
         return uv, numbers, [*images, GLASS]
+
+
+def part_of(mesh: TexturedMesh, faces: np.ndarray) -> TexturedMesh:
+    """Return some faces of a mesh."""
+    uv = None if mesh.corner_uv is None else mesh.corner_uv[faces]
+    return TexturedMesh(*compacted(mesh.vertices, mesh.faces[faces]), uv, mesh.texture)
 
 
 def _by_place(model: DrawnModel, element: ElementTree.Element, faces: np.ndarray, size: np.ndarray) -> np.ndarray:

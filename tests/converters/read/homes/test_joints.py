@@ -163,6 +163,35 @@ def test_a_written_scene_opens_as_its_source_does(tmp_path):
             assert _nearest(points + here.geom_xpos[hull], far) < 2e-3
 
 
+def test_the_lower_end_of_a_range_is_where_a_front_is_shut(tmp_path):
+    path = _mjcf(tmp_path / "home") / "scene.xml"
+    path.write_text(path.read_text().replace('axis="0 0 -1" range="0 90"', 'axis="0 0 1" range="-90 0"'))
+    raw = read_mjcf(tmp_path / "home")
+    (door,) = (a for a in raw.annotations if a.category == "cabinet_door")
+    assert door.hinge is not None and door.hinge.range_rad == pytest.approx((0.0, math.pi / 2))
+    assert _nearest(_opened(door, raw.cads[door.cad_id], 0.5), _corner("cabinet_door", 0.5)) < 1e-6
+
+
+def test_a_saved_state_leaves_fronts_open(tmp_path):
+    """The door by 0.4 rad, the drawer by 0.1 m; poses are in the world. What is off its joint is welded."""
+    state = """<state><model name='cabinet'><pose>-1 0.5 0 0 0 1.5707963</pose><link name='left_door'>
+<pose>-0.8 0.22 0.3 0 0 1.1707963</pose></link><link name='top'><pose>-0.69 0.5 0.7 0 0 3.1415926</pose></link></model>
+</state></world>"""
+    world = _sdf(tmp_path / "home") / "worlds" / "home.world"
+    text = world.read_text()
+    world.write_text(text.replace("</world>", state))
+    raw = read_sdf(tmp_path / "home")
+    fronts = {a.category: a for a in raw.annotations}
+    for category, start, most in (("cabinet_door", 0.4, math.pi / 2), ("drawer", 0.1, 0.3)):
+        annotation, cad = fronts[category], raw.cads[fronts[category].cad_id]
+        assert annotation.hinge is not None
+        assert annotation.hinge.range_rad == pytest.approx((-start, most - start), abs=1e-6)
+        for q in (0.0, start, most):
+            assert _nearest(_opened(annotation, cad, q - start), _corner(category, q)) < 1e-6
+    world.write_text(text.replace("</world>", state.replace("0.22 0.3", "0.22 0.35").replace("-0.69 0.5", "-0.3 0.5")))
+    assert [a.category for a in read_sdf(tmp_path / "home").annotations] == ["sideboard"]
+
+
 def test_joints_of_loose_models_and_of_other_kinds_are_counted(tmp_path):
     raw = read_sdf(_sdf(tmp_path / "loose", static="false"))
     assert {a.category for a in raw.annotations} == {"sideboard"}
