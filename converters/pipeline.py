@@ -81,6 +81,8 @@ class ConvertConfig:
     """Most, where a simplification within 1 cm leaves more."""
     structure_texture: int = 1024
     object_texture: int = 256
+    keep: bool = dataclasses.field(default=True, metadata=NOT_HASHED)
+    """Keep the results of stages for the next conversion of the same source."""
     auto_align: bool = dataclasses.field(default=False, metadata=NOT_HASHED)
     """Fits library models to labelled furniture that has no annotation."""
     library: Path | None = dataclasses.field(default=None, metadata=NOT_HASHED)
@@ -270,7 +272,7 @@ def _judge(
 
 def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock, cache: Path) -> Converted:
     """Run every stage after reading on one floor; write into `folder`, which exists and is empty."""
-    stages = StageCache(cache)
+    stages = StageCache(cache if config.keep else None)
     placed = _place(raw, config, clock, stages, cache)
     limits: list[str] = []
     while held := placed.settled.held:

@@ -203,7 +203,7 @@ def make_scene(
     number of decompositions side by side.
     """
     with part_folder(folder, overwrite=True) as work:
-        config = ConvertConfig(format="gibson", split=recipe.split, jobs=jobs, **conversion)
+        config = ConvertConfig(format="gibson", split=recipe.split, jobs=jobs, keep=False, **conversion)
         (result, seed), scene = _generated(recipe, config, work, report), work / recipe.name
         if isinstance(recipe.building, BuildingConfig):
             write_look(scene, recipe.seed, recipe.building)

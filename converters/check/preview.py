@@ -344,5 +344,5 @@ def _save(figure: Figure, target: Path, few: bool = False) -> None:
                 small = image.convert("RGB").quantize(
                     COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
                 )
-                small.save(picture, "PNG", optimize=True)
+                small.save(picture, "PNG", compress_level=7)
     plt.close(figure)

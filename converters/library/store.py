@@ -4,12 +4,13 @@ One archive, `models.zip`: `index.json`, and for each model its arrays and its t
 front along +z, the middle of its base at the origin.
 """
 
+import contextlib
 import dataclasses
 import functools
 import io
 import json
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -146,9 +147,15 @@ def attribution(models: Sequence[Model]) -> str:
     return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)]) + "\n"
 
 
+@functools.cache
+def _archive(path: Path) -> zipfile.ZipFile:
+    """Open an archive for good: its table of members takes as long to read as a model."""
+    return zipfile.ZipFile(path)
+
+
 def _member(path: Path, name: str) -> bytes:
-    with readable(path, FileError, "install the package again"), zipfile.ZipFile(path) as archive:
-        return archive.read(name)
+    with readable(path, FileError, "install the package again"):
+        return _archive(path).read(name)
 
 
 @functools.cache
@@ -160,21 +167,40 @@ def read_index(path: Path = PACKED) -> dict[str, Model]:
 
 
 @functools.cache
-def read_shape(name: str, path: Path = PACKED) -> Shape:
-    """Read a model's surface and hulls."""
-    buffer = io.BytesIO(_member(path, f"{name}.arrays"))
+def read_image(name: str, path: Path = PACKED) -> Image.Image:
+    """Read a model's texture, in all its colours."""
+    with _damage(name, path), Image.open(io.BytesIO(_member(path, f"{name}.webp"))) as picture:
+        return picture.convert("RGB")
+
+
+@contextlib.contextmanager
+def _damage(name: str, path: Path) -> Iterator[None]:
     try:
-        bounds, *planes = (np.lib.format.read_array(buffer, allow_pickle=False) for _ in range(8))
-        vertices, behind, uv, uv_behind, hull_vertices, hull_faces, counts = map(_table, planes)
-        with Image.open(io.BytesIO(_member(path, f"{name}.webp"))) as picture:
-            image = np.asarray(quantise(np.asarray(picture.convert("RGB")), COLOURS).convert("RGB"))
+        yield
     except (OSError, ValueError, EOFError) as error:
         raise FileError(f"{path}: {name} is damaged ({' '.join(str(error).split())}); install it again") from None
+
+
+def read_shape(name: str, path: Path = PACKED) -> Shape:
+    """Read a model's surface and hulls."""
+    visual, hulls = read_meshes(name, path)
+    image = np.asarray(quantise(np.asarray(read_image(name, path)), COLOURS).convert("RGB"))
+    return Shape(dataclasses.replace(visual, image=image), hulls)
+
+
+@functools.cache
+def read_meshes(name: str, path: Path = PACKED) -> tuple[VisualMesh, tuple[Hull, ...]]:
+    """Read what `read_shape` does, with a surface of one grey pixel: decoding images takes longest."""
+    buffer = io.BytesIO(_member(path, f"{name}.arrays"))
+    with _damage(name, path):
+        bounds, *planes = (np.lib.format.read_array(buffer, allow_pickle=False) for _ in range(8))
+        vertices, behind, uv, uv_behind, hull_vertices, hull_faces, counts = map(_table, planes)
 
     def metres(values: np.ndarray) -> np.ndarray:
         return bounds[0] + values / STEPS * bounds[1]
 
     at = np.cumsum(counts.astype(int), axis=0)
     solid = np.split(metres(hull_vertices), at[:-1, 0]), np.split(hull_faces.astype(np.int64), at[:-1, 1])
-    visual = VisualMesh(metres(vertices), _faces(behind), uv / STEPS, _faces(uv_behind), image)
-    return Shape(visual, tuple(Hull(v, f) for v, f in zip(*solid, strict=True)))
+    grey = np.full((1, 1, 3), 128, np.uint8)
+    visual = VisualMesh(metres(vertices), _faces(behind), uv / STEPS, _faces(uv_behind), grey)
+    return visual, tuple(Hull(v, f) for v, f in zip(*solid, strict=True))

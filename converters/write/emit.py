@@ -322,7 +322,7 @@ def write_scene(parts: SceneParts, folder: Path, palette: int = 96) -> None:
             write_obj(assets / f"{name}_visual.obj", *mesh, *digits, smooth=name != "structure")
         if look.image == name:
             image = as_png(visual.image) if visual.exact else quantise(visual.image, palette)
-            image.save(assets / f"{name}.png", optimize=True)
+            image.save(assets / f"{name}.png", compress_level=7)  # at 9, 3 % smaller in five times the time
     for placed in parts.objects:
         for i, (hull, name) in enumerate(zip(placed.hulls_b, hulls[placed.name], strict=True)):
             if name == f"{placed.name}_hull_{i}":

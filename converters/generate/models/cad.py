@@ -12,7 +12,7 @@ import functools
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Iterable, Set
+from collections.abc import Callable, Iterable, Set
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from converters.generate.models import parts as shapes
 from converters.generate.models.parts import MATERIALS, Part, on_floor
 from converters.geometry.boxes import convex_pieces
 from converters.geometry.faces import face_vectors, stacked
-from converters.library.store import read_index, read_shape
+from converters.library.store import read_image, read_index, read_meshes, read_shape
 from converters.read.annotations import MOST_PIECES, SLACK
 from converters.read.obj import texels
 from converters.records.raw import VisualMesh
@@ -116,10 +116,15 @@ class CadModel:
     """In the normalised CAD frame."""
     unit_m: float
     """Metres per CAD unit at the model's designed size."""
-    surface: VisualMesh | None = None
-    """Of a library model, CAD frame: what is drawn; its parts are its hulls."""
+    look: Callable[[], VisualMesh] | None = None
+    """Returns `surface`, which takes longer than the rest and is not needed to furnish a home."""
     solids: tuple[Part, ...] = ()
     """What of it collides; none: its parts."""
+
+    @functools.cached_property
+    def surface(self) -> VisualMesh | None:
+        """Return what is drawn of a library model, CAD frame; its parts are its hulls."""
+        return None if self.look is None else self.look()
 
     @functools.cached_property
     def bounds(self) -> np.ndarray:
@@ -145,10 +150,10 @@ class CadModel:
 
 def _library_parts(name: str) -> list[Part]:
     """Return the hulls of a library model, as the converter joins them, in the colour nearest to the model's."""
-    shape = read_shape(name)
-    colour = shape.visual.image.reshape(-1, 3).mean(axis=0) / 255
+    hulls = read_meshes(name)[1]
+    colour = np.asarray(read_image(name)).reshape(-1, 3).mean(axis=0) / 255
     material = min(MATERIALS, key=lambda m: float(np.abs(np.array(MATERIALS[m]) - colour).sum()))
-    pieces = convex_pieces(*stacked((h.vertices, h.faces) for h in shape.hulls), MOST_PIECES, SLACK)
+    pieces = convex_pieces(*stacked((h.vertices, h.faces) for h in hulls), MOST_PIECES, SLACK)
     assert pieces is not None, f"{name}: a hull is not convex"
     return [Part(v, f, material) for v, f in pieces]
 
@@ -192,11 +197,9 @@ def cad_model(name: str) -> CadModel:
     """
     plain, _, tint = name.partition("~")
     model = _tinted(_empty(plain), tint) if tint else _empty(plain)
-    if plain not in LOOKS.holds or model.surface is None:
+    if plain not in LOOKS.holds or model.look is None:
         return model
-    move = model.surface.vertices.min(axis=0) - read_shape(plain).visual.vertices.min(axis=0) / model.unit_m
-    things = drawn_parts(LOOKS.holds[plain])
-    return dataclasses.replace(model, surface=_holding(model.surface, things, model.unit_m, move))
+    return dataclasses.replace(model, look=functools.partial(_filled, model, plain))
 
 
 @functools.cache
@@ -215,13 +218,20 @@ def _empty(name: str) -> CadModel:
     shift = (np.frombuffer(bytes.fromhex(digest)[:3], np.uint8) / 255 - 0.5) * 0.06
     move = -(low + high) / 2 / unit_m + np.round(shift, 4)
     scaled = tuple(dataclasses.replace(p, vertices=np.round(p.vertices / unit_m + move, 6)) for p in parts)
-    surface, category = None, drawing.category
-    if name in _PACKAGED:
-        visual = read_shape(name).visual
-        surface = dataclasses.replace(visual, vertices=visual.vertices / unit_m + move)
+    look, category = functools.partial(_surface, name, unit_m, move) if name in _PACKAGED else None, drawing.category
     return CadModel(
-        name, category, CATEGORIES[category].synset, digest[:32], drawing.sym, drawing.front, scaled, unit_m, surface
+        name, category, CATEGORIES[category].synset, digest[:32], drawing.sym, drawing.front, scaled, unit_m, look
     )
+
+
+def as_drawn(surface: VisualMesh) -> VisualMesh:
+    """Return the surface: `CadModel.look` of one that is at hand."""
+    return surface
+
+
+def _surface(name: str, unit_m: float, move: np.ndarray) -> VisualMesh:
+    visual = read_shape(name).visual
+    return dataclasses.replace(visual, vertices=visual.vertices / unit_m + move)
 
 
 SWATCH = 8
@@ -237,17 +247,23 @@ def _digest(name: str) -> str:
 def _tinted(model: CadModel, tint: str) -> CadModel:
     """Return a model whose main material, or main colour of its texture, is another material; it is another model."""
     name = f"{model.name}~{tint}"
-    if (surface := model.surface) is None:
+    if model.look is None:
         area = dict.fromkeys((part.material for part in model.parts), 0.0)
         for part in model.parts:
             area[part.material] += float(np.linalg.norm(face_vectors(part.vertices, part.faces), axis=1).sum())
         main = max(area, key=lambda material: area[material])
         parts = tuple(dataclasses.replace(p, material=tint if p.material == main else p.material) for p in model.parts)
         return dataclasses.replace(model, name=name, id_cad=_digest(name)[:32], parts=parts)
-    image = _painted(surface, np.array(MATERIALS[tint]))
-    return dataclasses.replace(
-        model, name=name, id_cad=_digest(name)[:32], surface=dataclasses.replace(surface, image=image)
-    )
+    look = functools.partial(_painted, model, np.array(MATERIALS[tint]))
+    return dataclasses.replace(model, name=name, id_cad=_digest(name)[:32], look=look)
+
+
+def _filled(model: CadModel, name: str) -> VisualMesh:
+    """Return the surface of a model that is empty, with what the packaged model `name` holds."""
+    surface = model.surface
+    assert surface is not None
+    move = surface.vertices.min(axis=0) - read_meshes(name)[0].vertices.min(axis=0) / model.unit_m
+    return _holding(surface, drawn_parts(LOOKS.holds[name]), model.unit_m, move)
 
 
 def _holding(surface: VisualMesh, things: list[Part], unit_m: float, move: np.ndarray) -> VisualMesh:
@@ -270,8 +286,10 @@ def _holding(surface: VisualMesh, things: list[Part], unit_m: float, move: np.nd
     return VisualMesh(vertices, faces, np.vstack([uv, places]), uv_faces, np.vstack([kept, swatches]), surface.exact)
 
 
-def _painted(surface: VisualMesh, colour: np.ndarray) -> np.ndarray:
-    """Return a surface's image with its main colour, in all its shades, turned into another (3,) in 0..1."""
+def _painted(model: CadModel, colour: np.ndarray) -> VisualMesh:
+    """Return a model's surface with the main colour of its image, in all its shades, turned into another, (3,) 0..1."""
+    surface = model.surface
+    assert surface is not None
     area = np.linalg.norm(face_vectors(surface.vertices, surface.faces), axis=1)
     shown, of = np.unique(texels(surface.image, surface.uv[surface.uv_faces].mean(axis=1)), axis=0, return_inverse=True)
     shown, weight = shown / 255, np.bincount(of.ravel(), area)
@@ -284,7 +302,8 @@ def _painted(surface: VisualMesh, colour: np.ndarray) -> np.ndarray:
     painted = np.where(shade < 0, colour * (1 + shade), colour + (1 - colour) * shade)
     off = np.linalg.norm(pixels - bright - (main - usual), axis=2, keepdims=True) + 0.4 * np.abs(bright - usual)
     share = np.clip(2 - 2 * off / ALIKE, 0, 1)
-    return np.rint(255 * (share * painted + (1 - share) * pixels)).astype(np.uint8)
+    image = np.rint(255 * (share * painted + (1 - share) * pixels)).astype(np.uint8)
+    return dataclasses.replace(surface, image=image)
 
 
 def tints(name: str) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from converters.generate.models.cad import CadModel, Instance, LeafHinge, cad_model
+from converters.generate.models.cad import CadModel, Instance, LeafHinge, as_drawn, cad_model
 from converters.generate.models.parts import Part, box
 from converters.geometry.faces import compacted, loose_parts
 from converters.records.raw import VisualMesh
@@ -170,7 +170,7 @@ def _front(
         "id_cad": f"{model.id_cad[:28]}{k:04d}",
         "parts": (*drawn, *_normalised(tray, model)) if surface is None else _normalised(solids, model),
         "solids": _normalised(solids, model),
-        "surface": surface,
+        "look": surface and functools.partial(as_drawn, surface),
     }
     axis, origin = np.array(hinge.axis) * scale * model.unit_m, np.array(hinge.origin) * scale
     hinge = dataclasses.replace(hinge, axis=tuple(axis.tolist()), origin=tuple(origin.tolist()))
@@ -226,7 +226,8 @@ def carcass(model: CadModel, cut: tuple[Opening, ...]) -> CadModel:
     gone = {piece for opening in cut for piece in opening.pieces}
     if model.surface is not None:
         of, _ = _pieces(model)
-        return dataclasses.replace(model, surface=_cut(model.surface, ~np.isin(of, list(gone))))
+        rest = _cut(model.surface, ~np.isin(of, list(gone)))
+        return dataclasses.replace(model, look=functools.partial(as_drawn, rest))
     parts = [p for k, p in enumerate(model.parts) if k not in gone]
     return dataclasses.replace(model, parts=(*parts, *(opening.recess for opening in cut)))
 

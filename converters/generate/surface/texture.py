@@ -219,7 +219,7 @@ SHEETS = (1024, 1536, 2048)
 """Sides that a sheet may have, texels; on the largest the resolution is lowered until all fits."""
 MARGIN = 3
 """Texels around each patch that repeat its border, so that smaller versions of the sheet do not mix patches."""
-LIGHT_M = 0.06
+LIGHT_M = 0.08
 """Between the points of a patch at which light is worked out."""
 
 Light = Callable[[np.ndarray, np.ndarray], np.ndarray]

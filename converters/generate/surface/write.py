@@ -35,7 +35,7 @@ def _rows(pattern: str, table: np.ndarray) -> str:
 
 def write_png(path: Path, pixels: np.ndarray) -> None:
     """Write an 8-bit grey or RGB image."""
-    Image.fromarray(pixels).save(path, optimize=True)
+    Image.fromarray(pixels).save(path, compress_level=3)  # half as large again as at best, in a tenth of the time
 
 
 def write_npz(path: Path, packing: int = zipfile.ZIP_DEFLATED, /, **arrays: np.ndarray) -> None:
