@@ -272,7 +272,7 @@ def _judge(
 
 def convert_raw(raw: RawScene, folder: Path, config: ConvertConfig, clock: Clock, cache: Path) -> Converted:
     """Run every stage after reading on one floor; write into `folder`, which exists and is empty."""
-    stages = StageCache(cache if config.keep else None)
+    stages = StageCache(cache, keep=config.keep)
     placed = _place(raw, config, clock, stages, cache)
     limits: list[str] = []
     while held := placed.settled.held:

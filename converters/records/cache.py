@@ -71,14 +71,14 @@ def hashed(value: Any) -> Any:
 
 
 class StageCache:
-    """Results by content in one folder; none are kept without a folder."""
+    """Results by content in one folder."""
 
-    def __init__(self, folder: Path | None, limit_bytes: int = LIMIT_BYTES) -> None:
-        self.folder, self._limit_bytes = folder, limit_bytes
+    def __init__(self, folder: Path, limit_bytes: int = LIMIT_BYTES, keep: bool = True) -> None:
+        self.folder, self._limit_bytes, self._keep = folder, limit_bytes, keep
 
     def call(self, function: Callable[..., T], *arguments: Any) -> T:
         """Return `function(*arguments)`, read from the folder if it is there; the function must be pure."""
-        if self.folder is None:
+        if not self._keep:
             return function(*arguments)
         key = self.key(function.__name__.strip("_"), function.__module__, *arguments)
         value = self.load(key)
