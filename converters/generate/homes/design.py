@@ -264,7 +264,11 @@ def design_home(cfg: HomeConfig, rng: np.random.Generator) -> Building:
             refused = GenerationError("built-in furniture bars a room: ask for more area or fewer rooms")
             continue
         movable = tuple(item for item in items if not item.model.built_in)
-        built_in, fronts = open_fronts(plan, plan.built_in, movable, cfg.opening)
+        try:
+            built_in, fronts = open_fronts(plan, plan.built_in, movable, cfg.opening)
+        except GenerationError as error:
+            refused = error
+            continue
         plan = dataclasses.replace(plan, built_in=built_in)
         must_push = {robot: round(share, 4) for robot, share in shares.items()}
         measured = {"furniture_share": round(home.floor.share, 4), "must_push_share": must_push}

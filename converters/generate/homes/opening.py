@@ -1,10 +1,12 @@
-"""Cut the fronts out of built-in furniture that open where it stands: those that would hit something stay shut."""
+"""Cut the fronts out of built-in furniture that open where it stands; all of a kitchen do."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import shapely
 
+from converters.generate.design.config import GenerationError
 from converters.generate.design.plan import Plan
 from converters.generate.homes.arrange import TABLES
 from converters.generate.models.cad import Instance, LeafHinge
@@ -12,10 +14,12 @@ from converters.generate.models.fronts import Front, carcass, opened, openings
 
 KITCHEN = ("counter", "sink", "fridge", "stove")
 """Categories whose fronts open where the setting `opening` is `kitchen`."""
-STEPS, LEAST = 12, 0.6
-"""A front opens as far as it hits nothing, in so many steps; one that gets less far than this share stays shut."""
+OPENS = (*KITCHEN, "wardrobe", "washbasin", "shower")
+"""The same where it is `all`."""
+STEPS, LEAST_RAD, LEAST_M = 12, math.radians(60), 0.2
+"""A front opens as far as it hits nothing, in so many steps. Less than this is not open."""
 TOUCH_M = 0.005
-"""Fronts that overlap others' outlines by less hit nothing: neighbours stand side by side."""
+"""Fronts that overlap other furniture's outlines by less hit nothing: neighbours stand side by side. Walls are hit."""
 Slab = tuple[shapely.Geometry, float, float]
 """An outline from above, its lowest and its highest point."""
 
@@ -36,23 +40,30 @@ def open_fronts(
 ) -> tuple[tuple[Instance, ...], tuple[Instance, ...]]:
     """Return the built-in furniture without the fronts that open, and these; `others` is what stands around.
 
-    Light pieces are in no front's way: they are pushed.
+    Light pieces are in no front's way: they are pushed. Raise `GenerationError` where a front of a kitchen does not
+    open; others then stay shut.
     """
-    walls = [(shapely.box(w.rect.x0, w.rect.y0, w.rect.x1, w.rect.y1), w.low[2], w.high[2]) for w in plan.walls]
+    rects = [w.rect.grown(TOUCH_M, TOUCH_M) for w in plan.walls]
+    walls = [(rect.polygon, w.low[2], w.high[2]) for rect, w in zip(rects, plan.walls, strict=True)]
     heavy = [item for item in (*built_in, *others) if item.model.category not in TABLES.light]
     bodies, fronts = [], []
     for item in built_in:
         cut = []
         far = item.footprint.buffer(1.2)
-        opens = opening == "all" or (opening == "kitchen" and item.model.category in KITCHEN)
+        opens = item.model.category in {"all": OPENS, "kitchen": KITCHEN, "none": ()}[opening]
         around = [*walls, *(slab for other in heavy if other is not item for slab in other.slabs)] if opens else []
         around = [slab for slab in around if far.intersects(slab[0])]
         for part in openings(item.model.name) if opens else ():
-            share = _reach(item, part.front, around)
-            if share >= LEAST:
+            hinge: LeafHinge = part.front.hinge
+            limit = round(_reach(item, part.front, around) * hinge.range_rad[1], 4)
+            if limit >= min(LEAST_M if hinge.slides else LEAST_RAD, hinge.range_rad[1]) - 1e-3:
                 cut.append(part)
-                hinge: LeafHinge = part.front.hinge
-                hinge = dataclasses.replace(hinge, range_rad=(0.0, round(share * hinge.range_rad[1], 4)))
+                hinge = dataclasses.replace(hinge, range_rad=(0.0, limit))
                 fronts.append(dataclasses.replace(item, model=part.front.model, hinge=hinge))
+            elif item.model.category in KITCHEN:
+                raise GenerationError(
+                    f"a front of the {item.model.category} {item.model.name} opens by {limit:.2f} "
+                    f"{'m' if hinge.slides else 'rad'} only: ask for more area or fewer rooms"
+                )
         bodies.append(dataclasses.replace(item, model=carcass(item.model, tuple(cut))) if cut else item)
     return tuple(bodies), tuple(fronts)

@@ -2,7 +2,8 @@
 
 A model's pieces are what its surface, or its drawing, consists of. A thin upright piece at its front is a panel, and
 what lies within a panel's outline (a handle, a window, a gasket, the box of a drawer) goes with it. A handle beside
-the middle makes it a door, hinged at the other side; else a low panel is a drawer's, and an oven's a flap.
+the middle makes it a door, hinged at the other side; else a low panel is a drawer's, and an oven's a flap. A high one
+whose edge is before or behind another's slides to that side.
 """
 
 import dataclasses
@@ -29,8 +30,10 @@ DRAWER_M = 0.38
 """Greatest height of a drawer's panel."""
 DEEP_M, PULLED = 0.45, 0.75
 """Greatest depth of a drawer's box, and the share of it that a drawer is pulled out by."""
-SIDE_M, WALL_M, BEHIND_M = 0.03, 0.012, 0.06
-"""From a panel's edge to its drawer's box, how thick that is, and what is left behind it."""
+SIDE_M, WALL_M, BEHIND_M, LEAST_DEEP_M = 0.03, 0.012, 0.06, 0.15
+"""From a panel's edge to its drawer's box, how thick that is, what is left behind it, and its least depth."""
+LAPPED_M = 0.02
+"""Sliding doors cover each other by more than this."""
 Bounds = np.ndarray
 """(2, 3) lowest and highest corner."""
 
@@ -84,16 +87,26 @@ def _handle(panel: Bounds, with_it: list[Bounds]) -> float:
     return float((np.mean(middles) - panel[:, 0].mean()) / np.ptp(panel[:, 0]))
 
 
-def _hinge(panel: Bounds, handle: float, flap: bool) -> LeafHinge | None:
-    """Return how a panel opens, in metres, front along +z; None: it does not."""
+def _hinge(panel: Bounds, handle: float, category: str, rear: float, panels: list[Bounds]) -> LeafHinge | None:
+    """Return how a panel opens, in metres, front along +z; None: it does not. `rear`: the model's back."""
     low, high = panel
     if abs(handle) > ASIDE:
         # About its front edge, so that it sweeps nothing but the room before it.
         x, turn = (low[0], -1.0) if handle > 0 else (high[0], 1.0)
         return LeafHinge((0.0, turn, 0.0), (x, low[1], high[2]), (0.0, math.pi / 2))
+    middle = tuple(panel.mean(axis=0).tolist())
+    depth = min(DEEP_M, low[2] - rear - BEHIND_M)
     if high[1] - low[1] <= DRAWER_M:
-        return LeafHinge((0.0, 0.0, 1.0), tuple(panel.mean(axis=0)), (0.0, 0.0), slides=True)  # type: ignore[arg-type]
-    return LeafHinge((1.0, 0.0, 0.0), (0.0, low[1], high[2]), (0.0, math.pi / 2)) if flap else None
+        deep = depth >= LEAST_DEEP_M and category != "shower"  # a curtain's valance is none
+        return LeafHinge((0.0, 0.0, 1.0), middle, (0.0, round(PULLED * float(depth), 3)), slides=True) if deep else None
+    if category == "stove":
+        return LeafHinge((1.0, 0.0, 0.0), (0.0, low[1], high[2]), (0.0, math.pi / 2))
+    for other in panels if category == "wardrobe" else ():
+        lapped = min(high[0], other[1, 0]) - max(low[0], other[0, 0])
+        if other is not panel and lapped > LAPPED_M and np.ptp(other[:, 0]) > lapped + LAPPED_M:
+            way = math.copysign(1.0, other[:, 0].mean() - panel[:, 0].mean())
+            return LeafHinge((way, 0.0, 0.0), middle, (0.0, round(float(np.ptp(other[:, 0]) - lapped), 3)), slides=True)
+    return None
 
 
 @functools.cache
@@ -116,10 +129,11 @@ def openings(name: str) -> tuple[Opening, ...]:
         if k in taken:
             continue
         mine = [j for j in range(len(bounds)) if j not in taken | {k} and _inside(bounds[j], bounds[k], False)]
-        hinge = _hinge(bounds[k], _handle(bounds[k], [bounds[j] for j in mine]), model.category == "stove")
+        handle = _handle(bounds[k], [bounds[j] for j in mine])
+        hinge = _hinge(bounds[k], handle, model.category, rear, [bounds[j] for j in panels])
         if hinge is None:
             continue
-        if hinge.slides:
+        if hinge.slides and hinge.axis[2]:
             mine = [j for j in range(len(bounds)) if j not in taken | {k} and _inside(bounds[j], bounds[k], True)]
         taken |= {k, *mine}
         front, recess = _front(model, len(found), of, bounds, (k, *mine), hinge, rear), bounds[k].copy()
@@ -150,15 +164,14 @@ def _front(
         ends[0, 2] = panel[0, 2]
         solids.append(_block(ends, "white"))
     tray: list[Part] = []
-    if hinge.slides:
+    if hinge.slides and hinge.axis[2]:
         (x0, y0, z), (x1, y1, _) = panel
         depth = min(DEEP_M, z - rear - BEHIND_M)
         ends = np.array([(x0 + SIDE_M, y0 + SIDE_M, z - depth), (x1 - SIDE_M, y1 - SIDE_M, z)])
         solids.append(_block(ends, "white"))
-        hinge = dataclasses.replace(hinge, range_rad=(0.0, round(PULLED * depth, 3)))
         tray = [_block(side, "birch") for side in _sides(ends)]
     name = f"{model.name}#{k}"
-    category = "drawer" if hinge.slides else "cabinet_door"
+    category = "drawer" if tray else "cabinet_door"
     scale = np.array([model.front, 1.0, model.front]) / model.unit_m
     surface, drawn = None, [model.parts[j] for j in pieces] if model.surface is None else []
     if model.surface is not None:

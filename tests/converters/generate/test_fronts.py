@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from converters.generate.design.config import GenerationError
 from converters.generate.design.plan import Plan, PlanBox, Rect
 from converters.generate.homes.opening import KITCHEN, open_fronts
 from converters.generate.models.cad import LIBRARY, cad_model, place
@@ -18,6 +19,11 @@ OF = [
     ("stove_ceramic", ["cabinet_door", "drawer"]),
     ("fridge_american", ["cabinet_door", "cabinet_door"]),
     ("KatorLegaz/fridge", ["cabinet_door", "cabinet_door"]),
+    ("BlendSwap-CC-0/wardrobeWithSlidingDoors", ["cabinet_door"] * 2),
+    ("BlendSwap-CC-BY/wardrobe2", ["cabinet_door"] * 4),
+    ("BlendSwap-CC-0/cupboard", []),  # one welded piece
+    ("shower_curtain", []),
+    ("BlendSwap-CC-BY/radiatorAndTowels", []),  # thinner than a drawer's box
 ]
 
 
@@ -29,7 +35,7 @@ def test_what_opens_of_a_model(name, kinds):
     if model.surface is None:
         assert len(left.parts) == len(model.parts) - sum(len(o.pieces) for o in cut) + len(cut)
     else:
-        trays = sum(12 * 4 for o in cut if o.front.hinge.slides)
+        trays = sum(12 * 4 for o in cut if o.front.model.category == "drawer")
         assert left.surface is not None
         shown = sum(len(o.front.model.surface.faces) for o in cut if o.front.model.surface is not None)
         assert len(left.surface.faces) + shown == len(model.surface.faces) + trays
@@ -54,20 +60,36 @@ def test_fronts_come_forward_and_keep_to_their_own_width():
             assert wide[:, 1].min() > y0 - 0.06 and wide[:, 1].max() < y1 + 0.06 and wide[:, 0].min() > x0
 
 
-def test_a_front_before_a_wall_stays_shut():
+def test_sliding_doors_slide_one_before_the_other():
+    """Each of two that lap by 11 cm slides by the other's width less that, and leaves its half of the wardrobe open."""
+    model = cad_model("BlendSwap-CC-0/wardrobeWithSlidingDoors")
+    item = place(model, np.full(3, model.unit_m), np.zeros(2), 0.0)  # its right is +y
+    one, two = openings(model.name)
+    for front, other in ((one.front, two.front), (two.front, one.front)):
+        assert front.hinge.slides and front.hinge.range_rad[1] == pytest.approx(1.055 - 0.112, abs=2e-3)
+        shut, wide, beside = (np.concatenate(opened(item, f, s)) for f, s in ((front, 0), (front, 1), (other, 0)))
+        np.testing.assert_allclose(wide[:, [0, 2]], shut[:, [0, 2]], atol=1e-6)
+        assert wide[:, 1].mean() == pytest.approx(beside[:, 1].mean(), abs=5e-3)
+        assert shut[:, 0].min() > beside[:, 0].max() or shut[:, 0].max() < beside[:, 0].min()
+
+
+def test_a_kitchen_front_before_a_wall_refuses_the_plan():
     model = cad_model("BlendSwap-CC-0/drawersCabinet")
     item = place(model, np.full(3, model.unit_m), np.zeros(2), 0.0)
     x = float(item.footprint.bounds[2])
     rooms, outer = (Rect(-3, -3, 3, 3),), Rect(-3.1, -3.1, 3.1, 3.1)
-    for gap_m, fronts, reach in ((1.0, 3, 0.338), (0.30, 3, None), (0.15, 0, None)):
+    for gap_m, reach_m in ((1.0, 0.338), (0.30, None), (0.15, 0.0)):
         wall = PlanBox.over(Rect(x + gap_m, -3, x + gap_m + 0.1, 3), 0.0, 2.5)
         plan = Plan(rooms, outer, (wall,), (), (), (), None, 2.5)
+        if reach_m == 0:
+            with pytest.raises(GenerationError, match="a front of the counter .*drawersCabinet opens by 0.14 m only"):
+                open_fronts(plan, (item,), (), "kitchen")
+            continue
         bodies, out = open_fronts(plan, (item,), (), "kitchen")
-        assert len(out) == fronts and len(bodies) == 1
+        assert len(out) == 3 and len(bodies) == 1
         for front in out:
-            assert front.hinge is not None and front.hinge.range_rad[1] <= 0.338
-            assert reach is None or front.hinge.range_rad[1] == pytest.approx(reach)
-            far = max(p[:, 0].max() for p in opened(item, dataclasses.replace(openings(model.name)[0].front,
-                model=front.model, hinge=front.hinge), 1.0))  # fmt: skip
-            assert far < x + gap_m + 0.006
+            assert front.hinge is not None and 0.2 <= front.hinge.range_rad[1] <= 0.338
+            assert reach_m is None or front.hinge.range_rad[1] == pytest.approx(reach_m)
+            cut = dataclasses.replace(openings(model.name)[0].front, model=front.model, hinge=front.hinge)
+            assert max(p[:, 0].max() for p in opened(item, cut, 1.0)) <= x + gap_m
     assert open_fronts(plan, (item,), (), "none") == ((item,), ())
