@@ -73,6 +73,23 @@ def test_a_wall_before_it_blocks_a_front(hinge, line):
     assert blocked_fronts(_model(_front(f"{category}_0", category, hinge), (wall,))[1]) == (line,)
 
 
+def test_a_wall_close_to_a_front_that_is_shut_is_not_its_cabinet():
+    """One 7 cm before it blocks it; 1 cm beside it blocks what slides and turns past it by no more than its cells."""
+    for hinge, category in ((SLIDE, "drawer"), (DOOR, "cabinet_door")):
+        front = _front(f"{category}_0", category, hinge)
+        before, beside = _box((0, -0.12, 0.5), (1.0, 0.05, 0.5)), _box((0.31, -0.2, 0.5), (0.05, 0.5, 0.5))
+        (line,) = blocked_fronts(_model(front, (before,))[1])
+        assert line.startswith(f"{category}_0 hits structure at ")
+        assert blocked_fronts(_model(front, (beside,))[1]) == ()
+    skew = _box((-0.31, -0.325, 0.5), (0.05, 0.275, 0.5))  # at the hinge; a handle of 0.1 m would turn into it
+    for length, lines in ((0.02, ()), (0.1, ("cabinet_door_0 hits structure at 1.57 rad",))):
+        handle = _hull((0.1, -length), (0.2, 0.02))
+        front = _front("cabinet_door_0", "cabinet_door", DOOR)
+        boxes = (*front.boxes_b, _box((0.15, 0.01 - length / 2, 0.1), (0.05, length / 2 + 0.01, 0.1)))
+        front = front.__class__(**{**vars(front), "hulls_b": (*front.hulls_b, handle), "boxes_b": boxes})
+        assert blocked_fronts(_model(front, (skew,))[1]) == lines
+
+
 def test_light_furniture_is_pushed_and_heavy_furniture_blocks():
     front = _front("drawer_0", "drawer", SLIDE)
     assert blocked_fronts(_model(front, pieces=(_piece(-0.3, 5.0),))[1]) == ()
