@@ -15,6 +15,10 @@ from interactive_nav.physics import PhysicsState, make_physics
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
+from interactive_nav.sensing import make_renderer
+from interactive_nav.sensing.boxes import build_boxes
+from scenes_mjcf.categories import class_id
+from scenes_mjcf.look import Lens, look_along
 from tests.toys import write_room
 
 OPEN_M = 0.3
@@ -101,7 +105,27 @@ def test_backends_agree_on_a_drawer_that_is_let_go(world):
 
 
 def test_a_reset_shuts_what_was_open(kitchen):
+    """And pictures follow: where the flap was is the wall 0.4 m behind it while it is open, and the flap again after."""
     env = interactive_nav.make("turtlebot", [kitchen], backend="native", num_objects=0)
-    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    at = dict(zip(env.world.slots.names[0], env.world.layout.slot_qpos, strict=True))
     rest = env.world.rest_qpos[0][env.world.layout.slot_qpos]
-    np.testing.assert_allclose(state.pipeline_state.qpos[env.world.layout.slot_qpos], rest, atol=1e-6)
+    camera = look_along(jnp.asarray([[0.8, 0.4, 0.22]]), jnp.asarray([[0.0, 1.0, -0.02]]))
+    renderer = make_renderer(build_boxes(env.world, "all"), Lens(16, 16, 30.0), "auto", "native", env.world)
+    draw = jax.jit(lambda qpos: renderer.render_batch(jnp.zeros(1, jnp.int32), qpos[None], camera))
+    reset, step = jax.jit(env.reset), jax.jit(env.step)
+    first = reset(jax.random.PRNGKey(0))
+    np.testing.assert_allclose(first.pipeline_state.qpos[env.world.layout.slot_qpos], rest, atol=1e-6)
+    ajar = first.pipeline_state.qpos.at[jnp.array([at["cabinet_door_0"], at["drawer_0"]])].set(jnp.array([1.4, OPEN_M]))
+    state = first.replace(pipeline_state=dataclasses.replace(first.pipeline_state, qpos=ajar))
+    state = step(state, jnp.zeros(env.action_size))
+    assert state.pipeline_state.qpos[at["cabinet_door_0"]] > 1.2 and state.pipeline_state.qpos[at["drawer_0"]] > 0.25
+    again = reset(jax.random.PRNGKey(0))
+    np.testing.assert_allclose(again.pipeline_state.qpos, first.pipeline_state.qpos, atol=1e-6)
+    depths, ids = zip(*(draw(s.pipeline_state.qpos) for s in (first, state, again)), strict=True)
+    np.testing.assert_array_equal(ids[0], ids[2])
+    np.testing.assert_allclose(depths[0], depths[2], atol=1e-5)
+    flap = class_id("cabinet_door", "all")
+    shut, seen = (ids[0] == flap), (ids[1] == flap)
+    assert shut.sum() > 80 > 20 > seen.sum()
+    gone = shut & ~seen
+    np.testing.assert_allclose(depths[1][gone] - depths[0][gone], 0.405, atol=0.02)  # to the wall behind the flap
