@@ -46,7 +46,9 @@ def _points_w(model: mujoco.MjModel, data: mujoco.MjData, body: int, value: floa
         if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH and "_hull_" in model.geom(geom).name:
             mesh = model.mesh(model.geom_dataid[geom])
             corners = model.mesh_vert[mesh.vertadr[0] :][model.mesh_face[mesh.faceadr[0] :][: mesh.facenum[0]]]
-            points.append((WITHIN @ corners).reshape(-1, 3) @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
+            points.append(
+                (WITHIN @ corners).reshape(-1, 3) @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+            )
     return np.concatenate(points)
 
 

@@ -34,6 +34,8 @@ SIDE_M, WALL_M, BEHIND_M, LEAST_DEEP_M = 0.03, 0.012, 0.06, 0.15
 """From a panel's edge to its drawer's box, how thick that is, what is left behind it, and its least depth."""
 LAPPED_M = 0.02
 """Sliding doors cover each other by more than this."""
+PLAY_M = 0.001
+"""Around a panel, at least."""
 Bounds = np.ndarray
 """(2, 3) lowest and highest corner."""
 
@@ -158,7 +160,10 @@ def _front(
     """Return a front: its pieces, and where it is a drawer a box behind its panel."""
     panel = bounds[pieces[0]]
     out = [bounds[j] for j in pieces[1:] if bounds[j][1, 2] > panel[1, 2] + 0.004]
-    solids = [_block(panel, "white")]
+    # The inner edge of a door's free end comes out farther than its outer one: two doors side by side would jam.
+    wide, high, thick = np.ptp(panel, axis=0)
+    trimmed = panel + np.outer([1, -1], [1, 1, 0]) * (thick**2 / 2 / min(wide, high) + PLAY_M)
+    solids = [_block(trimmed, "white")]
     if out:
         ends = np.stack([np.min([b[0] for b in out], axis=0), np.max([b[1] for b in out], axis=0)])
         ends[0, 2] = panel[0, 2]
