@@ -38,6 +38,7 @@ def _piece(y, kg):
 SLIDE = BodyHinge(np.zeros(3), (0.0, 0.3), False, np.array([0.0, -1.0, 0.0]), slides=True)
 DOOR = BodyHinge(np.array([-0.25, 0.0, 0.0]), (0.0, np.pi / 2), False, np.array([0.0, 0.0, -1.0]))
 FLAP = BodyHinge(np.zeros(3), (0.0, np.pi / 2), False, np.array([1.0, 0.0, 0.0]))
+ASIDE = BodyHinge(np.zeros(3), (0.0, 0.4), False, np.array([1.0, 0.0, 0.0]), slides=True)
 CABINET = _box((0, 0.3, 0.4), (0.3, 0.295, 0.4))
 
 
@@ -71,6 +72,17 @@ def test_a_wall_before_it_blocks_a_front(hinge, line):
     category = "drawer" if hinge.slides else "cabinet_door"
     wall = _box((0, -0.25, 0.5), (1.0, 0.05, 0.5))
     assert blocked_fronts(_model(_front(f"{category}_0", category, hinge), (wall,))[1]) == (line,)
+
+
+def test_a_wardrobes_door_slides_along_its_front():
+    """Structure beside it does not block it, where the wardrobe is in cells; heavy furniture does."""
+    door = _front("cabinet_door_0", "cabinet_door", ASIDE)
+    beside = _box((0.36, 0.0, 0.4), (0.1, 0.045, 0.4))
+    assert blocked_fronts(_model(door, (beside,))[1]) == ()
+    heavy, physical = _piece(0.0, 40.0)
+    heavy = heavy.__class__(**{**vars(heavy), "position_w": np.array([0.4, 0.0, 0.35])})
+    (line,) = blocked_fronts(_model(door, pieces=((heavy, physical),))[1])
+    assert line.startswith("cabinet_door_0 hits box_0 at 0.")
 
 
 def test_a_wall_close_to_a_front_that_is_shut_is_not_its_cabinet():

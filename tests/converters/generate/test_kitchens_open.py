@@ -1,4 +1,4 @@
-"""Every front of a kitchen opens: C MuJoCo pulls each from shut to its limit, among walls and heavy furniture at rest."""
+"""Every front of a kitchen opens: C MuJoCo pulls each to its limit, among walls and heavy furniture at rest."""
 
 from __future__ import annotations
 

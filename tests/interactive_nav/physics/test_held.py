@@ -105,7 +105,7 @@ def test_backends_agree_on_a_drawer_that_is_let_go(world):
 
 
 def test_a_reset_shuts_what_was_open(kitchen):
-    """And pictures follow: where the flap was is the wall 0.4 m behind it while it is open, and the flap again after."""
+    """And pictures follow: where the flap was is the wall 0.4 m behind it while it is open, and the flap after."""
     env = interactive_nav.make("turtlebot", [kitchen], backend="native", num_objects=0)
     at = dict(zip(env.world.slots.names[0], env.world.layout.slot_qpos, strict=True))
     rest = env.world.rest_qpos[0][env.world.layout.slot_qpos]
