@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from collections import Counter
 from pathlib import Path
 
 import mujoco
@@ -112,7 +113,7 @@ def room(b: Building, item: Instance, more: tuple[PlanBox, ...] = ()) -> mujoco.
 )
 def test_every_front_of_a_kitchen_opens(seed: int, tier: str, wardrobes: int) -> None:
     """With `opening=all`: so do those of wardrobes, washbasins and showers, nine doors of two wardrobes in one home."""
-    b, count = kitchen(seed, tier), dict.fromkeys(OPENS, 0)
+    b, count = kitchen(seed, tier), Counter[str]()
     for item in (i for i in b.plan.built_in if i.model.category in OPENS and openings(i.model.name)):
         model = room(b, item)
         assert stuck(model) == []
