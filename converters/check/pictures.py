@@ -35,7 +35,7 @@ EVEN = 0.72
 """Of the light that is."""
 SQUARE = 0.35
 """Texels a pixel; colours are mixed where there are fewer."""
-FRAGMENTS = 2_000_000
+FRAGMENTS = 30_000
 """Pixels that are looked at together, of boxes about triangles."""
 ELEVATION_RAD = math.radians(53.0)
 CUT_M = 1.3

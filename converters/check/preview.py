@@ -15,6 +15,7 @@ import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from PIL import Image
@@ -173,13 +174,14 @@ def _draw_collision(axes: Axes, scene: _Scene, kind: str) -> None:
     """Draw outlines of one kind of collision shape, 'hull' or 'box', in the category's colour."""
     _draw_ground(axes, scene)
     category = {o.name: o.category for o in scene.manifest.objects}
-    count = 0
+    outlines, colours = [], []
     for name, body, geom in _geoms(scene.model):
         if body in category and name.startswith(f"{body}_{kind}_"):
-            colour = CATEGORIES[category[body]].preview_colour
-            outline = geom_outline(scene.model, scene.data, geom, np.eye(3))
-            axes.fill(*outline.T, facecolor=(*colour, 0.30), edgecolor=colour, linewidth=0.6)
-            count += 1
+            colours.append(CATEGORIES[category[body]].preview_colour)
+            outlines.append(geom_outline(scene.model, scene.data, geom, np.eye(3)))
+    inner = [(*colour, 0.30) for colour in colours]
+    axes.add_collection(PolyCollection(outlines, facecolors=inner, edgecolors=colours, linewidths=0.6))
+    count = len(outlines)
     walls = sum(name.startswith("wall_") for name, _, _ in _geoms(scene.model))
     title = f"{count} hulls" if kind == "hull" else f"{count} boxes of objects, {walls} of walls"
     _frame(axes, scene, title)
