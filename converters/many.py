@@ -1,7 +1,8 @@
 """Convert raw folders, and generate sets of scenes, side by side, resumable, on this machine or on many.
 
-Each source has a process (`python -m converters.many JSON`), which writes its row of `conversions.parquet`, and so has
-each scene (`generate-scenes --only NAME`): one that fails or is killed costs no other.
+Each source has a process (`python -m converters.many JSON`), which writes its row of `conversions.parquet`, and so have
+up to `TOGETHER` scenes (`generate-scenes --only NAME ...`): one that fails costs no other. A process that is killed
+costs the scene that it works on; the others of its scenes get another process.
 """
 
 import contextlib
@@ -24,7 +25,7 @@ from converters.clock import STAGES, Report, peak_memory_mib
 from converters.generate.design.config import GenerationError
 from converters.pipeline import ConvertConfig, Converted, convert_building
 from converters.read.source import root_of
-from converters.recipes import Recipes, chosen, load_recipes, make_scenes, parse_recipes
+from converters.recipes import PASSED, Recipes, chosen, load_recipes, make_scenes, parse_recipes
 from converters.records.errors import StageFailed
 from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError, FileError, UserError, readable
@@ -175,6 +176,10 @@ SEEDS = 100_000
 TEST_SHARE = 0.2
 CONVERSION = {"structure_faces": 16000, "object_faces": 3000, "structure_texture": 1024, "object_texture": 256}
 """How large meshes and textures are."""
+TOGETHER = 5
+"""Most scenes that a process generates one after the other: it imports libraries and reads furniture once."""
+REFUSED = "converters generate-scenes: "
+"""What an error begins with, of a process that generates one scene."""
 GRACE_S = 10.0
 """A process that is not wanted any more has this long to end itself."""
 
@@ -262,15 +267,27 @@ def generate_scenes(wanted: Any, report: Report, log: Callable[[str], None]) -> 
     recipes = load_recipes(path)
     todo = chosen(recipes, wanted.out, wanted.only, wanted.overwrite, log)
     if len(todo) > 1 and (wanted.jobs > 1 or wanted.launcher == "ray"):
-        launcher, _ = make_launcher(wanted.launcher, wanted.ray_address, wanted.jobs, len(todo))
+        launcher, at_once = make_launcher(wanted.launcher, wanted.ray_address, wanted.jobs, len(todo))
         words = [sys.executable, "-m", "converters", "generate-scenes", str(wanted.out), "--recipes", str(path)]
         words += ["--jobs", "1", *(["--overwrite"] if wanted.overwrite else []), "--only"]
-        commands, failed = {r.name: [*words, r.name] for r in todo}, []
-        with contextlib.closing(run_commands(commands, launcher, wanted.out, report, "scenes")) as results:
-            for name, code, printed in results:
-                lines = [line for line in printed.splitlines() if line.startswith((f"{name}:", "converters"))]
-                log(lines[-1] if lines else f"{name}: exit code {code}, {printed.strip()[-200:]}")
-                failed += [name] if code else []
+        size = min(TOGETHER, -(-len(todo) // at_once))
+        left, failed = [[r.name for r in todo[k : k + size]] for k in range(0, len(todo), size)], []
+        while left:
+            commands, left = {" ".join(names): [*words, *names] for names in left}, []
+            with contextlib.closing(
+                run_commands(commands, launcher, wanted.out, report, "groups of scenes")
+            ) as results:
+                for names, code, printed in results:
+                    rest = names.split()
+                    for line in (line.removeprefix(REFUSED) for line in printed.splitlines()):
+                        if (name := line.partition(":")[0]) in rest:
+                            rest.remove(name)
+                            failed += [] if line.endswith(PASSED) else [name]
+                            log(line)
+                    if rest:  # its process ended while it worked on the first of these
+                        failed.append(rest[0])
+                        log(f"{rest[0]}: exit code {code}, {printed.strip()[-200:]}")
+                        left += [rest[1:]] if rest[1:] else []
     else:
         gates = make_scenes(todo, recipes.conversion, wanted.out, wanted.overwrite, wanted.jobs, report, log)
         failed = [name for name, failing in gates.items() if failing]

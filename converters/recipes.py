@@ -24,6 +24,7 @@ from converters.generate.design.config import (
 )
 from converters.generate.models.cad import MODELS
 from converters.pipeline import ConvertConfig, Converted, convert
+from converters.records.errors import StageFailed
 from interactive_nav_common.config import Natural, nearest
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import check_name, part_folder, publish
@@ -35,6 +36,7 @@ MOST_SEEDS, NEXT_SEED = 5, 1_000_000
 """Seeds that a home's recipe stands for, and between them: of six one gives no plan that meets its shares."""
 SPARSE = "sparse"
 """Tier of buildings that `BuildingConfig` describes: a recipe's, where it names none."""
+PASSED = "every gate passes"
 GENERATE, CONVERT = 0.55, 0.35
 """Shares of one scene's time, hulls cached, the rest is drawing: weights of the progress bar."""
 
@@ -240,7 +242,7 @@ def make_scenes(
     """Generate scenes one after the other; return name -> gates that fail, of the scenes generated now.
 
     After an interruption, `chosen` names those that are left: a scene is there whole or not at all. `log` is called
-    with one line for each scene. Raise `GenerationError` where a recipe gives no scene with any of its seeds.
+    with one line for each scene, in which one that gives no scene says why; if it is the only one, it raises its error.
     """
     weight = [sum(r.building.floor_area_m2) for r in todo]
     failed: dict[str, list[str]] = {}
@@ -253,7 +255,14 @@ def make_scenes(
         if not overwrite and (out / recipe.name).exists():  # another generator's, finished since
             log(f"{recipe.name}: is there, kept")
             continue
-        failed[recipe.name], seed = make_scene(recipe, conversion, out / recipe.name, jobs, inner)
-        verdict = f"gates that fail: {', '.join(failed[recipe.name])}" if failed[recipe.name] else "every gate passes"
+        try:
+            failed[recipe.name], seed = make_scene(recipe, conversion, out / recipe.name, jobs, inner)
+        except (GenerationError, StageFailed) as error:
+            if len(todo) == 1:
+                raise
+            failed[recipe.name] = ["none"]
+            log(f"{recipe.name}: {str(error).removeprefix(f'{recipe.name}: ')}")
+            continue
+        verdict = f"gates that fail: {', '.join(failed[recipe.name])}" if failed[recipe.name] else PASSED
         log(f"{recipe.name}: {recipe.split}, {seed}, {verdict}")
     return failed

@@ -221,7 +221,7 @@ def test_an_interruption_leaves_the_old_scene_and_no_litter(tmp_path, monkeypatc
 
 @pytest.fixture
 def quick(tmp_path, monkeypatch):
-    """A recipe folder in which generating, converting and drawing write one file each."""
+    """A recipe folder in which generating, converting, its look and drawing write one file each."""
     (tmp_path / "recipes.yaml").write_text(TINY)
 
     def generate(folder: Path, *_: object) -> None:
@@ -234,6 +234,7 @@ def quick(tmp_path, monkeypatch):
 
     monkeypatch.setattr(recipes, "generate_building", generate)
     monkeypatch.setattr(recipes, "convert", convert)
+    monkeypatch.setattr(recipes, "write_look", lambda folder, *_: (folder / "look").write_text("walls"))
     monkeypatch.setattr(recipes, "preview", lambda folder, target: target.write_text("drawn"))
     return load_recipes(tmp_path / "recipes.yaml")
 

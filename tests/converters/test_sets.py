@@ -25,22 +25,25 @@ SCENES = Path(__file__).parents[2] / "scenes_mjcf"
 
 
 class Copier(LocalLauncher):
-    """Whose command copies a scene; 002 cannot be made."""
+    """Whose command copies scenes; 002 gives none, and whoever works on 003 with others is killed."""
 
     def __init__(self, out: Path):
         super().__init__(2)
         self.out, self.commands, self.closed = out, [], 0
 
     def start(self, job: Job) -> str | None:
-        code, said = 2, f"converters generate-scenes: {job.name}: no room"
-        if not job.name.endswith("002"):
-            code, said = 0, f"{job.name}: train, seed 1, every gate passes"
-        act = f"print({said!r}); raise SystemExit({code})"
+        names, said = job.name.split(), []
+        for name in names:
+            if name.endswith("003") and len(names) > 1:
+                break
+            said.append(f"{name}: no room" if name.endswith("002") else f"{name}: train, seed 1, every gate passes")
+        act = f"import os; print({chr(10).join(said)!r}, flush=True); os._exit({3 * (len(said) < len(names))})"
         begun = super().start(dataclasses.replace(job, command=(sys.executable, "-c", act)))
         if begun is not None:
             self.commands.append(list(job.command))
-            if code == 0:
-                shutil.copytree(SCENES / "apartment_0", self.out / job.name)
+            for line in said:
+                if line.endswith("passes"):
+                    shutil.copytree(SCENES / "apartment_0", self.out / line.partition(":")[0])
         return begun
 
     def close(self) -> None:
@@ -81,25 +84,29 @@ def test_wrong_words_are_one_line_and_leave_nothing(tmp_path: Path, capsys, word
 
 def test_scenes_are_made_side_by_side_listed_and_found_by_name(tmp_path: Path, monkeypatch) -> None:
     out, lines, shares = tmp_path / "homes", [], []
-    many.begin_set(out, "furnished", 5)
+    many.begin_set(out, "furnished", 10)
     runner = Copier(out)
     monkeypatch.setattr(many, "LocalLauncher", lambda jobs: runner)
     wanted = GenerateScenes(out=out, jobs=2)
-    assert many.generate_scenes(wanted, lambda _, share: shares.append(share), lines.append) == ["furnished_002"]
-    assert runner.closed == 1 and len(runner.commands) == 5 and shares[-1] == 1.0
+    failed = many.generate_scenes(wanted, lambda _, share: shares.append(share), lines.append)
+    assert sorted(failed) == ["furnished_002", "furnished_003"]
+    groups = [command[command.index("--only") + 1 :] for command in runner.commands]
+    names = [f"furnished_{k:03d}" for k in range(10)]
+    assert groups == [names[:5], names[5:], names[4:5]]  # 003 cost its process, and 004 got another
+    assert runner.closed == 2 and shares[-1] == 1.0
     assert runner.commands[0][:4] == [sys.executable, "-m", "converters", "generate-scenes"]
-    assert "converters generate-scenes: furnished_002: no room" in lines
+    assert "furnished_002: no room" in lines and "furnished_003: exit code 3, " in "\n".join(lines)
     assert not (out / "set.json").exists()
 
-    wanted = GenerateScenes(out=out, tier="furnished", count=5, seed=many.SEEDS, jobs=1)
+    wanted = GenerateScenes(out=out, tier="furnished", count=10, seed=many.SEEDS, jobs=1)
     monkeypatch.setattr(many, "make_scenes", lambda todo, *_: {recipe.name: ["drift_boxes"] for recipe in todo})
-    assert many.generate_scenes(wanted, lambda _, share: None, lines.append) == ["furnished_002"]
-    assert lines[-4:] == [f"furnished_00{k}: is there, kept" for k in (0, 1, 3, 4)]
+    assert many.generate_scenes(wanted, lambda _, share: None, lines.append) == ["furnished_002", "furnished_003"]
+    assert lines[-8:] == [f"{name}: is there, kept" for name in names if name[-3:] not in ("002", "003")]
     members = read_set(out / "set.json").scenes
     assert members["furnished_000"].digest == scene_digest(SCENES / "apartment_0")
     assert members["furnished_002"].digest == ""
     monkeypatch.chdir(tmp_path)
-    assert scene_folders(["homes/test"]) == ("homes/furnished_004",)
+    assert scene_folders(["homes/test"]) == ("homes/furnished_008", "homes/furnished_009")
 
 
 def test_a_scene_that_differs_from_the_list_is_told(tmp_path: Path) -> None:
