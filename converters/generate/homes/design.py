@@ -23,9 +23,9 @@ from converters.generate.models.cad import place
 from converters.geometry.density import ROBOTS, Ways, must_push_shares
 from interactive_nav_common.grids import clearance
 
-MOST_MOVES = 400
+MOST_MOVES = 250
 """Moves tried."""
-MOST_IN_VAIN = 100
+MOST_IN_VAIN = 60
 """Moves in a row that bring nothing, after which a plan is given up."""
 BEFORE_M = (0.15, 0.85)
 """From a doorway's middle to a piece that narrows it, along the way through."""
@@ -69,6 +69,8 @@ class Passages:
         self.room_m = {robot: np.minimum(clearance(floor.free(robot), CELL_M), FAR_M) for robot in self.ways}
         """Robot -> clearance of the floor as the furniture stands, up to `FAR_M`."""
         self.shares = self.measure(self.room_m)
+        self.idle: list[Standing] = []
+        """What bars no passage as the furniture stands."""
 
     def measure(self, room_m: dict[str, np.ndarray]) -> dict[str, Shares]:
         """Return the shares of pairs between which each robot must push, given the clearance."""
@@ -112,6 +114,7 @@ class Passages:
             self.room_m = self.room_after(standing)
             self.shares = self.measure(self.room_m)
             if self.miss() < self.miss(shares) - LEAST_GAIN:
+                self.idle = []
                 return True
         gone, come = _changed(standing, floor.standing)
         for pieces, by in ((come, -1), (gone, 1)):
@@ -215,7 +218,7 @@ def _narrow(home: Home, passages: Passages) -> None:
 def _clear(home: Home, passages: Passages) -> None:
     """Try to put one light piece that bars a passage to where its room, or another, has space for it."""
     rng, floor = home.rng, home.floor
-    light = passages.light()
+    light = [piece for piece in passages.light() if not any(piece is idle for idle in passages.idle)]
     if not light:
         return
     piece = light[rng.integers(len(light))]
@@ -228,6 +231,7 @@ def _clear(home: Home, passages: Passages) -> None:
         standing = floor.standing
         floor.remove(piece)
         if passages.miss(passages.measure(passages.room_after(standing))) >= passages.miss() - LEAST_GAIN:
+            passages.idle.append(piece)
             return False
         takes = (room for room in rooms if home.takes([model.category], room))
         any(settle(home, model.category, alone, room, home.narrow_m) for room in takes)
