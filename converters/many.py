@@ -176,7 +176,7 @@ SEEDS = 100_000
 TEST_SHARE = 0.2
 CONVERSION = {"structure_faces": 16000, "object_faces": 3000, "structure_texture": 1024, "object_texture": 256}
 """How large meshes and textures are."""
-TOGETHER = 5
+TOGETHER = 3
 """Most scenes that a process generates one after the other: it imports libraries and reads furniture once."""
 REFUSED = "converters generate-scenes: "
 """What an error begins with, of a process that generates one scene."""
