@@ -254,7 +254,7 @@ def _tinted(model: CadModel, tint: str) -> CadModel:
         main = max(area, key=lambda material: area[material])
         parts = tuple(dataclasses.replace(p, material=tint if p.material == main else p.material) for p in model.parts)
         return dataclasses.replace(model, name=name, id_cad=_digest(name)[:32], parts=parts)
-    look = functools.partial(_painted, model, np.array(MATERIALS[tint]))
+    look = functools.partial(_repainted, model, np.array(MATERIALS[tint]))
     return dataclasses.replace(model, name=name, id_cad=_digest(name)[:32], look=look)
 
 
@@ -286,10 +286,14 @@ def _holding(surface: VisualMesh, things: list[Part], unit_m: float, move: np.nd
     return VisualMesh(vertices, faces, np.vstack([uv, places]), uv_faces, np.vstack([kept, swatches]), surface.exact)
 
 
-def _painted(model: CadModel, colour: np.ndarray) -> VisualMesh:
-    """Return a model's surface with the main colour of its image, in all its shades, turned into another, (3,) 0..1."""
+def _repainted(model: CadModel, colour: np.ndarray) -> VisualMesh:
     surface = model.surface
     assert surface is not None
+    return dataclasses.replace(surface, image=_painted(surface, colour))
+
+
+def _painted(surface: VisualMesh, colour: np.ndarray) -> np.ndarray:
+    """Return a surface's image with its main colour, in all its shades, turned into another (3,) in 0..1."""
     area = np.linalg.norm(face_vectors(surface.vertices, surface.faces), axis=1)
     shown, of = np.unique(texels(surface.image, surface.uv[surface.uv_faces].mean(axis=1)), axis=0, return_inverse=True)
     shown, weight = shown / 255, np.bincount(of.ravel(), area)
@@ -302,8 +306,7 @@ def _painted(model: CadModel, colour: np.ndarray) -> VisualMesh:
     painted = np.where(shade < 0, colour * (1 + shade), colour + (1 - colour) * shade)
     off = np.linalg.norm(pixels - bright - (main - usual), axis=2, keepdims=True) + 0.4 * np.abs(bright - usual)
     share = np.clip(2 - 2 * off / ALIKE, 0, 1)
-    image = np.rint(255 * (share * painted + (1 - share) * pixels)).astype(np.uint8)
-    return dataclasses.replace(surface, image=image)
+    return np.rint(255 * (share * painted + (1 - share) * pixels)).astype(np.uint8)
 
 
 def tints(name: str) -> tuple[str, ...]:

@@ -224,7 +224,7 @@ def test_a_built_in_models_own_picture_is_drawn_once_for_all_that_have_it():
     corners = np.array([[-0.2, -0.1, 0.1], [0.2, -0.1, 0.1], [0.2, 0.1, 0.1], [-0.2, 0.1, 0.1]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     uv = np.array([[0.0, 0.0], [1, 0], [1, 1], [0, 1]])
-    model = dataclasses.replace(plain_model, surface=VisualMesh(corners, faces, uv, faces, image))
+    model = dataclasses.replace(plain_model, look=lambda: VisualMesh(corners, faces, uv, faces, image))
     built = tuple(Instance(model, np.ones(3), 0.0, np.array([x, 0.0, 0.5])) for x in (0.0, 1.0))
     plan = dataclasses.replace(home().plan, built_in=built)
     scan, atlas = model_building(plan, home().items, home().uses, np.random.default_rng(0))
