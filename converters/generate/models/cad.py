@@ -18,10 +18,9 @@ from typing import Any
 
 import numpy as np
 import shapely
-from PIL import Image
 
 from converters.generate.models import parts as shapes
-from converters.generate.models.parts import MATERIALS, Part, on_floor
+from converters.generate.models.parts import MATERIALS, Part, holding, on_floor
 from converters.geometry.boxes import convex_pieces
 from converters.geometry.faces import face_vectors, stacked
 from converters.library.store import read_image, read_index, read_meshes, read_shape
@@ -234,8 +233,6 @@ def _surface(name: str, unit_m: float, move: np.ndarray) -> VisualMesh:
     return dataclasses.replace(visual, vertices=visual.vertices / unit_m + move)
 
 
-SWATCH = 8
-"""Rows of an image that show plain colours."""
 ALIKE = 0.25
 """Colours whose channels, brightness aside, lie this near to a surface's main colour belong to what is tinted."""
 
@@ -263,27 +260,7 @@ def _filled(model: CadModel, name: str) -> VisualMesh:
     surface = model.surface
     assert surface is not None
     move = surface.vertices.min(axis=0) - read_meshes(name)[0].vertices.min(axis=0) / model.unit_m
-    return _holding(surface, drawn_parts(LOOKS.holds[name]), model.unit_m, move)
-
-
-def _holding(surface: VisualMesh, things: list[Part], unit_m: float, move: np.ndarray) -> VisualMesh:
-    """Return a surface with parts, m, in their materials' colours, which the lowest rows of its image then show."""
-    names, (high, wide) = sorted({part.material for part in things}), surface.image.shape[:2]
-    kept = np.asarray(Image.fromarray(surface.image).resize((wide, high - SWATCH), Image.Resampling.NEAREST))
-    colours = np.rint(255 * np.array([MATERIALS[n] for n in names])).astype(np.uint8)
-    swatches = np.broadcast_to(colours[np.arange(wide) * len(names) // wide], (SWATCH, wide, 3))
-    uv = surface.uv * [1, 1 - SWATCH / high] + [0, SWATCH / high]
-    places = np.array([((k + 0.5) / len(names), SWATCH / 2 / high) for k in range(len(names))])
-    vertices, faces = stacked((part.vertices / unit_m + move, part.faces) for part in things)
-    of = np.repeat([len(uv) + names.index(part.material) for part in things], [len(part.faces) for part in things])
-    normals = face_vectors(vertices, faces)
-    shown = (normals[:, 1:] > -0.99 * np.linalg.norm(normals, axis=1, keepdims=True)).all(
-        axis=1
-    )  # no back, no underside
-    faces, of = faces[shown], of[shown]
-    vertices, faces = stacked(((surface.vertices, surface.faces), (vertices, faces)))
-    uv_faces = np.vstack([surface.uv_faces, np.tile(of[:, None], 3)])
-    return VisualMesh(vertices, faces, np.vstack([uv, places]), uv_faces, np.vstack([kept, swatches]), surface.exact)
+    return holding(surface, drawn_parts(LOOKS.holds[name]), model.unit_m, move)
 
 
 def _repainted(model: CadModel, colour: np.ndarray) -> VisualMesh:

@@ -5,8 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from converters.geometry.faces import face_vectors, stacked
+from converters.records.raw import VisualMesh
 from interactive_nav_common.records import read_packaged
 
 MATERIALS: dict[str, tuple[float, float, float]] = read_packaged(
@@ -220,3 +223,26 @@ def fronts(low, high, z, columns, rows, material, handle="bar", metal="steel") -
             place = (x + side * (width / 2 - 0.05), y, z + 0.028)
             parts.append(box(place, (0.018, min(0.3, 0.4 * height), 0.024), metal))
     return parts
+
+
+SWATCH = 8
+"""Rows of an image that show plain colours."""
+
+
+def holding(surface: VisualMesh, things: list[Part], unit_m: float, move: np.ndarray) -> VisualMesh:
+    """Return a surface with parts, m, in their materials' colours, which the lowest rows of its image then show."""
+    names, (high, wide) = sorted({part.material for part in things}), surface.image.shape[:2]
+    kept = np.asarray(Image.fromarray(surface.image).resize((wide, high - SWATCH), Image.Resampling.NEAREST))
+    colours = np.rint(255 * np.array([MATERIALS[n] for n in names])).astype(np.uint8)
+    swatches = np.broadcast_to(colours[np.arange(wide) * len(names) // wide], (SWATCH, wide, 3))
+    uv = surface.uv * [1, 1 - SWATCH / high] + [0, SWATCH / high]
+    places = np.array([((k + 0.5) / len(names), SWATCH / 2 / high) for k in range(len(names))])
+    vertices, faces = stacked((part.vertices / unit_m + move, part.faces) for part in things)
+    of = np.repeat([len(uv) + names.index(part.material) for part in things], [len(part.faces) for part in things])
+    normals = face_vectors(vertices, faces)
+    # Neither back nor underside.
+    shown = (normals[:, 1:] > -0.99 * np.linalg.norm(normals, axis=1, keepdims=True)).all(axis=1)
+    faces, of = faces[shown], of[shown]
+    vertices, faces = stacked(((surface.vertices, surface.faces), (vertices, faces)))
+    uv_faces = np.vstack([surface.uv_faces, np.tile(of[:, None], 3)])
+    return VisualMesh(vertices, faces, np.vstack([uv, places]), uv_faces, np.vstack([kept, swatches]), surface.exact)

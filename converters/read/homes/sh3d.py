@@ -84,6 +84,8 @@ def read_sh3d(root: Path, strict: bool = False, chosen: Path | None = None) -> R
 def kind_of(catalogue_id: str, name: str, height_m: float = 1.0) -> str:
     """Return the category of a piece by its catalogue id, else by its name in some languages, else `other`."""
     catalogued = catalogue_id.rpartition("#")[2]
+    if catalogue_id.startswith(OURS) and catalogued in CATEGORIES:
+        return catalogued
     bare = re.sub("[^a-z]", "", catalogued.lower())
     if bare in BLOCKS or "stair" in bare:
         return "structure"
