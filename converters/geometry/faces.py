@@ -132,23 +132,6 @@ def sampled(
             yield points, np.full(len(points), face)
 
 
-def in_blocks(
-    parts: Iterable[tuple[np.ndarray, np.ndarray]], size: int = 16_384
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield what `sampled` yields in pieces of up to so many points, joining small ones."""
-    held: list[tuple[np.ndarray, np.ndarray]] = []
-    count = 0
-    for points, face in parts:
-        for start in range(0, len(face), size):
-            piece = points[start : start + size], face[start : start + size]
-            if count + len(piece[1]) > size:
-                yield np.concatenate([p for p, _ in held]), np.concatenate([f for _, f in held])
-                held, count = [], 0
-            held, count = [*held, piece], count + len(piece[1])
-    if held:
-        yield np.concatenate([p for p, _ in held]), np.concatenate([f for _, f in held])
-
-
 def _by_rows(corners: np.ndarray, n: int, spacing_m: float) -> Iterator[np.ndarray]:
     """Yield points of one triangle in n rows along its shortest side: a long thin one needs few."""
     side = int(_sides(corners[None])[0].argmin())

@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull, QhullError
 from shapely import MultiPoint, contains_xy
 
 from converters.bodies.objects import PlacedObject, to_world
-from converters.geometry.faces import beyond_block, face_labels, in_blocks, sampled, unit_normals
+from converters.geometry.faces import beyond_block, face_labels, sampled, unit_normals
 from converters.records.errors import SceneRejected
 from converters.records.raw import CEILING, DOOR, FLOOR, STRUCTURE_LABELS, UNLABELLED, GivenMap
 from interactive_nav_common.grids import label
@@ -61,6 +61,10 @@ LEAST_INSIDE_M2 = 3.0
 RIGHT_SHARE, HOME_SHARE = 0.5, 0.25
 """Least share of the floor within the hull that lies inside: for a width to be right at once, and for a home without
 furniture."""
+
+
+PIECE = 16_384
+"""Points on a scan that are looked at together."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -285,7 +289,9 @@ def _shown(grid: Grid, vertices_w: np.ndarray, faces: np.ndarray, of_face: np.nd
     large = beyond_block(vertices_w[faces[kept]], spacing_m)
     for chosen, push in ((kept[~large], 0.0), (kept[large], 1e-6)):
         # In blocks: the points on a large hall do not fit the memory, and blocks that fit the cache are the fastest.
-        for points, face in in_blocks(sampled(vertices_w, faces[chosen], spacing_m)):
+        blocks = sampled(vertices_w, faces[chosen], spacing_m)
+        pieces = ((p[k : k + PIECE], f[k : k + PIECE]) for p, f in blocks for k in range(0, len(f), PIECE))
+        for points, face in pieces:
             face, z = chosen[face], points[:, 2]
             label, structural = of_face[face], of_structure[face]
             is_floor = label == FLOOR
