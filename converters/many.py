@@ -25,7 +25,7 @@ from converters.clock import STAGES, Report, peak_memory_mib
 from converters.generate.design.config import GenerationError
 from converters.pipeline import ConvertConfig, Converted, convert_building
 from converters.read.source import root_of
-from converters.recipes import PASSED, Recipes, chosen, load_recipes, make_scenes, parse_recipes
+from converters.recipes import KEPT, PASSED, Recipes, chosen, load_recipes, make_scenes, parse_recipes
 from converters.records.errors import StageFailed
 from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError, FileError, UserError, readable
@@ -282,7 +282,7 @@ def generate_scenes(wanted: Any, report: Report, log: Callable[[str], None]) -> 
                     for line in (line.removeprefix(REFUSED) for line in printed.splitlines()):
                         if (name := line.partition(":")[0]) in rest:
                             rest.remove(name)
-                            failed += [] if line.endswith(PASSED) else [name]
+                            failed += [name] if code and not line.endswith((PASSED, KEPT)) else []
                             log(line)
                     if rest:  # its process ended while it worked on the first of these
                         failed.append(rest[0])

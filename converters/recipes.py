@@ -36,7 +36,8 @@ MOST_SEEDS, NEXT_SEED = 5, 1_000_000
 """Seeds that a home's recipe stands for, and between them: of six one gives no plan that meets its shares."""
 SPARSE = "sparse"
 """Tier of buildings that `BuildingConfig` describes: a recipe's, where it names none."""
-PASSED = "every gate passes"
+PASSED, KEPT = "every gate passes", "is there, kept"
+"""Ends of the lines about scenes that are as they should be."""
 GENERATE, CONVERT = 0.55, 0.35
 """Shares of one scene's time, hulls cached, the rest is drawing: weights of the progress bar."""
 
@@ -231,7 +232,7 @@ def chosen(
     todo = tuple(r for r in wanted if overwrite or not (out / r.name).exists())
     for recipe in wanted:
         if recipe not in todo:
-            log(f"{recipe.name}: is there, kept")
+            log(f"{recipe.name}: {KEPT}")
     return todo
 
 
@@ -253,7 +254,7 @@ def make_scenes(
             report(f"{k + 1}/{len(todo)} {recipe.name}: {stage}", done)
 
         if not overwrite and (out / recipe.name).exists():  # another generator's, finished since
-            log(f"{recipe.name}: is there, kept")
+            log(f"{recipe.name}: {KEPT}")
             continue
         try:
             failed[recipe.name], seed = make_scene(recipe, conversion, out / recipe.name, jobs, inner)

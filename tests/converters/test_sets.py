@@ -37,7 +37,8 @@ class Copier(LocalLauncher):
             if name.endswith("003") and len(names) > 1:
                 break
             said.append(f"{name}: no room" if name.endswith("002") else f"{name}: train, seed 1, every gate passes")
-        act = f"import os; print({chr(10).join(said)!r}, flush=True); os._exit({3 * (len(said) < len(names))})"
+        code = 3 if len(said) < len(names) else 1 if any(line.endswith("no room") for line in said) else 0
+        act = f"import os; print({chr(10).join(said)!r}, flush=True); os._exit({code})"
         begun = super().start(dataclasses.replace(job, command=(sys.executable, "-c", act)))
         if begun is not None:
             self.commands.append(list(job.command))

@@ -143,7 +143,7 @@ def run(arguments: Evaluate, build_env: Callable[[EnvConfig], Any] | None, kept:
         rows, stood = pa.table({}), out.exists()
         unfinished = out.with_name(f".unfinished-{out.name}")  # which figures and sweeps pass over
         for rows, played in evaluate(folder, config, player, request, arguments.record, console, file, arguments.batch):
-            # What is stopped keeps what has been played; whole rows that stood there give way to whole ones only.
+            # A stopped evaluation keeps what has been played; only complete rows replace complete rows.
             place = out if len(played) == len(policies) or not stood else unfinished
             write_paths(paths_beside(place), played, player.env)  # first: rows are never without paths as new as they
             write_parquet(rows, place, notes)

@@ -293,7 +293,7 @@ class _Reader:
         name, kind, axis, hinge = e.get("name") or "", e.get("type") or "", e.find("axis"), None
         parent, child = ((e.findtext(key) or "").strip() for key in ("parent", "child"))
         if axis is not None and {parent, child} <= places.keys():
-            # What a saved state has moved: it opens the joint, or takes the link off it.
+            # A saved state may have opened the joint, or moved the link off it.
             by, of_parent = (places[link] @ np.linalg.inv(model.frame(link)) for link in (child, parent))
             xyz, whole = next(axis.iter("xyz"), axis), axis.findtext("use_parent_model_frame") in ("1", "true")
             frame = xyz.get("expressed_in") or ("__model__" if whole else name)

@@ -5,7 +5,6 @@ python -m docs.studies.homes.sheet GENERATED... DRAWN... -o sheet.png
 
 import argparse
 from pathlib import Path
-from unittest import mock
 
 import mujoco
 import numpy as np
@@ -31,11 +30,7 @@ def main() -> None:
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         about = model, data, pictures.world_surfaces(model, data), load_maps(folder), SHAPE
-        views = []
-        for height_m in HEIGHTS_M:
-            with mock.patch.object(pictures, "EYE_M", height_m):
-                views.append(pictures.at_eye_height(*about))
-        rows.append(np.hstack(views))
+        rows.append(np.hstack([pictures.at_eye_height(*about, eye_m) for eye_m in HEIGHTS_M]))
     Image.fromarray(np.vstack(rows)).save(args.output)
 
 

@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.geometry.boxes import AXES, convex_hull, fit_box, upright_box
+from converters.geometry.boxes import AXES, convex_hull, fit_box, hull_of, upright_box
 from interactive_nav_common.rotations import yaw_matrix
 
 CUBE = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0])).reshape(3, -1).T
@@ -53,3 +54,14 @@ def test_a_tilted_box_is_named_so_that_it_turns_least():
     np.testing.assert_allclose(box.half, [0.02, 0.02, 0.4], atol=1e-6)
     np.testing.assert_allclose(box.rotation, tilt, atol=1e-6)
     assert len({tuple(axes.ravel()) for axes in AXES}) == 48
+
+
+def test_hulls_are_those_of_trimesh():
+    rng = np.random.default_rng(0)
+    box = np.array([[x, y, z] for x in (0, 0.4) for y in (0, 0.3) for z in (0, 0.9)])
+    clouds = [rng.normal(size=(n, 3)) for n in (4, 9, 40, 300)] + [box, np.vstack([box, box.mean(axis=0)])]
+    for points in clouds:
+        ours, theirs = hull_of(points), trimesh.convex.convex_hull(points)
+        np.testing.assert_array_equal(ours.vertices, theirs.vertices)
+        np.testing.assert_array_equal(ours.faces, theirs.faces)
+        assert trimesh.Trimesh(ours.vertices, ours.faces, process=False).volume == pytest.approx(theirs.volume)
