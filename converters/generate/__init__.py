@@ -27,7 +27,7 @@ from scenes_mjcf.look import LOOK, UV_STEPS
 
 __all__ = ["Building", "BuildingConfig", "GenerationError", "HomeConfig", "design_building", "generate_building"]
 
-GENERATOR_VERSION = 5
+GENERATOR_VERSION = 6
 """Raised whenever the same seed would give other bytes."""
 LOOK_TEXELS, LOOK_QUALITY = 1024, 30
 """Side and quality of the image that `write_look` writes."""

@@ -30,8 +30,8 @@ ONE = (1.0, 1.0, 1.0)
 SAME_M = 5e-5
 """Meshes no farther apart are one; half of what a file's last digit is."""
 HULL_DECIMALS = 5
-NORMAL_STEP, CURVED = 0.05, 0.998
-"""Of normals, in few digits; where a corner's has a cosine to its face's below that, a surface is curved.
+NEAR, CURVED = 0.9997, 0.998
+"""Cosine of a written normal to its own; where a corner's to its face's is below that, a surface is curved.
 
 MuJoCo computes normals where there are none, one a vertex, which bend the light at the rims of lids and seats; they do
 for the structure, which is mostly flat."""
@@ -267,6 +267,26 @@ def paired(faces: np.ndarray, corners: np.ndarray) -> list[list[int]]:
     return polygons
 
 
+def _commonest_first(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distinct ones of (m, 3, k) rows, the commonest first, whose number is short, and indices (m, 3)."""
+    rows = corners.reshape(-1, corners.shape[2]) + 0.0
+    rows, of, uses = np.unique(rows, axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(-uses, kind="stable")
+    return rows[order], np.argsort(order)[of].reshape(-1, 3)
+
+
+def _short(normals: np.ndarray) -> np.ndarray:
+    """Return multiples of about unit vectors (m, 3, 3), in whole numbers of one digit; readers normalise them."""
+    longest = np.maximum(np.abs(normals).max(axis=2, keepdims=True), 1e-9)
+    result, best = normals.copy(), np.full(normals.shape[:2], -1.0)
+    for most in range(1, 10):
+        whole = np.round(normals * (most / longest))
+        cosine = (whole * normals).sum(axis=2) / np.maximum(np.linalg.norm(whole, axis=2), 1.0)
+        better = (best < NEAR) & (cosine > best)
+        result[better], best[better] = whole[better], cosine[better]
+    return result
+
+
 def write_obj(
     path: Path,
     vertices: np.ndarray,
@@ -285,19 +305,19 @@ def write_obj(
         lines = [f"v {x:.{decimals}f} {y:.{decimals}f} {z:.{decimals}f}" for x, y, z in vertices + 0.0]
         lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]
     else:
-        vertices, uv = np.round(vertices, decimals) + 0.0, np.round(uv, uv_decimals) + 0.0
-        normals, indices = np.zeros((0, 3)), [faces, uv_faces]
         at_corners = corner_normals(vertices, faces)
-        if smooth and ((at_corners * unit_normals(vertices, faces)[:, None]).sum(axis=2) < CURVED).any():
-            rounded = np.round(at_corners.reshape(-1, 3) / NORMAL_STEP) * NORMAL_STEP + 0.0
-            normals, of, uses = np.unique(rounded, axis=0, return_inverse=True, return_counts=True)
-            order = np.argsort(-uses, kind="stable")  # the commonest has the shortest number
-            normals, indices = normals[order], [faces, uv_faces, np.argsort(order)[of].reshape(-1, 3)]
+        curved = smooth and ((at_corners * unit_normals(vertices, faces)[:, None]).sum(axis=2) < CURVED).any()
+        vertices, faces = _commonest_first(np.round(vertices, decimals)[faces])
+        apart = (faces != np.roll(faces, 1, axis=1)).all(axis=1)  # else two corners are in one place
+        vertices, faces = _commonest_first(vertices[faces[apart]])
+        uv, uv_faces = _commonest_first(np.round(uv, uv_decimals)[uv_faces[apart]])
+        tables, indices = {"v": vertices, "vt": uv}, [faces, uv_faces]
+        if curved:
+            tables["vn"], of = _commonest_first(_short(at_corners[apart]))
+            indices.append(of)
         rows = np.stack(indices, axis=2).reshape(-1, len(indices))
         rows, of = np.unique(rows, axis=0, return_inverse=True)
-        lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices]
-        lines += [f"vt {u:.9g} {v:.9g}" for u, v in uv]
-        lines += [f"vn {x:g} {y:g} {z:g}" for x, y, z in normals]
+        lines = [" ".join((k, *(f"{v:.9g}" for v in row))) for k, table in tables.items() for row in table.tolist()]
         lines = [re.sub(r"\b0\.", ".", line) for line in lines]  # -0.25: every reader takes -.25
         names = ["/".join(map(str, row)) for row in (rows + 1).tolist()]
         steps = np.hstack([vertices[rows[:, 0]] * 10**decimals, uv[rows[:, 1]] * 10**uv_decimals])

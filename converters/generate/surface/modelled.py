@@ -21,8 +21,9 @@ from converters.generate.surface.finishes import FRAMES, Finish, finishes, frame
 from converters.generate.surface.scan import NYU40, Scan, building_solids, fuse, solid_from_box
 from converters.generate.surface.sides import CLOTHS, ENTRANCES, FLOOR_M, PICTURE, Side
 from converters.generate.surface.texture import SHEETS, Atlas, Chart, assemble, piece_charts, plain, polygon
-from converters.records.raw import CEILING, FLOOR, WALL
+from converters.records.raw import CEILING, FLOOR, WALL, VisualMesh
 from converters.write.light import VOXEL_M, Daylight, Space
+from converters.write.texture import share_plain
 
 Sides = list[list[Side]]
 """Of each room its walls."""
@@ -175,7 +176,7 @@ def _fittings(
 def _built_in(items: Sequence[Instance]) -> list[Chart]:
     """Return built-in furniture: drawn parts in the colour of their material, a library's model with its image."""
     charts = []
-    images: dict[str, np.ndarray] = {}
+    looks: dict[str, tuple[VisualMesh, np.ndarray]] = {}
     for item in items:
         label, visual = NYU40[item.model.category], item.model.surface
         if visual is None:
@@ -183,13 +184,14 @@ def _built_in(items: Sequence[Instance]) -> list[Chart]:
                 paint = plain(MATERIALS[part.material])
                 charts += piece_charts(item.to_floor(part.vertices), part.faces, label, paint)
             continue
-        if item.model.name not in images:
-            picture = np.asarray(visual.image, float)[..., :3] / 255
-            h, w = (n // 2 * 2 for n in picture.shape[:2])
-            images[item.model.name] = picture[:h, :w].reshape(h // 2, 2, w // 2, 2, 3).mean(axis=(1, 3))
-        placed, image = item.to_floor(np.asarray(visual.vertices, float)), images[item.model.name]
-        uv, uv_faces = np.asarray(visual.uv, float), visual.uv_faces
-        charts.append(Chart(placed, visual.faces, label, image, uv=uv, uv_faces=uv_faces))
+        if item.model.name not in looks:
+            h, w = (n // 2 * 2 for n in visual.image.shape[:2])
+            image = visual.image[:h, :w, :3].reshape(h // 2, 2, w // 2, 2, 3).mean(axis=(1, 3))
+            look = share_plain(dataclasses.replace(visual, image=np.rint(image).astype(np.uint8)))
+            looks[item.model.name] = look, look.image / 255
+        look, image = looks[item.model.name]
+        placed = item.to_floor(visual.vertices.astype(float))
+        charts.append(Chart(placed, visual.faces, label, image, uv=look.uv, uv_faces=look.uv_faces))
     return charts
 
 

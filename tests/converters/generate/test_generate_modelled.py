@@ -69,7 +69,7 @@ def test_artefacts_are_a_checked_setting_of_homes_that_recipes_reach():
             building_of("cluttered", {"artefacts": wrong}, "train", "here")
     with pytest.raises(ConfigError, match="did you mean 'phone'"):
         home_config("furnished", {"artefacts": "phon"})
-    assert GENERATOR_VERSION == 5
+    assert GENERATOR_VERSION == 6
 
 
 def test_floors_and_ceilings_are_the_plans_and_look_into_the_rooms():

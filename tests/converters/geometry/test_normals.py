@@ -67,3 +67,12 @@ def test_files_of_what_is_curved_have_normals_which_mujoco_reads(tmp_path):
             turn = turn.reshape(3, 3)
             points = model.mesh_vert @ turn.T + model.mesh_pos[0]
             assert normals @ turn.T == pytest.approx(wanted(points, model.mesh_face.astype(int)), abs=0.05)
+
+
+def test_what_is_equal_is_written_once_the_commonest_first(tmp_path):
+    """Two triangles of one colour that share an edge, with corners of their own, and one whose corners coincide."""
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [1, 0, 0], [3, 0, 0], [1, 1, 1e-6], [1, 1, 2e-6]], float)
+    faces, uv = np.array([[0, 1, 2], [3, 4, 5], [2, 5, 6]]), np.array([[0.2, 0.5], [0.5, 0.5], [0.5, 0.50001]])
+    write_obj(tmp_path / "mesh.obj", vertices, faces, uv, np.array([[1, 1, 1], [2, 2, 2], [0, 0, 0]]))
+    lines = (tmp_path / "mesh.obj").read_text().splitlines()
+    assert lines == ["v 1 0 0", "v 1 1 0", "v 0 0 0", "v 3 0 0", "vt .5 .5", "f 2/1 3/1 1/1 4/1"]
