@@ -6,6 +6,7 @@ where there is no display.
 """
 
 import atexit
+import contextlib
 import dataclasses
 import importlib
 import io
@@ -38,6 +39,11 @@ of these `vertices_mm` (3, n) i16, and `uv` (2, n) u16, which counts these steps
 bytes of a WebP file."""
 SUN, SHADOW_TEXELS, SHADOW_M = 0.2, 4096, 12.0
 """Brightness of a light that casts shadows, side of the map that these are looked up in, how far that reaches."""
+
+GLASS = (170, 198, 202)
+"""Of 255, as images have it: faces in just this colour are glass."""
+GLASS_ALPHA = 0.3
+"""Share of the glass in what one sees; the rest is what lies behind."""
 
 
 class CameraPose(NamedTuple):
@@ -104,6 +110,55 @@ def spec_for_people(folder: Path) -> mujoco.MjSpec:
     texture.data = image.tobytes()
     light_evenly(spec)
     return spec
+
+
+def glaze(spec: mujoco.MjSpec, folder: Path) -> None:
+    """Split the glass off textured meshes of a scene folder's spec, into geoms `<geom>_glass` that one sees through."""
+    clear = [1.0, 1.0, 1.0, 1 - math.sqrt(1 - GLASS_ALPHA)]  # MuJoCo draws what is translucent twice
+    images: dict[str, np.ndarray] = {}
+    for texture in spec.textures:
+        with contextlib.suppress(OSError, ValueError):  # compiling says what is wrong with a file
+            image = Image.open(folder / spec.texturedir / texture.file)
+            colours = image.getpalette() if image.mode == "P" else None
+            if colours is None or GLASS in zip(*[iter(colours)] * 3, strict=False):
+                images[texture.name] = np.asarray(image.convert("RGB"))
+    of = {m.name: images.get(m.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB]) for m in spec.materials}
+    for geom in list(spec.geoms):
+        image = of.get(geom.material)
+        if geom.type != mujoco.mjtGeom.mjGEOM_MESH or image is None or not (image == GLASS).all(axis=2).any():
+            continue
+        mesh, alone = spec.mesh(geom.meshname), mujoco.MjSpec()
+        alone.add_mesh(name="mesh", file=str((folder / spec.meshdir / mesh.file).absolute()), inertia=mesh.inertia)
+        alone.worldbody.add_geom(type=geom.type, meshname="mesh", contype=0, conaffinity=0)
+        model = alone.compile()
+        uv = mesh_of(model, 0)[2]
+        assert uv is not None
+        inner = np.concatenate([uv.mean(axis=1, keepdims=True), (uv + uv.mean(axis=1, keepdims=True)) / 2], axis=1)
+        column, row = np.moveaxis((inner * image.shape[1::-1]).astype(int), -1, 0)
+        glass = (image[row % len(image), column % image.shape[1]] == GLASS).all(axis=(1, 2))
+        if glass.all():
+            geom.rgba = clear
+        elif glass.any():
+            pane = geom.parent.add_geom(type=geom.type, name=f"{geom.name}_glass", rgba=clear)
+            pane.pos, pane.quat, pane.material, pane.group = geom.pos, geom.quat, geom.material, geom.group
+            pane.contype = pane.conaffinity = pane.mass = 0
+            for part, chosen in ((geom, ~glass), (pane, glass)):
+                part.meshname = f"{part.name}_part"
+                cut = spec.add_mesh(name=part.meshname, scale=mesh.scale, inertia=mesh.inertia)
+                _take_faces(cut, model, uv, chosen)
+
+
+def _take_faces(mesh: mujoco.MjsMesh, model: mujoco.MjModel, uv: np.ndarray, chosen: np.ndarray) -> None:
+    """Give a mesh some faces (m,) of a model's only mesh, whose texture coordinates are [m, 3, 2]."""
+    vertices, faces = geom_mesh(model, 0)
+    used, index = np.unique(faces[chosen], return_inverse=True)
+    corners = np.arange(3 * chosen.sum(), dtype=np.int32)
+    mesh.uservert, mesh.userface = vertices[used].ravel(), index.ravel().astype(np.int32)
+    mesh.usertexcoord, mesh.userfacetexcoord = uv[chosen].ravel(), corners
+    if (normals := mesh_normals(model, 0)) is not None:
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, model.geom_quat[0])
+        mesh.usernormal, mesh.userfacenormal = (normals[chosen] @ turn.reshape(3, 3).T).ravel(), corners
 
 
 def look_along(pos_w: Any, forward_w: Any) -> CameraPose:

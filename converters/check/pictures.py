@@ -24,7 +24,7 @@ from converters.write.texture import box_pixels
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.grids import cell_centres, clearance
-from scenes_mjcf.look import CameraPose, Lens, geom_image, geom_mesh, look_along, mesh_of, over
+from scenes_mjcf.look import GLASS, GLASS_ALPHA, CameraPose, Lens, geom_image, geom_mesh, look_along, mesh_of, over
 from scenes_mjcf.schema import SceneMaps
 
 NEAREST_M = 0.05
@@ -71,8 +71,10 @@ class Picture:
         """Return (rows, columns, 3) uint8."""
         return self._colours.reshape(self._lens.height, self._lens.width, 3)
 
-    def draw(self, mesh: TexturedMesh, one_sided: bool = False, below_m: float = np.inf) -> None:
-        """Draw a mesh."""
+    def draw(
+        self, mesh: TexturedMesh, one_sided: bool = False, below_m: float = np.inf, glass: bool | None = None
+    ) -> None:
+        """Draw a mesh; only its `glass`, over what is drawn already, or all but that; None: all, glass opaque."""
         assert mesh.corner_uv is not None and mesh.texture is not None
         lens, eye, axes_w = self._lens, self._pose.pos_w, self._pose.axes_w
         bright = EVEN + (1 - EVEN) * np.abs(corner_normals(mesh.vertices, mesh.faces) @ LAMP_W)
@@ -108,11 +110,17 @@ class Picture:
             order = np.flatnonzero(far < self._depth[where])
             order = order[np.argsort(-far[order], kind="stable")]  # the nearest is written last
             face, share, where = face[order], share[order], where[order]
-            self._depth[where] = far[order]
             u, v = np.einsum("nc,ncd->nd", share, uv[face]).T
             texel = (np.stack([1 - v % 1, u % 1], axis=1) * texture.shape[:2]).T - 0.5  # the nearest, or between four
             planes = [map_coordinates(texture[..., k], texel, order=int(between), mode="nearest") for k in range(3)]
-            self._colours[where] = np.stack(planes, -1) * (share * light[face]).sum(axis=1)[:, None]
+            shown, far = np.stack(planes, -1), far[order]
+            if glass is not None:
+                chosen = (np.rint(shown) == GLASS).all(axis=1) == glass
+                shown, far, where = shown[chosen], far[chosen], where[chosen]
+                face, share = face[chosen], share[chosen]
+            alpha, shown = GLASS_ALPHA if glass else 1.0, shown * (share * light[face]).sum(axis=1)[:, None]
+            self._depth[where] = far
+            self._colours[where] = alpha * shown + (1 - alpha) * self._colours[where]
 
 
 def _areas(corners: np.ndarray) -> np.ndarray:
@@ -168,9 +176,10 @@ def world_surfaces(model: mujoco.MjModel, data: mujoco.MjData) -> Surfaces:
 def _taken(pose: CameraPose, lens: Lens, surfaces: Surfaces, cut_m: float = np.inf) -> np.ndarray:
     """Draw the picture (rows, columns, 3) of bodies."""
     picture = Picture(pose, lens)
-    for body, surface in surfaces.items():
+    glazed = [b for b, s in surfaces.items() if s.texture is not None and (s.texture == GLASS).all(axis=2).any()]
+    for body, glass in (*((body, False) for body in surfaces), *((body, True) for body in glazed)):
         structure = body == "structure"
-        picture.draw(surface, one_sided=structure, below_m=cut_m if structure else np.inf)
+        picture.draw(surfaces[body], one_sided=structure, below_m=cut_m if structure else np.inf, glass=glass)
     return picture.image
 
 

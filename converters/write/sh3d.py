@@ -20,7 +20,7 @@ from PIL import Image
 from converters.geometry.boxes import convex_hull
 from converters.read.files import read_image, read_obj
 from converters.read.homes.sh3d import OURS
-from converters.read.homes.sh3d_models import GLASS, HULLS, PANE
+from converters.read.homes.sh3d_models import HULLS, PANE, PANES
 from converters.records.errors import SceneRejected
 from converters.records.raw import ATTRIBUTION, ColourCloud, TexturedMesh
 from converters.write.sh3d_rooms import SIDE_M, Wall, gap_around, half_wall, merged_walls, rooms_of, wall_between
@@ -298,7 +298,7 @@ class _Export:
             self.walls.append(Wall(ends, 2 * deep, max(tall, at[2] + up)))
         sides = (-x, BAR_M - x, 0.0, high), (x - BAR_M, x, 0.0, high), (-x, x, 0.0, BAR_M), (-x, x, high - BAR_M, high)
         pane, glass = convex_hull(_bar(-x, x, 0.0, high, IN_M)), io.BytesIO()
-        Image.fromarray(GLASS).save(glass, "PNG")
+        Image.fromarray(PANES).save(glass, "PNG")
         rest = "vt 0.5 0.5\n" + "\n".join(f"f {a}/1 {b}/1 {c}/1" for a, b, c in pane.faces + 1)
         mesh = Mesh(pane.vertices, rest, glass.getvalue(), (site.name, ""), [])
         model = self._model(site.name, lambda points: points, mesh, PANE, np.array([_bar(*s, y) for s in sides]))

@@ -19,7 +19,7 @@ from interactive_nav.sensing.boxes import FLOOR_COLOUR, PALETTES
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.categories import MaskClasses, class_id
-from scenes_mjcf.look import cast, geom_colour, spec_for_people
+from scenes_mjcf.look import cast, geom_colour, glaze, spec_for_people
 
 THINGS, BUILDING, CUT_WALLS, ROBOT, ROBOT_SOLIDS, HIDDEN = range(6)
 """Geom groups: the floor and what stands on it; walls at full height; walls cut low; the robot; the collision shapes
@@ -40,9 +40,11 @@ def furnished_spec(
     """Return the scene of `scene.xml` with a robot and small objects added, which are boxes and stand at the origin.
 
     With `cut_walls` the walls are there once more, cut low. `for_people`: its structure is drawn as
-    `scenes_mjcf.look.spec_for_people` has it, and not as observations show it.
+    `scenes_mjcf.look.spec_for_people` has it, and not as observations show it, and one sees through glass.
     """
     spec = spec_for_people(scene.path) if for_people else mujoco.MjSpec.from_file(str(scene.path / "scene.xml"))
+    if for_people:
+        glaze(spec, scene.path)
     if cut_walls:
         _add_cut_walls(spec, scene.walls)
     if robot is not None:

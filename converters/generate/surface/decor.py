@@ -126,9 +126,7 @@ def _on_worktops(items: Sequence[Instance], rng: np.random.Generator) -> Iterato
         foot = item.to_floor(np.array([item.model.center * [1, 0, 1] + [0, level[np.argmax(area)], 0]]))[0]
         turn = yaw_matrix(item.yaw_rad + rng.uniform(-0.3, 0.3)) @ Y_UP_TO_Z_UP
         for part in drawn_parts(LOOKS.worktops[rng.integers(len(LOOKS.worktops))]):
-            yield from piece_charts(
-                part.vertices @ turn.T + foot, part.faces, OTHER_PROP, plain(MATERIALS[part.material])
-            )
+            yield from piece_charts(part.vertices @ turn.T + foot, part.faces, OTHER_PROP, part.material)
 
 
 def decor(

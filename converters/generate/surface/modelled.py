@@ -181,8 +181,7 @@ def _built_in(items: Sequence[Instance]) -> list[Chart]:
         label, visual = NYU40[item.model.category], item.model.surface
         if visual is None:
             for part in item.model.parts:
-                paint = plain(MATERIALS[part.material])
-                charts += piece_charts(item.to_floor(part.vertices), part.faces, label, paint)
+                charts += piece_charts(item.to_floor(part.vertices), part.faces, label, part.material)
             continue
         if item.model.name not in looks:
             h, w = (n // 2 * 2 for n in visual.image.shape[:2])

@@ -278,10 +278,11 @@ def polygon(points: Iterable[Iterable[float]], towards: Iterable[float], *about:
     return Chart(corners, np.array(fan), *about, **more)
 
 
-def piece_charts(vertices: np.ndarray, faces: np.ndarray, label: int, paint: Colouring) -> list[Chart]:
-    """Cut a mesh into patches of faces that look mostly along one axis."""
+def piece_charts(vertices: np.ndarray, faces: np.ndarray, label: int, material: str) -> list[Chart]:
+    """Cut a mesh of one material into patches of faces that look mostly along one axis; glass keeps its colour."""
     n, chart = charts_of(faces, face_axes(vertices, faces))
-    return [Chart(*compacted(vertices, faces[chart == k]), label, paint, 50.0) for k in range(n)]
+    about = label, plain(MATERIALS[material]), 50.0, material == "glass"
+    return [Chart(*compacted(vertices, faces[chart == k]), *about) for k in range(n)]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -28,6 +28,7 @@ from converters.records.errors import EXTENT_M, GEOMS, SceneRejected, check_coun
 from converters.records.raw import ScannedHinge
 from interactive_nav_common.records import read_packaged
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, transformed
+from scenes_mjcf.look import GLASS
 
 WHITE = np.array([235, 235, 230], np.uint8).reshape(1, 1, 3)
 """Of sides and rooms that have no colour."""
@@ -40,7 +41,7 @@ BUILT_IN = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, str])
 """Colours of the materials that models name without a file: those of the first OBJ viewers, diffuse."""
 PANE = "sweethome3d_window_pane"
 """Groups that begin so are glass: a piece's one colour leaves them."""
-GLASS = np.array([176, 200, 214], np.uint8).reshape(1, 1, 3)
+PANES = np.array(GLASS, np.uint8).reshape(1, 1, 3)
 LEAF = re.compile(r"sweethome3d_(?:opening|window_pane)_on_hinge_(\d{1,2})")
 OPENS = re.compile(r"sweethome3d_[a-z_]+_on_((?:hinge|rail)_\d{1,2})(?!\d)")
 """Groups that open on the one that is called so, or on `sweethome3d_unique_rail`."""
@@ -283,7 +284,7 @@ class DrawnModels:
                     uv = uv.copy()
                     uv[chosen] = _by_place(model, element, chosen, size)
         numbers[pane] = len(images)
-        return uv, numbers, [*images, GLASS]
+        return uv, numbers, [*images, PANES]
 
 
 def part_of(mesh: TexturedMesh, faces: np.ndarray) -> TexturedMesh:

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from converters.check.pictures import Picture, at_eye_height, from_the_south, world_surfaces
+from converters.check.pictures import Picture, _taken, at_eye_height, from_the_south, world_surfaces
 from converters.records.raw import TexturedMesh
-from scenes_mjcf.look import CameraPose, Lens, look_along, over
+from scenes_mjcf.look import GLASS, CameraPose, Lens, look_along, over
 from scenes_mjcf.schema import load_maps
 
 RED, BLUE, MAGENTA = (200, 0, 0), (0, 0, 200), (255, 0, 255)
@@ -50,6 +50,19 @@ def test_the_nearer_wall_hides_the_farther_as_perspective_has_it():
     seen = hue(picture.image)
     assert (seen[15:25, 15:25] == "r").all() and (seen == "r").sum() == 100
     assert (seen[10:30, 10:30] != ".").all() and (seen == "b").sum() == 300
+
+
+def test_glass_is_mixed_with_what_is_behind_it_in_whichever_order_it_comes():
+    """Both walls are upright and as bright, so 0.3 of the pane's colour shows with 0.7 of the red one's."""
+    red, pane = wall(4.0, 3.0, plain(RED)), wall(2.0, 0.5, plain(GLASS))
+    shown = []
+    for order in ({"far": red, "pane": pane}, {"pane": pane, "far": red}, {"far": red}, {"pane": pane}):
+        shown.append(_taken(*ahead((40, 40), 20.0), order).astype(float)[20, 20])
+    bright = shown[2][0] / RED[0]
+    assert 0.7 < bright <= 1.0
+    assert np.abs(shown[0] - bright * (0.3 * np.array(GLASS) + 0.7 * np.array(RED))).max() < 1.5
+    assert (shown[1] == shown[0]).all()
+    assert np.abs(shown[3] - (0.3 * bright * np.array(GLASS) + 0.7 * 255)).max() < 1.5  # white where nothing is
 
 
 @pytest.mark.parametrize("parallel", [False, True])

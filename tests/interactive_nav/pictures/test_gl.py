@@ -80,3 +80,52 @@ def test_pictures_larger_than_the_buffer_are_refused():
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     with pytest.raises(UserError, match=r"got pictures of 641 x 480 pixels, expected at most 640 x 480"):
         GlPainter(model, 641, 480)
+
+
+PANE = """
+import mujoco, sys, numpy as np
+from pathlib import Path
+from PIL import Image
+from scenes_mjcf.look import GLASS, GlPainter, cast, glaze, look_along
+folder = Path(sys.argv[1]).parent
+(folder / "assets").mkdir()
+image = np.zeros((4, 4, 3), np.uint8)  # glass on the left, blue on the right
+image[:, :2], image[:, 2:] = GLASS, (0, 0, 255)
+Image.fromarray(image).save(folder / "assets" / "pane.png")
+corners = [(2, y, z) for y in (1, -0.001, 0.001, -1) for z in (-1, 1)]
+lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"vt {u} {v}" for u in (0.1, 0.4, 0.6, 0.9) for v in (0.1, 0.9)]
+lines += [f"f {a}/{a} {b}/{b} {c}/{c} {d}/{d}" for a, b, c, d in ((1, 3, 4, 2), (5, 7, 8, 6))]
+(folder / "assets" / "pane.obj").write_text("\\n".join(lines) + "\\n")
+(folder / "scene.xml").write_text('''<mujoco><compiler meshdir="assets" texturedir="assets"/>
+<visual><headlight ambient="1 1 1" diffuse="0 0 0" specular="0 0 0"/><map znear=".01" zfar="100"/></visual>
+<statistic extent="1"/><asset><mesh name="pane" file="pane.obj" inertia="shell"/>
+<texture name="pane" type="2d" file="pane.png"/><material name="pane" texture="pane" specular="0"/></asset><worldbody>
+<geom type="mesh" mesh="pane" name="pane" material="pane" contype="0" conaffinity="0" group="2"/>
+<geom type="box" pos="3.5 0 0" size=".5 4 4" rgba="1 0 0 1" group="2"/></worldbody></mujoco>''')
+unit = np.array([[1.0, y, z] for y in (-0.3, 0.1, 0.3, 0.7) for z in (-0.2, 0.1, 0.3)])
+unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+out = {}
+for name in ("stored", "glazed"):
+    spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
+    if name == "glazed":
+        glaze(spec, folder)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    camera = look_along(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]]))
+    out[name] = GlPainter(model, 80, 80).draw(data, camera, 60.0, [2])[0]
+    out[name + "_m"] = cast(model, data, np.zeros(3), unit, [2])[1] * unit[:, 0]
+np.savez(sys.argv[1], **out)
+"""
+
+
+def test_one_sees_through_glass_and_through_nothing_else(tmp_path):
+    """Glass of alpha 0.3 before red: 0.3 (170, 198, 202) + 0.7 (255, 0, 0)."""
+    need_gl()
+    made = drawn(PANE, tmp_path)
+    for name, left in (("stored", (170, 198, 202)), ("glazed", (229.5, 59.4, 60.6))):
+        assert np.abs(made[name][30:50, 15:38] - np.array(left)).max() <= 2
+        assert np.abs(made[name][30:50, 42:65].astype(int) - (0, 0, 255)).max() <= 2
+    # Three of four columns of rays meet the pane, 2 m ahead, the last one the wall behind it, 3 m ahead.
+    assert np.allclose(made["stored_m"], [2.0] * 9 + [3.0] * 3, atol=1e-6)
+    assert np.allclose(made["glazed_m"], made["stored_m"], atol=1e-6)
