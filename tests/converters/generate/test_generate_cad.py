@@ -33,13 +33,14 @@ from converters.generate.surface.scan import (
     solid_from_mesh,
     surface_nets,
 )
-from converters.generate.surface.texture import pack_rows, paint
+from converters.generate.surface.texture import assemble, pack_rows, paint, piece_charts
 from converters.generate.surface.write import write_cad
 from converters.read.annotations import read_cad
 from converters.read.files import SourceFolder
 from converters.records.raw import VisualMesh
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP
 from scenes_mjcf.categories import CATEGORIES
+from scenes_mjcf.look import GLASS
 
 DRAWN = sorted(name for name in LIBRARY if "/" not in name)
 
@@ -264,3 +265,13 @@ def test_a_scan_shows_a_library_model_in_the_colours_of_its_texture():
     brightness = got.sum(axis=1) / np.maximum(want.sum(axis=1), 1e-3)
     off = np.abs(got / np.maximum(brightness, 1e-3)[:, None] - want).max(axis=1)
     assert np.median(off) < 0.03 and 0.6 < np.median(brightness) < 1.2
+
+
+def test_glass_is_drawn_in_its_one_colour_however_dark_it_is():
+    pane = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]]), np.array([[0, 1, 2], [0, 2, 3]])
+    charts = [*piece_charts(*pane, 38, "glass"), *piece_charts(*pane, 38, "white")]
+    _, atlas = assemble(charts, lambda points, normals: np.full((len(points), 3), 0.5), (128,))
+    middle = (np.array([1, -1]) * atlas.uv.reshape(2, 4, 2).mean(axis=1) + [0, 1]) * 128
+    glass, white = (atlas.image[int(row), int(column)] for column, row in middle)
+    assert tuple(glass) == GLASS == tuple(round(255 * v) for v in MATERIALS["glass"])
+    assert np.abs(white - 127.5 * np.array(MATERIALS["white"])).max() < 3
