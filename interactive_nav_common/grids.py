@@ -28,7 +28,9 @@ def clearance(free: np.ndarray, cell_m: float) -> np.ndarray:
 
     It is 0 for cells that are not free; cells beyond the grid are not. A disc of no larger radius fits at the centre.
     """
-    distance = np.asarray(ndimage.distance_transform_edt(np.pad(np.asarray(free, bool), 1)), float)[1:-1, 1:-1]
+    padded = np.zeros(np.add(free.shape, 2), bool)
+    padded[1:-1, 1:-1] = free
+    distance = np.asarray(ndimage.distance_transform_edt(padded), float)[1:-1, 1:-1]
     return np.maximum(distance - 0.5, 0.0) * cell_m
 
 

@@ -1,4 +1,4 @@
-"""Toy scene folders with known content, written through the same schema as the converters' output."""
+"""Toy scenes of fixed content, written through the same schema as the converters' output."""
 
 from __future__ import annotations
 

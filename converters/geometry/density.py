@@ -35,10 +35,10 @@ class Ways(NamedTuple):
         Counted are all pairs of places where the disc touches nothing and that it gets between with the movables away;
         0 where nothing is in the way, and where the disc fits nowhere.
         """
-        now = label((room_m >= self.radius_m) & (self.region > 0))[0]
-        here = now > 0
-        with_movables = np.bincount(now[here]).astype(float)
-        without = np.bincount(self.region[here]).astype(float)
+        here = (room_m >= self.radius_m) & (self.region > 0)
+        now, cells = label(here)[0], np.flatnonzero(here)
+        with_movables = np.bincount(now.ravel()[cells]).astype(float)
+        without = np.bincount(self.region.ravel()[cells]).astype(float)
         pairs = float((without**2).sum())
         return 1.0 - float((with_movables**2).sum()) / pairs if pairs else 0.0
 

@@ -1,4 +1,4 @@
-"""Rotations against SciPy's, on NumPy and on JAX arrays, in batches of any shape."""
+"""Rotations against SciPy's, on NumPy and JAX arrays, one or many."""
 
 from __future__ import annotations
 

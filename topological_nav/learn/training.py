@@ -2,7 +2,7 @@
 
 RUN/config.yaml      settings; a run that is started again with the same ones goes on
     versions.json    packages, device, commit
-    metrics.jsonl    one line an epoch, of both phases
+    metrics.jsonl    one line an epoch of both phases
     checkpoint.msgpack  the last epoch's learner
     weights.safetensors, network.json   what was learned, and how to build it
     results.json     scores on what was held out

@@ -8,6 +8,7 @@ import dataclasses
 import math
 from collections import Counter
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,8 +45,7 @@ LEAST_GAIN = 1e-4
 """A move that brings less is none."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Shares:
+class Shares(NamedTuple):
     """Hold shares of pairs between which a robot must push, for a disc a little smaller than it and one larger."""
 
     least: float
@@ -68,20 +68,40 @@ class Passages:
         }
         self.room_m = {robot: np.minimum(clearance(floor.free(robot), CELL_M), FAR_M) for robot in self.ways}
         """Robot -> clearance of the floor as the furniture stands, up to `FAR_M`."""
-        self.shares = self.measure(self.room_m)
-        self.idle: list[Standing] = []
-        """What bars no passage as the furniture stands."""
-
-    def measure(self, room_m: dict[str, np.ndarray]) -> dict[str, Shares]:
-        """Return the shares of pairs between which each robot must push, given the clearance."""
-        return {
-            robot: Shares(*(way.must_push_share(room_m[robot]) for way in ways)) for robot, ways in self.ways.items()
+        self.shares = {
+            robot: Shares(*(way.must_push_share(self.room_m[robot]) for way in ways))
+            for robot, ways in self.ways.items()
         }
+        """Robot -> shares of the pairs between which it must push."""
+        self.bars: dict[int, bool] = {}
+        """Id of a piece -> whether it bars a passage as the furniture stands; others were not looked at."""
 
-    def room_after(self, standing: list[Standing]) -> dict[str, np.ndarray]:
-        """Return `room_m` as the furniture stands now, where it stood as listed when that was measured."""
+    def nearer(self, standing: list[Standing]) -> tuple[dict[str, Shares], dict[str, np.ndarray]] | None:
+        """Return `shares` and `room_m` as the furniture stands now, where it stood as listed when they were measured.
+
+        None where they are no nearer to the wanted ranges: what misses them most is measured first, as mostly it stays.
+        """
+        unknown = dict.fromkeys(self.ways, Shares(math.inf, -math.inf))  # misses nothing
+
+        def with_one(shares: dict[str, Shares], robot: str, bound: str, share: float) -> dict[str, Shares]:
+            return shares | {robot: shares[robot]._replace(**{bound: share})}
+
+        every = [(robot, bound) for robot in self.ways for bound in Shares._fields]
+        every.sort(key=lambda one: -self.miss(with_one(unknown, *one, getattr(self.shares[one[0]], one[1]))))
+        shares, room_m, most = unknown, dict[str, np.ndarray](), self.miss() - LEAST_GAIN
+        for robot, bound in every:
+            if robot not in room_m:
+                room_m[robot] = self.room_after(standing, robot)
+            way = self.ways[robot][Shares._fields.index(bound)]
+            shares = with_one(shares, robot, bound, way.must_push_share(room_m[robot]))
+            if self.miss(shares) >= most:
+                return None
+        return shares, room_m
+
+    def room_after(self, standing: list[Standing], robot: str) -> np.ndarray:
+        """Return a robot's `room_m` as the furniture stands now, where it stood as listed when that was measured."""
         floor, reach = self.home.floor, math.ceil(FAR_M / CELL_M)
-        out = {robot: room_m.copy() for robot, room_m in self.room_m.items()}
+        room_m = self.room_m[robot].copy()
         gone, come = _changed(standing, floor.standing)
         for piece in gone + come:
             # What is farther than `FAR_M` from a piece does not feel it, nor what is farther than that from there.
@@ -89,9 +109,9 @@ class Passages:
                 tuple(slice(max(s.start - k * reach, 0), s.stop + k * reach) for s in piece.window) for k in (1, 2)
             )
             inner = tuple(slice(n.start - a.start, n.stop - a.start) for n, a in zip(near, around, strict=True))
-            for robot, room_m in out.items():
-                room_m[near] = np.minimum(clearance(floor.free(robot)[around], CELL_M), FAR_M)[inner]
-        return out
+            free = floor.inside[around] & (floor.below[robot][around] == 0)
+            room_m[near] = np.minimum(clearance(free, CELL_M), FAR_M)[inner]
+        return room_m
 
     def miss(self, shares: dict[str, Shares] | None = None) -> float:
         """Return how far shares (those measured last) lie from the wanted ranges, summed."""
@@ -109,18 +129,17 @@ class Passages:
     def trial(self, change: Callable[[], bool]) -> bool:
         """Keep a change of what stands where if it brings the shares nearer to the wanted ranges; undo it otherwise."""
         floor, cfg = self.home.floor, self.home.cfg
-        shares, standing, room_m = self.shares, list(floor.standing), self.room_m
+        standing = list(floor.standing)
         if change() and floor.share > cfg.furniture_share - SHARE_TOLERANCE:
-            self.room_m = self.room_after(standing)
-            self.shares = self.measure(self.room_m)
-            if self.miss() < self.miss(shares) - LEAST_GAIN:
-                self.idle = []
+            measured = self.nearer(standing)
+            if measured is not None:
+                (self.shares, self.room_m), self.bars = measured, {}
                 return True
         gone, come = _changed(standing, floor.standing)
         for pieces, by in ((come, -1), (gone, 1)):
             for piece in pieces:
                 floor.cover(piece, by)
-        floor.standing, self.shares, self.room_m = standing, shares, room_m
+        floor.standing = standing
         return False
 
     def narrowing(self, rng: np.random.Generator) -> tuple[np.ndarray, int] | None:
@@ -218,7 +237,7 @@ def _narrow(home: Home, passages: Passages) -> None:
 def _clear(home: Home, passages: Passages) -> None:
     """Try to put one light piece that bars a passage to where its room, or another, has space for it."""
     rng, floor = home.rng, home.floor
-    light = [piece for piece in passages.light() if not any(piece is idle for idle in passages.idle)]
+    light = [piece for piece in passages.light() if passages.bars.get(id(piece), True)]
     if not light:
         return
     piece = light[rng.integers(len(light))]
@@ -230,8 +249,9 @@ def _clear(home: Home, passages: Passages) -> None:
     def change() -> bool:
         standing = floor.standing
         floor.remove(piece)
-        if passages.miss(passages.measure(passages.room_after(standing))) >= passages.miss() - LEAST_GAIN:
-            passages.idle.append(piece)
+        if id(piece) not in passages.bars:
+            passages.bars[id(piece)] = passages.nearer(standing) is not None
+        if not passages.bars[id(piece)]:
             return False
         takes = (room for room in rooms if home.takes([model.category], room))
         any(settle(home, model.category, alone, room, home.narrow_m) for room in takes)

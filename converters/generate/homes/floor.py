@@ -5,8 +5,10 @@ corner of the building's outline.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import shapely
@@ -99,6 +101,14 @@ class Floor:
         self.bare = self.glass.copy()
         """Before windows without a radiator."""
         self.standing: list[Standing] = []
+        rows, columns = self.shape
+        rooms = [self.cells(rect.grown(BEYOND_M, BEYOND_M)) for rect in plan.rooms]
+        self._views = [(slice(r.start, min(r.stop, rows)), slice(c.start, min(c.stop, columns))) for r, c in rooms]
+        """By room: what is looked at to furnish it."""
+        self._lasting: dict[Any, np.ndarray] = {}
+        """By room, layers: sums without `covered`."""
+        self._passing: list[dict[Any, Any]] = [{} for _ in rooms]
+        """By room: those with it; `_middles`."""
 
     def cells(self, rect: Rect) -> tuple[slice, slice]:
         """Return the rows and columns of the cells whose middles lie in a rectangle."""
@@ -108,12 +118,17 @@ class Floor:
 
     def raster(self, shapes: list[shapely.Geometry]) -> tuple[tuple[slice, slice], np.ndarray]:
         """Return the window of cells around shapes, and which of them have their middle inside of one."""
+        window = self.around(shapes)
+        return window, self.rastered(shapes, window)
+
+    def around(self, shapes: list[shapely.Geometry]) -> tuple[slice, slice]:
+        """Return the rows and columns of the window of cells around shapes."""
         bounds = np.array([s.bounds for s in shapes])
         x0, y0 = bounds[:, :2].min(axis=0)
         x1, y1 = bounds[:, 2:].max(axis=0)
         window = self.cells(Rect(x0, y0, x1, y1).grown(CELL_M, CELL_M))
         window = tuple(slice(s.start, min(s.stop, n)) for s, n in zip(window, self.shape, strict=True))
-        return (window[0], window[1]), self.rastered(shapes, (window[0], window[1]))
+        return window[0], window[1]
 
     def rastered(self, shapes: list[shapely.Geometry], window: tuple[slice, slice]) -> np.ndarray:
         """Return which cells of a window have their middle inside of a shape."""
@@ -129,9 +144,12 @@ class Floor:
 
     def add(self, item: Instance, room: int, group: str) -> Standing:
         """Stand a piece on the floor."""
-        window, shadow = self.raster(item.outlines())
+        window = self.around(item.outlines())
+        masks = [(self.rastered([outline], window), low_m) for outline, low_m, _ in item.slabs]
+        shadow = np.any([mask for mask, _ in masks], axis=0)
         below = {
-            robot: self.rastered(item.outlines((-math.inf, disc.height_m)), window) for robot, disc in ROBOTS.items()
+            robot: np.any([mask & (low_m < disc.height_m) for mask, low_m in masks], axis=0)
+            for robot, disc in ROBOTS.items()
         }
         piece = Standing(item, room, group, window, shadow, below)
         self.standing.append(piece)
@@ -140,7 +158,13 @@ class Floor:
             for zone in (box.rect.grown(WINDOW_STRIP_M, WINDOW_STRIP_M) for box in self.plan.windows):
                 if item.footprint.intersects(zone.polygon):
                     self.bare[self.cells(zone)] = False
+            self._lasting.clear()
         return piece
+
+    def keep_front(self, rect: Rect) -> None:
+        """Keep the floor before furniture that one steps up to free."""
+        self.front[self.cells(rect)] = True
+        self._lasting.clear()
 
     def cover(self, piece: Standing, by: int) -> None:
         """Count a piece in (1) or out (-1) of what is covered."""
@@ -149,6 +173,9 @@ class Floor:
             self.below[robot][piece.window] += np.where(below, np.uint8(by % 256), np.uint8(0))
         if piece.item.model.built_in:
             self.fixed[piece.window] |= piece.shadow
+        for view, passing in zip(self._views, self._passing, strict=True):
+            if all(a.start < b.stop and b.start < a.stop for a, b in zip(view, piece.window, strict=True)):
+                passing.clear()
 
     def remove(self, piece: Standing) -> None:
         """Take away a piece that is not built in."""
@@ -160,7 +187,7 @@ class Floor:
         """Return (rows, columns) bool: floor on which nothing is in a robot's way."""
         return self.inside & (self.below[robot] == 0)
 
-    @property
+    @functools.cached_property
     def floor_cells(self) -> int:
         """Return the number of cells inside of the walls, doorways included."""
         return int(self.inside.sum())
@@ -168,7 +195,7 @@ class Floor:
     @property
     def share(self) -> float:
         """Return the share of the floor that furniture covers."""
-        return float((self.covered[self.inside] > 0).sum() / self.floor_cells)
+        return float(np.count_nonzero(self.inside & (self.covered > 0)) / self.floor_cells)
 
     def room_share(self, room: int) -> float:
         """Return the same of one room."""
@@ -177,14 +204,20 @@ class Floor:
 
     # -- where groups fit -----------------------------------------------
 
-    def _room_sums(self, room: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Return the lower left corner of a room's window and running sums of what hinders there."""
+    def _sums(self, room: int, *layers: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lower left corner of a room's window and running sums of the cells there with any of the layers.
+
+        Layers are "wall", "covered" and the names of this class's rasters.
+        """
         rows, columns = self.cells(self.plan.rooms[room])
         window = slice(max(rows.start - 8, 0), rows.stop + 8), slice(max(columns.start - 8, 0), columns.stop + 8)
-        layers = {"wall": self.room[window] != room, "taken": self.covered[window] > 0}
-        layers |= {name: getattr(self, name)[window] for name in ("kept", "front", "glass", "bare", "swept")}
-        sums = {k: np.pad(layer.cumsum(0, dtype=np.int32).cumsum(1), ((1, 0), (1, 0))) for k, layer in layers.items()}
-        return np.array([window[1].start, window[0].start]) * CELL_M + self.low, sums
+        memo, key = self._passing[room] if "covered" in layers else self._lasting, (room, *layers)
+        if key not in memo:
+            rasters = (getattr(self, name)[window] if name != "wall" else self.room[window] != room for name in layers)
+            cells = functools.reduce(np.logical_or, rasters).astype(bool)
+            memo[key] = np.zeros(np.add(cells.shape, 1), np.int32)
+            memo[key][1:, 1:] = cells.cumsum(0, dtype=np.int32).cumsum(1)
+        return np.array([window[1].start, window[0].start]) * CELL_M + self.low, memo[key]
 
     def places(self, arrangement: Arrangement, room: int, rng: np.random.Generator) -> Places:
         """Return all places of a room where a group might stand, before looking at what stands there."""
@@ -219,62 +252,76 @@ class Floor:
         r0, r1, c0, c1 = np.minimum(r0, rows), np.minimum(r1, rows), np.minimum(c0, columns), np.minimum(c1, columns)
         return sums[r1, c1] - sums[r0, c1] - sums[r1, c0] + sums[r0, c0] + out
 
-    def fitting(self, arrangement: Arrangement, room: int, places: Places, strict: bool = True) -> np.ndarray:
-        """Return (n, pieces) bool: which pieces of a group have room at each place."""
-        low, sums = self._room_sums(room)
+    def fitting(self, arrangement: Arrangement, room: int, places: Places) -> np.ndarray:
+        """Return (n, pieces) bool: which pieces of a group have room at each place where those that it needs have."""
+        fits = np.zeros((len(places.side), len(arrangement.pieces)), bool)
+        left = np.arange(len(places.side))
+        front = arrangement.front
 
-        def clear(box: np.ndarray, layers: Iterable[str], gap_m: float = 0.0) -> np.ndarray:
-            return np.all([self.hindered(box, places, low, sums[layer], gap_m) == 0 for layer in layers], axis=0)
+        def clear(box: np.ndarray, layers: tuple[str, ...], gap_m: float = 0.0) -> np.ndarray:
+            at = Places(places.origin[left], places.side[left], places.ends[left])
+            return self.hindered(box, at, *self._sums(room, *layers), gap_m) == 0
 
-        fits = np.ones((len(places.side), len(arrangement.pieces)), bool)
-        for k, piece in enumerate(arrangement.pieces):
+        if front is not None:
+            left = left[clear(np.array(front), ("wall", "covered"))]
+        # Those that the group needs first: where one of them has no room, the others need not be looked at.
+        for k, piece in sorted(enumerate(arrangement.pieces), key=lambda of: of[0] > 0 and not of[1].needed):
             box = np.array(piece.corners_m)
             # A scan's annotations are a centimetre off: what stood in an alcove without play would be wedged there.
             beside = 0.0 if piece.model.built_in else GAP_M
             high = piece.size_m[1] > LOW_M and piece.model.category != "sink"  # a tap may stand before a window
             high &= piece.size_m[0] > 0.4 or piece.model.built_in
-            fits[:, k] = clear(box + [-beside, 0, beside, 0], ["wall"]) & clear(box, ["taken"], GAP_M)
-            fits[:, k] &= clear(box, ["swept", *(("kept", "front") if strict else ()), *(("glass",) if high else ())])
-        if arrangement.front is not None and strict:
-            fits[:, 0] &= clear(np.array(arrangement.front), ("wall", "taken"))
+            here = clear(box + [-beside, 0, beside, 0], ("wall",)) & clear(box, ("covered",), GAP_M)
+            here &= clear(box, ("swept", "kept", "front", *(("glass",) if high else ())))
+            fits[left, k] = here
+            left = left[here] if k == 0 or piece.needed else left
         return fits
 
     def before_window(self, arrangement: Arrangement, places: Places, room: int) -> np.ndarray:
         """Return (n,) the share of the anchor's width that stands before a window without a radiator."""
-        low, sums = self._room_sums(room)
         half = arrangement.pieces[0].half_m[0]
         strip = np.array([-half, 0.0, half, WINDOW_STRIP_M - 2 * CELL_M])
-        return self.hindered(strip, places, low, sums["bare"]) * CELL_M**2 / (2 * half * strip[3])
+        return self.hindered(strip, places, *self._sums(room, "bare")) * CELL_M**2 / (2 * half * strip[3])
 
     # -- whether one still gets through ---------------------------------
 
-    def reach(self, room: int, radius_m: float, boxes: list[Rect] | None = None) -> tuple[bool, float]:
+    def reach(self, room: int, radius_m: float, boxes: Iterable[Rect] = ()) -> tuple[bool, float]:
         """Return what a disc reaches of a room with the furniture where it stands.
 
         That is whether it gets from each doorway of the room to each other one inside of the room, and the area, m2, in
         which its middle could be but to which it does not get from there.
         """
-        rows, columns = self.cells(self.plan.rooms[room].grown(BEYOND_M, BEYOND_M))
-        corner = np.array([rows.start, columns.start])
+        passing = self._passing[room]
+        if radius_m not in passing:
+            passing[radius_m] = self._middles(room, radius_m)
+        middles, doors = passing[radius_m]
+        middles, more = middles.copy(), math.ceil(radius_m / CELL_M) + 1
+        row, column = (np.arange(n) for n in middles.shape)
+        for y, x in (self._in_view(room, box) for box in boxes):
+            if y.start < y.stop and x.start < x.stop:
+                near = tuple(slice(max(s.start - more, 0), s.stop + more) for s in (y, x))
+                dy = np.maximum(y.start - row, row - y.stop + 1)[near[0], None].clip(0)
+                dx = np.maximum(x.start - column, column - x.stop + 1)[near[1]].clip(0)
+                middles[near] &= np.maximum(np.sqrt(dy**2 + dx**2) - 0.5, 0.0) * CELL_M >= radius_m  # as `clearance`
+        region = label(middles)[0]
+        at = [int(region[door]) for door in doors]
+        main = at[0] if at else int(np.bincount(region.ravel())[1:].argmax() + 1) if region.any() else 0
+        return main > 0 and set(at) <= {main}, float(((region > 0) & (region != main)).sum() * CELL_M**2)
 
-        def here(rect: Rect) -> tuple[slice, slice]:
-            window = zip(self.cells(rect), corner, free.shape, strict=True)
-            y, x = (slice(max(s.start - low, 0), min(max(s.stop - low, 0), n)) for s, low, n in window)
-            return y, x
+    def _in_view(self, room: int, rect: Rect) -> tuple[slice, slice]:
+        """Return the rows and columns of a room's view, counted from its corner, that lie in a rectangle."""
+        both = zip(self.cells(rect), self._views[room], strict=True)
+        y, x = (slice(*(min(max(k, v.start), v.stop) - v.start for k in (s.start, s.stop))) for s, v in both)
+        return y, x
 
-        inside = self.room[rows, columns] == room
+    def _middles(self, room: int, radius_m: float) -> tuple[np.ndarray, list[tuple[int, int]]]:
+        """Return where in a room's view a disc's middle may be, (rows, columns) bool, and the cells of its doorways."""
+        view = self._views[room]
+        corner, inside = [s.start for s in view], self.room[view] == room
         free = inside.copy()
         doorways = [d for d in (*self.plan.doorways, self.plan.entrance) if d is not None and room in d.rooms]
         for doorway in doorways:  # the floor behind a doorway counts as free
-            free[here(doorway_zone(doorway, BEYOND_M, 0.0))] = True
-        free &= ~inside | (self.covered[rows, columns] == 0)
-        for box in boxes or []:
-            free[here(box)] = False
-        region = label(clearance(free, CELL_M) >= radius_m)[0]
-        at = []
-        for doorway in doorways:
-            x, y = doorway.rect.centre
-            row, column = (np.array([y, x]) - self.low[::-1]) // CELL_M - corner
-            at.append(int(region[int(row), int(column)]))
-        main = at[0] if at else int(np.bincount(region.ravel())[1:].argmax() + 1) if region.any() else 0
-        return main > 0 and set(at) <= {main}, float(((region > 0) & (region != main)).sum() * CELL_M**2)
+            free[self._in_view(room, doorway_zone(doorway, BEYOND_M, 0.0))] = True
+        free &= ~inside | (self.covered[view] == 0)
+        doors = [(np.array(d.rect.centre) - self.low)[::-1] // CELL_M - corner for d in doorways]
+        return clearance(free, CELL_M) >= radius_m, [(int(row), int(column)) for row, column in doors]

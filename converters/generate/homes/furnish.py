@@ -159,7 +159,7 @@ def settle(home: Home, name: str, arrangement: Arrangement, room: int, radius_m:
                     group = name if k == 0 else f"{name}: {piece.model.category}"
                     floor.add(stand(piece, origin, side * math.pi / 2), room, group)
             if way.front is not None:
-                floor.front[floor.cells(_on_floor(way.front, origin, side))] = True
+                floor.keep_front(_on_floor(way.front, origin, side))
             return True
     return False
 

@@ -353,7 +353,7 @@ class Instance:
     """(3,) of the CAD origin; z above the floor."""
     hinge: LeafHinge | None = None
 
-    @property
+    @functools.cached_property
     def matrix(self) -> np.ndarray:
         """Return (4, 4) CAD frame (y up) -> scan x, y and height above the floor (z up)."""
         return transform(yaw_matrix(self.yaw_rad) @ Y_UP_TO_Z_UP @ np.diag(self.scale), self.position)
@@ -362,7 +362,7 @@ class Instance:
         """Move (n, 3) points of the CAD frame into scan x, y and height above the floor."""
         return transformed(points_cad, self.matrix)
 
-    @property
+    @functools.cached_property
     def footprint(self) -> shapely.Polygon:
         """Return the rectangle that it stands on."""
         (x0, _, z0), (x1, _, z1) = self.model.bounds

@@ -1,4 +1,4 @@
-"""Models are cut at their doors and drawers: which open, about what, and what is left of the model."""
+"""Models are cut at doors and drawers: which open, about what, and what is left of them."""
 
 import dataclasses
 

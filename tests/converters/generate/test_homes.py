@@ -16,6 +16,7 @@ from scipy import ndimage
 from converters.generate import Building, BuildingConfig, GenerationError, HomeConfig, design_building
 from converters.generate.design.config import MOST_SHARE, TIERS, home_config, home_fields
 from converters.generate.design.furnish import Effort, furnish_plan
+from converters.generate.design.plan import Rect
 from converters.generate.design.sparse import make_plan
 from converters.generate.homes import design, furnish
 from converters.generate.homes.arrange import SEAT_M, TABLES, _seats, apart, arrange, draw_set, least_of, stand
@@ -282,6 +283,25 @@ def test_the_clearance_after_moves_is_that_of_the_whole_floor_measured_again():
         whole = design.clearance(home.floor.free(robot), design.CELL_M)
         np.testing.assert_allclose(room_m, np.minimum(whole, design.FAR_M))
         assert (home.floor.below[robot] < 9).all()  # nothing was taken away that was not there
+
+
+def test_what_a_disc_reaches_beside_boxes_is_what_it_reaches_where_they_stand():
+    home = first_home(home_config("cluttered", FLAT), 3)
+    for _ in range(10):
+        design._clear(home, design.Passages(home))
+    cut_off = 0
+    for room, rect in enumerate(home.plan.rooms):
+        x, y = rect.centre
+        boxes = [Rect(x - 0.6, rect.y0, x + 0.1, y + 0.3), Rect(x + 0.2, y, x + 0.21, y), Rect(x, y - 0.3, rect.x1, y)]
+        stood = Floor(home.plan, [])
+        for piece in home.floor.standing:
+            stood.add(piece.item, piece.room, piece.group)
+        for box in boxes:
+            stood.covered[stood.cells(box)] = 1
+        for radius_m in (0.2, 0.3):
+            assert home.floor.reach(room, radius_m, boxes) == stood.reach(room, radius_m)
+            cut_off += home.floor.reach(room, radius_m) != stood.reach(room, radius_m)
+    assert cut_off
 
 
 # -- groups -------------------------------------------------------------
