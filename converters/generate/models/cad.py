@@ -92,6 +92,8 @@ class Looks:
     """Role -> models that have it."""
     tints: dict[str, tuple[str, ...]]
     """Category -> materials in whose colour its models come too."""
+    palettes: tuple[tuple[str, ...], ...]
+    """Of each the materials that a home's cloth is in: in place of each tint of sofas, then of none."""
     holds: dict[str, tuple[list[Any], ...]]
     """Model of the library -> what is drawn in it and nothing else, as `Drawing.parts`, in the library's frame."""
     worktops: tuple[tuple[list[Any], ...], ...]

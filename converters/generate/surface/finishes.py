@@ -20,7 +20,9 @@ FRAMES = np.array([[0.16, 0.15, 0.14], [0.45, 0.30, 0.19], [0.90, 0.90, 0.88]])
 SKIES = np.array([[0.78, 0.84, 0.88], [0.92, 0.83, 0.70], [0.86, 0.80, 0.82], [0.70, 0.80, 0.82], [0.92, 0.90, 0.86]])
 LANDS = np.array([[0.32, 0.42, 0.34], [0.52, 0.35, 0.26], [0.40, 0.34, 0.44], [0.20, 0.32, 0.42], [0.28, 0.28, 0.31]])
 PRINTS = np.stack([SKIES, LANDS], axis=1)
-"""Sky and land of pictures."""
+"""Ground and ink of pictures, such as sky and land."""
+ACCENTS = np.array([[0.80, 0.45, 0.25], [0.85, 0.66, 0.28], [0.62, 0.22, 0.24], [0.30, 0.50, 0.55], [0.78, 0.52, 0.50]])
+PALE = np.array([0.97, 0.92, 0.76])
 SKIRTING_M = 0.09
 """Height of the white board along the foot of painted walls."""
 WET = ("bathroom", "kitchen")
@@ -92,21 +94,74 @@ def _rug(room: Rect, colour: np.ndarray, rng: np.random.Generator) -> Callable[[
     return lay
 
 
+INK, MID, ACCENT, LIGHT = 1, 2, 3, 4
+"""Colours of a picture beside its ground, 0."""
+Layers = list[tuple[np.ndarray, int]]
+"""What covers the ground, from the back: where it is positive, in halves of the picture's short side; its colour."""
+MOTIFS: tuple[Callable[[np.ndarray, np.ndarray, np.ndarray], Layers], ...] = (
+    lambda x, y, r: [  # hills
+        (0.13 - np.hypot(x - 0.6 * r[0], y - 0.5), LIGHT),
+        (0.25 * r[1] + 0.15 * np.sin(5 * x + 5 * r[0]) - y, MID),
+        (0.25 * r[1] + 0.15 * np.sin(5 * x + 2 * r[0]) - y - 0.35, INK),
+    ],
+    lambda x, y, r: [  # a sail at sea
+        (0.3 - np.hypot(x - 0.5 * r[0], y - 0.1), ACCENT),
+        (-y, INK),
+        (np.minimum(-0.06 - y, 0.025 - abs(np.mod(y + 0.02 * np.sin(9 * x), 0.17) - 0.085)), MID),
+        (np.minimum(y + 0.1, 0.2 - 0.4 * y - abs(x + 0.6 * r[1])), LIGHT),
+    ],
+    lambda x, y, r: [  # fields of colour
+        (np.minimum(y - 0.06 - 0.4 * r[0], 0.86 - y), ACCENT),
+        (np.minimum(0.4 * r[0] - 0.06 - y, 0.86 + y), INK),
+    ],
+    lambda x, y, r: [  # stripes
+        (0.07 - abs(np.mod(x + r[0] * y, 0.32) - 0.16), INK),
+        (0.07 - abs(np.mod(x + r[0] * y, 0.96) - 0.16), ACCENT),
+    ],
+    lambda x, y, r: [  # discs
+        (0.45 + 0.15 * r[k] - np.hypot(x - 0.7 * r[k - 1], y - 0.5 * r[k - 2]), k + 1) for k in range(3)
+    ],
+    lambda x, y, r: [  # a twig
+        (np.minimum(0.025 - abs(x), 0.9 - abs(y)), INK),
+        (
+            0.15 * np.sin(np.minimum(np.pi, abs(x) * 5 / (1 + 0.5 * r[1] * y)))
+            - 0.02
+            - abs(np.mod(y - abs(x), 0.34) - 0.17),
+            INK,
+        ),
+    ],
+    lambda x, y, r: [  # a skyline
+        (0.25 - np.hypot(x - 0.5 * r[0], y - 0.4), ACCENT),
+        (0.9 * hashed(np.floor(4 * x + 9 * r[1])) - 0.35 - y, MID),
+        (0.8 * hashed(np.floor(3 * x + 9 * r[2])) - 0.75 - y, INK),
+    ],
+    lambda x, y, r: [  # a poster with text
+        (0.02 + y, ACCENT),
+        (0.32 - np.hypot(x - 0.4 * r[0], y - 0.48), LIGHT),
+        (0.05 - abs(np.mod(y, 0.17) - 0.06) - (y > -0.1) - (hashed(np.floor(8 * x), np.floor(y / 0.17)) < 0.3), INK),
+    ],
+    lambda x, y, r: [  # flowers in a vase
+        (-0.55 - y, MID),
+        *((0.02 - abs(x - d * (y + 0.2)) - (abs(y) > 0.3), INK) for d in (-0.6, 0.1, 0.7)),
+        *((0.2 + 0.05 * r[0] - np.hypot(x - d, y - 0.35), ACCENT) for d in (-0.33, 0.05, 0.38)),
+        (0.2 - abs(y + 0.45) * (0.5 + 0.2 * r[1]) - 0.5 * x**2 / 0.2 - (y > -0.15), INK),
+    ],
+)
+"""What pictures show, at (n,) places in halves of the short side from the middle, for numbers in -1..1."""
+
+
 def framed(at: np.ndarray, half: np.ndarray, frame: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Paint a picture behind a mount, two ridges under a sky with a sun, at (n, 2) places -1..1, right and up on it.
+    """Paint one of `MOTIFS` behind a mount, at (n, 2) places -1..1, right and up on the picture.
 
     `half` is (2,) half its width and height, m; `frame` (3,) the colour of its rim.
     """
     sky, land = PRINTS[rng.integers(len(PRINTS))] + rng.uniform(-0.05, 0.05, (2, 3))
-    sun, horizon = rng.uniform(-0.6, 0.6), rng.uniform(-0.3, 0.2)
+    colours = sky, land, 0.55 * land + 0.45 * sky, ACCENTS[rng.integers(len(ACCENTS))], PALE
+    motif, inner = MOTIFS[rng.integers(len(MOTIFS))], np.tile(sky, (len(at), 1))
+    for level, k in motif(*(at * half / half.min()).T, rng.uniform(-1, 1, 3)):
+        share = np.clip(level * half.min() / 0.008 + 0.5, 0, 1)[:, None]
+        inner = inner * (1 - share) + share * colours[k]
     from_edge = ((1 - np.abs(at)) * half).min(axis=1)[:, None]
-    far, near = (
-        np.clip((level + 0.15 * np.sin(5 * at[:, [0]] + turn * sun) - at[:, [1]]) * half[1] / 0.008 + 0.5, 0, 1)
-        for level, turn in ((horizon, 9), (horizon - 0.35, 4))
-    )
-    inner = sky * (1 - far) + far * ((0.55 * land + 0.45 * sky) * (1 - near) + land * near)
-    shines = np.hypot((at[:, [0]] - sun) * half[0] / half[1], at[:, [1]] - 0.5) < 0.13
-    inner = np.where(shines & (far < 0.5), [0.97, 0.92, 0.76], inner)
     return np.where(from_edge < 0.02, frame, np.where(from_edge < 0.055, [0.95, 0.94, 0.91], inner))
 
 
@@ -155,12 +210,12 @@ def _wall(room: Rect, use: str, rng: np.random.Generator, pictured: bool) -> Col
     return colour
 
 
-def _floor(room: Rect, use: str, wood: np.ndarray, along: int, rng: np.random.Generator) -> Colouring:
+def _floor(room: Rect, use: str, wood: np.ndarray, along: int, rugs: np.ndarray, rng: np.random.Generator) -> Colouring:
     """Choose tiles in wet rooms, carpet in some bedrooms, boards elsewhere; a rug in some."""
     tile, carpet = TILES[rng.integers(len(TILES))], CARPETS[rng.integers(len(CARPETS))]
     side_m, chequered = rng.choice([0.2, 0.3, 0.45]), bool(rng.random() < 0.3)
     soft = use in SOFT and rng.random() < 0.5
-    rug = _rug(room, RUGS[rng.integers(len(RUGS))], rng) if use in WITH_RUG and not soft else None
+    rug = _rug(room, rugs[rng.integers(len(rugs))], rng) if use in WITH_RUG and not soft else None
 
     def colour(p: np.ndarray) -> np.ndarray:
         if use in WET:
@@ -174,13 +229,17 @@ def _floor(room: Rect, use: str, wood: np.ndarray, along: int, rng: np.random.Ge
 
 
 def finishes(
-    rooms: Sequence[Rect], uses: Sequence[str], rng: np.random.Generator, pictures: bool = True
+    rooms: Sequence[Rect],
+    uses: Sequence[str],
+    rng: np.random.Generator,
+    pictures: bool = True,
+    rugs: np.ndarray = RUGS,
 ) -> list[Finish]:
     """Choose how each room is finished."""
     wood, along = WOODS[rng.integers(len(WOODS))], int(rng.integers(2))
     if uses:
         return [
-            Finish(_floor(room, use, wood, along, rng), _wall(room, use, rng, pictures), use != "bathroom")
+            Finish(_floor(room, use, wood, along, rugs, rng), _wall(room, use, rng, pictures), use != "bathroom")
             for room, use in zip(rooms, uses, strict=True)
         ]
     tiled = rng.random(len(rooms)) < 0.25

@@ -17,7 +17,7 @@ from converters.generate.models.cad import Instance
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface import sides as at_walls
 from converters.generate.surface.decor import decor
-from converters.generate.surface.finishes import FRAMES, Finish, finishes, framed
+from converters.generate.surface.finishes import FRAMES, RUGS, Finish, finishes, framed
 from converters.generate.surface.scan import NYU40, Scan, building_solids, fuse, solid_from_box
 from converters.generate.surface.sides import CLOTHS, ENTRANCES, FLOOR_M, PICTURE, Side
 from converters.generate.surface.texture import SHEETS, Atlas, Chart, assemble, piece_charts, plain, polygon
@@ -100,12 +100,14 @@ def _standing(items: Sequence[Instance], above_m: float) -> shapely.Geometry:
     return shapely.union_all([i.footprint for i, top_m in tops_m if top_m > above_m])
 
 
-def _windows(uses: Sequence[str], sides: Sides, items: Sequence[Instance], rng: np.random.Generator) -> list[Chart]:
+def _windows(
+    uses: Sequence[str], sides: Sides, items: Sequence[Instance], cloths: np.ndarray, rng: np.random.Generator
+) -> list[Chart]:
     """Return windows, and curtains where nothing is in their way."""
     charts, sky = [], np.array([0.52, 0.70, 0.92]) + rng.uniform(-0.06, 0.06, 3)
     low, tall = _standing(items, 0.1), _standing(items, 0.84)
     for walls, use in zip(sides, uses, strict=True):
-        cloth, draped = CLOTHS[rng.integers(len(CLOTHS))], rng.random() < DRAPED.get(use, 0.0)
+        cloth, draped = cloths[rng.integers(len(cloths))], rng.random() < DRAPED.get(use, 0.0)
         for side in walls:
             for box in side.windows:
                 charts += at_walls.window(side, box, at_walls.outlook(side, sky, float(rng.uniform(0, 9))))
@@ -200,17 +202,22 @@ def model_building(
     uses: Sequence[str],
     rng: np.random.Generator,
     sheets: Sequence[int] = SHEETS,
+    palette: Sequence[str] = (),
 ) -> tuple[Scan, Atlas]:
     """Model and paint the structure; no vertex of the mesh is in faces of two labels.
 
-    Rooms without a use, "", are finished as those of a scanned building are.
+    Rooms without a use, "", are finished as those of a scanned building are. Rugs and, paler, curtains are in the
+    materials of a palette.
     """
-    finish = finishes(plan.rooms, uses if any(uses) else (), rng, pictures=False)
+    shades = np.array([MATERIALS[name] for name in palette])
+    # As many as without a palette: pictures, which collide, are drawn from the same stream.
+    rugs, cloths = (shades[: len(RUGS)], 0.5 + 0.5 * shades[: len(CLOTHS)]) if palette else (RUGS, CLOTHS)
+    finish = finishes(plan.rooms, uses if any(uses) else (), rng, False, rugs)
     sides = [at_walls.sides_of(room, plan.doorways, plan.windows) for room in plan.rooms]
     everything = [*plan.built_in, *items]
     lamps = np.array([[*np.round(r.centre, 3), plan.wall_height_m] for r in plan.rooms])
     charts = _shell(plan, sides, finish)
-    charts += _windows(uses, sides, everything, rng)
+    charts += _windows(uses, sides, everything, cloths, rng)
     hung, boxes = decor(uses, sides, everything, plan.wall_height_m, rng)
     charts += hung
     tall = shapely.union_all([_standing(everything, 1.1), *(box.rect.polygon for box in boxes)])
