@@ -15,7 +15,7 @@ from converters.generate.design.plan import Building
 from converters.generate.design.space import floor_maps
 from converters.generate.design.sparse import make_plan
 from converters.generate.homes.design import design_home
-from converters.generate.models.cad import LOOKS, Instance, cad_model
+from converters.generate.models.cad import CLOTH, LOOKS, cad_model
 from converters.generate.surface import write as surface_files
 from converters.generate.surface.modelled import model_building
 from converters.generate.surface.scan import Scan, scan_building
@@ -39,21 +39,18 @@ def _streams(seed: int) -> list[np.random.Generator]:
     return [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
 
 
-def _palette(seed: int) -> tuple[str, ...]:
-    return LOOKS.palettes[seed % len(LOOKS.palettes)]
-
-
-def _in_palette(home: Building, palette: tuple[str, ...]) -> Building:
-    """Return a home with its sofas, armchairs, poufs and beds in a palette; looks that differ still do."""
-    cloth = LOOKS.tints["sofa"]
-
-    def worn(item: Instance) -> Instance:
+def _in_palette(home: Building, seed: int) -> Building:
+    """Return a home with its cloth and coloured chairs in a palette; looks that differ still do."""
+    palette = LOOKS.palettes[seed % len(LOOKS.palettes)]
+    chairs = {"moss": palette[0], "teal": palette[0], "rust": palette[1]}
+    worn = dict.fromkeys(CLOTH, dict(zip((*LOOKS.tints["sofa"], ""), palette, strict=True)))
+    worn |= {"chair": chairs, "stool": chairs}
+    items = []
+    for item in home.items:
         plain, _, tint = item.model.name.partition("~")
-        if LOOKS.tints.get(item.model.category) != cloth:
-            return item
-        return dataclasses.replace(item, model=cad_model(f"{plain}~{palette[(*cloth, '').index(tint)]}"))
-
-    return dataclasses.replace(home, items=tuple(map(worn, home.items)))
+        worn_tint = worn.get(item.model.category, {}).get(tint)
+        items.append(dataclasses.replace(item, model=cad_model(f"{plain}~{worn_tint}")) if worn_tint else item)
+    return dataclasses.replace(home, items=tuple(items))
 
 
 def design_building(seed: int, config: BuildingConfig | HomeConfig | None = None, max_plans: int = 40) -> Building:
@@ -64,7 +61,7 @@ def design_building(seed: int, config: BuildingConfig | HomeConfig | None = None
     rng = _streams(seed)[0]
     if isinstance(cfg, HomeConfig):
         try:
-            return _in_palette(design_home(cfg, rng), _palette(seed))
+            return _in_palette(design_home(cfg, rng), seed)
         except GenerationError as error:
             raise GenerationError(f"seed {seed}: {error}") from error
     floor_height_m = round(float(rng.uniform(*cfg.floor_height_m)), 3)
@@ -86,7 +83,8 @@ def render_building(
     streams = _streams(seed)
     if isinstance(config, HomeConfig) and config.artefacts == "none":
         progress("painting", 0.1)
-        return model_building(building.plan, building.items, building.uses, streams[2], palette=_palette(seed))
+        palette = LOOKS.palettes[seed % len(LOOKS.palettes)]
+        return model_building(building.plan, building.items, building.uses, streams[2], palette=palette)
     config = config.shell if isinstance(config, HomeConfig) else config
     progress("scanning", 0.1)
     scan = scan_building(building.plan, list(building.items), config, streams[1])

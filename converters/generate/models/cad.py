@@ -101,6 +101,8 @@ class Looks:
 
 
 LOOKS: Looks = read_packaged(Path(__file__).with_name("looks.yaml"), Looks)
+CLOTH = ("armchair", "bed", "sofa")
+"""Categories whose looks a home's palette decides."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -268,16 +270,16 @@ def _filled(model: CadModel, name: str) -> VisualMesh:
 def _repainted(model: CadModel, colour: np.ndarray) -> VisualMesh:
     surface = model.surface
     assert surface is not None
-    return dataclasses.replace(surface, image=_painted(surface, colour))
+    return dataclasses.replace(surface, image=_painted(surface, colour, model.category in CLOTH))
 
 
-def _painted(surface: VisualMesh, colour: np.ndarray) -> np.ndarray:
-    """Return a surface's image with its main colour, in all its shades, turned into another (3,) in 0..1."""
+def _painted(surface: VisualMesh, colour: np.ndarray, vivid: bool = False) -> np.ndarray:
+    """Return a surface's image with its main colour, or a `vivid` one, turned in all shades into another (3,)."""
     area = np.linalg.norm(face_vectors(surface.vertices, surface.faces), axis=1)
     shown, of = np.unique(texels(surface.image, surface.uv[surface.uv_faces].mean(axis=1)), axis=0, return_inverse=True)
     shown, weight = shown / 255, np.bincount(of.ravel(), area)
     near = np.linalg.norm(shown[:, None] - shown, axis=2) < ALIKE
-    near = near[np.argmax(near @ weight)]
+    near = near[np.argmax(near @ (weight * (0.25 + np.ptp(shown, axis=1) if vivid else 1.0)))]
     main = np.average(shown[near], axis=0, weights=weight[near])
     pixels = surface.image / 255
     bright, usual = pixels.mean(axis=2, keepdims=True), main.mean()

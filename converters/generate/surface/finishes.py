@@ -22,7 +22,6 @@ LANDS = np.array([[0.32, 0.42, 0.34], [0.52, 0.35, 0.26], [0.40, 0.34, 0.44], [0
 PRINTS = np.stack([SKIES, LANDS], axis=1)
 """Ground and ink of pictures, such as sky and land."""
 ACCENTS = np.array([[0.80, 0.45, 0.25], [0.85, 0.66, 0.28], [0.62, 0.22, 0.24], [0.30, 0.50, 0.55], [0.78, 0.52, 0.50]])
-PALE = np.array([0.97, 0.92, 0.76])
 SKIRTING_M = 0.09
 """Height of the white board along the foot of painted walls."""
 WET = ("bathroom", "kitchen")
@@ -96,69 +95,49 @@ def _rug(room: Rect, colour: np.ndarray, rng: np.random.Generator) -> Callable[[
 
 INK, MID, ACCENT, LIGHT = 1, 2, 3, 4
 """Colours of a picture beside its ground, 0."""
-Layers = list[tuple[np.ndarray, int]]
-"""What covers the ground, from the back: where it is positive, in halves of the picture's short side; its colour."""
-MOTIFS: tuple[Callable[[np.ndarray, np.ndarray, np.ndarray], Layers], ...] = (
-    lambda x, y, r: [  # hills
-        (0.13 - np.hypot(x - 0.6 * r[0], y - 0.5), LIGHT),
-        (0.25 * r[1] + 0.15 * np.sin(5 * x + 5 * r[0]) - y, MID),
-        (0.25 * r[1] + 0.15 * np.sin(5 * x + 2 * r[0]) - y - 0.35, INK),
-    ],
-    lambda x, y, r: [  # a sail at sea
-        (0.3 - np.hypot(x - 0.5 * r[0], y - 0.1), ACCENT),
-        (-y, INK),
-        (np.minimum(-0.06 - y, 0.025 - abs(np.mod(y + 0.02 * np.sin(9 * x), 0.17) - 0.085)), MID),
-        (np.minimum(y + 0.1, 0.2 - 0.4 * y - abs(x + 0.6 * r[1])), LIGHT),
-    ],
-    lambda x, y, r: [  # fields of colour
-        (np.minimum(y - 0.06 - 0.4 * r[0], 0.86 - y), ACCENT),
-        (np.minimum(0.4 * r[0] - 0.06 - y, 0.86 + y), INK),
-    ],
-    lambda x, y, r: [  # stripes
-        (0.07 - abs(np.mod(x + r[0] * y, 0.32) - 0.16), INK),
-        (0.07 - abs(np.mod(x + r[0] * y, 0.96) - 0.16), ACCENT),
-    ],
-    lambda x, y, r: [  # discs
-        (0.45 + 0.15 * r[k] - np.hypot(x - 0.7 * r[k - 1], y - 0.5 * r[k - 2]), k + 1) for k in range(3)
-    ],
-    lambda x, y, r: [  # a twig
-        (np.minimum(0.025 - abs(x), 0.9 - abs(y)), INK),
-        (
-            0.15 * np.sin(np.minimum(np.pi, abs(x) * 5 / (1 + 0.5 * r[1] * y)))
-            - 0.02
-            - abs(np.mod(y - abs(x), 0.34) - 0.17),
-            INK,
-        ),
-    ],
-    lambda x, y, r: [  # a skyline
-        (0.25 - np.hypot(x - 0.5 * r[0], y - 0.4), ACCENT),
-        (0.9 * hashed(np.floor(4 * x + 9 * r[1])) - 0.35 - y, MID),
-        (0.8 * hashed(np.floor(3 * x + 9 * r[2])) - 0.75 - y, INK),
-    ],
-    lambda x, y, r: [  # a poster with text
-        (0.02 + y, ACCENT),
-        (0.32 - np.hypot(x - 0.4 * r[0], y - 0.48), LIGHT),
-        (0.05 - abs(np.mod(y, 0.17) - 0.06) - (y > -0.1) - (hashed(np.floor(8 * x), np.floor(y / 0.17)) < 0.3), INK),
-    ],
-    lambda x, y, r: [  # flowers in a vase
-        (-0.55 - y, MID),
-        *((0.02 - abs(x - d * (y + 0.2)) - (abs(y) > 0.3), INK) for d in (-0.6, 0.1, 0.7)),
-        *((0.2 + 0.05 * r[0] - np.hypot(x - d, y - 0.35), ACCENT) for d in (-0.33, 0.05, 0.38)),
-        (0.2 - abs(y + 0.45) * (0.5 + 0.2 * r[1]) - 0.5 * x**2 / 0.2 - (y > -0.15), INK),
-    ],
-)
-"""What pictures show, at (n,) places in halves of the short side from the middle, for numbers in -1..1."""
+
+
+def _motifs(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> list[tuple[str, np.ndarray, int]]:
+    """Return what pictures show: its name, a layer of it, which is where that is positive, and its colour; back first.
+
+    `x`, `y` are (n,) places in halves of the short side from the middle, `r` three numbers in -1..1.
+    """
+    slant, leaf = x + r[0] * y, 0.15 * np.sin(np.minimum(np.pi, abs(x) * 5 / (1 + 0.5 * r[1] * y)))
+    word, line = hashed(np.floor(8 * x), np.floor(y / 0.17)), abs(np.mod(y, 0.17) - 0.06)
+    return [
+        ("hills", 0.13 - np.hypot(x - 0.6 * r[0], y - 0.5), LIGHT),
+        *(("hills", 0.25 * r[1] + 0.15 * np.sin(5 * x + 2 * k * r[0]) - y - 0.35 / k, 3 - k) for k in (2, 1)),
+        ("sea", 0.3 - np.hypot(x - 0.5 * r[0], y - 0.1), ACCENT),
+        ("sea", -y, INK),
+        ("sea", np.minimum(-0.06 - y, 0.025 - abs(np.mod(y + 0.02 * np.sin(9 * x), 0.17) - 0.085)), MID),
+        ("sea", np.minimum(y + 0.1, 0.2 - 0.4 * y - abs(x + 0.6 * r[1])), LIGHT),
+        *(("fields", np.minimum(s * (y - 0.4 * r[0]) - 0.06, 0.86 - s * y), k) for s, k in ((1, ACCENT), (-1, INK))),
+        *(("stripes", 0.07 - abs(np.mod(slant, 0.32 * k) - 0.16), k) for k in (INK, ACCENT)),
+        *(("discs", 0.45 + 0.15 * r[k] - np.hypot(x - 0.7 * r[k - 1], y - 0.5 * r[k - 2]), k + 1) for k in range(3)),
+        ("twig", np.minimum(0.025 - abs(x), 0.9 - abs(y)), INK),
+        ("twig", leaf - 0.02 - abs(np.mod(y - abs(x), 0.34) - 0.17), INK),
+        ("skyline", 0.25 - np.hypot(x - 0.5 * r[0], y - 0.4), ACCENT),
+        *(("skyline", 0.85 * hashed(np.floor((2 + k) * x + 9 * r[k])) + 0.4 * k - 1.15 - y, k) for k in (MID, INK)),
+        ("poster", 0.02 + y, ACCENT),
+        ("poster", 0.32 - np.hypot(x - 0.4 * r[0], y - 0.48), LIGHT),
+        ("poster", 0.05 - line - (y > -0.1) - (word < 0.3), INK),
+        ("vase", -0.55 - y, MID),
+        *(("vase", 0.02 - abs(x - d * (y + 0.2)) - (abs(y) > 0.3), INK) for d in (-0.6, 0.1, 0.7)),
+        *(("vase", 0.2 + 0.05 * r[0] - np.hypot(x - d, y - 0.35), ACCENT) for d in (-0.33, 0.05, 0.38)),
+        ("vase", 0.2 - abs(y + 0.45) * (0.5 + 0.2 * r[1]) - 2.5 * x**2 - (y > -0.15), INK),
+    ]
 
 
 def framed(at: np.ndarray, half: np.ndarray, frame: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Paint one of `MOTIFS` behind a mount, at (n, 2) places -1..1, right and up on the picture.
+    """Paint one of `_motifs` behind a mount, at (n, 2) places -1..1, right and up on the picture.
 
     `half` is (2,) half its width and height, m; `frame` (3,) the colour of its rim.
     """
     sky, land = PRINTS[rng.integers(len(PRINTS))] + rng.uniform(-0.05, 0.05, (2, 3))
-    colours = sky, land, 0.55 * land + 0.45 * sky, ACCENTS[rng.integers(len(ACCENTS))], PALE
-    motif, inner = MOTIFS[rng.integers(len(MOTIFS))], np.tile(sky, (len(at), 1))
-    for level, k in motif(*(at * half / half.min()).T, rng.uniform(-1, 1, 3)):
+    colours = np.array([sky, land, 0.55 * land + 0.45 * sky, rng.choice(ACCENTS), (0.97, 0.92, 0.76)])
+    layers, inner = _motifs(*(at * half / half.min()).T, rng.uniform(-1, 1, 3)), np.tile(sky, (len(at), 1))
+    motif = rng.choice(sorted({name for name, *_ in layers}))
+    for level, k in ((level, k) for name, level, k in layers if name == motif):
         share = np.clip(level * half.min() / 0.008 + 0.5, 0, 1)[:, None]
         inner = inner * (1 - share) + share * colours[k]
     from_edge = ((1 - np.abs(at)) * half).min(axis=1)[:, None]
@@ -229,11 +208,7 @@ def _floor(room: Rect, use: str, wood: np.ndarray, along: int, rugs: np.ndarray,
 
 
 def finishes(
-    rooms: Sequence[Rect],
-    uses: Sequence[str],
-    rng: np.random.Generator,
-    pictures: bool = True,
-    rugs: np.ndarray = RUGS,
+    rooms: Sequence[Rect], uses: Sequence[str], rng: np.random.Generator, pictures: bool = True, rugs: np.ndarray = RUGS
 ) -> list[Finish]:
     """Choose how each room is finished."""
     wood, along = WOODS[rng.integers(len(WOODS))], int(rng.integers(2))

@@ -206,8 +206,7 @@ def model_building(
 ) -> tuple[Scan, Atlas]:
     """Model and paint the structure; no vertex of the mesh is in faces of two labels.
 
-    Rooms without a use, "", are finished as those of a scanned building are. Rugs and, paler, curtains are in the
-    materials of a palette.
+    Rooms without a use, "", are finished as those of a scanned building are. Rugs and pale curtains are of a `palette`.
     """
     shades = np.array([MATERIALS[name] for name in palette])
     # As many as without a palette: pictures, which collide, are drawn from the same stream.

@@ -130,6 +130,9 @@ def test_a_tint_keeps_legs_and_shades():
 def test_tints_and_roles_name_what_there_is():
     assert {m for names in LOOKS.tints.values() for m in names} <= set(MATERIALS)
     assert set(LOOKS.tints) <= set(CATEGORIES)
+    # Six differ, so that models which look different still do; a chair in one of the first two is not white or brown.
+    assert all(len(set(p)) == 6 and set(p) <= set(MATERIALS) for p in LOOKS.palettes)
+    assert not {m for p in LOOKS.palettes for m in p[:2]} & {"white", "walnut", "charcoal"}
     assert {n for names in LOOKS.roles.values() for n in names} <= set(LIBRARY)
 
 
