@@ -106,7 +106,7 @@ def _motifs(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> list[tuple[str, np.n
     word, line = hashed(np.floor(8 * x), np.floor(y / 0.17)), abs(np.mod(y, 0.17) - 0.06)
     return [
         ("hills", 0.13 - np.hypot(x - 0.6 * r[0], y - 0.5), LIGHT),
-        *(("hills", 0.25 * r[1] + 0.15 * np.sin(5 * x + 2 * k * r[0]) - y - 0.35 / k, 3 - k) for k in (2, 1)),
+        *(("hills", 0.25 * r[1] + 0.15 * np.sin(5 * x + 2 * k * r[0]) - y - 0.35 / k, k) for k in (2, 1)),
         ("sea", 0.3 - np.hypot(x - 0.5 * r[0], y - 0.1), ACCENT),
         ("sea", -y, INK),
         ("sea", np.minimum(-0.06 - y, 0.025 - abs(np.mod(y + 0.02 * np.sin(9 * x), 0.17) - 0.085)), MID),
