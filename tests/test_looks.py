@@ -15,7 +15,8 @@ from converters.generate.design.space import floor_maps
 from interactive_nav.pictures.scene_model import picture_spec
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.grids import cell_centres, clearance
-from scenes_mjcf.look import LOOK, spec_for_people
+from scenes_mjcf.agreement import is_lit
+from scenes_mjcf.look import LOOK, cast, spec_for_people
 from scenes_mjcf.schema import SceneError
 from tests.test_scenes import RECIPES, SCENES
 
@@ -56,8 +57,9 @@ def test_people_see_rooms_that_are_closed_above_and_at_the_sides(name):
     assert above.min() > 2.05 and above.max() < high + 0.01 and np.mean(above > low - 0.01) > 0.9
 
 
-def test_observations_draw_the_scan_and_nothing_else_differs():
-    scene = load_scene(SCENES / "alder")
+@pytest.mark.parametrize("name", ["alder", "drawn/flat"])
+def test_observations_draw_what_is_stored_and_nothing_else_differs(name):
+    scene = load_scene(SCENES / name)
     stored = mujoco.MjModel.from_xml_path(str(scene.path / "scene.xml"))
     people, watched = spec_for_people(scene.path).compile(), picture_spec(scene).compile()
     for mine, other in zip(structure(watched), structure(stored), strict=True):
@@ -68,6 +70,24 @@ def test_observations_draw_the_scan_and_nothing_else_differs():
     for field in ("geom_size", "geom_pos", "geom_contype", "geom_friction"):
         mine, other = (np.delete(getattr(m, field), m.geom("structure_visual").id, 0) for m in (people, stored))
         assert np.array_equal(mine, other)
+
+
+def test_the_drawn_flat_is_lit_for_people_on_the_surfaces_that_observations_have():
+    scene = load_scene(SCENES / "drawn/flat")
+    models = mujoco.MjModel.from_xml_path(str(scene.path / "scene.xml")), spec_for_people(scene.path).compile()
+    assert [is_lit(model) for model in models] == [False, True]
+    turns = np.linspace(0, 2 * np.pi, 400, endpoint=False)
+    way = np.stack([np.cos(turns), np.sin(turns), 0.3 * np.sin(9 * turns)], -1)
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    distances = []
+    for model in models:
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        places = np.array([[2.0, -2.0, 1.2], [6.0, -2.5, 1.2], [5.5, -4.5, 1.2]])  # one in each room
+        distances.append([cast(model, data, place, way, (2,))[1] for place in places])
+    stored, lit = np.array(distances)
+    assert np.mean(lit > 0) > 0.9 and np.array_equal(lit > 0, stored > 0)
+    assert np.mean(np.abs(lit - stored) < 0.005) > 0.99  # others pass by an edge
 
 
 @pytest.mark.parametrize("name", ["apartment_0", "rowan"])

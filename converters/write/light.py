@@ -131,7 +131,8 @@ def light_on(points: np.ndarray, normals: np.ndarray, light: Daylight) -> np.nda
     places = np.hstack([points, LIGHT_M * normals])
     _, first = np.unique(np.round(places / LIGHT_M).astype(int), axis=0, return_index=True)
     bright = light(points[first], normals[first])
-    distance, index = KDTree(places[first]).query(places, k=min(6, len(first)))
-    weight = 1.0 / (np.reshape(distance, (len(places), -1)) + 0.1 * LIGHT_M)
+    distance, index = KDTree(places[first]).query(places, k=min(12, len(first)))
+    distance = np.reshape(distance, (len(places), -1))
+    weight = np.exp(-(distance**2 - distance[:, :1] ** 2) / LIGHT_M**2)  # smooth: others show where these places are
     share = weight / weight.sum(axis=1, keepdims=True)
     return np.einsum("nk,nkc->nc", share, bright[np.reshape(index, share.shape)])

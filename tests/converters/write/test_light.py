@@ -51,6 +51,14 @@ def test_a_corner_is_darker():
     assert bright.max() <= (GAIN * AMBIENT).max() + 1e-6
 
 
+def test_light_shows_no_pattern_of_the_places_where_it_is_computed():
+    points = plane((0, 0), (2, 2))
+    bright = light_on(points, np.tile(UP, (len(points), 1)), lambda at, _: np.repeat(at[:, :1] ** 2, 3, axis=1))
+    across = bright[:, 0].reshape(67, 67)[10:-10]  # rows along x: light depends on x alone
+    assert np.ptp(across, axis=0).max() < 0.02
+    assert across.mean(axis=0)[10:-10] == pytest.approx((0.03 * np.arange(67))[10:-10] ** 2, abs=0.05)
+
+
 def test_joined_images_show_no_neighbour_within_two_texels():
     images = [np.full((8, 8, 3), value, np.uint8) for value in (40, 200)]
     corners = np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]] * 2)
