@@ -344,7 +344,7 @@ def _save(figure: Figure, target: Path, few: bool = False) -> None:
         if few:
             with Image.open(picture) as image:
                 small = image.convert("RGB").quantize(
-                    COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
+                    COLOURS, method=Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE
                 )
                 small.save(picture, "PNG", compress_level=7)
     plt.close(figure)
