@@ -50,7 +50,7 @@ COLUMNS, PANEL_IN, LEAST_WIDTH_IN = 3, 3.3, 9.0
 """Panels beside each other, how high one is, and the page's least width."""
 SLANTWISE = 0.62
 """Of the page's width, the view from the south; that at eye height stands beside it."""
-DPI, COLOURS = 100, 96
+DPI, COLOURS = 100, 192
 TRAVERSABLE = (0.85, 0.94, 0.85)
 WALL = (0.75, 0.75, 0.75)
 
