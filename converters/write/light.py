@@ -1,7 +1,7 @@
 """Compute the light that falls on a building's surfaces: lamps, daylight through windows, dark corners and shade."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy import ndimage
@@ -126,7 +126,9 @@ def daylight(points: np.ndarray, lamps: Sequence[Lamp], windows: Sequence[Window
     return Daylight(space, at, *beside, shine / POWER, GAIN, 2 * VOXEL_M)
 
 
-def light_on(points: np.ndarray, normals: np.ndarray, light: Daylight) -> np.ndarray:
+def light_on(
+    points: np.ndarray, normals: np.ndarray, light: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> np.ndarray:
     """Return the brightness (n, 3) at close places (n, 3) on surfaces, interpolated between some of these."""
     places = np.hstack([points, LIGHT_M * normals])
     _, first = np.unique(np.round(places / LIGHT_M).astype(int), axis=0, return_index=True)
