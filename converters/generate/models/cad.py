@@ -101,8 +101,7 @@ class Looks:
 
 
 LOOKS: Looks = read_packaged(Path(__file__).with_name("looks.yaml"), Looks)
-CLOTH = ("armchair", "bed", "sofa")
-"""Categories whose looks a home's palette decides."""
+CLOTH = ("armchair", "bed", "sofa")  # whose looks a home's palette decides
 
 
 @dataclasses.dataclass(frozen=True)

@@ -135,7 +135,8 @@ def framed(at: np.ndarray, half: np.ndarray, frame: np.ndarray, rng: np.random.G
     """
     sky, land = PRINTS[rng.integers(len(PRINTS))] + rng.uniform(-0.05, 0.05, (2, 3))
     colours = np.array([sky, land, 0.55 * land + 0.45 * sky, rng.choice(ACCENTS), (0.97, 0.92, 0.76)])
-    layers, inner = _motifs(*(at * half / half.min()).T, rng.uniform(-1, 1, 3)), np.tile(sky, (len(at), 1))
+    (x, y), inner = (at * half / half.min()).T, sky
+    layers = _motifs(x, y, rng.uniform(-1, 1, 3))
     motif = rng.choice(sorted({name for name, *_ in layers}))
     for level, k in ((level, k) for name, level, k in layers if name == motif):
         share = np.clip(level * half.min() / 0.008 + 0.5, 0, 1)[:, None]
