@@ -30,7 +30,6 @@ from rich.console import Console
 
 import interactive_nav
 from interactive_nav.physics import resolve_backend
-from interactive_nav.physics.mjx_batch import KINDS, propose_tiers
 from interactive_nav.physics.nearness import widths_at
 from interactive_nav.physics.window import PhysicsWindow
 from interactive_nav.task.wrappers import AutoResetEnv, ShardedEnv
@@ -98,8 +97,6 @@ CHUNK = 20
 """Steps in one compiled scan."""
 LEFT_OUT_SHARE = 0.005
 """Of environment steps: windows are proposed that are too small in fewer."""
-TIER_SHARES = ((0.7,), (0.7, 0.2), (0.5, 0.3, 0.15))
-"""Of the batch, in smaller windows: for which tiers are proposed."""
 SETTLED_STEPS = 10
 """Of an episode, after which objects that were laid out lie still."""
 SETTINGS = {"free": "active_furniture", "small": "active_small", "hinge": "active_doors", "walls": "active_walls"}
@@ -215,7 +212,7 @@ def simulation(
         if i % 10 == 0:
             memory.append(_gpu_memory_mib())
     nav, physics = state.info["nav"], env.physics
-    tiers = getattr(physics, "tiers", (physics,) if hasattr(physics, "window") else ())
+    window = getattr(physics, "window", None)
     rate, clock = statistics.median(rates), env.config
     return {
         "env_steps_per_s": round(rate),
@@ -227,8 +224,8 @@ def simulation(
         "running": {name: int(nav.memory[name].sum()) for name in FAILURES if name in nav.memory},
         "peak_memory_mib": _peak_memory_mib(),
         "gpu_memory_mib": [m for m in (memory[0], memory[1], memory[-1]) if m is not None],
-        "nv": tiers[-1].window.model.nv if tiers else physics.nv,
-        "tiers": [(tier.window.model.nv, tier.contacts_per_env, tier.constraints_per_env) for tier in tiers],
+        "nv": window.model.nv if window else physics.nv,
+        **{name: getattr(physics, name, None) for name in ("active_dofs", "contacts_per_env", "constraints_per_env")},
         "movables": int(env.world.slots.occupied.sum(1).max()),
     }
 
@@ -270,15 +267,6 @@ def windows(
         "left_out_share": left_out(widths),
         "proposed": by_setting(proposed),
         "proposed_left_out_share": left_out(proposed),
-        "tiers": [
-            {
-                "windows": [" ".join(map(str, tier)) for tier in tiers],
-                "too_small_shares": [
-                    left_out(dict(zip(KINDS, tier[1:], strict=True)) | {"slide": tier.doors}) for tier in tiers
-                ],
-            }
-            for tiers in (propose_tiers(counts, shares) for shares in TIER_SHARES)
-        ],
     }
 
 

@@ -1,11 +1,10 @@
 """Define the environment's settings in three parts (task, physics, sensors), checked on construction."""
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 from interactive_nav.camera_config import CameraNoise, CameraView, FovDeg, ImageSide
 from interactive_nav_common.config import (
@@ -134,30 +133,6 @@ WINDOW = ("active_furniture", "active_small", "active_doors", "active_walls")
 """Settings that size what MJX simulates at a time."""
 
 
-class WindowTier(NamedTuple):
-    """A share of the batch, and what there is room for in its windows."""
-
-    share: float
-    furniture: int
-    small: int
-    doors: int
-    walls: int
-
-
-def parse_window_tiers(words: Sequence[str]) -> tuple[WindowTier, ...]:
-    """Return the tiers that the setting `windows` lists."""
-    try:
-        tiers = tuple(WindowTier(float(s), *map(int, widths)) for s, *widths in map(str.split, words))
-        good = all(t.share > 0 and min(t[1:]) >= 0 for t in tiers) and sum(t.share for t in tiers) < 1
-        good &= all(a <= b for one, two in itertools.pairwise(tiers) for a, b in zip(one[1:], two[1:], strict=True))
-    except (TypeError, ValueError):
-        good, tiers = False, ()
-    if not good:
-        expected = 'such as ["0.7 2 1 1 12", "0.2 3 2 1 20"]: "share furniture small doors walls", none narrower than'
-        raise ConfigError(f"windows is {list(words)}, expected {expected} the one before, and shares below 1 in all")
-    return tiers
-
-
 @dataclasses.dataclass(frozen=True)
 class PhysicsConfig(Settings):
     """How the world is simulated. With backend auto, settings of all backends may stand side by side."""
@@ -189,19 +164,21 @@ class PhysicsConfig(Settings):
     """MJX backends: doors simulated at a time (auto: likewise; 0: all)."""
     active_walls: Natural | None = None
     """MJX backends: wall boxes that can be met at a time (auto: likewise; 0: all)."""
-    windows: tuple[str, ...] | None = ()
-    """MJX backends: smaller windows than that of `active_*`, for environments that need less: each "share furniture
-    small doors walls", such as "0.7 2 1 1 12", smallest first; what is left of the batch gets the whole window (auto:
-    measured in these scenes; (): one window for all)."""
+    active_dofs: Natural | None = None
+    """MJX-Warp: degrees of freedom that are awake at a time, the robot's among them, if objects at rest sleep (auto:
+    measured in these scenes; 0: all)."""
     sleep: bool = True
-    """Native backend: objects at rest sleep until touched."""
+    """Native and warp: objects at rest sleep until touched."""
     threads: Natural = 0
     """Native backend: threads; 0: all cores."""
 
     IDLE = (
         (" ".join(WINDOW), "backend auto, jax or warp, or 0 (all)", lambda c: c.backend != "native"),
-        ("windows", "backend auto, jax or warp, or ()", lambda c: c.backend != "native"),
-        ("contacts_per_env constraints_per_env", "backend auto or warp", lambda c: c.backend in ("auto", "warp")),
+        (
+            "contacts_per_env constraints_per_env active_dofs",
+            "backend auto or warp",
+            lambda c: c.backend in ("auto", "warp"),
+        ),
         ("threads", "backend auto or native", lambda c: c.backend in ("auto", "native")),
     )
 
@@ -210,7 +187,6 @@ class PhysicsConfig(Settings):
         control, sim = self.control_dt_s, self.sim_dt_s
         if abs(control / sim - round(control / sim)) > 1e-6:
             raise ConfigError(f"sim_dt_s is {sim}, expected a divisor of control_dt_s ({control} s)")
-        parse_window_tiers(self.windows or ())
 
     @property
     def substeps(self) -> int:

@@ -32,9 +32,16 @@ def from_dict(plain: Any, base: TrainConfig | None = None, where: str = "config"
     return overlay(base or TrainConfig(), plain, where, elsewhere=list(flatten(TrainConfig())))
 
 
+GONE = ("windows",)
+"""Settings of environments that older runs wrote: they sized what was simulated, not what happens."""
+
+
 def from_yaml(text: str, where: str = "config") -> TrainConfig:
-    """Return the config of YAML text, as `from_dict`."""
-    return from_dict(_parsed(text, where), where=where)
+    """Return the config that a run wrote as YAML, as `from_dict`, without settings that are gone."""
+    values = _parsed(text, where)
+    if isinstance(values, dict) and isinstance(env := values.get("env"), dict):
+        values = values | {"env": {name: value for name, value in env.items() if name not in GONE}}
+    return from_dict(values, where=where)
 
 
 def _parsed(text: str, where: str) -> Any:

@@ -66,10 +66,10 @@ def make_physics(world: World, config: NavConfig) -> Physics:
         from interactive_nav.physics.native import NativePhysics
 
         return NativePhysics(world, config)
-    from interactive_nav.physics.mjx_batch import JaxPhysics, TieredPhysics, WarpPhysics
+    from interactive_nav.physics.mjx_batch import JaxPhysics, WarpPhysics
 
     engine = WarpPhysics if backend == "warp" else JaxPhysics
-    return engine(world, config) if config.windows == () else TieredPhysics(engine, world, config)
+    return engine(world, config)
 
 
 __all__ = ["Physics", "PhysicsState", "StepSignals", "make_physics", "resolve_backend"]

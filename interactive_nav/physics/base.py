@@ -90,6 +90,8 @@ class StepSignals:
     """[] i32: 1 if an object within the robot's reach was not simulated, because MJX's window was full."""
     unconverged: Any
     """[] i32: 1 if the solver met its iteration limit in any substep."""
+    crowded: Any
+    """[] i32: 1 if more degrees of freedom were awake in any substep than there was room for: some went unsolved."""
     nonfinite: Any
     """[] i32: 1 if the new state is not finite or the engine gave up on it."""
 

@@ -2,13 +2,14 @@
 
 Environments differ only in model fields: each fills the slots of one small model from its scene's tables
 (`window.py`). The engine's data is rebuilt from a template at every control step, so only `PhysicsState` is carried.
-A step costs as the degrees of freedom of its model do, and most environments need few: `TieredPhysics` steps each part
-of a batch in the smallest window that holds it.
+A step costs as the degrees of freedom that it solves for, and the robot touches nothing in most steps: on `warp`, what
+rests in the window sleeps, as it does in C MuJoCo.
 """
 
 import abc
+import copy
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,7 +18,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from interactive_nav.config import NavConfig, WindowTier, parse_window_tiers
+from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces, uncommitted
 from interactive_nav.physics.nearness import Measured
 from interactive_nav.physics.warp_callbacks import keep_collector_out
@@ -27,21 +28,16 @@ from interactive_nav.scenes.slots import Layout
 from interactive_nav.scenes.world import World
 
 # Bits of MJX-Warp's OverflowType: constraint rows, their non-zeros, broadphase, narrowphase, convex collider,
-# contact matches; and the solver's iteration limit. A test compares them with the engine's.
+# contact matches; then awake degrees of freedom, and the solver's iteration limit. A test compares them.
 _DROPPED = 0b1011111
+_CROWDED = 1 << 7
 _UNCONVERGED = 1 << 9
+_AWAKE = -(1 + 10)
+"""MuJoCo's `tree_asleep` of what has just moved: it counts up to -1, from where it sleeps; a sleeper has its number."""
 _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
 """First of the kinds of constraint rows that are contacts'."""
 CCD_PER_ENV = 32
 """Pairs of boxes per environment that Warp's convex collider has room for at once; more are counted as overflow."""
-KINDS: tuple[str, ...] = ("free", "small", "hinge", "walls")
-"""Of what a `WindowTier` has room for, in its order; as many that slide as hang on hinges."""
-AUTO_SHARES = (0.7, 0.2)
-"""Of a batch, in measured tiers."""
-HEAD_ROOM = 2.0
-"""Measured tiers let this many times as many environments need more as were counted."""
-LEAST_ENVS = 64
-"""In smaller batches all environments have the whole window: launching kernels is what costs there."""
 
 
 class MjxPhysics(Physics):
@@ -51,6 +47,8 @@ class MjxPhysics(Physics):
         self.window = window or PhysicsWindow(world, config)
         self._world, self._substeps = world, config.substeps
         self.nv = world.models[0].nv
+        self.active_dofs = self.window.model.nv
+        """That can be awake at a time."""
         self.contacts_per_env, self.constraints_per_env = config.contacts_per_env, config.constraints_per_env
         self._host = self._host_model()
         self._model = uncommitted(mjx.put_model(self._host, impl=self.name))
@@ -67,6 +65,10 @@ class MjxPhysics(Physics):
 
     def _placed(self, data: mjx.Data, scene: jax.Array, walls: jax.Array) -> mjx.Data:
         """Return the data of one environment with its walls where they stand."""
+        return data
+
+    def _resting(self, data: mjx.Data, awake: jax.Array) -> mjx.Data:
+        """Return the data of one environment in which only these of the window's slots are awake."""
         return data
 
     @abc.abstractmethod
@@ -88,7 +90,8 @@ class MjxPhysics(Physics):
         )
         inner = window.enter(state, chosen)
         data = template.replace(qpos=inner.qpos, qvel=inner.qvel, qacc_warmstart=inner.qacc_warmstart)
-        data = self._controlled(self._placed(data, scene, walls), command, time_s)
+        data = self._resting(self._placed(data, scene, walls), window.awake(measured, chosen))
+        data = self._controlled(data, command, time_s)
 
         def control(data, k):
             if not self._world.robot.control_every_substep:
@@ -113,6 +116,7 @@ class MjxPhysics(Physics):
             **summarise_forces(forces, jnp, contacts, self._config),
             overflow=((failures & _DROPPED) != 0).astype(jnp.int32),
             left_out=missed,
+            crowded=((failures & _CROWDED) != 0).astype(jnp.int32),
             unconverged=((failures & _UNCONVERGED) != 0).astype(jnp.int32),
             nonfinite=(~finite).astype(jnp.int32),
         )
@@ -125,9 +129,13 @@ class WarpPhysics(MjxPhysics):
 
     def __init__(self, world: World, config: NavConfig, window: PhysicsWindow | None = None):
         keep_collector_out()
+        self._sleeps = config.sleep and config.active_dofs != 0
         super().__init__(world, config, window)
+        if self._sleeps:
+            self.active_dofs = min(config.active_dofs or self.window.awake_at_rest, self.active_dofs)
+        self._tree_of_slot = self._host.body_treeid[self.window.layout.slot_body]
         if not (self.contacts_per_env and self.constraints_per_env):
-            measured = measure_buffers(world, self.window)
+            measured = measure_buffers(world, self.window, self.active_dofs)
             self.contacts_per_env = self.contacts_per_env or measured[0]
             self.constraints_per_env = self.constraints_per_env or measured[1]
         # Warp prints a line per overflow or unconverged solve: ours are counted instead.
@@ -141,7 +149,30 @@ class WarpPhysics(MjxPhysics):
             naconmax=n * self.contacts_per_env,
             naccdmax=n * min(self.contacts_per_env, CCD_PER_ENV),
             njmax=self.constraints_per_env,
+            nvmax=self.active_dofs if self._sleeps else None,
         )
+
+    def _host_model(self):
+        model = super()._host_model()
+        if self._sleeps:
+            model = copy.copy(model)
+            model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
+        return model
+
+    def _resting(self, data, awake):
+        # The engine counts steps at rest before it lets a body sleep, and takes more than a control step for it. What
+        # touches something awake wakes up within the step; it may not move at all before that.
+        if not self._sleeps:
+            return data
+        impl, trees = data._impl, jnp.asarray(self._tree_of_slot)
+        asleep = jnp.full(self._host.ntree, _AWAKE).at[trees].set(jnp.where(awake, _AWAKE, trees))
+        still = asleep[jnp.asarray(self._host.dof_treeid)] >= 0
+        qvel, warm = (jnp.where(still, 0.0, x) for x in (data.qvel, data.qacc_warmstart))
+        new: dict[str, Any] = {
+            "_impl.tree_asleep": asleep.astype(impl.tree_asleep.dtype),
+            "_impl.tree_awake": (asleep < 0).astype(impl.tree_awake.dtype),
+        }
+        return data.replace(qvel=qvel, qacc_warmstart=warm).tree_replace(new)
 
     def _placed(self, data, scene, walls):
         # Warp computes the world poses of static geoms (walls) once, in make_data, from the one model
@@ -249,10 +280,11 @@ def _without_sensors(spec: mujoco.MjSpec) -> mujoco.MjModel:
     return spec.compile()
 
 
-def measure_buffers(world: World, window: PhysicsWindow, head_room: float = 1.6) -> tuple[int, int]:
+def measure_buffers(world: World, window: PhysicsWindow, dofs: int, head_room: float = 1.6) -> tuple[int, int]:
     """Return contact slots and constraint rows per environment that the window needs, measured at rest.
 
-    Everything rests, the small objects laid out on the floor; the window holds the bodies with the most contacts.
+    Everything rests, the small objects laid out on the floor; the window holds the bodies with the most contacts, of
+    which those are awake that have room in `dofs` degrees of freedom beside the robot. What sleeps makes no contacts.
     `head_room` leaves place for a robot that pushes objects into each other. Metrics count what overflows anyway.
     """
     contacts = rows = 0
@@ -262,82 +294,14 @@ def measure_buffers(world: World, window: PhysicsWindow, head_room: float = 1.6)
         mujoco.mj_forward(model, data)
         per_body = np.bincount(model.geom_bodyid[data.contact.geom].ravel(), minlength=model.nbody)
         dims = int(data.contact.dim.max(initial=3))
-        slots = [np.sort(per_body[world.layout.slot_body[g.slots]])[::-1][: g.width].sum() for g in window.groups]
-        in_window = int(sum(slots)) + int(per_body[world.layout.robot_bodies].sum())
+        bodies = [world.layout.slot_body[g.slots] for g in window.groups]
+        most = [ids[np.argsort(-per_body[ids])][: g.width] for ids, g in zip(bodies, window.groups, strict=True)]
+        held = np.concatenate([ids for ids in most if len(ids)] or [np.zeros(0, int)])
+        held = held[np.argsort(-per_body[held], kind="stable")]
+        awake = held[np.cumsum(model.body_dofnum[held]) <= dofs - window.layout.robot_nv]
+        in_window = int(per_body[awake].sum()) + int(per_body[world.layout.robot_bodies].sum())
         contacts = max(contacts, in_window)
         rows = max(rows, in_window * max(2 * (dims - 1), 1) + (data.nefc - data.ne - (data.efc_type >= _CONTACT).sum()))
     extra = 24
     contacts, rows = int(contacts * head_room) + extra, int(rows * head_room) + 4 * extra
     return contacts, -(-rows // 16) * 16
-
-
-def tier_sizes(count: int, shares: Sequence[float] | np.ndarray) -> tuple[int, ...]:
-    """Return the environments in each tier, smallest window first: `count` in all, the last has the rest, one or more.
-
-    `count` is N, at least 1; `shares` are of all tiers but the last.
-    """
-    ends = [min(round(count * end), count - 1) for end in np.cumsum(shares)]
-    return tuple(int(size) for size in np.diff([0, *ends, count]))
-
-
-def assign(needed: jax.Array, sizes: Sequence[int]) -> tuple[jax.Array, ...]:
-    """Return the environments [size] i32 of each tier, in order of what they need, equal ones in the batch's order.
-
-    `needed` is [N] i32, the first tier that holds what the environment needs. Spare places of larger tiers go to those
-    that need less; where too many need a large one, the first of them get less than they need. `sizes` are N in all.
-    """
-    return tuple(jnp.split(jnp.argsort(needed, stable=True), np.cumsum(sizes)[:-1]))
-
-
-def propose_tiers(counts: Mapping[str, np.ndarray], shares: Sequence[float] = AUTO_SHARES) -> tuple[WindowTier, ...]:
-    """Return tiers of these shares that fit the counts: each the least quantile of all kinds alike that suffices.
-
-    `counts` are [P] of each kind of slot, and of walls; `shares` of the batch, of all tiers but the last.
-    """
-    counts = {**counts, "hinge": np.maximum(counts["hinge"], counts.get("slide", 0))}
-    kinds = np.stack([counts[kind] for kind in KINDS])
-    tiers = []
-    for share, below in zip(shares, np.cumsum(shares), strict=True):
-        least, widths = 1 - (1 - below) / HEAD_ROOM, kinds.max(1)
-        for quantile in np.linspace(least, 1, 101):
-            widths = np.quantile(kinds, quantile, axis=1, method="higher")
-            if (kinds <= widths[:, None]).all(0).mean() >= least:
-                break
-        tiers.append(WindowTier(share, *map(int, widths)))
-    return tuple(tiers)
-
-
-class TieredPhysics(Physics):
-    """Several engines of one backend, each with its window and its share of the batch."""
-
-    def __init__(self, make: Callable[..., MjxPhysics], world: World, config: NavConfig):
-        """Build the engines; `make` takes a world, settings and a window."""
-        whole = make(world, config)
-        self.name, self.nv, self.window = whole.name, whole.nv, whole.window
-        self.reports_convergence = whole.reports_convergence
-        words = config.windows
-        proposed = propose_tiers(whole.window.needs_at_rest) if words is None else parse_window_tiers(words)
-        self.shares = tuple(tier.share for tier in proposed)
-        wanted = (dict(zip(KINDS, tier[1:], strict=True)) | {"slide": tier.doors} for tier in proposed)
-        self.tiers = (*(make(world, config, whole.window.narrower(widths, config)) for widths in wanted), whole)
-
-    def needed(self, counts: Mapping[str, jax.Array]) -> jax.Array:
-        """Return [N] i32, the first tier that holds what each environment needs, or the last: `counts` are [N] each."""
-        rooms = [tier.window.room for tier in self.tiers[:-1]]
-        small = [jnp.stack([counts[kind] > width for kind, width in room.items()]).any(0) for room in rooms]
-        return jnp.stack(small).sum(0)
-
-    def step_batch(self, scene, state, command, time_s):
-        if scene.shape[0] < LEAST_ENVS:
-            return self.tiers[-1].step_batch(scene, state, command, time_s)
-        measured = jax.vmap(self.window.measure)(scene, state)
-        needed = self.needed(jax.vmap(self.window.needs)(measured))
-        places = assign(needed, tier_sizes(scene.shape[0], self.shares))
-        whole = (measured, scene, state, command, time_s)
-        parts = [
-            tier.step_measured(*jax.tree.map(lambda x, rows=rows: x[rows], whole))
-            for tier, rows in zip(self.tiers, places, strict=True)
-            if len(rows)
-        ]
-        back = jnp.argsort(jnp.concatenate(places))
-        return jax.tree.map(lambda *x: jnp.concatenate(x)[back], *parts)

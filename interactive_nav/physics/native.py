@@ -160,6 +160,7 @@ class NativePhysics(Physics):
                 **forces,
                 overflow=raised[:, _OVERFLOWS].any(1).astype(np.int32),
                 left_out=np.zeros(len(scene), np.int32),
+                crowded=np.zeros(len(scene), np.int32),
                 unconverged=(iterations >= self._iterations).astype(np.int32),
                 nonfinite=nonfinite.astype(np.int32),
             ),

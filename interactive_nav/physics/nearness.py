@@ -35,7 +35,7 @@ _PLACES = 4000
 """Of the robot, at which a window's size is measured: of all scenes together, but at least 200 in each."""
 _AT_ONCE = 100
 """Places that are measured in one go."""
-_SHARE = 0.999
+SHARE = 0.999
 """Of these places a window has room for what stands near."""
 Measured = tuple[Any, Any, Any]
 """What `Nearness.measure` returns."""
@@ -165,7 +165,7 @@ class Nearness:
         return {kind: np.concatenate(values) for kind, values in counts.items()}
 
 
-def widths_at(counts: Mapping[str, np.ndarray], share: float = _SHARE) -> dict[str, int]:
+def widths_at(counts: Mapping[str, np.ndarray], share: float = SHARE) -> dict[str, int]:
     """Return, of each kind, what suffices in this share of the counts; at least one, since 0 stands for all."""
     return {k: max(1, int(np.quantile(c, share, method="higher"))) for k, c in counts.items()}
 

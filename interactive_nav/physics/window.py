@@ -8,10 +8,8 @@ every control step each environment fills them with what is nearest to its robot
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import functools
-from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -20,10 +18,14 @@ import numpy as np
 
 from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import PhysicsState
-from interactive_nav.physics.nearness import REACH_M, Measured, Nearness, widths_at
+from interactive_nav.physics.nearness import REACH_M, SHARE, TOUCH_M, Measured, Nearness, widths_at
 from interactive_nav.scenes.slots import Layout
 from interactive_nav.scenes.world import FEET, World, build_empty_spec
 
+AWAKE_M = 0.05
+"""What is this near to the robot's footprint stays awake: it may be pushed slowly, and is not stopped for it."""
+TILE = 16
+"""MJX-Warp's solver pads the degrees of freedom that are awake, and one column, to a multiple of this."""
 _MOVING_BONUS_M = 2.0
 """Moving objects rank as if they were this much nearer."""
 _FIRST_M = 1e3
@@ -88,21 +90,11 @@ class PhysicsWindow:
         self._boxes = {kind: int(counts[slots].max(initial=0)) for kind, slots in self._slots.items()}
         self._tables = {kind: self._group_tables(kind) for kind, slots in self._slots.items() if len(slots)}
         self._wall_tables = self._walls()
-        self._fit({kind: min(width or there[kind], there[kind]) for kind, width in self.widths.items()}, config)
-
-    def narrower(self, widths: Mapping[str, int], config: NavConfig) -> PhysicsWindow:
-        """Return one with the same tables and at most these numbers of slots and walls, but one wall at least."""
-        other = copy.copy(self)
-        least = {**widths, "walls": max(1, widths["walls"])}
-        other._fit({kind: min(least[kind], room) for kind, room in self.room.items()}, config)
-        return other
-
-    def _fit(self, room: dict[str, int], config: NavConfig) -> None:
-        self.room = room
+        self.room = {kind: min(width or there[kind], there[kind]) for kind, width in self.widths.items()}
         """Kind of slot, and `walls` -> how many there is room for."""
         self.n_walls = self.room["walls"]
         slots = tuple((kind, self._boxes[kind]) for kind in self._tables for _ in range(self.room[kind]))
-        self.spec, self.model, self.layout = build_empty_spec(self.world.robot, slots, self.n_walls, config)
+        self.spec, self.model, self.layout = build_empty_spec(world.robot, slots, self.n_walls, config)
         self.groups, first = (), 0
         for kind, (tables, outer) in self._tables.items():
             width = self.room[kind]
@@ -118,6 +110,17 @@ class PhysicsWindow:
     def needs_at_rest(self) -> dict[str, np.ndarray]:
         """Return [P] of each kind of slot, and of walls: needed with the robot at random places, everything at rest."""
         return self._nearness.counts(self._reach_m)
+
+    @functools.cached_property
+    def awake_at_rest(self) -> int:
+        """Return the degrees of freedom of the robot and of what it meets at 999 of 1,000 random places.
+
+        They are rounded up to one less than a multiple of the solver's tile, which costs the same.
+        """
+        counts = self._nearness.counts(self.world.robot.footprint_radius_m + TOUCH_M)
+        dofs = sum(n * (1 if kind in ("hinge", "slide") else 6) for kind, n in counts.items() if kind != "walls")
+        need = self.layout.robot_nv + int(np.quantile(dofs, SHARE, method="higher"))
+        return -(-(need + 1) // TILE) * TILE - 1
 
     def _group_tables(self, kind: str) -> tuple[dict[str, jax.Array], dict[str, np.ndarray]]:
         tables: dict[str, list[np.ndarray]] = {name: [] for name in FIELDS}
@@ -173,6 +176,12 @@ class PhysicsWindow:
         needed = (near < 0) | moving
         counts = {kind: needed[jnp.asarray(slots)].sum() for kind, slots in self._slots.items()}
         return {**counts, "walls": (walls < 0).sum()}
+
+    def awake(self, measured: Measured, chosen: tuple[jax.Array, ...]) -> jax.Array:
+        """Return [window slots] bool: what moves, or the robot may already touch; all else rests."""
+        near, moving, _ = measured
+        awake = moving | (near < AWAKE_M - REACH_M)
+        return jnp.concatenate([awake[jnp.asarray(g.slots)[i]] for g, i in zip(self.groups, chosen, strict=True)])
 
     def fields(self, scene: jax.Array, chosen: tuple[jax.Array, ...], walls: jax.Array) -> dict[str, jax.Array]:
         """Return values of all `FIELDS` of the window's model, in MuJoCo's shapes."""

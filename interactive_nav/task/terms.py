@@ -233,6 +233,8 @@ TERMS = (
     _count("left_out_steps", "In which an object within reach was not simulated (MJX's window was full).",
            lambda step: step.signals.left_out),
     _count("unconverged_steps", "In which the solver met its iteration limit.", lambda step: step.signals.unconverged),
+    _count("crowded_steps", "In which more was awake than `active_dofs` has room for, and went unsolved.",
+           lambda step: step.signals.crowded),
     Term("objects_dropped", "Small objects for which no free place was left: parked outside.", "metric",
          lambda _, step: step.nav.objects_dropped),
     Term("off_distance", "1 where start and goal are nearer or farther than the settings ask.", "metric",

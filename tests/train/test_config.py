@@ -13,7 +13,7 @@ from interactive_nav_common.config import field_docs
 from interactive_nav_common.errors import ConfigError
 from train import config_io
 from train.config import AUTO, EnvConfig, PPOConfig, RunConfig, TrainConfig, resolve, validate
-from train.config_io import apply_overrides, flatten, from_yaml, help_text, load_config, to_yaml
+from train.config_io import apply_overrides, flatten, from_dict, from_yaml, help_text, load_config, to_yaml
 
 BASE = TrainConfig(env=EnvConfig(scenes=("a",)))
 
@@ -27,6 +27,13 @@ def test_round_trip_of_every_kind_of_value():
     assert from_yaml(to_yaml(config)) == config
     assert from_yaml(to_yaml(TrainConfig())) == TrainConfig()
     assert from_yaml("") == TrainConfig()
+
+
+def test_a_run_of_an_older_version_is_read_without_settings_that_are_gone():
+    older = to_yaml(TrainConfig()).replace("  active_walls:", "  windows: [0.7 2 1 1 9]\n  active_walls:", 1)
+    assert "windows" in older and from_yaml(older) == TrainConfig()
+    with pytest.raises(ConfigError, match="unknown key 'env.windows'"):
+        from_dict({"env": {"windows": []}})
 
 
 @pytest.mark.parametrize("name", config_io.preset_names())

@@ -57,7 +57,7 @@ def config_to_play(
     """
     if "env.backend=native" in words:
         # It simulates everything, and takes no sizes of windows; those that the run learned with do no harm.
-        words = ["env.windows=[]", *(f"env.{name}=auto" for name in WINDOW), *words]
+        words = [*(f"env.{name}=auto" for name in WINDOW), *words]
     config = config_io.apply_overrides(folder.read_config(), words)
     env = dataclasses.replace(config.env, scenes=scene_folders(scenes) if scenes else config.env.scenes)
     if not any(word.startswith("env.backend=") for word in words):
@@ -67,7 +67,7 @@ def config_to_play(
             there = resolve_backend("auto")
             note = f"{folder.path}: trained with backend {env.backend}, which is not here; played with {there}"
             console.print(note, highlight=False, soft_wrap=True)
-            sizes = {"windows": (), **dict.fromkeys(WINDOW)} if there == "native" else {}
+            sizes = dict.fromkeys(WINDOW) if there == "native" else {}
             env = replace(env, backend=there, **sizes)
     return dataclasses.replace(config, env=env)
 

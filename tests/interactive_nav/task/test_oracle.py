@@ -127,7 +127,9 @@ def oracle(model, layout, qpos, forces, i: int) -> tuple[dict[str, float], list[
         "structure_steps": structure,
         "lifted": lifted,
     }
-    scores |= dict.fromkeys(("nonfinite", "overflow_steps", "left_out_steps", "objects_dropped", "off_distance"), 0.0)
+    scores |= dict.fromkeys(
+        ("nonfinite", "overflow_steps", "left_out_steps", "crowded_steps", "objects_dropped", "off_distance"), 0.0
+    )
     of_objects = {"object_path_m": paths, "object_contact_steps": contact_steps, "object_force_sum_n": on_objects}
     return {name: float(value) for name, value in scores.items()}, rewards, of_objects
 
