@@ -179,16 +179,16 @@ def test_what_learned_in_a_window_of_mjx_is_played_without_one():
         config_to_play(folder, ["env.backend=native", "env.active_doors=3"], None, console)
 
 
-def test_smaller_windows_are_dropped_by_who_takes_none(tmp_path, monkeypatch):
+def test_room_for_what_is_awake_is_dropped_by_who_takes_none(tmp_path, monkeypatch):
     """Where the backend is asked for, and where it is all there is."""
     folder, console = RunFolder(tmp_path), Console(quiet=True)
     kept = (ROOT / "results" / "kint" / "runs" / "k_int0-turtlebot-ppo-seed0" / "config.yaml").read_text()
-    folder.config.write_text(kept.replace("  sleep: true", '  windows: ["0.7 2 1 1 12"]\n  sleep: true'))
-    assert config_to_play(folder, ["env.backend=warp"], None, console).env.windows == ("0.7 2 1 1 12",)
-    assert config_to_play(folder, ["env.backend=native"], None, console).env.windows == ()
-    with pytest.raises(ConfigError, match="windows is .*, which changes nothing here"):
-        config_to_play(folder, ["env.backend=native", 'env.windows=["0.7 2 1 1 12"]'], None, console)
+    folder.config.write_text(kept.replace("  sleep: true", "  active_dofs: 31\n  sleep: true"))
+    assert config_to_play(folder, ["env.backend=warp"], None, console).env.active_dofs == 31
+    assert config_to_play(folder, ["env.backend=native"], None, console).env.active_dofs is None
+    with pytest.raises(ConfigError, match="active_dofs is 31, which changes nothing here"):
+        config_to_play(folder, ["env.backend=native", "env.active_dofs=31"], None, console)
     usual = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "warp" else usual(name, *a))
     played = config_to_play(folder, [], None, console)
-    assert (played.env.backend, played.env.windows) == ("native", ())
+    assert (played.env.backend, played.env.active_dofs) == ("native", None)

@@ -47,6 +47,10 @@ def build_env(config: EnvConfig) -> Any:
         raise ConfigError(f"env: {error}") from error
 
 
+SIZES = (*WINDOW, "active_dofs")
+"""Settings of MJX that `native` does not take."""
+
+
 def config_to_play(
     folder: RunFolder, words: Sequence[str], scenes: Sequence[str] | None, console: Console
 ) -> TrainConfig:
@@ -57,7 +61,7 @@ def config_to_play(
     """
     if "env.backend=native" in words:
         # It simulates everything, and takes no sizes of windows; those that the run learned with do no harm.
-        words = [*(f"env.{name}=auto" for name in WINDOW), *words]
+        words = [*(f"env.{name}=auto" for name in SIZES), *words]
     config = config_io.apply_overrides(folder.read_config(), words)
     env = dataclasses.replace(config.env, scenes=scene_folders(scenes) if scenes else config.env.scenes)
     if not any(word.startswith("env.backend=") for word in words):
@@ -67,7 +71,7 @@ def config_to_play(
             there = resolve_backend("auto")
             note = f"{folder.path}: trained with backend {env.backend}, which is not here; played with {there}"
             console.print(note, highlight=False, soft_wrap=True)
-            sizes = dict.fromkeys(WINDOW) if there == "native" else {}
+            sizes = dict.fromkeys(SIZES) if there == "native" else {}
             env = replace(env, backend=there, **sizes)
     return dataclasses.replace(config, env=env)
 

@@ -220,4 +220,5 @@ def test_overflow_bits_are_the_engines():
     from mujoco.mjx.third_party.mujoco_warp._src.types import OverflowType as Bit
 
     dropped = Bit.NEFC | Bit.NJMAX_NNZ | Bit.BROADPHASE | Bit.NARROWPHASE | Bit.CCD | Bit.CONTACT_MATCH
+    assert int(Bit.NVMAX) == mjx_batch._CROWDED
     assert int(dropped) == mjx_batch._DROPPED and int(Bit.ITERATIONS) == mjx_batch._UNCONVERGED
