@@ -5,8 +5,10 @@ from typing import Any
 import flax.struct
 import jax
 
-FAILURES = ("nonfinite", "overflow_steps", "left_out_steps", "unconverged_steps", "crowded_steps")
+FAILURES = ("nonfinite", "overflow_steps", "left_out_steps", "crowded_steps", "unconverged_steps")
 """Metrics of an episode that count what physics lost (`interactive_nav.physics.base.StepSignals`)."""
+LOST = ("overflow_steps", "left_out_steps", "crowded_steps")
+"""Those of them that are steps in which forces or bodies were missing."""
 OF_OBJECTS = ("object_path_m", "object_contact_steps", "object_force_sum_n")
 """Terms whose memory rows report by category."""
 

@@ -22,6 +22,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from interactive_nav import InteractiveNav
 from interactive_nav.task.rollout import Player, Recorder
+from interactive_nav.types import LOST
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.grids import MOVES_32, cell_centres, grid_graph, nearest_cell
 from interactive_nav_common.rotations import wrap_angle
@@ -274,7 +275,7 @@ class Expert:
         assert size_m is not None
         begun, xy_w = nav.step_count > 0, nav.robot_pos_w[:2]
         arrived = begun & (jnp.linalg.norm(xy_w - task.goals_w[memory["leg"]], axis=-1) < config.reached_m)
-        lost = (nav.memory["overflow_steps"] > 0) | (nav.memory["left_out_steps"] > 0)
+        lost = sum((nav.memory[name] for name in LOST), jnp.zeros(())) > 0
         broken = (state.metrics["nonfinite"] > 0) | lost
         reached = arrived & (memory["leg"] + 1 >= task.legs) & ~broken
         leg = jnp.minimum(memory["leg"] + arrived, task.legs - 1)

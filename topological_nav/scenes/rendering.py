@@ -25,7 +25,7 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import SmallObject, body_names
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import World
-from interactive_nav.types import EpisodeStart
+from interactive_nav.types import LOST, EpisodeStart
 from interactive_nav_common.errors import UserError, missing, optional
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.look import CameraPose, GlPainter, Lens, look_along
@@ -240,23 +240,24 @@ class Snapshot:
     qpos: np.ndarray
     """[B, nq] of the environment: where everything is."""
     broken: np.ndarray
-    """[B] bool: the physics gave up on it, lost contacts, or left out something near (MJX's window was full)."""
+    """[B] bool: the physics gave up on it, lost contacts, or had no room for something near or awake (MJX)."""
 
     @classmethod
     def of(cls, state: Any) -> "Snapshot":
         """Read the state of a batch of environments."""
         nav = state.info["nav"]
-        memory = [nav.memory[name] for name in ("robot_path_m", "touching", "overflow_steps", "left_out_steps")]
-        parts = nav.robot_pos_w, nav.yaw_rad, *memory, state.metrics["nonfinite"], state.pipeline_state.qpos
+        memory = [nav.memory[name] for name in ("robot_path_m", "touching")]
+        lost = sum((nav.memory[name] for name in LOST), jnp.zeros(()))
+        parts = nav.robot_pos_w, nav.yaw_rad, *memory, lost, state.metrics["nonfinite"], state.pipeline_state.qpos
         values = np.asarray(_packed(*parts)).astype(float)
         (yaw, path), (movable, wall, broken) = values[:, 2:4].T, values[:, 4:7].T > 0
         return cls(values[:, :2], yaw, path, movable, wall, values[:, 7:], broken)
 
 
 @jax.jit
-def _packed(pos, yaw, path, touching, overflow, left_out, nonfinite, qpos) -> jax.Array:
+def _packed(pos, yaw, path, touching, lost, nonfinite, qpos) -> jax.Array:
     """Return a `Snapshot` as one array [B, 7 + nq] f32, because every transfer from an accelerator makes it wait."""
-    broken = (nonfinite > 0) | (overflow + left_out > 0)
+    broken = (nonfinite > 0) | (lost > 0)
     flags = jnp.stack([yaw, path, *touching.T[:2], broken], 1)
     return jnp.concatenate([pos[:, :2], flags, qpos], 1).astype(jnp.float32)
 

@@ -10,7 +10,7 @@ import pyarrow as pa
 from rich.console import Console
 
 from interactive_nav.episodes import EpisodeFile, EpisodeFileError, load_episode_files
-from interactive_nav.types import FAILURES
+from interactive_nav.types import LOST
 from interactive_nav_common.config import refuse_unused, replace
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.jobs.progress import SafeConsole
@@ -160,7 +160,7 @@ def _report(console: Console, rows: pa.Table, config: TrainConfig, env: Any, out
     """Print the table of scores, and whether they are in doubt."""
     console.print(score_table(rows, f"{config.run.name}: {', '.join(scene.name for scene in env.scenes)}"))
     # A solve that met its iteration limit is inexact, not lost.
-    for name in FAILURES[:3]:
+    for name in ("nonfinite", *LOST):
         bad = int((rows[name].to_numpy() > 0).sum())
         if bad:
             console.print(f"{bad} of {len(rows)} episodes with {name} > 0: their scores are in doubt", style="yellow")

@@ -371,6 +371,7 @@ def test_one_array_tells_what_the_state_holds():
         "touching": np.array([[True, False, True], [False, True, False], [False, False, True]]),
         "overflow_steps": np.array([0, 2, 0], np.int32),
         "left_out_steps": np.array([0, 0, 1], np.int32),
+        "crowded_steps": np.zeros(3, np.int32),
     }
     nav = {
         name: jnp.asarray(value, value.dtype if value.dtype != float else jnp.float32) for name, value in nav.items()

@@ -27,7 +27,7 @@ def test_an_episode_with_lost_contacts_or_left_out_bodies_is_broken(room):
     starts = episode_starts(np.zeros((3, 2)) - 1.0, np.zeros(3), np.ones((3, 2)), 0)
     state = jax.jit(jax.vmap(env.reset_to))(starts, episode_keys(0, 3))
     assert Snapshot.of(state).broken.tolist() == [False] * 3
-    for name in ("overflow_steps", "left_out_steps"):
+    for name in ("overflow_steps", "left_out_steps", "crowded_steps"):
         nav = state.info["nav"]
         lost = nav.replace(memory=nav.memory | {name: jnp.asarray([0, 1, 0], nav.memory[name].dtype)})
         seen = Snapshot.of(state.replace(info={**state.info, "nav": lost}))
