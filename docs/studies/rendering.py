@@ -40,7 +40,7 @@ class Skip(Exception):
 def _turned(camera: CameraPose, angle_rad: jax.Array) -> CameraPose:
     cos, sin = jnp.cos(angle_rad), jnp.sin(angle_rad)
     turn = jnp.stack([jnp.stack([cos, -sin, 0 * cos]), jnp.stack([sin, cos, 0 * cos]), jnp.asarray([0.0, 0.0, 1.0])])
-    return camera.replace(axes_w=turn @ camera.axes_w)
+    return camera._replace(axes_w=turn @ camera.axes_w)
 
 
 def program(
