@@ -205,6 +205,8 @@ class RunConfig(Settings):
     """Folder of this run inside out_dir; empty: <config name>-seed<seed>."""
     seed: Seed = 0
     """The one seed of networks, environments and sampling."""
+    devices: AtLeastOne = 1
+    """Devices of this machine that share the environments and the minibatches; ppo only."""
     num_timesteps: AtLeastOne = 20_000_000
     """Environment steps to train for, rounded up to whole updates."""
     log_every_steps: AtLeastOne = 100_000
@@ -290,12 +292,29 @@ def validate(config: TrainConfig) -> None:
     if isinstance(section, OffPolicyConfig):
         _validate_replay(config.algorithm, section, config.run.num_timesteps)
     ppo = config.ppo
+    if config.run.devices > 1:
+        _validate_devices(config.algorithm, ppo, config.run.devices)
     if ppo.num_envs and ppo.batch_size and ppo.num_minibatches:
         collected = ppo.batch_size * ppo.num_minibatches
         if collected % ppo.num_envs:
             raise ConfigError(
                 f"ppo.batch_size * ppo.num_minibatches is {collected} sequences, expected a multiple of "
                 f"ppo.num_envs ({ppo.num_envs}); change one of the three"
+            )
+
+
+def _validate_devices(name: str, ppo: PPOConfig, devices: int) -> None:
+    """Raise `ConfigError` where several devices cannot take equal shares."""
+    if name != "ppo":
+        raise ConfigError(
+            f"run.devices is {devices}, expected 1 with algorithm {name}: its replay stays on one device; "
+            "set run.devices=1, or algorithm=ppo"
+        )
+    for key, value in (("num_envs", ppo.num_envs), ("batch_size", ppo.batch_size)):
+        if value and value % devices:
+            raise ConfigError(
+                f"ppo.{key} is {value}, expected a multiple of run.devices ({devices}), since devices take equal "
+                f"shares; take {devices * max(1, value // devices)}"
             )
 
 

@@ -220,8 +220,8 @@ class ShardedEnv(Wrapper):
         """Wrap an environment."""
         super().__init__(env)
         self.mesh = Mesh(np.asarray(devices if devices is not None else jax.devices()), (AXIS,))
-        self.sharding = NamedSharding(self.mesh, PartitionSpec(AXIS))
         spec = PartitionSpec(AXIS)
+        self.sharding, self.replicated = NamedSharding(self.mesh, spec), NamedSharding(self.mesh, PartitionSpec())
         self._reset = jax.shard_map(env.reset, mesh=self.mesh, in_specs=(spec, spec), out_specs=spec, check_vma=False)
         self._step = jax.shard_map(env.step, mesh=self.mesh, in_specs=(spec, spec), out_specs=spec, check_vma=False)
 

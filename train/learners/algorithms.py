@@ -9,6 +9,7 @@ import jax
 from brax.envs import Env
 from brax.training import types
 
+from interactive_nav.task.wrappers import ShardedEnv
 from train.config import TrainConfig
 from train.learners import offpolicy, ppo
 from train.learners.actor_critic import DDPG, SAC, policy_part
@@ -40,6 +41,9 @@ class Algorithm:
             fresh, data = reset_envs(agent, env, key), first.env_state
             state = data.replace(env_state=fresh) if isinstance(data, offpolicy.OffPolicyData) else fresh
             snapshot = dataclasses.replace(snapshot, env_state=state)
+        if isinstance(env, ShardedEnv):  # a checkpoint's arrays come from one device
+            learner = jax.device_put(snapshot.learner, env.replicated)
+            snapshot = Snapshot(snapshot.env_steps, learner, jax.device_put(snapshot.env_state, env.sharding))
         update_fn = functools.partial(self.update, agent, env)
         return run_loop(update_fn, snapshot, agent.steps_per_update, config.run, callbacks)
 

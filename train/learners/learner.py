@@ -127,7 +127,9 @@ def run_loop(
         return TrainResult(start, metrics, completed=done >= total)
 
     clock = time.perf_counter()
-    lowered = jax.jit(update_typed, donate_argnums=1).lower(learner, env_state)
+    # Each update leaves arrays on the devices where the next one expects them.
+    places = jax.tree.map(lambda x: x.sharding, (learner, env_state))
+    lowered = jax.jit(update_typed, donate_argnums=1, out_shardings=(*places, None)).lower(learner, env_state)
     compiled = lowered.compile(compiler_options())
     compile_s = time.perf_counter() - clock
 

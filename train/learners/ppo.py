@@ -3,8 +3,12 @@
 Brax's `ppo.train` cannot be stopped and continued: it gives out parameters only, not the optimiser or the
 random key, and keeps its loop to itself. So the loop is ours (`learner.run_loop`) and the update below is
 Brax's, with its keys split in the same places: a test compares the parameters after an update with those of
-`brax.training.agents.ppo.train`. What differs is one device instead of pmap, and less memory: episode scores
+`brax.training.agents.ppo.train`. What differs is jit instead of pmap, and less memory: episode scores
 are summed before learning, and a sequence keeps only its last next-observation (the loss reads no other).
+
+With `run.devices` above 1 the environments are a `ShardedEnv`, and XLA reduces statistics and gradients over devices.
+Transitions stay on the device that collected them: each minibatch takes an equal share from each, and shuffling is
+within the shares. One device that shuffles within as many groups of its environments computes the same (a test).
 
 Time limits: an episode cut by the clock has `done` = 1 and `truncation` = 1. Brax's GAE then leaves the cut
 step out and bootstraps the step before it from V(observation at the cut step), which is a state of the right
@@ -69,6 +73,8 @@ class PPOParts:
     observation_size: ObservationSize
     shared: bool = False
     """Actor and critic have one encoder."""
+    groups: int = 1
+    """Equal groups of environments, within which sequences are shuffled: one for each device."""
 
     @property
     def steps_per_update(self) -> int:
@@ -108,7 +114,8 @@ def make_agent(env: Any, config: TrainConfig) -> PPOParts:
     if c.learning_rate_schedule == "adaptive_kl":
         adam = optax.inject_hyperparams(optax.adam)(learning_rate=c.learning_rate)
     optimizer = optax.chain(optax.clip_by_global_norm(c.max_grad_norm), adam)
-    return PPOParts(c, built, optimizer, size, network.share_encoder and isinstance(size, Mapping))
+    shared = network.share_encoder and isinstance(size, Mapping)
+    return PPOParts(c, built, optimizer, size, shared, config.run.devices)
 
 
 def policy_part(learner: Mapping[str, Any]) -> dict[str, Any]:
@@ -155,24 +162,42 @@ def collect(
 
     length = config.batch_size * config.num_minibatches // config.num_envs
     (env_state, _), (data, sums) = jax.lax.scan(unroll, (env_state, key), None, length=length)
-    # [unrolls, time, envs, ...] -> [unrolls * envs, time, ...]
-    data = jax.tree.map(lambda x: jnp.swapaxes(x, 1, 2).reshape((-1, x.shape[1]) + x.shape[3:]), data)
-    return env_state, data, jax.tree.map(jnp.sum, sums)
+
+    def sequences(x: jax.Array) -> jax.Array:
+        """[unrolls, time, envs, ...] -> [sequences, time, ...], group by group."""
+        unrolls, time, _, *rest = x.shape
+        x = x.reshape(unrolls, time, parts.groups, -1, *rest)
+        return x.transpose(2, 0, 3, 1, *range(4, x.ndim)).reshape(-1, time, *rest)
+
+    return env_state, jax.tree.map(sequences, data), jax.tree.map(jnp.sum, sums)
 
 
-def shared_loss(
+def loss_of_images(
     both: ppo_networks.PPONetworks,
-    params: SharedParams,
+    params: ppo_losses.PPONetworkParams | SharedParams,
     normalizer_params: Any,
     data: types.Transition,
     key: jax.Array,
     **settings: Any,
 ) -> tuple[jax.Array, types.Metrics]:
-    """Return Brax's loss of the two heads, on features that are computed once."""
-    encode = functools.partial(both.policy_network.encoder.apply, normalizer_params, params.encoder)  # type: ignore
+    """Return Brax's loss of the two heads, on features: of one encoder, computed once, or of one each.
+
+    They are computed before Brax puts time first: where devices share the sequences, a convolution over [time,
+    sequences] would gather all images on each.
+    """
+    networks, whole = (both.policy_network, both.value_network), whole_params(params)
+    encoders = [network.encoder.apply for network in networks]  # type: ignore[attr-defined]
+    parts = list(zip(encoders, whole, strict=True))[: 1 if isinstance(params, SharedParams) else 2]
+
+    def encode(observation: Any) -> list[jax.Array]:
+        return [apply(normalizer_params, each["encoder"], observation) for apply, each in parts]
+
+    def head(network: Any, index: int) -> Any:
+        return dataclasses.replace(network.head, apply=lambda _, p, features: network.head.apply(_, p, features[index]))
+
     data = data._replace(observation=encode(data.observation), next_observation=encode(data.next_observation))
-    heads = ppo_losses.PPONetworkParams(policy=params.policy, value=params.value)  # type: ignore[call-arg]
-    of_heads: Any = both.replace(policy_network=both.policy_network.head, value_network=both.value_network.head)
+    heads = ppo_losses.PPONetworkParams(policy=whole[0]["head"], value=whole[1]["head"])  # type: ignore[call-arg]
+    of_heads: Any = both.replace(policy_network=head(networks[0], 0), value_network=head(networks[1], -1))  # type: ignore
     return ppo_losses.compute_ppo_loss(heads, None, data, key, ppo_network=of_heads, **settings)
 
 
@@ -184,9 +209,10 @@ def learn(
     Return the optimiser's state, the parameters, and losses [passes, minibatches].
     """
     config = parts.config
-    whole_loss = functools.partial(ppo_losses.compute_ppo_loss, ppo_network=parts.nets)
+    of_vectors = functools.partial(ppo_losses.compute_ppo_loss, ppo_network=parts.nets)
+    images = isinstance(parts.observation_size, Mapping)
     loss_fn = functools.partial(
-        functools.partial(shared_loss, parts.nets) if parts.shared else whole_loss,
+        functools.partial(loss_of_images, parts.nets) if images else of_vectors,
         **{name: getattr(config, name) for name in OF_LOSS},
         vf_coefficient=config.vf_loss_coefficient,
     )
@@ -210,8 +236,13 @@ def learn(
         optimizer_state, params, key = carry
         key, key_perm, key_grad = jax.random.split(key, 3)
 
+        keys = jax.random.split(key_perm, parts.groups) if parts.groups > 1 else key_perm[None]  # 1: Brax's
+
         def shuffle(x: jax.Array) -> jax.Array:
-            return jax.random.permutation(key_perm, x).reshape((config.num_minibatches, -1) + x.shape[1:])
+            """[sequences, ...] -> [minibatches, sequences of one, ...]."""
+            x = jax.vmap(jax.random.permutation)(keys, x.reshape(parts.groups, -1, *x.shape[1:]))
+            x = x.reshape(parts.groups, config.num_minibatches, -1, *x.shape[2:]).swapaxes(0, 1)
+            return x.reshape(config.num_minibatches, -1, *x.shape[3:])
 
         carry = optimizer_state, params, key_grad
         (optimizer_state, params, _key), losses = jax.lax.scan(minibatch_step, carry, jax.tree.map(shuffle, data))

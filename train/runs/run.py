@@ -16,7 +16,7 @@ import interactive_nav
 from interactive_nav.config import WINDOW
 from interactive_nav.physics import keep_programs, resolve_backend
 from interactive_nav.robots import robot_name
-from interactive_nav.task.wrappers import AutoResetEnv
+from interactive_nav.task.wrappers import AutoResetEnv, ShardedEnv
 from interactive_nav.types import FAILURES
 from interactive_nav_common.config import flatten, replace
 from interactive_nav_common.errors import ConfigError, UserError
@@ -258,6 +258,7 @@ def train_run(
     folder = RunFolder(Path(config.run.out_dir) / config.run.name)
     claim(folder.path)
     try:
+        devices_here(config.run.devices)  # before tables are computed
         env = build_env(config.env)
         config = resolve(config, env.backend)
     except UserError:
@@ -271,14 +272,26 @@ def train_run(
         return _train_in(folder, config, env, console, resume_from)
 
 
+def devices_here(number: int) -> list[Any]:
+    """Return the first devices of this machine; raise `ConfigError` where there are fewer."""
+    here = jax.local_devices()
+    if number > len(here):
+        raise ConfigError(
+            f"run.devices is {number}, expected at most {len(here)}, the {here[0].platform} devices here; lower it, or "
+            "let the process use more (CUDA_VISIBLE_DEVICES)"
+        )
+    return here[:number]
+
+
 def _train_in(
     folder: RunFolder, config: TrainConfig, env: Any, console: Console, resume_from: str
 ) -> tuple[TrainResult, RunFolder, int | None]:
     """Train in a folder that nobody else writes to."""
-    exists = folder.open(config)
+    exists, devices = folder.open(config), devices_here(config.run.devices)
     console.print(
         f"{folder.path}: {'continuing' if exists else 'training'} {config.algorithm} on {config.env.robot}, "
-        f"{len(config.env.scenes)} scene(s), backend {env.backend}, {num_envs(config)} environments",
+        f"{len(config.env.scenes)} scene(s), backend {env.backend}, {num_envs(config)} environments"
+        + (f" on {len(devices)} devices" if len(devices) > 1 else ""),
         highlight=False,
         soft_wrap=True,
     )
@@ -289,7 +302,9 @@ def _train_in(
     with stop_signals() as stops, progress_bar(console, "training") as bar:
         bar(status="compiling")
         with contextlib.closing(FolderCallbacks(folder, config, env, console, bar, stops, resume_from)) as callbacks:
-            result = ALGORITHMS[config.algorithm].train(AutoResetEnv(env), config, callbacks)
+            batch: Any = AutoResetEnv(env)
+            batch = ShardedEnv(batch, devices) if len(devices) > 1 else batch
+            result = ALGORITHMS[config.algorithm].train(batch, config, callbacks)
         last = (folder.read_metrics() or [{}])[-1]
         metrics = result.metrics or {k: v for k, v in last.items() if k not in ("env_steps", "wall_s")}
         write_json(folder.summary, summary(config, folder, result, metrics))

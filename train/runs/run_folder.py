@@ -29,10 +29,11 @@ from train.config_io import from_yaml, to_yaml
 
 MAY_CHANGE = (
     *("run.name", "run.out_dir", "run.num_timesteps", "run.keep_checkpoints", "run.tensorboard"),
-    *("run.wandb", "run.wandb_project"),
+    *("run.wandb", "run.wandb_project", "run.devices"),
     *("run.env_state_limit_mb", "env.threads"),
 )
-"""Settings that a run may be continued with at other values: they do not change what an update does."""
+"""Settings that a run may be continued with at other values: they change nothing of an update but, with
+`run.devices`, the groups that minibatches are shuffled in."""
 HEADROOM_MB = 64.0
 
 

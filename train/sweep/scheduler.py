@@ -72,18 +72,22 @@ def parse_gpus(listing: str, visible: str | None) -> list[Gpu]:
 
 
 class Machine(LocalLauncher):
-    """Processes on this machine, each with its share of a GPU or of the cores."""
+    """Processes on this machine, each with its share of a GPU, or whole GPUs, or of the cores."""
 
     def __init__(self, gpus: list[Gpu], slots: int):
         super().__init__(slots)
         self._gpus = gpus
 
     def take(self, job: "RunJob") -> Share | None:
-        """Return a share of the emptiest GPU, or of the cores where there is none."""
+        """Return a share of the emptiest GPU, whole GPUs for a job of several, or a share of the cores without GPUs."""
         if not self._gpus:
             return super().take(job)
         taken = [share for *_, share in self.running]
-        free = {gpu: 1.0 - sum(part for name, part in taken if name == gpu.name) for gpu in self._gpus}
+        free = {g: 1.0 - sum(part for names, part in taken if g.name in (names or "").split(",")) for g in self._gpus}
+        if job.gpus > 1:
+            # A run that needs more than there are gets all, and says itself what is missing.
+            idle, wanted = [g.name for g in free if free[g] > 1 - 1e-9], min(int(job.gpus), len(free))
+            return (",".join(idle[:wanted]), 1.0) if len(idle) >= wanted else None
         gpu, runs = max(free, key=lambda g: free[g]), job.launch.runs_per_gpu
         if job.launch.gpu_memory_gb:
             runs = max(1, min(runs, int(USABLE * gpu.memory_gb / job.launch.gpu_memory_gb)))
@@ -110,7 +114,7 @@ class RunJob(Job):
         return {
             "CUDA_DEVICE_ORDER": "PCI_BUS_ID",  # nvidia-smi's order
             "CUDA_VISIBLE_DEVICES": gpu,
-            "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{USABLE * part * self.launch.jax_memory_share:.3f}",
+            "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{USABLE * min(part, 1.0) * self.launch.jax_memory_share:.3f}",
         }
 
 
@@ -247,6 +251,7 @@ class Scheduler:
 
     def _job(self, kind: str, names: list[str]) -> RunJob:
         run, others, program = self._runs[names[0]], len(names) - 1, self.programs[kind]
+        devices = run.config.run.devices if kind == "train" else 1
         launch, factor = run.launch, max(self._factor.get((kind, name), 1.0) for name in names)
         if kind == "evaluate":
             command = words_of_evaluation(self.folder, names, program)
@@ -264,7 +269,7 @@ class Scheduler:
             launch=launch,
             factor=factor,
             cpus=launch.cpus_per_run,
-            gpus=min(1.0, factor / launch.runs_per_gpu),
+            gpus=float(devices) if devices > 1 else min(1.0, factor / launch.runs_per_gpu),
         )
 
     def _over(self, job: RunJob, code: int) -> None:

@@ -158,17 +158,23 @@ def test_shared_and_separate_encoders_give_the_same_loss_and_gradient():
     settings = {"entropy_cost": 0.01, "normalize_advantage": False, "discounting": 0.9}
 
     def loss_shared(params):
-        return ppo.shared_loss(shared.nets, params, one.normalizer_params, data, KEY, **settings)[0]
+        return ppo.loss_of_images(shared.nets, params, one.normalizer_params, data, KEY, **settings)[0]
 
     def loss_apart(params):
         return ppo_losses.compute_ppo_loss(
             params, one.normalizer_params, data, KEY, ppo_network=apart.nets, **settings
         )[0]
 
+    def loss_on_features(params):
+        return ppo.loss_of_images(apart.nets, params, one.normalizer_params, data, KEY, **settings)[0]
+
     both = ppo_losses.PPONetworkParams(policy=policy, value=value)  # type: ignore[call-arg]
     loss, grad = jax.jit(jax.value_and_grad(loss_shared))(one.params)
     loss_2, grad_2 = jax.jit(jax.value_and_grad(loss_apart))(both)
     np.testing.assert_allclose(loss, loss_2, rtol=1e-5)
+    loss_3, grad_3 = jax.jit(jax.value_and_grad(loss_on_features))(both)
+    np.testing.assert_allclose(loss_3, loss_2, rtol=1e-5)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-6), grad_3, grad_2)
     total = jax.tree.map(jnp.add, grad_2.policy["encoder"], grad_2.value["encoder"])
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-6), grad.encoder, total)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-6), grad.value, grad_2.value["head"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import itertools
 import json
@@ -226,6 +227,15 @@ def test_a_run_out_of_memory_gets_twice_the_share(tmp_path, monkeypatch):
     assert seen == {"0", "1"}
 
 
+def test_a_run_on_two_devices_gets_two_gpus(tmp_path, monkeypatch):
+    set_fates(tmp_path, {})
+    path = write_sweep(tmp_path, seeds=1, settings={"run": {"num_timesteps": 50, "devices": 2}})
+    outcome, _, folder = sweep(path, Machine([Gpu("0", 100.0), Gpu("1", 100.0)], 1))
+    assert outcome.exit_code("done") == 0
+    tries = [(folder.runs / run.name / "tries").read_text().split() for run in folder.sweep.runs]
+    assert tries == [["0,1", "0.570"]] * 2  # 0.95 usable * 0.6 for JAX
+
+
 def test_time_limit_stops_with_what_was_done_and_the_same_command_goes_on(tmp_path, monkeypatch):
     slow = {f"k_int{k}-seed{s}": ["slow"] for k in (0, 1) for s in (0, 1)}
     set_fates(tmp_path, slow)
@@ -415,6 +425,16 @@ def test_shares_of_a_machine(tmp_path):
     }
     del machine.running[0]
     assert taken(machine) == shares[0] and taken(machine) is None
+    # Whole GPUs for a run on two devices, once they are idle; all where it wants more, so that it says what is missing.
+    pair = dataclasses.replace(job, gpus=2.0)
+    assert machine.take(pair) is None
+    for wanted, given in ((2.0, "0,1"), (3.0, "0,1")):
+        idle = Machine(gpus, 1)
+        share = idle.take(dataclasses.replace(pair, gpus=wanted))
+        assert share is not None and share == (given, 1.0)
+        idle.running.append((pair, None, share))
+        assert taken(idle) is None
+    assert pair.env_on("0,1", 2.0)["XLA_PYTHON_CLIENT_MEM_FRACTION"] == "0.475"
     cpu = Machine([], 2)
     assert [taken(cpu) for _ in range(3)] == [(None, 0.5), (None, 0.5), None]
 

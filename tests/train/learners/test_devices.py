@@ -1,0 +1,150 @@
+"""PPO on two devices learns what one device learns, and its checkpoints continue on either."""
+
+import dataclasses
+import functools
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from interactive_nav.task.wrappers import ShardedEnv
+from interactive_nav_common.errors import ConfigError
+from tests.train.learners.test_ppo import Recorder, copy_snapshot, make_config
+from tests.train.runs.test_run import quiet
+from tests.train.toy_env import batched
+from tests.train.toy_pixels import SMALL, ToyPixels
+from tests.train.toy_run import build_toy, toy_config
+from train.config import SACConfig, TrainConfig, validate
+from train.learners import ppo
+from train.learners.algorithms import ALGORITHMS
+from train.runs.run import train_run
+
+ROOT = Path(__file__).parents[3]
+DEVICES = 2
+EXCHANGED = re.compile(r"= (.*?) (all-gather|all-reduce|all-to-all|collective-permute)(?:-start)?\(")
+
+
+def on_devices(config: TrainConfig, devices: int) -> TrainConfig:
+    return dataclasses.replace(config, run=dataclasses.replace(config.run, devices=devices))
+
+
+def same(mine: Any, theirs: Any) -> None:
+    """An update moves weights by about 1e-3: sums differ in float32's rounding only."""
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=2e-6), mine, theirs)
+
+
+def images_stay() -> None:
+    """Two updates; the compiled program exchanges sums, of no more numbers than there are parameters."""
+    config = dataclasses.replace(on_devices(make_config(2), DEVICES), network=SMALL)
+    ended, text = [], ""
+    for env in (batched(ToyPixels()), ShardedEnv(batched(ToyPixels()))):
+        parts = ppo.make_agent(env, config)
+        first = ppo.start(parts, env, seed=0)
+        learner: Any = first.learner
+        env_state: Any = first.env_state
+        if isinstance(env, ShardedEnv):
+            learner = jax.device_put(learner, env.replicated)
+        update = jax.jit(functools.partial(ppo.update, parts, env))
+        text = update.lower(learner, env_state).compile().as_text()
+        for _ in range(2):
+            learner, env_state, _ = update(learner, env_state)
+        ended.append((learner, env_state.obs))
+    same(*ended)
+    exchanged = EXCHANGED.findall(text or "")
+    assert exchanged and {kind for _, kind in exchanged} == {"all-reduce"}, exchanged
+
+
+def checkpoints_continue(folder: Path) -> None:
+    """Two updates on one number of devices and two on another, against one process that never stops to change."""
+    for before, after in ((1, DEVICES), (DEVICES, 1)):
+        out = folder / f"{before}-{after}"
+        stopped, _, _ = train_run(toy_config(out, updates=2, devices=before), quiet(), build_env=build_toy)
+        leaves = jax.tree.leaves(stopped.snapshot.env_state)
+        assert {len(leaf.sharding.device_set) for leaf in leaves} == {before}
+        straight = on_devices(toy_config(out, updates=4), after)
+        single = jax.device_put((stopped.snapshot.learner, stopped.snapshot.env_state), jax.devices()[0])
+        resumed = copy_snapshot(dataclasses.replace(stopped.snapshot, learner=single[0], env_state=single[1]))
+        # On one device, in as many groups.
+        expected = ALGORITHMS["ppo"].train(batched(), straight, Recorder(resumed)).snapshot
+        result, _, _ = train_run(straight, quiet(), build_env=build_toy)
+        assert result.completed and result.snapshot.env_steps == expected.env_steps == 2 * stopped.snapshot.env_steps
+        same(result.snapshot.learner, expected.learner)
+
+
+def in_two_devices(call: str) -> None:
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={DEVICES}"
+    done = subprocess.run(
+        [sys.executable, "-c", f"import interactive_nav\nfrom tests.train.learners import test_devices as t\nt.{call}"],
+        cwd=ROOT,
+        env={**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+@pytest.mark.heavy
+def test_two_devices_learn_as_one_and_exchange_no_images():
+    in_two_devices("images_stay()")
+
+
+@pytest.mark.heavy
+def test_checkpoints_continue_on_another_number_of_devices(tmp_path):
+    in_two_devices(f"checkpoints_continue(t.Path({str(tmp_path)!r}))")
+
+
+def test_sequences_are_shuffled_within_groups(monkeypatch):
+    """Of 8 sequences in 2 groups, each of 2 minibatches takes 2 from 0 to 3 and 2 from 4 to 7; each is taken once."""
+    config = make_config(1, num_envs=8, batch_size=4, num_minibatches=2, num_updates_per_batch=1)
+    env = batched()
+    parts = ppo.make_agent(env, on_devices(config, 2))
+    first = ppo.start(parts, env, seed=0)
+    _, data, _ = jax.jit(lambda s, e: ppo.collect(parts, env, s, e, jax.random.PRNGKey(3)))(
+        first.learner, first.env_state
+    )
+    data = data._replace(reward=np.broadcast_to(np.arange(8.0)[:, None], data.reward.shape).astype(np.float32))
+
+    def loss(params, normalizer_params, batch, key, **_):
+        total = sum(leaf.sum() for leaf in jax.tree.leaves(params))
+        return 0.0 * total, {"taken": batch.reward[:, 0], "kl_mean": 0.0}
+
+    monkeypatch.setattr(ppo.ppo_losses, "compute_ppo_loss", loss)
+    _, _, losses = ppo.learn(parts, first.learner, data, first.learner.normalizer_params, jax.random.PRNGKey(5))
+    taken = np.asarray(losses["taken"])[0]
+    assert taken.shape == (2, 4) and sorted(taken.ravel()) == list(range(8))
+    assert ((taken < 4).sum(1) == 2).all() and (taken[:, :2] < 4).all()
+
+
+def test_unequal_shares_are_refused():
+    def refused(match: str, config: TrainConfig) -> None:
+        with pytest.raises(ConfigError, match=match):
+            validate(config)
+
+    uneven = on_devices(make_config(1, num_envs=15, batch_size=15), 2)
+    refused(r"ppo.num_envs is 15, expected a multiple of run.devices \(2\).*; take 14", uneven)
+    refused(
+        r"ppo.batch_size is 15, expected a multiple of run.devices \(2\)",
+        on_devices(make_config(1, num_envs=10, batch_size=15), 2),
+    )
+    one = TrainConfig(env=make_config(1).env, algorithm="sac", sac=SACConfig())
+    validate(one)
+    refused("run.devices is 2, expected 1 with algorithm sac.*run.devices=1, or algorithm=ppo", on_devices(one, 2))
+
+
+def test_more_devices_than_there_are_is_refused(tmp_path):
+    number = len(jax.local_devices()) + 1
+    config = toy_config(tmp_path / "runs", devices=number)
+    config = dataclasses.replace(
+        config, ppo=dataclasses.replace(config.ppo, num_envs=8 * number, batch_size=8 * number)
+    )
+    with pytest.raises(
+        ConfigError, match=rf"run.devices is {number}, expected at most {number - 1}, the cpu devices here"
+    ):
+        train_run(config, quiet(), build_env=build_toy)
+    assert not (tmp_path / "runs").exists()
