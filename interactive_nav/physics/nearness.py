@@ -24,6 +24,10 @@ TOUCH_M = 0.15
 """What is this near to a moving object can be met by it: at 1 m/s it moves 0.1 m in a control step."""
 MOVING_M_S = 0.05
 """Or rad/s. What rests in the solver's tolerance turns by up to 0.02."""
+_COASTING_M_S = 0.005
+"""Or rad/s, of what a hinge or slide holds: at 0.05 rad/s a door of 30 kg still turns by 3 degrees."""
+_TIPPING_M_S2 = 1.0
+"""Or rad/s2, of free bodies: what tips or falls stands still where it turns round, but is not at rest."""
 _PUSH_M = 0.3
 """What is this near to the robot's footprint may be pushed before the window is chosen anew."""
 _PUSHED = 4
@@ -76,6 +80,7 @@ class Nearness:
         self._qpos = layout.slot_qpos[:, None] + np.where(self.held[:, None], 0, np.arange(7))
         self._qvel = layout.slot_qvel[:, None] + np.where(self.held[:, None], 0, np.arange(6))
         self._robot = layout.robot_qpos + np.arange(2)
+        self._moving = np.where(self.held, _COASTING_M_S, MOVING_M_S)
         (offset, half), arm = _bounds(slots), slots.anchor_b_m
         swung, arm, axis = ((slots.axes_w @ v[..., None])[..., 0] for v in (offset - arm, arm, slots.axis_b))
         offset, anchor = np.where(self.held[:, None], swung, offset), slots.pos_w_m + arm
@@ -130,14 +135,15 @@ class Nearness:
         boxes, occupied = self.boxes(scene, state), jnp.asarray(self.world.slots.occupied)[scene]
         gap = boxes.gap_m(state.qpos[self._robot], jnp.eye(2, 3), jnp.zeros(3)) - reach_m
         speed = jnp.where(occupied, jnp.abs(state.qvel[self._qvel]).max(-1), 0.0)
-        moving = speed > MOVING_M_S
+        turning = jnp.abs(state.qacc_warmstart[self._qvel]).max(-1) > jnp.where(self.held, jnp.inf, _TIPPING_M_S2)
+        moving = (speed > self._moving) | (turning & occupied)
         push = jnp.where(moving, -FAR_M, gap + (REACH_M - _PUSH_M))
-        fastest, movers = jax.lax.top_k(speed, min(_MOVERS, len(self.held)))
+        _, movers = jax.lax.top_k(speed, min(_MOVERS, len(self.held)))
         for k in range(len(movers)):
             one = movers[k]
             behind = boxes.gap_m(boxes.centre[one], boxes.axes[one], boxes.half[one]) - TOUCH_M
             behind = jnp.where(jnp.arange(len(self.held)) == one, FAR_M, behind)
-            behind = jnp.where(fastest[k] > MOVING_M_S, behind, FAR_M)
+            behind = jnp.where(moving[one], behind, FAR_M)
             gap, push = jnp.minimum(gap, behind), jnp.minimum(push, behind)
         walls = self._walls_gap_m(scene, state, reach_m, boxes, jnp.where(occupied, push, FAR_M))
         return jnp.where(occupied, gap, FAR_M), moving, walls

@@ -11,6 +11,7 @@ import pytest
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import PhysicsState, make_physics
 from interactive_nav.physics.mjx_batch import measure_buffers
+from interactive_nav.physics.nearness import Nearness
 from interactive_nav.physics.window import AWAKE_M, PhysicsWindow
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
@@ -27,6 +28,12 @@ ALL = NavConfig.of(num_objects=0, active_furniture=0)
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
     folder = write_room(tmp_path_factory.mktemp("sleep") / "room", (8.0, 5.0), FURNITURE)
+    return build_world(get_robot("turtlebot"), (load_scene(folder),), NavConfig.of(num_objects=0))
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    folder = write_room(tmp_path_factory.mktemp("door") / "room", door=True)
     return build_world(get_robot("turtlebot"), (load_scene(folder),), NavConfig.of(num_objects=0))
 
 
@@ -52,6 +59,26 @@ def test_what_moves_or_may_be_touched_is_awake(world):
         chosen, _, _ = window.select(measured)
         slots = np.concatenate([g.slots[np.asarray(i)] for g, i in zip(window.groups, chosen, strict=True)])
         assert slots[np.asarray(window.awake(measured, chosen))].tolist() == awake, x_m
+
+
+@pytest.mark.parametrize(
+    ("category", "speed", "acceleration", "moves"),
+    [
+        ("door", 0.01, 0.0, True),
+        ("door", 0.001, 0.0, False),
+        ("door", 0.0, 2.0, False),
+        ("chair", 0.0, 2.0, True),
+        ("chair", 0.01, 0.5, False),
+    ],
+)
+def test_a_coasting_door_and_a_tipping_chair_are_not_at_rest(room, category, speed, acceleration, moves):
+    """An 8 kg leaf with 0.5 N m s/rad coasts by I w / d = 1.7 x 0.05 / 0.5 = 0.17 rad from 0.05 rad/s. A chair on its
+    edge stands still where it turns round, and falls back."""
+    state, slot = start(room, -3.0), room.layout.slot_kind.index("hinge" if category == "door" else "free")
+    at = room.layout.slot_qvel[slot]
+    state = state.replace(qvel=state.qvel.at[at].set(speed), qacc_warmstart=state.qvel.at[at].set(acceleration))
+    _, moving, _ = Nearness(room).measure(jnp.int32(0), state, 0.6)
+    assert np.flatnonzero(moving).tolist() == ([slot] if moves else [])
 
 
 def test_room_is_measured_for_what_is_awake(world):
