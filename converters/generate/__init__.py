@@ -29,7 +29,7 @@ from scenes_mjcf.look import LOOK, UV_STEPS, geom_mesh, mesh_of
 
 __all__ = ["Building", "BuildingConfig", "GenerationError", "HomeConfig", "design_building", "generate_building"]
 
-GENERATOR_VERSION = 6
+GENERATOR_VERSION = 7
 """Raised whenever the same seed would give other bytes."""
 LOOK_TEXELS, LOOK_QUALITY, COPY_QUALITY = 1024, 30, 60
 """Side and quality of the image that `write_look` writes; quality of one that `copy_look` does."""

@@ -92,7 +92,9 @@ class Tables:
     """Category -> most in one room and in a home of `PLENTY_M2`; more in a larger one. Of others, as `Group.most`
     says."""
     light: tuple[str, ...]
-    """What a small robot can push: it may narrow a passage."""
+    """What a small robot can push."""
+    strewn: tuple[str, ...]
+    """What of it people leave in passages; the rest stands where they put it."""
 
 
 TABLES: Tables = read_packaged(Path(__file__).with_name("groups.yaml"), Tables)
@@ -301,22 +303,30 @@ def _shorter(group: Group, fewer: int) -> tuple[Satellite, ...]:
     return tuple(left)
 
 
+def group_of(name: str) -> Group:
+    """Return a group of the tables, or one of a single piece that stands anywhere."""
+    return TABLES.groups.get(name) or Group(name, "anywhere", most=99)
+
+
+def anchored(group: Group, piece: GroupMember, rng: np.random.Generator) -> GroupMember:
+    """Return a piece as its group's anchor: turned, and away from the wall behind it by a small gap."""
+    gap = 0.005 if piece.model.built_in else float(rng.uniform(*WALL_GAP_M))
+    turn = 0.0 if piece.model.built_in else float(rng.normal(0, 0.012))
+    turn = float(rng.uniform(-math.pi, math.pi)) if group.at == "anywhere" else turn
+    piece = dataclasses.replace(piece, turn_rad=turn)
+    return dataclasses.replace(piece, v=piece.half_m[1] + gap) if group.at in ("wall", "corner", "window") else piece
+
+
 def arrange(name: str, models: Models, rng: np.random.Generator, fewer: int = 0) -> Arrangement | None:
     """Choose models for a group and stand them against each other.
 
     Return None without a model of its anchor, or where fewer pieces than it needs find a place beside each other.
     """
-    group = TABLES.groups.get(name) or Group(name, "anywhere", most=99)
+    group = group_of(name)
     if not models.has(group.anchor, group.role):
         return None
     draw = draw_set(models, rng)
-    anchor = draw(group.anchor, group.role)
-    gap = 0.005 if anchor.model.built_in else float(rng.uniform(*WALL_GAP_M))
-    turn = 0.0 if anchor.model.built_in else float(rng.normal(0, 0.012))
-    turn = float(rng.uniform(-math.pi, math.pi)) if group.at == "anywhere" else turn
-    anchor = dataclasses.replace(anchor, turn_rad=turn)
-    if group.at in ("wall", "corner", "window"):
-        anchor = dataclasses.replace(anchor, v=anchor.half_m[1] + gap)
+    anchor = anchored(group, draw(group.anchor, group.role), rng)
     pieces, row = [anchor], [anchor]
     for satellite in _shorter(group, fewer):
         hosts = [p for p in pieces if p.model.category == (satellite.host or group.anchor)]

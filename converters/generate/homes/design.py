@@ -15,7 +15,7 @@ import numpy as np
 from converters.generate.design.config import SHARE_TOLERANCE, GenerationError, HomeConfig, Range
 from converters.generate.design.plan import Building
 from converters.generate.design.space import rooms_joined, static_grid
-from converters.generate.homes.arrange import TABLES, Arrangement, Group, GroupMember, least_of
+from converters.generate.homes.arrange import TABLES, Arrangement, GroupMember, anchored, group_of, least_of
 from converters.generate.homes.floor import CELL_M, Standing
 from converters.generate.homes.furnish import WIDE_M, Full, Home, clutter_category, furnish_home, settle
 from converters.generate.homes.opening import open_fronts
@@ -208,12 +208,12 @@ def _narrow(home: Home, passages: Passages) -> None:
     if place_at is None:
         return
     xy, room = place_at
-    alone = [s for s in passages.light() if ":" not in s.group]
+    alone = [s for s in passages.light() if ":" not in s.group and s.item.model.category in TABLES.strewn]
     piece, category = None, clutter_category(home, room)
     if alone and (floor.share > home.cfg.furniture_share or rng.random() < 0.7):
         piece = alone[rng.integers(len(alone))]
         model, scale = piece.item.model, piece.item.scale
-    elif category in TABLES.light and floor.share < home.cfg.furniture_share + SHARE_TOLERANCE / 2:
+    elif category in TABLES.strewn and floor.share < home.cfg.furniture_share + SHARE_TOLERANCE / 2:
         model, scale = home.models.draw(category, rng)
     else:
         return
@@ -241,9 +241,9 @@ def _clear(home: Home, passages: Passages) -> None:
     if not light:
         return
     piece = light[rng.integers(len(light))]
-    model, scale = piece.item.model, piece.item.scale
-    group = Group(model.category, "anywhere")
-    alone = Arrangement(group, (GroupMember(model, scale, 0.0, 0.0, float(rng.uniform(-math.pi, math.pi))),), None)
+    model = piece.item.model
+    group = group_of(model.category)
+    alone = Arrangement(group, (anchored(group, GroupMember(model, piece.item.scale, 0.0, 0.0, 0.0), rng),), None)
     rooms = [piece.room, *(int(k) for k in rng.permutation(len(home.plan.rooms))[:3])]
 
     def change() -> bool:

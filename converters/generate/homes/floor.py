@@ -20,8 +20,8 @@ from converters.geometry.density import ROBOTS
 from interactive_nav_common.grids import clearance, label
 
 CELL_M = 0.025
-DOORWAY_ZONE_M = 0.75
-"""Before a doorway, free of furniture at first."""
+DOORWAY_ZONE_M, DOORWAY_SIDE_M = 0.75, 0.15
+"""Before a doorway and beside its edges, free of furniture at first."""
 GAP_M = 0.03
 """Between pieces of different groups, at least."""
 STEP_M = 0.05
@@ -85,7 +85,7 @@ class Floor:
         self.kept = np.zeros(self.shape, bool)
         """Before doorways."""
         for doorway in plan.doorways:
-            self.kept[self.cells(doorway_zone(doorway, DOORWAY_ZONE_M))] = True
+            self.kept[self.cells(doorway_zone(doorway, DOORWAY_ZONE_M, DOORWAY_SIDE_M))] = True
         self.swept = np.zeros(self.shape, bool)
         """What door leaves sweep."""
         for sweep in sweeps:

@@ -110,17 +110,17 @@ def room(b: Building, item: Instance, more: tuple[PlanBox, ...] = ()) -> mujoco.
 @pytest.mark.parametrize(
     ("seed", "tier", "wardrobes"),
     [
-        (720_003, "furnished", 0),
-        (720_007, "furnished", 9),
-        pytest.param(720_007, "cluttered", 4, marks=pytest.mark.slow),
+        (720_003, "furnished", 4),
+        (720_007, "furnished", 3),
+        pytest.param(720_007, "cluttered", 5, marks=pytest.mark.slow),
     ],
 )
 def test_every_front_of_a_kitchen_opens(seed: int, tier: str, wardrobes: int) -> None:
-    """With `opening=all`: so do those of wardrobes, washbasins and showers, nine doors of two wardrobes in one home."""
+    """With `opening=all`: so do those of wardrobes, washbasins and showers. A vanity's drawers are 0.18 m deep."""
     b, count = kitchen(seed, tier), Counter[str]()
     for item in (i for i in b.plan.built_in if i.model.category in OPENS and openings(i.model.name)):
         model = room(b, item)
-        assert stuck(model) == []
+        assert stuck(model, 0.9) == []
         assert model.njnt == len(openings(item.model.name)) or item.model.category not in KITCHEN
         count[item.model.category] += model.njnt
     assert sum(count.values()) == sum(i.model.category in ("cabinet_door", "drawer") for i in b.items)
