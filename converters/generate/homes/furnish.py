@@ -1,6 +1,7 @@
 """Furnish a home's plan: what each room's use demands first, then more until it is full enough."""
 
 import dataclasses
+import functools
 import itertools
 import math
 from collections import Counter
@@ -82,7 +83,9 @@ class Home:
         return sum(s.group == group and s.room == room for s in self.floor.standing)
 
     def takes(self, categories: Sequence[str], room: int) -> bool:
-        """Return whether with these pieces more there are no more of a kind than a room and a home have."""
+        """Return whether a room has such pieces, and with these more there are no more than a room and a home have."""
+        if not {c for c in categories if c in TABLES.strewn} <= _kinds(_room_set(self, room)):
+            return False
         larger = max(self.floor.floor_cells * CELL_M**2 / PLENTY_M2, 1.0)
         for category, more in Counter(c for c in categories if c in TABLES.most).items():
             here = [s.room == room for s in self.floor.standing if s.item.model.category == category]
@@ -205,6 +208,14 @@ def _room_set(home: Home, room: int) -> RoomSet:
     if use == "living" and len(home.uses) <= 2:
         return dataclasses.replace(chosen, base=(("bed", 1.0), *chosen.base))
     return chosen
+
+
+@functools.cache
+def _kinds(has: RoomSet) -> set[str]:
+    """Return the categories of all furniture that a room may have."""
+    groups = [TABLES.groups[name] for name, _ in (*has.base, *has.more)]
+    pieces = {s.category for group in groups for s in group.satellites} | {group.anchor for group in groups}
+    return pieces | {category for category, _ in has.clutter}
 
 
 def stand_base(home: Home) -> None:
