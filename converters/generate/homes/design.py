@@ -17,7 +17,7 @@ from converters.generate.design.plan import Building
 from converters.generate.design.space import rooms_joined, static_grid
 from converters.generate.homes.arrange import TABLES, Arrangement, GroupMember, anchored, group_of, least_of
 from converters.generate.homes.floor import CELL_M, Standing
-from converters.generate.homes.furnish import WIDE_M, Full, Home, clutter_category, furnish_home, settle
+from converters.generate.homes.furnish import WIDE_M, Full, Home, clutter_category, furnish_home, kinds, room_set, settle
 from converters.generate.homes.opening import open_fronts
 from converters.generate.homes.plans import home_plan
 from converters.generate.models.cad import place
@@ -208,7 +208,8 @@ def _narrow(home: Home, passages: Passages) -> None:
     if place_at is None:
         return
     xy, room = place_at
-    alone = [s for s in passages.light() if ":" not in s.group and s.item.model.category in TABLES.strewn]
+    kept = kinds(room_set(home, room)).intersection(TABLES.strewn)
+    alone = [s for s in passages.light() if ":" not in s.group and s.item.model.category in kept]
     piece, category = None, clutter_category(home, room)
     if alone and (floor.share > home.cfg.furniture_share or rng.random() < 0.7):
         piece = alone[rng.integers(len(alone))]

@@ -84,7 +84,7 @@ class Home:
 
     def takes(self, categories: Sequence[str], room: int) -> bool:
         """Return whether a room has such pieces, and with these more there are no more than a room and a home have."""
-        if not {c for c in categories if c in TABLES.strewn} <= _kinds(_room_set(self, room)):
+        if not {c for c in categories if c in TABLES.strewn} <= kinds(room_set(self, room)):
             return False
         larger = max(self.floor.floor_cells * CELL_M**2 / PLENTY_M2, 1.0)
         for category, more in Counter(c for c in categories if c in TABLES.most).items():
@@ -199,7 +199,7 @@ def try_group(home: Home, name: str, room: int, radius_m: float) -> bool:
     return False
 
 
-def _room_set(home: Home, room: int) -> RoomSet:
+def room_set(home: Home, room: int) -> RoomSet:
     """Return what a room has; the living room has the table where there is no dining room and the kitchen is small."""
     use = home.uses[room]
     chosen = TABLES.rooms[use]
@@ -211,7 +211,7 @@ def _room_set(home: Home, room: int) -> RoomSet:
 
 
 @functools.cache
-def _kinds(has: RoomSet) -> set[str]:
+def kinds(has: RoomSet) -> set[str]:
     """Return the categories of all furniture that a room may have."""
     groups = [TABLES.groups[name] for name, _ in (*has.base, *has.more)]
     pieces = {s.category for group in groups for s in group.satellites} | {group.anchor for group in groups}
@@ -221,7 +221,7 @@ def _kinds(has: RoomSet) -> set[str]:
 def stand_base(home: Home) -> None:
     """Stand what each room's use demands, the most important pieces of all rooms first."""
     rng = home.rng
-    sets = [_room_set(home, k) for k in range(len(home.uses))]
+    sets = [room_set(home, k) for k in range(len(home.uses))]
     for level in range(max(len(s.base) for s in sets)):
         for room in rng.permutation(len(sets)):
             if level < len(sets[room].base):
@@ -268,7 +268,7 @@ def grow(home: Home) -> None:
             return
         hungry = {k: floor.room_share(k) / TABLES.rooms[use].appetite for k, use in enumerate(home.uses)}
         for room in sorted(hungry, key=lambda k: hungry[k]):
-            chosen = _room_set(home, room)
+            chosen = room_set(home, room)
             every = (*((g, 1.0) for g, _ in chosen.base), *chosen.more)
             every = [(g, w) for g, w in every if (room, g) not in tired]
             groups = [(g, w) for g, w in every if home.count(g, room) < TABLES.groups[g].most]

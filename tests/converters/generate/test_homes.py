@@ -148,6 +148,45 @@ def test_light_pieces_to_move_are_none_that_a_table_or_desk_needs():
     assert needed >= 4
 
 
+KEPT = {
+    "box": {"bedroom", "hall", "office", "storage"},
+    "chair": {"bedroom", "dining", "hall", "kitchen", "living", "office"},
+    "drying_rack": {"bathroom", "bedroom", "storage"},
+    "pouf": {"bedroom", "living", "office"},
+    "suitcase": {"bedroom", "hall", "storage"},
+}
+"""Category of what people leave about -> the rooms in which they do."""
+
+
+def test_what_is_moved_into_passages_stays_in_rooms_that_have_such_things():
+    adjusted = [furnished(seed, "cluttered") for seed in range(20, 24)]
+    standing = [(home.uses[s.room], s.item.model.category) for home in adjusted for s in home.floor.standing]
+    assert len([c for _, c in standing if c in KEPT]) > 40
+    assert [(use, c) for use, c in standing if use not in KEPT.get(c, {use})] == []
+    assert set(KEPT) < set(TABLES.strewn) < set(TABLES.light) and not {"plant", "bin", "cart"} & set(TABLES.strewn)
+    assert not several()[0].takes(["box"], several()[0].uses.index("living"))
+
+
+def test_a_room_has_one_table_and_its_chairs_are_of_one_model():
+    tables = 0
+    for home in several():
+        for room in range(len(home.uses)):
+            here = [s for s in home.floor.standing if s.room == room]
+            tables += (count := sum(s.item.model.category == "table" for s in here))
+            seats = {s.item.model.name for s in here if s.group.endswith("table: chair")}
+            assert count <= 1 and len(seats) <= 1
+    assert tables >= 5
+
+
+def test_nothing_stands_beside_a_doorways_edge_before_passages_are_narrowed():
+    for home in several():
+        for doorway in home.plan.doorways:
+            beside = (0.3, 0.13) if doorway.axis == 0 else (0.13, 0.3)
+            zone = polygon(doorway.rect.grown(*beside))
+            near = [s.group for s in home.floor.standing if s.item.footprint.intersection(zone).area > 1e-3]
+            assert set(near) <= {"door", "radiator"}
+
+
 def test_a_window_has_one_radiator_and_a_bathroom_one_for_towels():
     for home in several():
         heaters = [s for s in home.floor.standing if s.item.model.category == "radiator"]
