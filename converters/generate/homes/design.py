@@ -17,7 +17,16 @@ from converters.generate.design.plan import Building
 from converters.generate.design.space import rooms_joined, static_grid
 from converters.generate.homes.arrange import TABLES, Arrangement, GroupMember, anchored, group_of, least_of
 from converters.generate.homes.floor import CELL_M, Standing
-from converters.generate.homes.furnish import WIDE_M, Full, Home, clutter_category, furnish_home, kinds, room_set, settle
+from converters.generate.homes.furnish import (
+    WIDE_M,
+    Full,
+    Home,
+    clutter_category,
+    furnish_home,
+    kinds,
+    room_set,
+    settle,
+)
 from converters.generate.homes.opening import open_fronts
 from converters.generate.homes.plans import home_plan
 from converters.generate.models.cad import place
