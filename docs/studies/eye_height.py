@@ -45,7 +45,7 @@ def main() -> None:
         views.append(np.full_like(views[0], 255))
     rows = [views] if arguments.south else [views[k : k + 2] for k in range(0, len(views), 2)]
     picture = np.vstack([np.hstack(row) for row in rows]) if not arguments.south else np.vstack(views)
-    Image.fromarray(picture).save(arguments.output, quality=82, optimize=True)
+    Image.fromarray(picture).save(arguments.output, quality=72, optimize=True)
 
 
 if __name__ == "__main__":
