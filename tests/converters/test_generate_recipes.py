@@ -65,7 +65,7 @@ def test_a_tier_makes_a_home_with_the_split_s_models():
             ["--tier", "furnished", "furniture_shar=0.2"],
             "unknown key 'furniture_shar', did you mean 'furniture_share'?",
         ),
-        (["--tier", "furnished", "furniture_share=0.9"], "furniture_share is 0.9, expected between 0 and 0.42"),
+        (["--tier", "furnished", "furniture_share=0.9"], "furniture_share is 0.9, expected between 0 and 0.38"),
         (["--tier", "furnished", "furniture_share=x"], 'furniture_share is "x", expected a number'),
         (["--tier", "furnished", "n_chairs=3"], "unknown key 'n_chairs'"),
         (["n_rooms=[3"], 'settings: n_rooms is "[3", expected a list'),
