@@ -36,6 +36,10 @@ def test_what_is_put_wrong_in_a_home_is_counted():
     chairs = [at("Scopia/chair4", living + [0, way * 0.7], -way * math.pi / 2) for way in (1, -1)]
     right = home_counts(plan, uses, [table, *chairs, at("Scopia/corner_bathtub", bath)])
     assert right["dining tables of 2 chairs"] == 1 and not any(right[name] for name in WRONG)
+    bedroom = np.array(plan.rooms[uses.index("bedroom")].centre)
+    for away, over in ((living, 0), (bedroom, 1)):  # pulled away from the table, or spread over the home
+        more = [at("Scopia/chair4", away + [k / 10, 1.4]) for k in range(-1, 3)]
+        assert home_counts(plan, uses, [table, *chairs, *more])["models over 3 times"] == over
     wrong = [
         *(
             at("Scopia/office_chair", living + [2, 0]),
