@@ -67,7 +67,7 @@ class Scenario:
     robot: str
     category: str
     behind: tuple[str, ...] = ()
-    """What the object is pushed into, or, a box, what lies on it."""
+    """Categories of the objects that it is pushed into; for a box, of the box on top of it."""
     seconds: float = 2.5
     drives_s: float = math.inf
     """After this the robot drives back."""

@@ -92,9 +92,9 @@ class Tables:
     """Category -> most in one room and in a home of `PLENTY_M2`; more in a larger one. Of others, as `Group.most`
     says."""
     light: tuple[str, ...]
-    """What a small robot can push."""
+    """Categories that a small robot can push."""
     strewn: tuple[str, ...]
-    """What of it people leave in passages; the rest stands where they put it."""
+    """Light categories that people leave in passages; the search moves the others only out of them."""
 
 
 TABLES: Tables = read_packaged(Path(__file__).with_name("groups.yaml"), Tables)

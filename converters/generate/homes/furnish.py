@@ -83,7 +83,7 @@ class Home:
         return sum(s.group == group and s.room == room for s in self.floor.standing)
 
     def takes(self, categories: Sequence[str], room: int) -> bool:
-        """Return whether a room has such pieces, and with these more there are no more than a room and a home have."""
+        """Return whether a room may have such pieces, and neither it nor the home would have too many of a kind."""
         if not {c for c in categories if c in TABLES.strewn} <= kinds(room_set(self, room)):
             return False
         larger = max(self.floor.floor_cells * CELL_M**2 / PLENTY_M2, 1.0)

@@ -103,7 +103,7 @@ def home_counts(plan: Plan, uses: Sequence[str], items: Sequence[Instance]) -> C
     )
     out["cartons"] = len(of.get("box", []))
     out["cartons misplaced"] = sum(use(box) not in CARTONS for box in of.get("box", []))
-    # Chairs of a table's model in its room are the table's, also where somebody pulled them away.
+    # Chairs of one model in the room of their table belong to it, even where they were pulled away from it.
     sets = [(at[0], c) for at in chairs if at for c in of["chair"] if c.model.name == at[0].model.name]
     at_tables = {id(c) for first, c in sets if c is not first and room(c) == room(first)}
     alike = Counter(i.model.name for i in items if i.model.category not in IN_ROWS and id(i) not in at_tables)
