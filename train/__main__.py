@@ -60,8 +60,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(config_io.to_yaml(config), end="")
         return 0
     # Heavy: after the config has been checked.
+    from train.runs.processes import join_processes
     from train.runs.run import train_run
 
+    join_processes()
     _, _, stopped_by = train_run(config, SafeConsole(), resume_from=arguments.checkpoint)
     return 128 + stopped_by if stopped_by else 0
 

@@ -99,7 +99,8 @@ def whole_updates(steps: int, steps_per_update: int) -> int:
 
 def reset_envs(agent: Any, env: Env, key: jax.Array) -> PyTree:
     """Start a new episode in every environment."""
-    return jax.jit(env.reset)(jax.random.split(key, agent.config.num_envs or 1))
+    number = agent.config.num_envs or 1
+    return jax.jit(lambda k: env.reset(jax.random.split(k, number)))(np.asarray(key))
 
 
 def run_loop(

@@ -32,7 +32,7 @@ from train import config_io
 from train.config import EnvConfig, TrainConfig, resolve
 from train.learners.algorithms import ALGORITHMS
 from train.learners.learner import Snapshot, TrainResult, Update
-from train.runs import checkpoint, tracking
+from train.runs import checkpoint, processes, tracking
 from train.runs.checkpoint import CheckpointError, CheckpointMeta
 from train.runs.run_folder import RunFolder, claim
 from train.runs.tracking import describe
@@ -256,6 +256,12 @@ def train_run(
     if config.run.wandb:
         tracking.import_wandb()
     folder = RunFolder(Path(config.run.out_dir) / config.run.name)
+    if jax.process_index():
+        env = build_env(config.env)
+        config = resolve(config, env.backend)
+        with stop_signals() as stops:
+            callbacks = processes.Together(None, stops, config.run.env_state_limit_mb)
+            return learn(env, config, callbacks), folder, stops[0] if stops else None
     claim(folder.path)
     try:
         devices_here(config.run.devices)  # before tables are computed
@@ -273,8 +279,10 @@ def train_run(
 
 
 def devices_here(number: int) -> list[Any]:
-    """Return the first devices of this machine; raise `ConfigError` where there are fewer."""
-    here = jax.local_devices()
+    """Return the first devices, or those of all processes; raise `ConfigError` where the number does not fit."""
+    here, several = jax.devices(), jax.process_count()
+    if several > 1 and number != len(here):
+        raise ConfigError(f"run.devices is {number}, expected {len(here)}, all devices of {several} processes")
     if number > len(here):
         raise ConfigError(
             f"run.devices is {number}, expected at most {len(here)}, the {here[0].platform} devices here; lower it, or "
@@ -302,9 +310,9 @@ def _train_in(
     with stop_signals() as stops, progress_bar(console, "training") as bar:
         bar(status="compiling")
         with contextlib.closing(FolderCallbacks(folder, config, env, console, bar, stops, resume_from)) as callbacks:
-            batch: Any = AutoResetEnv(env)
-            batch = ShardedEnv(batch, devices) if len(devices) > 1 else batch
-            result = ALGORITHMS[config.algorithm].train(batch, config, callbacks)
+            several = jax.process_count() > 1
+            limit_mb = config.run.env_state_limit_mb
+            result = learn(env, config, processes.Together(callbacks, stops, limit_mb) if several else callbacks)
         last = (folder.read_metrics() or [{}])[-1]
         metrics = result.metrics or {k: v for k, v in last.items() if k not in ("env_steps", "wall_s")}
         write_json(folder.summary, summary(config, folder, result, metrics))
@@ -321,6 +329,14 @@ def _train_in(
         note = ", ".join(f"{name} {count:,.0f}" for name, count in lost.items())
         console.print(f"what physics lost, summed over ended episodes: {note}", style="yellow", soft_wrap=True)
     return result, folder, stops[0] if stops else None
+
+
+def learn(env: Any, config: TrainConfig, callbacks: Any) -> TrainResult:
+    """Train on the config's devices."""
+    devices, batch = devices_here(config.run.devices), AutoResetEnv(env)
+    return ALGORITHMS[config.algorithm].train(
+        ShardedEnv(batch, devices) if len(devices) > 1 else batch, config, callbacks
+    )
 
 
 def num_envs(config: TrainConfig) -> int:

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import os
 import re
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from rich.console import Console
 
 from interactive_nav.task.wrappers import ShardedEnv
 from interactive_nav_common.errors import ConfigError
@@ -23,6 +25,7 @@ from tests.train.toy_run import build_toy, toy_config
 from train.config import SACConfig, TrainConfig, validate
 from train.learners import ppo
 from train.learners.algorithms import ALGORITHMS
+from train.runs.processes import join_processes
 from train.runs.run import train_run
 
 ROOT = Path(__file__).parents[3]
@@ -77,16 +80,50 @@ def checkpoints_continue(folder: Path) -> None:
         same(result.snapshot.learner, expected.learner)
 
 
-def in_two_devices(call: str) -> None:
-    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={DEVICES}"
-    done = subprocess.run(
+def train_toy(folder: Path, updates: int) -> None:
+    """Train on all devices of the processes that the environment names, and save what was learned."""
+    join_processes()
+    result, _, _ = train_run(toy_config(folder, updates, devices=DEVICES), Console(), build_env=build_toy)
+    if jax.process_index() == 0:
+        np.savez(folder / "learned.npz", *map(np.asarray, jax.tree.leaves(result.snapshot.learner)))
+
+
+def start(call: str, devices: int, **variables: str) -> subprocess.Popen[str]:
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"
+    return subprocess.Popen(
         [sys.executable, "-c", f"import interactive_nav\nfrom tests.train.learners import test_devices as t\nt.{call}"],
         cwd=ROOT,
-        env={**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)},
-        capture_output=True,
+        env={**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT), **variables},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
     )
-    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def in_two_devices(call: str) -> None:
+    process = start(call, DEVICES)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors[-3000:]
+
+
+@pytest.mark.heavy
+def test_two_processes_learn_as_one_and_one_continues_their_run(tmp_path):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{probe.getsockname()[1]}"
+    one, two = tmp_path / "one", tmp_path / "two"
+    names = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": "2"}
+    call = f"train_toy(t.Path({str(two)!r}), 3)"
+    started = [start(call, 1, **names, JAX_PROCESS_ID=str(i)) for i in range(2)]
+    printed = [process.communicate(timeout=300) for process in started]
+    assert [process.returncode for process in started] == [0, 0], printed
+    assert "done at 768 steps" in printed[0][0] and "steps" not in printed[1][0]
+    for updates in (3, 5):  # 5: each goes on from its checkpoint
+        in_two_devices(f"train_toy(t.Path({str(one)!r}), {updates})")
+        if updates == 5:
+            in_two_devices(f"train_toy(t.Path({str(two)!r}), 5)")
+        mine, theirs = (np.load(folder / "learned.npz") for folder in (one, two))
+        same(dict(mine), dict(theirs))
 
 
 @pytest.mark.heavy
