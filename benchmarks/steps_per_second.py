@@ -39,6 +39,7 @@ from interactive_nav_common.config import AtLeastOne
 from interactive_nav_common.errors import reports_errors
 from interactive_nav_common.versions import commit, package_versions
 from train import config_io
+from train.runs.processes import join_processes
 from train.runs.run import train_run
 from train.sweep.scheduler import gpu_listing
 
@@ -198,14 +199,15 @@ def simulation(
     if devices > 1:
         batch = ShardedEnv(batch, jax.devices()[:devices])
     step = _counting(step_of(env, part, num_envs, batch))
-    state = jax.jit(batch.reset)(jax.random.split(jax.random.PRNGKey(0), num_envs))
+    keys = np.asarray(jax.vmap(jax.random.PRNGKey)(jnp.arange(2 + max(1, steps // CHUNK))))  # the same in each process
+    state = jax.jit(lambda key: batch.reset(jax.random.split(key, num_envs)))(keys[0])
     # Not donated: the first state may share buffers with constants.
     program = jax.jit(random_driving(step, (num_envs, env.action_size), CHUNK))
-    (state, _), compile_s = timed(program, state, jax.random.PRNGKey(1))
+    (state, _), compile_s = timed(program, state, keys[1])
     rates, totals = [], {name: 0.0 for name in (*FAILURES, "episodes", "nonfinite_observations")}
     memory = [_gpu_memory_mib()]
-    for i in range(max(1, steps // CHUNK)):
-        (state, seen), took_s = timed(program, state, jax.random.PRNGKey(2 + i))
+    for i, key in enumerate(keys[2:]):
+        (state, seen), took_s = timed(program, state, key)
         rates.append(CHUNK * num_envs / took_s)
         for name in totals:
             totals[name] += float(seen[name].sum())
@@ -348,6 +350,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Measure and append rows."""
     args = parse(Bench, "python -m benchmarks.steps_per_second", argv)
     settings = {name: json.loads(value) for name, _, value in (word.partition("=") for word in args.environment)}
+    join_processes()
     for num_envs in args.num_envs:
         for mode in args.mode:
             row: dict[str, Any] = {
@@ -367,7 +370,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 row |= windows(args.robot, *measure)
             elif mode != "train":
                 row |= simulation(args.robot, *measure, part=mode, devices=args.devices)
-            append_row(args.out, row)
+            if jax.process_index() == 0:
+                append_row(args.out, row | ({"processes": jax.process_count()} if jax.process_count() > 1 else {}))
     return 0
 
 
