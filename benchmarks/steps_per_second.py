@@ -39,7 +39,7 @@ from interactive_nav_common.config import AtLeastOne
 from interactive_nav_common.errors import reports_errors
 from interactive_nav_common.versions import commit, package_versions
 from train import config_io
-from train.runs.processes import join_processes
+from train.runs.processes import one_for_each_gpu
 from train.runs.run import train_run
 from train.sweep.scheduler import gpu_listing
 
@@ -298,6 +298,8 @@ def training(
             *learner,
         ]
         _, run_folder, _ = train_run(config_io.load_config(preset, overrides), Console(quiet=True))
+        if jax.process_index():
+            return {}  # process 0 has the run folder
         lines = [json.loads(line) for line in run_folder.metrics.read_text(encoding="utf-8").splitlines()]
     rates = [line["env_steps_per_s"] for line in lines[1:]] or [lines[0]["env_steps_per_s"]]
     last = lines[-1]
@@ -350,29 +352,35 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Measure and append rows."""
     args = parse(Bench, "python -m benchmarks.steps_per_second", argv)
     settings = {name: json.loads(value) for name, _, value in (word.partition("=") for word in args.environment)}
-    join_processes()
-    for num_envs in args.num_envs:
-        for mode in args.mode:
-            row: dict[str, Any] = {
-                "mode": mode,
-                "backend": resolve_backend(args.backend),
-                "num_envs": num_envs,
-                "scenes": list(args.scenes),
-                "settings": settings,
-                **origin(args.commit),
-            }
-            measure = (list(args.scenes), args.backend, num_envs, args.steps, settings)
-            if mode == "train":
-                row |= training(*measure, args.preset, list(args.learner))
-            else:
-                row |= {"robot": args.robot, "devices": args.devices}
-            if mode == "windows":
-                row |= windows(args.robot, *measure)
-            elif mode != "train":
-                row |= simulation(args.robot, *measure, part=mode, devices=args.devices)
-            if jax.process_index() == 0:
-                append_row(args.out, row | ({"processes": jax.process_count()} if jax.process_count() > 1 else {}))
+    training_on = config_io.load_config(args.preset, args.learner).run.devices if "train" in args.mode else 1
+    command = [sys.executable, "-m", "benchmarks.steps_per_second", *(sys.argv[1:] if argv is None else argv)]
+    with one_for_each_gpu(max(args.devices, training_on), command):
+        for num_envs in args.num_envs:
+            for mode in args.mode:
+                row = measured(args, mode, num_envs, settings)
+                if jax.process_index() == 0:
+                    append_row(args.out, row)
     return 0
+
+
+def measured(args: Bench, mode: str, num_envs: int, settings: dict[str, Any]) -> dict[str, Any]:
+    """Return a row."""
+    row: dict[str, Any] = {
+        "mode": mode,
+        "backend": resolve_backend(args.backend),
+        "num_envs": num_envs,
+        "scenes": list(args.scenes),
+        "settings": settings,
+        **({"processes": jax.process_count()} if jax.process_count() > 1 else {}),
+        **origin(args.commit),
+    }
+    measure = (list(args.scenes), args.backend, num_envs, args.steps, settings)
+    if mode == "train":
+        return row | training(*measure, args.preset, list(args.learner))
+    row |= {"robot": args.robot, "devices": args.devices}
+    if mode == "windows":
+        return row | windows(args.robot, *measure)
+    return row | simulation(args.robot, *measure, part=mode, devices=args.devices)
 
 
 if __name__ == "__main__":

@@ -60,11 +60,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(config_io.to_yaml(config), end="")
         return 0
     # Heavy: after the config has been checked.
-    from train.runs.processes import join_processes
+    from train.runs.processes import one_for_each_gpu
     from train.runs.run import train_run
 
-    join_processes()
-    _, _, stopped_by = train_run(config, SafeConsole(), resume_from=arguments.checkpoint)
+    command = [sys.executable, "-m", "train", *(sys.argv[1:] if argv is None else argv)]
+    with one_for_each_gpu(config.run.devices, command):
+        _, _, stopped_by = train_run(config, SafeConsole(), resume_from=arguments.checkpoint)
     return 128 + stopped_by if stopped_by else 0
 
 

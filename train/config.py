@@ -206,7 +206,7 @@ class RunConfig(Settings):
     seed: Seed = 0
     """The one seed of networks, environments and sampling."""
     devices: AtLeastOne = 1
-    """Devices of this machine that share the environments and the minibatches; ppo only."""
+    """Devices that share the environments and the minibatches, each GPU in a process of its own; ppo only."""
     num_timesteps: AtLeastOne = 20_000_000
     """Environment steps to train for, rounded up to whole updates."""
     log_every_steps: AtLeastOne = 100_000

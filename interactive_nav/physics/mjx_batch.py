@@ -51,7 +51,7 @@ class MjxPhysics(Physics):
         """That can be awake at a time."""
         self.contacts_per_env, self.constraints_per_env = config.contacts_per_env, config.constraints_per_env
         self._host = self._host_model()
-        self._model = uncommitted(mjx.put_model(self._host, impl=self.name))
+        self._model = uncommitted(mjx.put_model(self._host, impl=self.name, device=jax.local_devices()[0]))
         layout = self.window.layout
         self._sensors = layout.force_sensors[:, None] + np.arange(3)
         self._config = config

@@ -34,7 +34,7 @@ class WarpRenderer(BoxRenderer):
         keep_collector_out()
         self.lens, self.tables = lens, tables
         self._host = _box_model(tables.num_boxes, lens)
-        self._model = uncommitted(mjx.put_model(self._host, impl="warp"))
+        self._model = uncommitted(mjx.put_model(self._host, impl="warp", device=jax.local_devices()[0]))
         self._contexts: dict[int, object] = {}
 
     def through(self, lens):
@@ -129,7 +129,7 @@ class WarpColour:
         model = copy.copy(model)
         model.cam_fovy[:] = lens.fov_deg
         self._host, self._lens = model, lens
-        self._model = uncommitted(mjx.put_model(model, impl="warp"))
+        self._model = uncommitted(mjx.put_model(model, impl="warp", device=jax.local_devices()[0]))
         self._context = mjx.create_render_context(
             model,
             nworld=n,

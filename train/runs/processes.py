@@ -1,6 +1,10 @@
 """Train one policy in several processes, joined by JAX: process 0 keeps the run folder, all stop together."""
 
+import contextlib
 import os
+import socket
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -9,21 +13,81 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from interactive_nav.task.wrappers import start_distributed
-from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.errors import ConfigError, UserError
 from train.learners.learner import Callbacks, Snapshot, Update
 from train.runs.checkpoint import megabytes
+from train.sweep.scheduler import find_gpus
+
+ADDRESS, COUNT, INDEX = "JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
+FAILED, ANEW = -2, -1
+"""What process 0 sends in place of the steps of a checkpoint."""
 
 
 def join_processes() -> None:
     """Join the processes that the environment names, before anything else uses JAX; do nothing where it names none."""
-    names = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
-    address, *numbers = (os.environ.get(name, "") for name in names)
+    address, *numbers = (os.environ.get(name, "") for name in (ADDRESS, COUNT, INDEX))
     if not address:
         return
     if not all(number.isdigit() for number in numbers):
-        raise ConfigError(f"{names[0]} is set, expected whole numbers in {names[1]} and {names[2]} too")
+        raise ConfigError(f"{ADDRESS} is set, expected whole numbers in {COUNT} and {INDEX} too")
     jax.config.update("jax_enable_preemption_service", False)  # it would take SIGTERM, at which a run saves
     start_distributed(address, int(numbers[0]), int(numbers[1]))
+
+
+@contextlib.contextmanager
+def one_for_each_gpu(devices: int, command: Sequence[str]) -> Iterator[None]:
+    """Join the processes that the environment names; where it names none, start one for each of several GPUs.
+
+    One process would wait for itself: MJX-Warp's calls hold Python's lock. The others run the same `command`, and end
+    with the block.
+    """
+    gpus = [] if devices == 1 or os.environ.get(ADDRESS) else find_gpus()[:devices]
+    if len(gpus) < devices or devices == 1:
+        join_processes()
+        yield
+        return
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        names = {ADDRESS: f"127.0.0.1:{probe.getsockname()[1]}", COUNT: str(devices)}
+    each = [{**names, INDEX: str(i), "CUDA_VISIBLE_DEVICES": gpu.name} for i, gpu in enumerate(gpus)]
+    others = [subprocess.Popen(command, env={**os.environ, **variables}) for variables in each[1:]]
+    os.environ.update(each[0])
+    try:
+        join_processes()
+        yield
+    except KeyboardInterrupt:
+        # The others are interrupted too, and JAX would wait for them at the end.
+        for other in others:
+            other.kill()
+        os._exit(130)
+    finally:
+        jax.distributed.shutdown()  # at which all wait for each other
+        for other in others:
+            other.wait()
+
+
+@contextlib.contextmanager
+def beginning() -> Iterator[Callable[[], None]]:
+    """Yield what each process calls once when it is ready to train; where one fails before, all end."""
+    called = False
+
+    def ready(fine: bool = True) -> None:
+        nonlocal called
+        called = True
+        if jax.process_count() > 1 and not multihost_utils.process_allgather(np.int32(fine)).all() and fine:
+            raise another_failed()
+
+    try:
+        yield ready
+    except UserError:
+        if not called:
+            ready(False)
+        raise
+
+
+def another_failed() -> BaseException:
+    """Return what ends a process where another could not go on, which has said why."""
+    return SystemExit(2) if jax.process_index() else ConfigError("another process could not begin; it says why above")
 
 
 class Together:
@@ -35,10 +99,17 @@ class Together:
 
     def restore(self, template: Snapshot) -> Snapshot | None:
         """Return what process 0 restores, as all processes do."""
-        mine = self.folder.restore(template) if self.folder else None
-        steps, whole = -1 if mine is None else mine.env_steps, mine is not None and mine.env_state is not None
+        failure, mine = None, None
+        try:
+            mine = self.folder.restore(template) if self.folder else None
+        except UserError as error:
+            failure = error
+        steps = FAILED if failure else ANEW if mine is None else mine.env_steps
+        whole = mine is not None and mine.env_state is not None
         steps, whole = multihost_utils.broadcast_one_to_all((np.int64(steps), np.int64(whole)))
-        if steps < 0:
+        if steps == FAILED:
+            raise failure or another_failed()
+        if steps == ANEW:
             return None
         parts = (template.learner, template.env_state if whole else None)
         # Values of other processes count for nothing: process 0 sends its own.

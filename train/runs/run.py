@@ -256,26 +256,28 @@ def train_run(
     if config.run.wandb:
         tracking.import_wandb()
     folder = RunFolder(Path(config.run.out_dir) / config.run.name)
-    if jax.process_index():
-        env = build_env(config.env)
-        config = resolve(config, env.backend)
-        with stop_signals() as stops:
-            callbacks = processes.Together(None, stops, config.run.env_state_limit_mb)
-            return learn(env, config, callbacks), folder, stops[0] if stops else None
-    claim(folder.path)
-    try:
-        devices_here(config.run.devices)  # before tables are computed
-        env = build_env(config.env)
-        config = resolve(config, env.backend)
-    except UserError:
-        # Nothing half-built stays behind: `rmdir` takes only empty folders.
-        with contextlib.suppress(OSError):
-            folder.path.rmdir()
-            folder.path.parent.rmdir()
-        raise
-    busy = f"{folder.path}: {{holder}} trains this run; wait until it ends, or set run.name to begin another run"
-    with locked(folder.lock, busy):
-        return _train_in(folder, config, env, console, resume_from)
+    with processes.beginning() as ready:
+        if jax.process_index():
+            env = build_env(config.env)
+            config = resolve(config, env.backend)
+            ready()
+            with stop_signals() as stops:
+                callbacks = processes.Together(None, stops, config.run.env_state_limit_mb)
+                return learn(env, config, callbacks), folder, stops[0] if stops else None
+        claim(folder.path)
+        try:
+            devices_here(config.run.devices)  # before tables are computed
+            env = build_env(config.env)
+            config = resolve(config, env.backend)
+        except UserError:
+            # Nothing half-built stays behind: `rmdir` takes only empty folders.
+            with contextlib.suppress(OSError):
+                folder.path.rmdir()
+                folder.path.parent.rmdir()
+            raise
+        busy = f"{folder.path}: {{holder}} trains this run; wait until it ends, or set run.name to begin another run"
+        with locked(folder.lock, busy):
+            return _train_in(folder, config, env, console, resume_from, ready)
 
 
 def devices_here(number: int) -> list[Any]:
@@ -292,10 +294,11 @@ def devices_here(number: int) -> list[Any]:
 
 
 def _train_in(
-    folder: RunFolder, config: TrainConfig, env: Any, console: Console, resume_from: str
+    folder: RunFolder, config: TrainConfig, env: Any, console: Console, resume_from: str, ready: Callable[[], None]
 ) -> tuple[TrainResult, RunFolder, int | None]:
     """Train in a folder that nobody else writes to."""
     exists, devices = folder.open(config), devices_here(config.run.devices)
+    ready()
     console.print(
         f"{folder.path}: {'continuing' if exists else 'training'} {config.algorithm} on {config.env.robot}, "
         f"{len(config.env.scenes)} scene(s), backend {env.backend}, {num_envs(config)} environments"

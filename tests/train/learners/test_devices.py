@@ -4,9 +4,10 @@ import dataclasses
 import functools
 import os
 import re
-import socket
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,9 @@ from tests.train.toy_run import build_toy, toy_config
 from train.config import SACConfig, TrainConfig, validate
 from train.learners import ppo
 from train.learners.algorithms import ALGORITHMS
-from train.runs.processes import join_processes
+from train.runs import processes
 from train.runs.run import train_run
+from train.sweep.scheduler import Gpu
 
 ROOT = Path(__file__).parents[3]
 DEVICES = 2
@@ -80,11 +82,14 @@ def checkpoints_continue(folder: Path) -> None:
         same(result.snapshot.learner, expected.learner)
 
 
-def train_toy(folder: Path, updates: int) -> None:
-    """Train on all devices of the processes that the environment names, and save what was learned."""
-    join_processes()
-    result, _, _ = train_run(toy_config(folder, updates, devices=DEVICES), Console(), build_env=build_toy)
-    if jax.process_index() == 0:
+def train_toy(folder: Path, updates: int, gpus: int = 0, seed: int = 0) -> None:
+    """Train on all devices of this process, or of one for each of so many GPUs, and save what was learned."""
+    processes.find_gpus = lambda: [Gpu(str(i), 80.0) for i in range(gpus)]
+    with processes.one_for_each_gpu(DEVICES, sys.orig_argv):
+        config = toy_config(folder, updates, devices=DEVICES)
+        config = dataclasses.replace(config, run=dataclasses.replace(config.run, seed=seed))
+        result, _, _ = train_run(config, Console(), build_env=build_toy)
+    if os.environ.get(processes.INDEX, "0") == "0":
         np.savez(folder / "learned.npz", *map(np.asarray, jax.tree.leaves(result.snapshot.learner)))
 
 
@@ -108,22 +113,41 @@ def in_two_devices(call: str) -> None:
 
 @pytest.mark.heavy
 def test_two_processes_learn_as_one_and_one_continues_their_run(tmp_path):
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{probe.getsockname()[1]}"
     one, two = tmp_path / "one", tmp_path / "two"
-    names = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": "2"}
-    call = f"train_toy(t.Path({str(two)!r}), 3)"
-    started = [start(call, 1, **names, JAX_PROCESS_ID=str(i)) for i in range(2)]
-    printed = [process.communicate(timeout=300) for process in started]
-    assert [process.returncode for process in started] == [0, 0], printed
-    assert "done at 768 steps" in printed[0][0] and "steps" not in printed[1][0]
+    process = start(f"train_toy(t.Path({str(two)!r}), 3, gpus=2)", 1)
+    printed, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors[-3000:]
+    assert printed.count("done at 768 steps") == 1
     for updates in (3, 5):  # 5: each goes on from its checkpoint
         in_two_devices(f"train_toy(t.Path({str(one)!r}), {updates})")
         if updates == 5:
             in_two_devices(f"train_toy(t.Path({str(two)!r}), 5)")
         mine, theirs = (np.load(folder / "learned.npz") for folder in (one, two))
         same(dict(mine), dict(theirs))
+
+
+@pytest.mark.heavy
+def test_a_signal_to_one_of_two_processes_stops_both_and_an_error_of_one_ends_both(tmp_path):
+    call = f"train_toy(t.Path({str(tmp_path)!r}), 100_000, gpus=2)"
+    process = start(call, 1)
+    metrics = next_file(tmp_path, "metrics.jsonl", process)
+    process.send_signal(signal.SIGTERM)
+    printed, errors = process.communicate(timeout=120)
+    assert process.returncode == 0 and "stopped at" in printed, errors[-3000:]
+    assert list(metrics.parent.glob("checkpoints/*"))
+    process = start(call.replace("gpus=2", "gpus=2, seed=7"), 1)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 1 and "has run.seed = 0, this one 7" in errors
+    assert "Check failure" not in errors and "another process" not in errors
+
+
+def next_file(folder: Path, name: str, process: subprocess.Popen[str]) -> Path:
+    """Return a file with something in it, once the process has written it."""
+    while process.poll() is None:
+        if paths := [path for path in folder.rglob(name) if path.stat().st_size]:
+            return paths[0]
+        time.sleep(0.2)
+    raise AssertionError(process.communicate())
 
 
 @pytest.mark.heavy
