@@ -37,11 +37,11 @@ from interactive_nav.types import FAILURES
 from interactive_nav_common.commands import Command, option, parse
 from interactive_nav_common.config import AtLeastOne
 from interactive_nav_common.errors import reports_errors
+from interactive_nav_common.jobs.gpus import gpu_listing
 from interactive_nav_common.versions import commit, package_versions
 from train import config_io
 from train.runs.processes import one_for_each_gpu
 from train.runs.run import train_run
-from train.sweep.scheduler import gpu_listing
 
 RESULTS = Path("benchmarks/results")
 SCENE = "scenes_mjcf/apartment_0"

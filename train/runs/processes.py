@@ -14,9 +14,9 @@ from jax.experimental import multihost_utils
 
 from interactive_nav.task.wrappers import start_distributed
 from interactive_nav_common.errors import ConfigError, UserError
+from interactive_nav_common.jobs.gpus import find_gpus
 from train.learners.learner import Callbacks, Snapshot, Update
 from train.runs.checkpoint import megabytes
-from train.sweep.scheduler import find_gpus
 
 ADDRESS, COUNT, INDEX = "JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
 FAILED, ANEW = -2, -1

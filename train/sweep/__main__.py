@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from interactive_nav_common.commands import Command, Flag, Repeated, option, parse, word
 from interactive_nav_common.config import Bounds, Positive, refuse_unused, settings_help
 from interactive_nav_common.errors import ConfigError, reports_errors
+from interactive_nav_common.jobs.gpus import find_gpus
 from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.signals import stop_signals
 from train.config_io import preset_names
@@ -16,7 +17,7 @@ from train.runs import STEP
 from train.runs.run_folder import claim
 from train.sweep import spec
 from train.sweep.folder import SweepDisplay, SweepFolder, status_table, totals
-from train.sweep.scheduler import PROGRAMS, STAGES, Machine, Programs, Scheduler, find_gpus
+from train.sweep.scheduler import PROGRAMS, STAGES, Machine, Programs, Scheduler
 from train.sweep.spec import SweepConfig
 
 

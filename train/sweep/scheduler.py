@@ -6,13 +6,13 @@ import functools
 import math
 import os
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from interactive_nav_common.config import replace
+from interactive_nav_common.jobs.gpus import Gpu
 from interactive_nav_common.jobs.processes import LOCKED, LOST, Job, Launcher, LocalLauncher, Share, run_jobs
 from train.sweep.folder import RunState, SweepDisplay, SweepFolder, log_tail, words_of_evaluation
 from train.sweep.spec import LaunchConfig
@@ -35,40 +35,6 @@ PROGRAMS: Programs = {"train": ("-m", "train"), "evaluate": ("-m", "train.evalua
 """Stage -> the words of its `python`; tests give others."""
 USABLE = 0.95
 """Part of a GPU's memory that runs may fill: the driver takes some."""
-
-
-class Gpu(NamedTuple):
-    """One GPU."""
-
-    name: str
-    """As CUDA_VISIBLE_DEVICES takes it: an index or a UUID."""
-    memory_gb: float
-
-
-def find_gpus() -> list[Gpu]:
-    """Return the NVIDIA GPUs that this process may use."""
-    return parse_gpus(gpu_listing("index,uuid,memory.total"), os.environ.get("CUDA_VISIBLE_DEVICES"))
-
-
-def gpu_listing(fields: str) -> str:
-    """Return nvidia-smi's line for each NVIDIA GPU; nothing where there are none."""
-    query = ["nvidia-smi", f"--query-gpu={fields}", "--format=csv,noheader,nounits"]
-    try:
-        done = subprocess.run(query, capture_output=True, text=True, timeout=60)
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return done.stdout if done.returncode == 0 else ""
-
-
-def parse_gpus(listing: str, visible: str | None) -> list[Gpu]:
-    """Return the GPUs of nvidia-smi's `index, uuid, MiB` lines that CUDA_VISIBLE_DEVICES (None: unset) leaves."""
-    gpus: dict[str, Gpu] = {}
-    for line in listing.splitlines():
-        fields = [field.strip() for field in line.split(",")]
-        if len(fields) == 3 and fields[2].isdecimal():
-            gpus |= {name: Gpu(name, int(fields[2]) * 2**20 / 1e9) for name in fields[:2]}
-    names = [n for n in gpus if n.isdecimal()] if visible is None else [n.strip() for n in visible.split(",")]
-    return [gpus[name] for name in names if name in gpus]
 
 
 class Machine(LocalLauncher):

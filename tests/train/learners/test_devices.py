@@ -18,6 +18,7 @@ from rich.console import Console
 
 from interactive_nav.task.wrappers import ShardedEnv
 from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.jobs.gpus import Gpu
 from tests.train.learners.test_ppo import Recorder, copy_snapshot, make_config
 from tests.train.runs.test_run import quiet
 from tests.train.toy_env import batched
@@ -28,7 +29,6 @@ from train.learners import ppo
 from train.learners.algorithms import ALGORITHMS
 from train.runs import processes
 from train.runs.run import train_run
-from train.sweep.scheduler import Gpu
 
 ROOT = Path(__file__).parents[3]
 DEVICES = 2

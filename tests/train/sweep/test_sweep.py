@@ -21,10 +21,11 @@ from rich.console import Console
 
 from interactive_nav_common.files import is_locked, take_lock
 from interactive_nav_common.jobs import processes as jobs
+from interactive_nav_common.jobs.gpus import Gpu, find_gpus, parse_gpus
 from train.sweep import spec
 from train.sweep.__main__ import main
 from train.sweep.folder import RunState, SweepDisplay, SweepFolder, last_line, totals
-from train.sweep.scheduler import Gpu, Machine, Outcome, RunJob, Scheduler, find_gpus, parse_gpus
+from train.sweep.scheduler import Machine, Outcome, RunJob, Scheduler
 from train.sweep.spec import LaunchConfig
 
 FAKE = {stage: ("-m", "tests.train.sweep.fake", stage) for stage in ("train", "evaluate")}
