@@ -5,6 +5,7 @@ whatever turn. Gaps are planar and never larger than the true ones: the largest 
 the boxes' shadows and between their centres (separating axes).
 """
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -52,23 +53,22 @@ class Boxes:
     centre: Array
     """[M, 2] m"""
     axes: Array
-    """[M, 2, 3] planar parts of the box's three unit axes."""
+    """[M, 2, 3] planar parts of the box's three unit axes, or of the two that are not vertical."""
     half: Array
-    """[M, 3] half sizes, m"""
+    """[M, 3] half sizes along these, m"""
 
     def gap_m(self, centre: Array, axes: Array, half: Array) -> Array:
         """Return [..., M] m from each box to one other, whose `half` is 0 for a point; at most 0 where they overlap."""
         xp = namespace(self.centre, centre)
-        between = self.centre - centre[..., None, :]
-        mine, others = xp.broadcast_arrays(self.axes, axes[..., None, :, :])
-        edges = xp.concatenate([mine, others], -1)
-        across = xp.stack([-edges[..., 1, :], edges[..., 0, :]], -2)
-        ways = xp.concatenate([between[..., None], across], -1)
-        ways = ways / xp.maximum(xp.linalg.norm(ways, axis=-2, keepdims=True), 1e-6)
-        apart = xp.abs(xp.einsum("...pw,...p->...w", ways, between))
-        ours = xp.einsum("...wa,...a->...w", xp.abs(xp.einsum("...pw,...pa->...wa", ways, mine)), self.half)
-        theirs = (xp.abs(xp.einsum("...pw,...pa->...wa", ways, others)) * half[..., None, None, :]).sum(-1)
-        return (apart - ours - theirs).max(-1)
+        x_m, y_m = (self.centre[..., i] - centre[..., i, None] for i in range(2))
+        mine = [(*(self.axes[..., i, k] for i in range(2)), self.half[..., k]) for k in range(self.axes.shape[-1])]
+        mine += [(*(axes[..., i, k, None] for i in range(2)), half[..., k, None]) for k in range(axes.shape[-1])]
+        gaps = []
+        for x, y in ((x_m, y_m), *((-y, x) for x, y, _ in mine)):
+            sizes = (xp.abs(x * side_x + y * side_y) * size for side_x, side_y, size in mine)
+            gaps.append((xp.abs(x * x_m + y * y_m) - sum(sizes)) / xp.maximum(xp.sqrt(x * x + y * y), 1e-6))
+        # Nothing is less than 0 away from what is upright: its third axis, whose shadow is a point, parts nothing.
+        return functools.reduce(xp.maximum, gaps, 0.0 if min(self.axes.shape[-1], axes.shape[-1]) < 3 else -xp.inf)
 
 
 class Nearness:
@@ -82,9 +82,14 @@ class Nearness:
         self._robot = layout.robot_qpos + np.arange(2)
         self._moving = np.where(self.held, _COASTING_M_S, MOVING_M_S)
         (offset, half), arm = _bounds(slots), slots.anchor_b_m
-        swung, arm, axis = ((slots.axes_w @ v[..., None])[..., 0] for v in (offset - arm, arm, slots.axis_b))
-        offset, anchor = np.where(self.held[:, None], swung, offset), slots.pos_w_m + arm
-        self._tables = tuple(t.astype(np.float32) for t in (offset, half, slots.axes_w, anchor, axis))
+        # A hinge's angle turns the box's axes, and the way to its centre: a part stays, two go with cosine and sine.
+        turned = np.concatenate([slots.axes_w, slots.axes_w @ (offset - arm)[..., None]], -1)
+        anchor, axis = (slots.axes_w @ v[..., None] for v in (arm, slots.axis_b))
+        stays = np.where(self._slides[..., None], turned, axis * (axis * turned).sum(-2, keepdims=True))
+        parts = [stays, turned - stays, np.where(self._slides[..., None], 0.0, np.cross(axis, turned, axis=-2))]
+        parts[0][..., 3:] += slots.pos_w_m[..., None] + anchor
+        tables = (offset, half, *(part[..., :2, :] for part in parts), (axis[..., 0] * self._slides)[..., :2])
+        self._tables = tuple(t.astype(np.float32) for t in tables)
         walls = slots.boxes_b[:, slots.box_slot == layout.num_slots]
         axes = matrix_from_quat(walls[..., 3:7])[..., :2, :2]
         self._walls = tuple(t.astype(np.float32) for t in (walls[..., :2], axes, walls[..., 7:9], walls[..., 7] > 0))
@@ -92,32 +97,27 @@ class Nearness:
     def boxes(self, scene: Array, state: PhysicsState) -> Boxes:
         """Return those of all slots of one environment, or, in NumPy, of many of one scene."""
         xp = namespace(state.qpos)
-        offset, half, frame, anchor, axis = (xp.asarray(t)[scene] for t in self._tables)
+        offset, half, stays, cosine, sine, slide = (xp.asarray(t)[scene] for t in self._tables)
         qpos = state.qpos[..., self._qpos]
-        angle = qpos[..., :1]
-        if self._slides.any():
-            anchor = anchor + xp.where(self._slides, angle, 0.0) * axis
-            angle = xp.where(self._slides, 0.0, angle)
-        turn = matrix_from_quat(xp.concatenate([xp.cos(angle / 2), xp.sin(angle / 2) * axis], -1))
-        hung = anchor + xp.einsum("...mij,mj->...mi", turn, offset)
-        quat = qpos[..., 3:]
-        free = matrix_from_quat(quat / xp.maximum(xp.linalg.norm(quat, axis=-1, keepdims=True), 1e-6))
-        placed = qpos[..., :3] + xp.einsum("...mij,mj->...mi", free, offset)
-        held = xp.asarray(self.held)
-        axes = xp.where(held[:, None, None], turn @ frame, free)
-        centre = xp.where(held[:, None], hung, placed)
-        return Boxes(centre[..., :2], axes[..., :2, :], half)
+        angle, quat = qpos[..., :1], qpos[..., 3:]
+        turned = stays + xp.cos(angle)[..., None] * cosine + xp.sin(angle)[..., None] * sine
+        quat = quat / xp.maximum(xp.linalg.norm(quat, axis=-1, keepdims=True), 1e-6)
+        free, held = matrix_from_quat(quat)[..., :2, :], xp.asarray(self.held)[:, None]
+        placed = qpos[..., :2] + sum(free[..., k] * offset[..., k, None] for k in range(3))
+        centre = xp.where(held, turned[..., 3] + angle * slide, placed)
+        return Boxes(centre, xp.where(held[..., None], turned[..., :3], free), half)
 
     def _walls_gap_m(self, scene: Array, state: PhysicsState, reach_m: float, boxes: Boxes, push_m: Array) -> Array:
         """Return [..., W] m to where walls are met: within `reach_m` of the robot, or `TOUCH_M` of what it may push."""
         xp = namespace(state.qpos)
         xpos, xmat, half, used = (xp.asarray(t)[scene] for t in self._walls)
-        offset = xp.einsum("...wi,wij->...wj", state.qpos[..., None, self._robot] - xpos, xmat)
+        away = state.qpos[..., None, self._robot] - xpos
+        offset = sum(away[..., k, None] * xmat[..., k, :] for k in range(2))
         outside = xp.maximum(xp.abs(offset) - half, 0.0)
         gap = xp.where(used > 0, xp.linalg.norm(outside, axis=-1), FAR_M) - reach_m
-        walls = Boxes(xpos, xp.pad(xmat, ((0, 0), (0, 0), (0, 1))), xp.pad(half, ((0, 0), (0, 1))))
-        nearest = xp.argsort(push_m)
-        for k in range(min(_PUSHED, push_m.shape[-1])):
+        walls, count = Boxes(xpos, xmat, half), min(_PUSHED, push_m.shape[-1])
+        nearest = np.argsort(push_m) if xp is np else jax.lax.top_k(-push_m, count)[1]
+        for k in range(count):
             one = nearest[..., k]
             at = (np.arange(len(one)), one) if one.ndim else one
             if xp is np and (push_m[at] >= 0).all():
@@ -133,7 +133,7 @@ class Nearness:
         to where each wall can be met, see `_walls_gap_m`.
         """
         boxes, occupied = self.boxes(scene, state), jnp.asarray(self.world.slots.occupied)[scene]
-        gap = boxes.gap_m(state.qpos[self._robot], jnp.eye(2, 3), jnp.zeros(3)) - reach_m
+        gap = boxes.gap_m(state.qpos[self._robot], jnp.eye(2), jnp.zeros(2)) - reach_m
         speed = jnp.where(occupied, jnp.abs(state.qvel[self._qvel]).max(-1), 0.0)
         turning = jnp.abs(state.qacc_warmstart[self._qvel]).max(-1) > jnp.where(self.held, jnp.inf, _TIPPING_M_S2)
         moving = (speed > self._moving) | (turning & occupied)
@@ -146,7 +146,8 @@ class Nearness:
             behind = jnp.where(moving[one], behind, FAR_M)
             gap, push = jnp.minimum(gap, behind), jnp.minimum(push, behind)
         walls = self._walls_gap_m(scene, state, reach_m, boxes, jnp.where(occupied, push, FAR_M))
-        return jnp.where(occupied, gap, FAR_M), moving, walls
+        # XLA would measure again in each kernel that reads the result.
+        return jax.lax.optimization_barrier((jnp.where(occupied, gap, FAR_M), moving, walls))
 
     def counts(self, reach_m: float) -> dict[str, np.ndarray]:
         """Return [P] how many of each kind of slot, and of walls, are near at rest, the robot and the small objects
@@ -164,7 +165,7 @@ class Nearness:
                 qpos[:, self._robot], qpos[:, self._qpos[small, :2]] = places[:, 0], places[:, 1:]
                 state = PhysicsState(qpos, np.zeros(0), np.zeros(0))
                 boxes = self.boxes(scene, state)
-                gap = np.where(world.slots.occupied[scene], boxes.gap_m(places[:, 0], np.eye(2, 3), np.zeros(3)), FAR_M)
+                gap = np.where(world.slots.occupied[scene], boxes.gap_m(places[:, 0], np.eye(2), np.zeros(2)), FAR_M)
                 walls = self._walls_gap_m(scene, state, reach_m, boxes, gap - reach_m + (REACH_M - _PUSH_M)) < 0
                 for kind, values in counts.items():
                     values.append((walls if kind == "walls" else (gap < reach_m)[:, kinds == kind]).sum(-1))

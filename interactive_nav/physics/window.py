@@ -48,8 +48,9 @@ _HIDDEN = {
     "geom_aabb": np.array([0, 0, 0, 1e-3, 1e-3, 1e-3]),
 }
 """Padding boxes: too small to be met, at the body's centre of mass."""
+_POSE = ("xpos", "xmat")
+_Owners = list[tuple[np.ndarray, np.ndarray, np.ndarray]]
 _A_GEOM = mujoco.mjtObj.mjOBJ_GEOM
-_WALL = ("geom_size", "geom_pos", "geom_quat", "geom_rbound", "geom_aabb")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,12 +62,6 @@ class _Group:
     width: int
     first: int
     """Of the window's slots."""
-    tables: dict[str, jax.Array]
-    """Field -> [scenes, m, ...] values of the slot's body, boxes, joint or degrees of freedom."""
-    rows: dict[str, np.ndarray]
-    """Field -> [width, ...] rows of the window's model that they fill."""
-    outer: dict[str, np.ndarray]
-    """Field -> [m, ...] rows of the world's models."""
 
 
 class PhysicsWindow:
@@ -88,23 +83,18 @@ class PhysicsWindow:
         there = {kind: len(slots) for kind, slots in self._slots.items()} | {"walls": len(layout.wall_geoms)}
         counts = np.bincount(world.slots.box_slot, minlength=layout.num_slots)
         self._boxes = {kind: int(counts[slots].max(initial=0)) for kind, slots in self._slots.items()}
-        self._tables = {kind: self._group_tables(kind) for kind, slots in self._slots.items() if len(slots)}
-        self._wall_tables = self._walls()
         self.room = {kind: min(width or there[kind], there[kind]) for kind, width in self.widths.items()}
         """Kind of slot, and `walls` -> how many there is room for."""
         self.n_walls = self.room["walls"]
-        slots = tuple((kind, self._boxes[kind]) for kind in self._tables for _ in range(self.room[kind]))
+        slots = tuple((kind, self._boxes[kind]) for kind in self._slots for _ in range(self.room[kind]))
         self.spec, self.model, self.layout = build_empty_spec(world.robot, slots, self.n_walls, config)
         self.groups, first = (), 0
-        for kind, (tables, outer) in self._tables.items():
-            width = self.room[kind]
-            rows, _ = _rows(self.model, self.layout, np.arange(first, first + width), self._boxes[kind], kind)
-            self.groups += (_Group(self._slots[kind], width, first, tables, rows, outer),)
-            first += width
-        self._wall_rows = self.layout.wall_geoms
-        self._base = {name: np.asarray(getattr(self.model, name), np.float32) for name in FIELDS}
-        xpos, xmat = _static_poses(self.model)
-        self._xpos, self._xmat = jax.device_put((np.float32(xpos), np.float32(xmat)))
+        for kind, width in self.room.items():
+            if kind != "walls" and width:
+                self.groups += (_Group(self._slots[kind], width, first),)
+                first += width
+        self._tables = self._build_tables()
+        self._owners = _owners(layout, world.models[0]), _owners(self.layout, self.model)
 
     @functools.cached_property
     def needs_at_rest(self) -> dict[str, np.ndarray]:
@@ -122,26 +112,48 @@ class PhysicsWindow:
         need = self.layout.robot_nv + int(np.quantile(dofs, SHARE, method="higher"))
         return -(-(need + 1) // TILE) * TILE - 1
 
-    def _group_tables(self, kind: str) -> tuple[dict[str, jax.Array], dict[str, np.ndarray]]:
-        tables: dict[str, list[np.ndarray]] = {name: [] for name in FIELDS}
-        outer: dict[str, np.ndarray] = {}
+    def _group_tables(self, group: _Group) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Return field -> [width, ...] rows of the window's model; [scenes, m, ...] values of slots to fill them."""
+        kind, tables = self.world.layout.slot_kind[group.slots[0]], {name: [] for name in FIELDS}
         for model in self.world.models:
-            outer, padding = _rows(model, self.world.layout, self._slots[kind], self._boxes[kind], kind)
+            outer, padding = _rows(model, self.world.layout, group.slots, self._boxes[kind], kind)
             hidden = _HIDDEN | {"geom_pos": model.body_ipos[outer["body_ipos"]][:, None]}
             for name, rows in outer.items():
                 values = getattr(model, name)[rows]
                 if name in hidden:
                     values = np.where(padding.reshape(padding.shape + (1,) * (values.ndim - 2)), hidden[name], values)
                 tables[name].append(values)
-        return jax.device_put({name: np.float32(np.stack(values)) for name, values in tables.items()}), outer
+        inner = _rows(self.model, self.layout, group.first + np.arange(group.width), self._boxes[kind], kind)
+        return inner[0], {name: np.stack(values) for name, values in tables.items()}
 
-    def _walls(self) -> dict[str, jax.Array]:
-        world, geoms = self.world, self.world.layout.wall_geoms
-        tables = {name: np.stack([getattr(m, name)[geoms] for m in world.models]) for name in _WALL}
-        poses = [_static_poses(m) for m in world.models]
-        tables["xpos"] = np.stack([xpos[geoms] for xpos, _ in poses])
-        tables["xmat"] = np.stack([xmat[geoms] for _, xmat in poses])
-        return jax.device_put({k: np.float32(v) for k, v in tables.items()})
+    def _build_tables(self) -> list[tuple[np.ndarray, dict[str, jax.Array]]]:
+        """Return all that rows of the window's model can be, so that one gather makes a field.
+
+        A field's table has the rows of each scene's slots and walls, then those of the window's model. [4, rows] tell
+        where the window's are: at `of_scene * scene + first + step * pick[at]`, with what `select` chose in `pick`.
+        """
+        base, *every = [_values(model) for model in (self.model, *self.world.models)]
+        scenes, geoms, walls = len(every), self.world.layout.wall_geoms, (*_GEOM, *_POSE)
+        of_walls = {name: np.stack([values[name][geoms] for values in every]) for name in walls}
+        sources = [(group.first, *self._group_tables(group)) for group in self.groups]
+        sources.append((self.layout.num_slots, dict.fromkeys(walls, self.layout.wall_geoms[:, None]), of_walls))
+        out = []
+        for names in (_BODY, _GEOM, _JOINT, _DOF, _QPOS, _POSE):
+            mine, size = [source for source in sources if names[0] in source[1]], 0
+            place = of_scene, first, step, at = np.zeros((4, len(base[names[0]])), np.int32)
+            for start, rows, values in mine:
+                its = rows[names[0]].reshape(len(rows[names[0]]), -1)
+                first[its], step[its] = size + np.arange(its.shape[1]), its.shape[1]
+                at[its] = start + np.arange(len(its))[:, None]
+                size += values[names[0]].shape[1] * its.shape[1]
+            of_scene[step > 0], first[step == 0] = size, scenes * size + np.flatnonzero(step == 0)
+            tables = {}
+            for name in names:
+                parts = [of[name].reshape(scenes, -1, *base[name].shape[1:]) for _, _, of in mine]
+                rows = np.concatenate(parts, 1).reshape(-1, *base[name].shape[1:]) if parts else base[name][:0]
+                tables[name] = np.float32(np.concatenate([rows, base[name]]))
+            out.append((place, jax.device_put(tables)))
+        return out
 
     def measure(self, scene: jax.Array, state: PhysicsState) -> Measured:
         """Return `Nearness.measure` of one environment's scene, [] i32, and state of the whole world."""
@@ -162,12 +174,12 @@ class PhysicsWindow:
             gap, moves = near[group.slots], moving[group.slots]
             needed = (gap < 0) | moves
             _, index = jax.lax.top_k(-(gap - _MOVING_BONUS_M * moves - _FIRST_M * needed), group.width)
-            missed |= jnp.any(needed.at[index].set(False))
+            missed |= needed.sum() > group.width
             chosen.append(index)
         if self.n_walls == len(walls):
             return tuple(chosen), jnp.arange(self.n_walls), missed.astype(jnp.int32)
         _, index = jax.lax.top_k(-walls, self.n_walls)
-        missed |= jnp.any((walls < 0).at[index].set(False))
+        missed |= (walls < 0).sum() > self.n_walls
         return tuple(chosen), index, missed.astype(jnp.int32)
 
     def needs(self, measured: Measured) -> dict[str, jax.Array]:
@@ -181,60 +193,72 @@ class PhysicsWindow:
         """Return [window slots] bool: what moves, or the robot may already touch; all else rests."""
         near, moving, _ = measured
         awake = moving | (near < AWAKE_M - REACH_M)
-        return jnp.concatenate([awake[jnp.asarray(g.slots)[i]] for g, i in zip(self.groups, chosen, strict=True)])
+        return awake[self._inside(chosen)[:-1]]
 
     def fields(self, scene: jax.Array, chosen: tuple[jax.Array, ...], walls: jax.Array) -> dict[str, jax.Array]:
         """Return values of all `FIELDS` of the window's model, in MuJoCo's shapes."""
-        out = {name: jnp.asarray(value) for name, value in self._base.items()}
-        for group, index in zip(self.groups, chosen, strict=True):
-            for name, rows in group.rows.items():
-                out[name] = out[name].at[rows].set(group.tables[name][scene, index])
-        for name in _WALL:
-            out[name] = out[name].at[self._wall_rows].set(self._wall_tables[name][scene, walls])
+        pick, out = jnp.concatenate([*chosen, walls]), {}
+        for (of_scene, first, step, at), tables in self._tables[:-1]:
+            index = of_scene * scene + first + step * pick[at]
+            out |= {name: table[index] for name, table in tables.items()}
         return out
 
     def static_poses(self, scene: jax.Array, walls: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return world positions [ngeom, 3] and matrices [ngeom, 3, 3] of the geoms, right where these never move."""
-        xpos = self._xpos.at[self._wall_rows].set(self._wall_tables["xpos"][scene, walls])
-        return xpos, self._xmat.at[self._wall_rows].set(self._wall_tables["xmat"][scene, walls])
+        (of_scene, first, step, at), tables = self._tables[-1]
+        index = of_scene * scene + first + step * jnp.pad(walls, (self.layout.num_slots, 0))[at]
+        return tables["xpos"][index], tables["xmat"][index]
 
-    def _addresses(self, chosen: tuple[jax.Array, ...]) -> list[tuple[jax.Array, jax.Array]]:
-        """Return addresses in the window and in the world of the robot and each group: of qpos, then of qvel."""
-        inner, outer, addresses = self.layout, self.world.layout, []
-        for name, field, count in (
-            ("robot_qpos", "qpos0", inner.robot_nq),
-            ("robot_qvel", "dof_damping", inner.robot_nv),
-        ):
-            robot = (jnp.arange(count) + getattr(of, name) for of in (inner, outer))
-            here = [jnp.ravel(group.rows[field]) for group in self.groups]
-            there = [jnp.asarray(group.outer[field])[i].ravel() for group, i in zip(self.groups, chosen, strict=True)]
-            addresses.append(
-                tuple(jnp.concatenate([first, *rest]) for first, rest in zip(robot, (here, there), strict=True))
-            )
-        return addresses
+    def _inside(self, chosen: tuple[jax.Array, ...]) -> jax.Array:
+        """Return the world's slots [window slots + 1] that are in the window; last, for the robot, how many it has."""
+        slots = [jnp.asarray(group.slots)[i] for group, i in zip(self.groups, chosen, strict=True)]
+        return jnp.concatenate([*slots, jnp.asarray([self.world.layout.num_slots])])
+
+    def _places(self, chosen: tuple[jax.Array, ...]) -> jax.Array:
+        """Return where in the window the world's slots and, last, the robot are, [M + 1]; -1 for what is outside."""
+        inside, outside = self._inside(chosen), jnp.full(self.world.layout.num_slots + 1, -1)
+        return outside.at[inside].set(jnp.arange(len(inside)), unique_indices=True)
 
     def enter(self, state: PhysicsState, chosen: tuple[jax.Array, ...]) -> PhysicsState:
         """Return the window's state out of the world's."""
-        (q_in, q_out), (v_in, v_out) = self._addresses(chosen)
-        qpos, still = jnp.zeros(self.model.nq, jnp.float32), jnp.zeros(self.model.nv, jnp.float32)
-        qvel, warm = (still.at[v_in].set(x[v_out]) for x in (state.qvel, state.qacc_warmstart))
-        return PhysicsState(qpos.at[q_in].set(state.qpos[q_out]), qvel, warm)
+        q, v = _addresses(*self._owners, self._inside(chosen))
+        return PhysicsState(state.qpos[q], state.qvel[v], state.qacc_warmstart[v])
 
     def leave(self, state: PhysicsState, inner: PhysicsState, chosen: tuple[jax.Array, ...]) -> PhysicsState:
         """Return the world's new state: what is outside of the window stays, at rest."""
-        (q_in, q_out), (v_in, v_out) = self._addresses(chosen)
-        still = jnp.zeros_like(state.qvel)
-        qvel, warm = (still.at[v_out].set(x[v_in]) for x in (inner.qvel, inner.qacc_warmstart))
-        return PhysicsState(state.qpos.at[q_out].set(inner.qpos[q_in]), qvel, warm)
+        places, (worlds, mine) = self._places(chosen), self._owners
+        (q, v), (has_q, has_v) = _addresses(mine, worlds, places), (places[owner] >= 0 for _, owner, _ in worlds)
+        qvel, warm = (jnp.where(has_v, x[v], 0.0) for x in (inner.qvel, inner.qacc_warmstart))
+        return PhysicsState(jnp.where(has_q, inner.qpos[q], state.qpos), qvel, warm)
 
     def spread_forces(self, forces: jax.Array, chosen: tuple[jax.Array, ...]) -> jax.Array:
         """Spread [..., window slots + 1, 3] forces to [..., world slots + 1, 3], the structure last; 0 elsewhere."""
-        slots = self.world.layout.num_slots
-        out = jnp.zeros((*forces.shape[:-2], slots + 1, 3), forces.dtype)
-        for group, index in zip(self.groups, chosen, strict=True):
-            mine = forces[..., group.first : group.first + group.width, :]
-            out = out.at[..., jnp.asarray(group.slots)[index], :].set(mine)
-        return out.at[..., slots, :].set(forces[..., -1, :])
+        places = self._places(chosen)
+        return jnp.where(places[:, None] >= 0, forces[..., places, :], 0.0)
+
+
+def _values(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """Return all fields, and the world poses that the geoms have in `qpos0`."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    poses = {"xpos": data.geom_xpos.copy(), "xmat": data.geom_xmat.reshape(-1, 3, 3).copy()}
+    return {name: getattr(model, name) for name in FIELDS} | poses
+
+
+def _owners(layout: Layout, model: mujoco.MjModel) -> _Owners:
+    """Return, for qpos and for qvel, where each slot and, last, the robot begins; each number's owner; its offset."""
+    out = []
+    for name, size in (("qpos", model.nq), ("qvel", model.nv)):
+        first, numbers = np.append(getattr(layout, f"slot_{name}"), getattr(layout, f"robot_{name}")), np.arange(size)
+        owner = np.where(first <= numbers[:, None], first, -1).argmax(-1)
+        out.append((first, owner, numbers - first[owner]))
+    return out
+
+
+def _addresses(of: _Owners, to: _Owners, slots: jax.Array) -> tuple[jax.Array, ...]:
+    """Return where in one state's qpos and qvel the numbers of another are, whose owners are these slots of it."""
+    pairs = zip(of, to, strict=True)
+    return tuple(jnp.asarray(first)[slots[owner]] + offset for (first, _, _), (_, owner, offset) in pairs)
 
 
 def _rows(
@@ -252,9 +276,3 @@ def _rows(
     rows |= dict.fromkeys(_JOINT, model.body_jntadr[body])
     rows |= dict.fromkeys(_DOF, layout.slot_qvel[slots][:, None] + np.arange(n_v))
     return rows | dict.fromkeys(_QPOS, layout.slot_qpos[slots][:, None] + np.arange(n_q)), padding
-
-
-def _static_poses(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    return data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
