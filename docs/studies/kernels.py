@@ -4,7 +4,7 @@
 
 Runs `AutoResetEnv.step`, or parts of it, under JAX's profiler, which sees Warp's kernels too, and adds up the device
 time of each kernel. Two parts' difference is what lies between them: `--part simulation` less `observed` is drawing new
-episodes.
+episodes. `--preset NAME` profiles PPO instead: `--part collect` acts for an update, `--part update` learns from it too.
 `busy` is the share of the time between the first and the last kernel in which at least one ran: the rest is launching.
 The kernels' row is appended to `benchmarks/results/kernels.jsonl`.
 """
@@ -14,6 +14,7 @@ from __future__ import annotations
 import collections
 import re
 import tempfile
+import time
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +27,17 @@ from benchmarks.steps_per_second import MODES, append_row, origin, random_drivin
 from docs.studies import command_line
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav_common.errors import ConfigError
+from train import config_io
+from train.config import TrainConfig, resolve
+from train.learners import ppo
+from train.runs.run import build_env, num_envs
 
 PARTS = (
+    ("networks", r"gemm|cudnn|cutlass|nvjet|xmma|implicit_con|fprop|dgrad|wgrad|nchw|nhwc|conv2d|convolve"),
     ("rendering", r"render|bvh"),
     ("solver", r"solve|linesearch|cholesky|gradient|JTDA|update_constraint|zero_qfrc_constraint|mul_m"),
     ("collision", r"broadphase|narrowphase|ccd|collision|contact_match|contact_sort"),
+    ("sleeping", r"sleep|wake|island"),
     ("constraint rows", r"efc|friction_dof|limit_|equality"),
     (
         "smooth dynamics",
@@ -39,7 +46,7 @@ PARTS = (
     ),
     ("copies", r"memcpy|memset|memtile"),
 )
-"""Parts of a step by what their kernels are called; the first that fits. XLA's own fusions are the task's."""
+"""Parts of a step by what their kernels are called; the first that fits. XLA's own fusions are the rest."""
 
 
 def part_of(kernel: str) -> str:
@@ -47,7 +54,7 @@ def part_of(kernel: str) -> str:
     for part, pattern in PARTS:
         if re.search(pattern, kernel, re.IGNORECASE):
             return part
-    return "task, observation, window (XLA)"
+    return "task, observation, window, learner (XLA)"
 
 
 def plain_name(kernel: str) -> str:
@@ -89,16 +96,40 @@ def device_events(folder: Path) -> list[tuple[str, float, float]]:
     return found
 
 
-def profile(env: Any, num_envs: int, steps: int, part: str = "simulation") -> dict[str, Any]:
-    """Device time of `steps` environment steps by kernel; `part` as in `benchmarks.steps_per_second`."""
+def stepping(env: Any, num_envs: int, steps: int, part: str) -> tuple[Any, Any]:
+    """A program of `steps` environment steps of random driving, (state, key) to (state, _), and its first state."""
     batch = AutoResetEnv(env)
     step = step_of(env, part, num_envs, batch)
-
-    state = jax.jit(batch.reset)(jax.random.split(jax.random.PRNGKey(0), num_envs))
     drive = random_driving(lambda state, action: (step(state, action), None), (num_envs, env.action_size), steps)
-    program = jax.jit(drive)
+    return drive, jax.jit(batch.reset)(jax.random.split(jax.random.PRNGKey(0), num_envs))
+
+
+def learning(config: TrainConfig, part: str) -> tuple[Any, Any, int, int]:
+    """A program of one update of PPO, or of acting for one, its first state, environments, and steps of each."""
+    env: Any = build_env(config.env)
+    config, env = resolve(config, env.backend), AutoResetEnv(env)
+    agent = ppo.make_agent(env, config)
+
+    def program(state: Any, key: jax.Array) -> tuple[Any, Any]:
+        learner, env_state = state
+        if part == "collect":
+            env_state, data, _ = ppo.collect(agent, env, learner, env_state, key)
+            return (learner, env_state), data
+        learner, env_state, done = ppo.update(agent, env, learner, env_state)
+        return (learner, env_state), done.losses
+
+    first = ppo.start(agent, env, seed=0)
+    return program, (first.learner, first.env_state), num_envs(config), agent.steps_per_update // num_envs(config)
+
+
+def profile(program: Any, state: Any, num_envs: int, steps: int) -> dict[str, Any]:
+    """Device time by kernel of a program that takes `steps` steps in each environment: (state, key) to (state, _)."""
+    program = jax.jit(program)
     for i in range(3):
         state, _ = jax.block_until_ready(program(state, jax.random.PRNGKey(i)))
+    began = time.perf_counter()
+    state, _ = jax.block_until_ready(program(state, jax.random.PRNGKey(8)))
+    wall_s = time.perf_counter() - began
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):
             jax.block_until_ready(program(state, jax.random.PRNGKey(9)))
@@ -115,6 +146,7 @@ def profile(env: Any, num_envs: int, steps: int, part: str = "simulation") -> di
     return {
         "num_envs": num_envs,
         "steps": steps,
+        "wall_ms_per_step": round(wall_s / steps * 1e3, 3),
         "device_ms_per_step": round(total / steps / 1e6, 3),
         "launches_per_step": round(sum(launched.values()) / steps, 1),
         "busy": round(busy_share([(begin, end) for _, begin, end in events]), 4),
@@ -130,13 +162,24 @@ def main(argv: list[str] | None = None) -> int:
     """Measures, prints and appends a row."""
     parser = command_line(__doc__, "kernels", settings=True)
     parser.add_argument("--num-envs", type=int, default=8192)
-    parser.add_argument("--part", choices=MODES[:-1], default="simulation")
+    parser.add_argument("--part", choices=(*MODES[:-2], "collect", "update"), default="simulation")
     parser.add_argument("--steps", type=int, default=4, help="environment steps under the profiler")
+    parser.add_argument("--preset", help="of `python -m train`, for `collect` and `update`: its scenes and sizes")
+    parser.add_argument("--learner", nargs="*", default=[], metavar="KEY=VALUE", help="laid over the preset")
     args = parser.parse_args(argv)
-    settings = dict(args.settings)
-    env = interactive_nav.make(args.robot, args.scenes, backend="warp", **settings)
-    row: dict[str, Any] = {"robot": args.robot, "scenes": args.scenes, "settings": settings, "part": args.part}
-    row |= profile(env, args.num_envs, args.steps, args.part) | origin(args.commit)
+    if (args.part in ("collect", "update")) != bool(args.preset):
+        parser.error("--part collect and update need a --preset, and only they take one")
+    row: dict[str, Any] = {"part": args.part}
+    if args.preset:
+        config = config_io.load_config(args.preset, args.learner)
+        row |= {"preset": args.preset, "learner": args.learner, "scenes": list(config.env.scenes)}
+        row |= profile(*learning(config, args.part))
+    else:
+        settings = dict(args.settings)
+        row |= {"robot": args.robot, "scenes": args.scenes, "settings": settings}
+        env = interactive_nav.make(args.robot, args.scenes, backend="warp", **settings)
+        row |= profile(*stepping(env, args.num_envs, args.steps, args.part), args.num_envs, args.steps)
+    row |= origin(args.commit)
     append_row(args.out, row, hidden=None)
     console = Console(width=120)
     table = Table("kernel", "part", "ms a step", "launches a step", title=f"{row['device_ms_per_step']} ms a step")
