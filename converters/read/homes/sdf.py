@@ -342,7 +342,7 @@ class _Reader:
             x, y = np.maximum(urdf.numbers(size, (1.0, 1.0)), 1e-3) / 2
             a, b, c = urdf.numbers(shape.findtext("normal"), (0.0, 0.0, 1.0))
             axis, angle = (-b, a, 0.0) if a or b else (1.0, 0.0, 0.0), math.atan2(math.hypot(a, b), c)
-            turn = trimesh.transformations.rotation_matrix(angle, axis)
+            turn = np.asarray(trimesh.transformations.rotation_matrix(angle, axis))
             return urdf.placed(urdf.rectangle(x, y), turn)
         return urdf.primitive(path, shape.tag, shape.findtext)
 

@@ -173,7 +173,8 @@ class DrawnModels:
             )
             group = np.tile(group, 2)
         pitch, roll = number(element, "pitch", 0.0), number(element, "roll", 0.0)
-        tilt = trimesh.transformations.rotation_matrix(-pitch if pitch else -roll, [1, 0, 0] if pitch else [0, 0, 1])
+        axis = [1, 0, 0] if pitch else [0, 0, 1]
+        tilt = np.asarray(trimesh.transformations.rotation_matrix(-pitch if pitch else -roll, axis))
         tilt[:3, :3] = Y_UP_TO_Z_UP @ tilt[:3, :3]
         mesh = placed(mesh, tilt)
         return dataclasses.replace(mesh, vertices=mesh.vertices - [0, 0, mesh.vertices[:, 2].min()]), group

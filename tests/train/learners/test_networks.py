@@ -207,13 +207,14 @@ def test_ppo_learns_from_a_picture():
     assert result.metrics["episode/success"] >= 0.9
 
 
+@pytest.mark.parametrize("name", ["conv_for_cpu", "conv_in_blocks"])
 @pytest.mark.parametrize(("size", "k", "stride"), [(11, 8, 4), (12, 4, 2), (5, 3, 1), (7, 2, 3)])
-def test_convolutions_for_a_cpu_are_xlas_in_value_and_gradients(size: int, k: int, stride: int):
+def test_convolutions_are_xlas_in_value_and_gradients(name: str, size: int, k: int, stride: int):
     images = jax.random.normal(jax.random.PRNGKey(0), (2, size, size + 1, 3))
     kernel = jax.random.normal(jax.random.PRNGKey(1), (k, k, 3, 5))
 
     def ours(images, kernel) -> Any:
-        return networks.conv_for_cpu(images, kernel, (stride, stride))
+        return getattr(networks, name)(images, kernel, (stride, stride))
 
     def xlas(images, kernel):
         names = ("NHWC", "HWIO", "NHWC")
@@ -224,6 +225,22 @@ def test_convolutions_for_a_cpu_are_xlas_in_value_and_gradients(size: int, k: in
     found, expected = (jax.grad(lambda x, w, f=f: (f(x, w) ** 2).sum(), (0, 1))(images, kernel) for f in (ours, xlas))
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-3)
+
+
+def test_a_gpu_convolves_blocks_of_few_channels_with_stride_one():
+    """68 pixels in blocks of 4 are 17 of 2 * 16 channels; 32 channels stay as they are."""
+    text = str(
+        jax.make_jaxpr(networks.conv_in_blocks, static_argnums=2)(
+            jnp.zeros((1, 68, 68, 2)), jnp.zeros((8, 8, 2, 32)), (4, 4)
+        )
+    )
+    assert "f32[1,17,17,32]" in text and "window_strides=(1, 1)" in text and "f32[1,16,16,32]" in text
+    text = str(
+        jax.make_jaxpr(networks.conv_in_blocks, static_argnums=2)(
+            jnp.zeros((1, 16, 16, 32)), jnp.zeros((4, 4, 32, 64)), (2, 2)
+        )
+    )
+    assert "window_strides=(2, 2)" in text and "pad" not in text.split("conv_general")[0]
 
 
 def test_on_a_cpu_acting_has_xlas_convolutions_and_learning_none():
