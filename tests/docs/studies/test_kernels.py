@@ -22,8 +22,8 @@ def test_busy_is_what_the_intervals_cover():
         ("_update_constraint_efc__locals__kernel_0539aa50", None, "solver"),  # in every iteration of the solver
         ("_JTDACJ_sparse__locals__kernel_0d23ad07", None, "solver"),
         ("_comvel_branch", None, "smooth dynamics"),
-        ("some_other_kernel", None, "task, observation, window (XLA)"),
-        ("loop_add_fusion.12", "loop_add_fusion", "task, observation, window (XLA)"),
+        ("some_other_kernel", None, "task, observation, window, learner (XLA)"),
+        ("loop_add_fusion.12", "loop_add_fusion", "task, observation, window, learner (XLA)"),
         ("MemcpyD2D", "MemcpyD2D", "copies"),
     ],
 )
