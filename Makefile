@@ -69,15 +69,24 @@ $(DEMO)/figures/.complete: $(DEMO)/scores.txt
 	  || echo "scikit-fmm cannot be built here: the comparison of geodesics with fast marching will be skipped"
 	@touch $@
 
+# Optional packages, whose tests are skipped without them. No dependencies: those of PyTorch would be gigabytes of CUDA.
+PACKAGES := torch==2.13.0+cpu stable-baselines3 rsl-rl-lib tensordict pyvers gitpython gitdb smmap skrl tensorboard sympy mpmath==1.3.0 \
+  wandb opentelemetry-api xxhash scenezoo open3d-cpu av cachetools plyfile plotly dash janus
+.venv/.optional: .venv/.complete tests/optional.lock
+	@$(PY) -m pip install --disable-pip-version-check --quiet --no-compile --no-deps --require-hashes -r tests/optional.lock \
+	  || echo "Tests with PyTorch, wandb and scenezoo will be skipped: their wheels are for Python 3.11 on x86-64; for PyTorch's, set" \
+	    "PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu"
+	@touch $@
+
 # A worker that dies is not replaced: with a new one pytest-xdist 3.8 may wait for ever at the end (its issue 1378).
 # Files go to workers in the order of tests/conftest.py, not by how many tests they have.
 PYTEST = $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
-test: sync .venv/.oracles
+test: sync .venv/.oracles .venv/.optional
 	$(say) "Tests (two workers; the slow ones compile MJX on the CPU)"
 	@$(PYTEST) -m "not heavy or changed" --durations=15
 
-test-all: sync .venv/.oracles
+test-all: sync .venv/.oracles .venv/.optional
 	$(say) "All tests, the heavy ones too"
 	@$(PYTEST)
 
@@ -86,7 +95,7 @@ lint: sync
 	@$(PY) -m ruff check .
 	@$(PY) -m ruff format --check .
 
-types: sync
+types: sync .venv/.optional
 	$(say) "Types"
 	@$(PY) -m pyright
 
@@ -107,6 +116,9 @@ lock:
 	  --no-emit-index-url --no-header --no-annotate -o tests/oracles-build.lock
 	echo 'scikit-fmm==2025.6.23' | uv pip compile - --no-deps --generate-hashes \
 	  --no-emit-index-url --no-header --no-annotate -o tests/oracles.lock
+	rm -rf .venv/optional && $(PY) -m pip download --quiet --no-deps --only-binary :all: -d .venv/optional $(PACKAGES)
+	cd .venv/optional && for wheel in *; do IFS=- read -r name version _ <<<"$$wheel"; \
+	  printf '%s==%s --hash=sha256:%s\n' "$$name" "$$version" "$$(sha256sum "$$wheel" | cut -c -64)"; done >../../tests/optional.lock
 
 clean-demo:
 	rm -rf $(DEMO)

@@ -7,7 +7,9 @@ import torch  # pyright: ignore[reportMissingImports]
 from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
 from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
 
+import interactive_nav
 from interactive_nav.interop.sb3_env import SB3VecEnv
+from interactive_nav.interop.torch_bridge import TorchVectorEnv
 
 
 class Scores(BaseCallback):
@@ -33,9 +35,13 @@ class Scores(BaseCallback):
         return True
 
 
+def train(envs: TorchVectorEnv, total_steps: int, **settings) -> PPO:
+    """Return the model after this many steps of all environments together."""
+    model = PPO("MlpPolicy", SB3VecEnv(envs), batch_size=256, n_epochs=5, seed=0, device="cpu", **settings)
+    return model.learn(total_steps, callback=Scores())
+
+
 if __name__ == "__main__":
     torch.set_num_threads(1)  # networks this small gain nothing from more, and the simulation uses the others
-    envs = SB3VecEnv("turtlebot", ["scenes_mjcf/apartment_0"], num_envs=32, episode_steps=400, max_goal_distance_m=4.0)
-    model = PPO("MlpPolicy", envs, n_steps=64, batch_size=256, n_epochs=5, ent_coef=0.002, seed=0, device="cpu")
-    model.learn(100_000, callback=Scores())
-    model.save("sb3_ppo")
+    env = interactive_nav.make("turtlebot", ["scenes_mjcf/apartment_0"], episode_steps=400, max_goal_distance_m=4.0)
+    train(TorchVectorEnv(env, num_envs=32), 100_000, n_steps=64, ent_coef=0.002).save("sb3_ppo")

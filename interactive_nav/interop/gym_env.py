@@ -1,4 +1,4 @@
-"""Offer the environment to those who do not use JAX, with Gymnasium's API on NumPy arrays or PyTorch tensors.
+"""Offer the environment to those who do not use JAX, with Gymnasium's API on NumPy arrays.
 
     import gymnasium
     import interactive_nav.interop.gym_env  # registers the ids
@@ -20,7 +20,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import interactive_nav
-from interactive_nav.interop.torch_bridge import to_jax, to_torch
 from interactive_nav.pictures.camera import ThirdPerson
 from interactive_nav.robots import robot_names
 from interactive_nav.task.env import InteractiveNav
@@ -37,7 +36,6 @@ try:
 except ImportError as error:
     raise MissingPackage(missing(__name__, "gymnasium", "gymnasium")) from error
 
-ARRAYS = ("numpy", "jax", "torch")
 SCENES = ("scenes_mjcf/apartment_0",)
 """Come with the package; taken where none are given."""
 VERSION = 0
@@ -227,9 +225,7 @@ class InteractiveNavVectorEnv(_Playing, VectorEnv):
     `info["final_obs"]` and its scores are in `info["final_info"]`; NEXT_STEP: the next `step` ignores
     the action and resets; DISABLED: `reset(options={"reset_mask": ended})` does.
 
-    `arrays` says what goes in and out: "numpy", "jax", or "torch" tensors that share JAX's memory
-    (`interactive_nav.interop.torch_bridge`). For the latter two nothing leaves the device, and `final_obs` is a batch
-    in which the rows of `_final_obs` count; for NumPy it is Gymnasium's array of objects.
+    Learners whose tensors stay on the device take `interactive_nav.interop.torch_bridge.TorchVectorEnv` instead.
     """
 
     def __init__(
@@ -238,7 +234,6 @@ class InteractiveNavVectorEnv(_Playing, VectorEnv):
         scenes: Sequence[str] = SCENES,
         num_envs: int = 1,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
-        arrays: str = "numpy",
         render_mode: str | None = None,
         **settings: Any,
     ):
@@ -249,7 +244,6 @@ class InteractiveNavVectorEnv(_Playing, VectorEnv):
             scenes: scene folders; each episode draws one.
             num_envs: N.
             autoreset_mode: an `AutoresetMode` or its value ("SameStep", "NextStep", "Disabled").
-            arrays: "numpy", "jax" or "torch".
             render_mode: none, or "rgb_array": `render` returns a third-person view of each.
             **settings: of `NavConfig`'s parts.
 
@@ -258,11 +252,9 @@ class InteractiveNavVectorEnv(_Playing, VectorEnv):
         """
         if num_envs < 1:
             raise ConfigError(f"num_envs is {num_envs}, expected at least 1")
-        if arrays not in ARRAYS:
-            raise ConfigError(f"arrays is {arrays!r}, expected one of {', '.join(ARRAYS)}")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self._make(robot, scenes, render_mode, settings)
-        self.num_envs, self.arrays = num_envs, arrays
+        self.num_envs = num_envs
         self.metadata["autoreset_mode"] = self.autoreset_mode
         self.single_observation_space = observation_space_of(self.env)
         self.single_action_space = action_space_of(self.env)
@@ -302,7 +294,7 @@ class InteractiveNavVectorEnv(_Playing, VectorEnv):
         else:
             self._state = self._reset_to(given["start"], keys) if "start" in given else self._reset(keys)
             self._ended = jnp.zeros(self.num_envs, bool)
-        return self._out(self._state.obs), {}
+        return _to_numpy(self._state.obs), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Advance by one control period; see the class for what follows an episode's end."""
@@ -312,13 +304,12 @@ class InteractiveNavVectorEnv(_Playing, VectorEnv):
                 f"episodes of environments {np.flatnonzero(self._ended).tolist()} are over: "
                 "reset(options={'reset_mask': terminated | truncated})"
             )
-        actions = jnp.asarray(to_jax(actions) if self.arrays == "torch" else actions, jnp.float32)
-        self._state, was_over, stepped = self._step(self._state, actions, self._ended)
+        self._state, was_over, stepped = self._step(self._state, jnp.asarray(actions, jnp.float32), self._ended)
         obs, reward, terminated, truncated, metrics = stepped
         self._ended = terminated | truncated
         info = self._info(obs, metrics, was_over)
         now = self._state.obs if self.autoreset_mode is AutoresetMode.SAME_STEP else obs
-        return (*self._out((now, reward, terminated, truncated)), info)
+        return (*_to_numpy((now, reward, terminated, truncated)), info)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return a third-person view of each environment; None without a render mode."""
@@ -338,20 +329,10 @@ class InteractiveNavVectorEnv(_Playing, VectorEnv):
                 keys[i] = _key(seeding.np_random(int(given))[0])
         return jnp.asarray(keys)
 
-    def _out(self, tree: Any) -> Any:
-        if self.arrays == "numpy":
-            return _to_numpy(tree)
-        return to_torch(tree) if self.arrays == "torch" else tree
-
     def _info(self, obs: Any, metrics: dict[str, jax.Array], was_over: jax.Array) -> dict[str, Any]:
         """Return values with their masks `_name`, in the places where `SyncVectorEnv` has them."""
         same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
         steps = (*self.env.reward_names, NONFINITE_ACTIONS)
-        if self.arrays != "numpy":
-            terms = {name: metrics[name] for name in steps}
-            scores = {name: metrics[name] for name in self.env.metric_names}
-            final = {"final_obs": obs, "final_info": {**terms, **scores}} if same_step else scores
-            return self._out({**terms, **final, **{f"_{name}": self._ended for name in final}})
         ended = np.array(self._ended)
         running = ~ended if same_step else ~np.array(was_over)
         info = _masked({name: metrics[name] for name in steps}, running)

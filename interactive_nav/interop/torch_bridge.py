@@ -1,4 +1,8 @@
-"""Convert JAX arrays and PyTorch tensors into one another through DLPack, which shares the memory.
+"""Step environments with PyTorch tensors, which share JAX's memory through DLPack.
+
+    envs = TorchVectorEnv(interactive_nav.make("turtlebot", ["scenes_mjcf/apartment_0"]), num_envs=64)
+    obs = envs.reset(seed=0)
+    obs, reward, terminated, truncated, info = envs.step(torch.zeros(64, 2, device=envs.device))
 
 Both sides then look at the same bytes on the same device. JAX takes its arrays to be constant, so write into
 a tensor that came from JAX only after `clone()`, and into one that was handed to JAX not at all.
@@ -9,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav_common.errors import ConfigError, optional
 
 MISSING = "PyTorch is not installed; follow https://pytorch.org/get-started"
@@ -58,3 +63,84 @@ def to_jax(tree: Any) -> Any:
         return jnp.from_dlpack(x.contiguous())
 
     return jax.tree.map(convert, tree)
+
+
+class TorchVectorEnv:
+    """N environments as one compiled program, with tensors in and out; a new episode follows a finished one at once.
+
+    Where an episode ended, `obs` is the first observation of the new one; everything else is of the step. `info` is
+    empty where none ended, otherwise it has `final_obs` [N, ...] and `final_info`, name -> [N], the scores
+    (`env.metric_names`, `length`, `sum_reward`), whose rows count where an episode ended, and `episode`, their means
+    over these rows.
+    """
+
+    def __init__(self, env: Any, num_envs: int, device: Any = None, final_obs: bool = True):
+        """Wrap an environment.
+
+        Args:
+            env: one that `interactive_nav.make` returns.
+            num_envs: N.
+            device: of the tensors; None: where the simulation runs, or "cpu" where PyTorch cannot use that.
+            final_obs: whether `info` has `final_obs`, for which every step observes twice. Stable-Baselines3 needs it.
+
+        Raises:
+            MissingPackage: PyTorch is not installed.
+            ConfigError: no environments, or a device that is neither the simulation's nor the CPU.
+        """
+        torch = optional("torch", MISSING)
+        if num_envs < 1:
+            raise ConfigError(f"num_envs is {num_envs}, expected at least 1")
+        self.env, self.num_envs, self.num_actions, self.final_obs = env, num_envs, env.action_size, final_obs
+        self._home, self._key = jax.devices()[0], jax.random.PRNGKey(0)
+        self.state: Any = None
+        shared = f"cuda:{self._home.local_hardware_id}" if self._home.platform == "gpu" else "cpu"
+        self.device = torch.device(device or (shared if torch.cuda.is_available() else "cpu"))
+        if str(self.device) not in (shared, "cpu"):
+            raise ConfigError(f"device is {self.device}, expected {' or '.join(sorted({shared, 'cpu'}))}")
+        batch = AutoResetEnv(env, final_obs=final_obs)
+
+        def step(state: Any, actions: jax.Array) -> tuple[Any, ...]:
+            state = batch.step(state, actions)
+            over, truncated = state.done > 0, state.info["truncation"] > 0
+            scores = jnp.stack(list(state.info["episode_metrics"].values()))  # one array to hand over
+            means = jnp.where(over, scores, 0.0).sum(-1) / jnp.maximum(over.sum(), 1)
+            return state, over & ~truncated, truncated, scores, means
+
+        self._reset, self._step = jax.jit(batch.reset), jax.jit(step)
+
+    def reset(self, seed: int | None = None) -> Any:
+        """Begin new episodes everywhere, with a seed always the same ones; return the observations [N, ...]."""
+        self._key, key = jax.random.split(self._key if seed is None else jax.random.PRNGKey(seed))
+        self.state = self._reset(jax.random.split(key, self.num_envs))
+        return self._out(self.state.obs)
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Return observations, rewards, terminated, truncated and `info` after [N, A] actions in [-1, 1]."""
+        if self.state is None:
+            raise ConfigError("step was called before reset")
+        actions = jax.device_put(to_jax(actions.detach().float()), self._home)
+        self.state, *ends, scores, means = self._step(self.state, actions)
+        obs, reward, terminated, truncated = self._out((self.state.obs, self.state.reward, *ends))
+        info = {}
+        if (terminated | truncated).any():
+            names, (scores, means) = self.state.info["episode_metrics"], self._out((scores, means))
+            info = {
+                "final_info": dict(zip(names, scores, strict=True)),
+                "episode": dict(zip(names, means, strict=True)),
+            }
+            info |= {"final_obs": self._out(self.state.info["final_obs"])} if self.final_obs else {}
+        return obs, reward, terminated, truncated, info
+
+    @property
+    def episode_steps(self) -> Any:
+        """Return the control steps [N] that the present episodes have taken; assign to it to shift their time limit."""
+        return self._out(self.state.info["nav"].step_count)
+
+    @episode_steps.setter
+    def episode_steps(self, steps: Any) -> None:
+        nav = self.state.info["nav"].replace(step_count=jax.device_put(to_jax(steps.int()), self._home))
+        self.state = self.state.replace(info=self.state.info | {"nav": nav})
+
+    def _out(self, tree: Any) -> Any:
+        # On the CPU of a simulation on the CPU, nothing is copied.
+        return to_torch(jax.device_put(tree, jax.devices("cpu")[0]) if self.device.type == "cpu" else tree)

@@ -149,24 +149,26 @@ class AutoResetEnv(Wrapper):
     `reward`, `done`, `info["truncation"]`, `info["time_out"]` and `metrics` belong to the last step;
     where an episode ended, `obs`, `pipeline_state` and `info["nav"]` are those of a new one. `info` also has
     `steps` [N] (of the episode that the step belongs to), `episode_done` [N] and `episode_metrics`: name ->
-    [N], the scores of the last finished episode, with `length` and `sum_reward`.
+    [N], the scores of the last finished episode, with `length` and `sum_reward`. With `final_obs`, that is the
+    observation after the step, of the old episode where it ended.
     """
 
     env: InteractiveNav
 
-    def __init__(self, env: Any, action_repeat: int = 1):
+    def __init__(self, env: Any, action_repeat: int = 1, final_obs: bool = False):
         """Wrap an environment.
 
         Args:
             env: of one episode; wrappers of it override `draw`, `advance` and `observe`, parts of `reset` and `step`.
             action_repeat: control steps that an action is held for; rewards are summed.
+            final_obs: whether `info` has `final_obs`, for which every step observes twice.
 
         Raises:
             ConfigError: a wrapper that overrides `step` or `reset` alone, and so would never be called.
         """
         super().__init__(env)
         _refuse_passed_over(env)
-        self.action_repeat = action_repeat
+        self.action_repeat, self.final_obs = action_repeat, final_obs
 
     def reset(self, rng: jax.Array, slot: jax.Array | None = None) -> State:
         """Return N states for [N, 2] keys; `slot` as in `reset_all`."""
@@ -179,15 +181,16 @@ class AutoResetEnv(Wrapper):
             "running_reward": zero,
             "episode_metrics": {name: zero for name in (*self.env.metric_names, "length", "sum_reward")},
         }
-        return state.replace(info=info)
+        return state.replace(info=info | ({"final_obs": state.obs} if self.final_obs else {}))
 
     def step(self, state: State, action: jax.Array) -> State:
         """Return the states that follow N states and [N, A] actions."""
         # What ended in the last step has begun anew.
-        stepped = jax.vmap(self.env.advance)(state.replace(done=jnp.zeros_like(state.done)), action)
+        advance = jax.vmap(self.env.step if self.final_obs else self.env.advance)
+        stepped = advance(state.replace(done=jnp.zeros_like(state.done)), action)
         for _ in range(self.action_repeat - 1):
             paid = stepped.reward
-            stepped = jax.vmap(self.env.advance)(stepped, action)
+            stepped = advance(stepped, action)
             stepped = stepped.replace(reward=paid + stepped.reward)
         done = stepped.done > 0
         steps = stepped.info["nav"].step_count.astype(jnp.float32)
@@ -208,7 +211,7 @@ class AutoResetEnv(Wrapper):
             "episode_done": stepped.done,
             "running_reward": jnp.where(done, 0.0, total),
             "episode_metrics": episode_metrics,
-        }
+        } | ({"final_obs": stepped.obs} if self.final_obs else {})
         # Observed once, after new episodes have begun: images cost as much as physics.
         return jax.vmap(self.env.observe)(stepped.replace(pipeline_state=physics, info=info))
 

@@ -185,25 +185,9 @@ def test_a_given_start_is_played(same_step):
     np.testing.assert_allclose(nav.robot_pos_w[1, :2], start.start_xy_w)
 
 
-@pytest.mark.heavy
-def test_arrays_stay_on_the_device_when_asked(settings):
-    envs = InteractiveNavVectorEnv("turtlebot", num_envs=N, arrays="jax", **settings)
-    first, _ = envs.reset(seed=7)
-    for action in actions(4):
-        obs, reward, terminated, truncated, info = envs.step(jnp.asarray(action))
-    assert all(isinstance(x, jax.Array) for x in (first, obs, reward, terminated, info["final_obs"]))
-    assert truncated.all() and info["_final_obs"].all() and info["final_obs"].shape == (N, 29)
-    np.testing.assert_array_equal(info["final_info"]["episode_steps"], 4)
-    assert not np.array_equal(obs, info["final_obs"])
-
-
 def test_wrong_use_is_refused_in_one_line(settings, same_step):
-    for wrong, message in (
-        ({"num_envs": 0}, "num_envs is 0, expected at least 1"),
-        ({"arrays": "tensors"}, "arrays is 'tensors', expected one of numpy, jax, torch"),
-    ):
-        with pytest.raises(UserError, match=message):
-            InteractiveNavVectorEnv("turtlebot", **{"num_envs": N, **settings, **wrong})
+    with pytest.raises(UserError, match="num_envs is 0, expected at least 1"):
+        InteractiveNavVectorEnv("turtlebot", num_envs=0, **settings)
     with pytest.raises(ValueError, match="'Later' is not a valid AutoresetMode"):  # Gymnasium's own
         InteractiveNavVectorEnv("turtlebot", num_envs=N, **settings, autoreset_mode="Later")
     for options, message in (

@@ -1,7 +1,12 @@
-"""Stable-Baselines3's view: its own checks of a VecEnv's returns, and a short PPO run through it."""
+"""Stable-Baselines3's view of a batch, with its own checks of a VecEnv's returns."""
 
 import numpy as np
 import pytest
+
+import interactive_nav
+from interactive_nav.interop.torch_bridge import TorchVectorEnv
+from interactive_nav_common.errors import UserError
+from tests.train.toy_env import ToyEnv
 
 sb3 = pytest.importorskip("stable_baselines3", reason="stable_baselines3 is not installed")
 
@@ -10,7 +15,8 @@ sb3 = pytest.importorskip("stable_baselines3", reason="stable_baselines3 is not 
 def envs(room):
     from interactive_nav.interop.sb3_env import SB3VecEnv
 
-    return SB3VecEnv("turtlebot", [room], num_envs=4, backend="native", num_objects=1, episode_steps=8)
+    env = interactive_nav.make("turtlebot", [room], backend="native", num_objects=1, episode_steps=8)
+    return SB3VecEnv(TorchVectorEnv(env, num_envs=4), render_mode="rgb_array")
 
 
 def test_an_episodes_end_is_told_as_stable_baselines_expects(envs):
@@ -31,12 +37,11 @@ def test_an_episodes_end_is_told_as_stable_baselines_expects(envs):
     np.testing.assert_array_equal(envs.reset(), first)
     assert not np.array_equal(envs.reset(), first)
 
+    assert [image.shape for image in envs.get_images()] == [(360, 480, 3)] * 4
 
-def test_ppo_learns_through_it(envs):
-    model = sb3.PPO("MlpPolicy", envs, n_steps=16, batch_size=32, n_epochs=1, seed=0, device="cpu")
-    before = [p.detach().clone() for p in model.policy.parameters()]
-    model.learn(128)
-    assert model.num_timesteps == 128
-    assert len(model.ep_info_buffer) == 16 and model.ep_info_buffer[0]["l"] == 8
-    changed = [not np.array_equal(a, b.detach()) for a, b in zip(before, model.policy.parameters(), strict=True)]
-    assert any(changed) and all(np.isfinite(p.detach().numpy()).all() for p in model.policy.parameters())
+
+def test_a_batch_without_last_observations_is_refused():
+    from interactive_nav.interop.sb3_env import SB3VecEnv
+
+    with pytest.raises(UserError, match="envs has final_obs=False, expected True"):
+        SB3VecEnv(TorchVectorEnv(ToyEnv(), 2, final_obs=False))
