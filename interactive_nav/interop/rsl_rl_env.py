@@ -4,22 +4,23 @@ from collections.abc import Mapping
 from typing import Any
 
 from interactive_nav.interop.torch_bridge import TorchVectorEnv
-from interactive_nav_common.errors import MissingPackage
+from interactive_nav_common.errors import optional
 
-try:
-    import torch  # pyright: ignore[reportMissingImports]
-    from rsl_rl.env import VecEnv  # pyright: ignore[reportMissingImports]
-    from tensordict import TensorDict  # pyright: ignore[reportMissingImports]
-except ImportError as error:
-    raise MissingPackage("rsl_rl is not installed: pip install rsl-rl-lib") from error
+MISSING = "rsl_rl is not installed: pip install rsl-rl-lib"
+TensorDict = optional("tensordict", MISSING).TensorDict
 
 
-class RslRlVecEnv(VecEnv):
+class RslRlVecEnv(optional("rsl_rl.env", MISSING).VecEnv):
     """`TorchVectorEnv` behind rsl_rl's interface, on its device.
 
-    A flat observation is the group `policy`. One in parts has a group for each, images as float32 in 0 to 1 with their
-    channels first. Time limits are in `extras["time_outs"]`, mean scores of finished episodes in `extras["log"]`.
+    A flat observation is the group `policy`. One in parts has a group for each, images as floats with their channels
+    first (u8 becomes 0 to 1). Time limits are in `extras["time_outs"]`, mean scores of finished episodes in
+    `extras["log"]`. rsl_rl may assign to `episode_length_buf`, to spread the ends of first episodes.
     """
+
+    episode_length_buf = property(
+        lambda self: self.envs.episode_steps, lambda self, steps: setattr(self.envs, "episode_steps", steps)
+    )
 
     def __init__(self, envs: TorchVectorEnv):
         """Wrap a batch, which need not have `final_obs`."""
@@ -27,29 +28,17 @@ class RslRlVecEnv(VecEnv):
         self.cfg, self.max_episode_length = envs.env.config, envs.env.config.episode_steps
         self._obs = envs.reset()
 
-    @property
-    def episode_length_buf(self) -> torch.Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Return the steps that the present episodes have taken; rsl_rl may assign others to spread their ends."""
-        return self.envs.episode_steps
-
-    @episode_length_buf.setter
-    def episode_length_buf(self, steps: torch.Tensor) -> None:
-        self.envs.episode_steps = steps
-
-    def get_observations(self) -> TensorDict:
+    def get_observations(self) -> Any:
         """Return the present observations by group."""
         parts = self._obs if isinstance(self._obs, Mapping) else {"policy": self._obs}
         return TensorDict({name: _channels_first(x) for name, x in parts.items()}, [self.num_envs], self.device)
 
-    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[Any, ...]:
         """Return observations, rewards, ends and extras."""
         self._obs, reward, terminated, truncated, info = self.envs.step(actions)
-        log = {f"/{name}": mean for name, mean in info.get("episode", {}).items()}
-        extras = {"time_outs": truncated.float()} | ({"log": log} if log else {})
-        return self.get_observations(), reward, (terminated | truncated).long(), extras
+        log = {"log": {f"/{name}": mean for name, mean in info["episode"].items()}} if info else {}
+        return self.get_observations(), reward, (terminated | truncated).long(), {"time_outs": truncated.float()} | log
 
 
-def _channels_first(x: torch.Tensor) -> torch.Tensor:
-    if x.ndim != 4:
-        return x
-    return (x / 255 if x.dtype == torch.uint8 else x).permute(0, 3, 1, 2)
+def _channels_first(x: Any) -> Any:
+    return x if x.ndim != 4 else (x if x.is_floating_point() else x / 255).permute(0, 3, 1, 2)

@@ -13,21 +13,17 @@ import numpy as np
 from interactive_nav.interop.gym_env import action_space_of, observation_space_of
 from interactive_nav.interop.torch_bridge import TorchVectorEnv
 from interactive_nav.pictures.camera import ThirdPerson
-from interactive_nav_common.errors import ConfigError, MissingPackage
+from interactive_nav_common.errors import ConfigError, optional
 
-try:
-    import torch  # pyright: ignore[reportMissingImports]
-    from stable_baselines3.common.monitor import Monitor  # pyright: ignore[reportMissingImports]
-    from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
-except ImportError as error:
-    raise MissingPackage("stable_baselines3 is not installed: pip install stable-baselines3") from error
+MISSING = "stable_baselines3 is not installed: pip install stable-baselines3"
+Monitor, torch = optional("stable_baselines3.common.monitor", MISSING).Monitor, optional("torch", MISSING)
 
 
 def _to_numpy(tree: Any) -> Any:
     return jax.tree.map(lambda x: x.cpu().numpy().copy(), tree)
 
 
-class SB3VecEnv(VecEnv):
+class SB3VecEnv(optional("stable_baselines3.common.vec_env", MISSING).VecEnv):
     """`TorchVectorEnv` behind Stable-Baselines3's interface, which wants NumPy arrays: copies.
 
     A finished episode's info has `terminal_observation`, `TimeLimit.truncated`, its scores
@@ -77,13 +73,11 @@ class SB3VecEnv(VecEnv):
         """Return the attribute, which all environments share, once for each index."""
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refuse it: environments share their attributes."""
-        raise NotImplementedError(f"cannot set {attr_name!r}: the environments are one program; make them anew")
+    def set_attr(self, attr_name: str, *_: Any, **__: Any) -> Any:
+        """Refuse it, and `env_method`: environments share their attributes and methods."""
+        raise NotImplementedError(f"cannot set or call {attr_name!r}: the environments are one program")
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Refuse it: environments share their methods."""
-        raise NotImplementedError(f"cannot call {method_name!r}: the environments are one program")
+    env_method = set_attr
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """Return False for each environment, save that the `Monitor`'s numbers are there."""

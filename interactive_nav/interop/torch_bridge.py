@@ -20,36 +20,16 @@ MISSING = "PyTorch is not installed; follow https://pytorch.org/get-started"
 
 
 def to_torch(tree: Any) -> Any:
-    """Convert JAX arrays to PyTorch tensors on the same device, without a copy.
-
-    Args:
-        tree: an array, or any pytree of arrays (dictionaries, tuples, flax structs).
-
-    Returns:
-        The same structure with a tensor for each JAX array; other leaves are left alone.
-
-    Raises:
-        MissingPackage: PyTorch is not installed.
-    """
+    """Convert the JAX arrays of a pytree to PyTorch tensors on the same device, without a copy; keep other leaves."""
     torch = optional("torch", MISSING)
     return jax.tree.map(lambda x: torch.from_dlpack(x) if isinstance(x, jax.Array) else x, tree)
 
 
 def to_jax(tree: Any) -> Any:
-    """Convert PyTorch tensors to JAX arrays on the same device, without a copy.
+    """Convert the PyTorch tensors of a pytree to JAX arrays on the same device, without a copy; keep other leaves.
 
-    Tensors must be contiguous (others are copied into it) and carry no gradient: detach them. JAX
-    copies a CPU tensor whose memory is not aligned to 64 bytes, such as a slice.
-
-    Args:
-        tree: a tensor, or any pytree of tensors.
-
-    Returns:
-        The same structure with a JAX array for each tensor; other leaves are left alone.
-
-    Raises:
-        MissingPackage: PyTorch is not installed.
-        ConfigError: a tensor that requires a gradient.
+    A tensor that is not contiguous, or on the CPU not aligned to 64 bytes, such as a slice, is copied. One that
+    requires a gradient is a `ConfigError`.
     """
     torch = optional("torch", MISSING)
 
@@ -74,18 +54,11 @@ class TorchVectorEnv:
     over these rows.
     """
 
-    def __init__(self, env: Any, num_envs: int, device: Any = None, final_obs: bool = True):
-        """Wrap an environment.
+    def __init__(self, env: Any, num_envs: int, cpu: bool = False, final_obs: bool = True):
+        """Wrap what `interactive_nav.make` returns.
 
-        Args:
-            env: one that `interactive_nav.make` returns.
-            num_envs: N.
-            device: of the tensors; None: where the simulation runs, or "cpu" where PyTorch cannot use that.
-            final_obs: whether `info` has `final_obs`, for which every step observes twice. Stable-Baselines3 needs it.
-
-        Raises:
-            MissingPackage: PyTorch is not installed.
-            ConfigError: no environments, or a device that is neither the simulation's nor the CPU.
+        Tensors are where the simulation runs, but on the CPU with `cpu` or if PyTorch cannot use the GPU. With
+        `final_obs`, which Stable-Baselines3 needs, every step observes twice. No environment is a `ConfigError`.
         """
         torch = optional("torch", MISSING)
         if num_envs < 1:
@@ -93,10 +66,8 @@ class TorchVectorEnv:
         self.env, self.num_envs, self.num_actions, self.final_obs = env, num_envs, env.action_size, final_obs
         self._home, self._key = jax.devices()[0], jax.random.PRNGKey(0)
         self.state: Any = None
-        shared = f"cuda:{self._home.local_hardware_id}" if self._home.platform == "gpu" else "cpu"
-        self.device = torch.device(device or (shared if torch.cuda.is_available() else "cpu"))
-        if str(self.device) not in (shared, "cpu"):
-            raise ConfigError(f"device is {self.device}, expected {' or '.join(sorted({shared, 'cpu'}))}")
+        shared = self._home.platform == "gpu" and torch.cuda.is_available() and not cpu
+        self.device = torch.device(f"cuda:{self._home.local_hardware_id}" if shared else "cpu")
         batch = AutoResetEnv(env, final_obs=final_obs)
 
         def step(state: Any, actions: jax.Array) -> tuple[Any, ...]:
@@ -142,5 +113,4 @@ class TorchVectorEnv:
         self.state = self.state.replace(info=self.state.info | {"nav": nav})
 
     def _out(self, tree: Any) -> Any:
-        # On the CPU of a simulation on the CPU, nothing is copied.
         return to_torch(jax.device_put(tree, jax.devices("cpu")[0]) if self.device.type == "cpu" else tree)
