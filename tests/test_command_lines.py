@@ -20,7 +20,7 @@ HELP, ERRORS = (Path(__file__).parent / "snapshots" / name for name in ("help.tx
 PROGRAMS = (
     "interactive_nav",
     *(f"interactive_nav.{name}" for name in ("view", "record", "topdown", "episodes", "robots")),
-    *("train", "train.sweep", "train.evaluate", "train.figures", "train.record", "train.replay"),
+    *("train", "train.sweep", "train.evaluate", "train.export", "train.figures", "train.record", "train.replay"),
     *("converters", "topological_nav", "topological_nav.ros", "benchmarks.steps_per_second", "benchmarks.startup"),
 )
 SCENE = "scenes_mjcf/apartment_0"

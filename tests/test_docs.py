@@ -87,8 +87,9 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-# This page reads a robot file of the user's: tests/interactive_nav/robots/test_add_a_robot.py writes one and runs it.
-ELSEWHERE = ("add-a-robot.md",)
+# These read a robot file and a policy of the user's: tests/interactive_nav/robots/test_add_a_robot.py and
+# tests/train/test_export.py write them and run the pages.
+ELSEWHERE = ("add-a-robot.md", "from-a-checkpoint-to-a-robot.md")
 # Half a minute each, for calls that README's and the other tests make too.
 LONG = ("gymnasium.md", "sensors.md", "sweep.md", "videos.md")
 with_python = [

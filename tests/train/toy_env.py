@@ -53,7 +53,7 @@ class ToyEnv(Env):
         self.robot, self.metric_names = get_robot("turtlebot"), EPISODE_METRICS
         maps = SceneMaps(np.ones((80, 80), bool), 0.1, (-4.0, -4.0), 0.0)
         self.scenes = (SimpleNamespace(name="plane", split="train", maps=maps, task_digest="task-1:plane"),)
-        self.sensors = SimpleNamespace(sizes={"waypoints": 20, "goal": 3, "velocity": 6})
+        self.sensors = SimpleNamespace(sizes={"waypoints": 20, "goal": 3, "velocity": 6}, cameras=())
         self.world = SimpleNamespace(slots=SimpleNamespace(names=(("box_0",),), categories=(("box",),)))
         self.furniture_map = lambda scene: np.zeros((80, 80), bool)
         self.nan_at_step = nan_at_step

@@ -25,6 +25,10 @@ SMALL = NetworkConfig(
 class ToyPixels(ToyEnv):
     """ToyEnv seen from above: a u8 map with a blob at the goal, in the robot's frame; the vector is the velocity."""
 
+    def __init__(self, *given: Any, **named: Any):
+        super().__init__(*given, **named)
+        self.sensors.sizes = {"velocity": 6}
+
     @property
     def observation_size(self) -> Any:
         return {"state": (6,), "pixels/depth": (SIDE, SIDE, 1), "pixels/segmentation": (SIDE, SIDE, 1)}

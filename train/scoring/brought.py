@@ -13,9 +13,10 @@ import numpy as np
 from interactive_nav.task.rollout import HostPolicy
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.imports import first_line, import_function
+from train.scoring.onnx_policy import OnnxPolicy
 
 TAKEN = ("learned", "random", "follower", "avoider", "namo")
-EXPECTED = "expected [name=]module:factory or [name=]path/to/file.py:factory"
+EXPECTED = "expected [name=]module:factory, [name=]path/to/file.py:factory or [name=]policy.onnx"
 
 
 class PolicyError(UserError):
@@ -61,12 +62,16 @@ def describe_env(env: Any) -> PlayedEnv:
 
 
 def named(word: str) -> str:
-    """Return `name=module:factory` of a word of `--policy`; without a name it is the module's and factory's."""
+    """Return `name=module:factory` or `name=policy.onnx` of a word of `--policy`; what has no name gets the place's."""
     name, equals, place = word.rpartition("=")
     module, _, factory = place.rpartition(":")
-    if not module or not factory.isidentifier():
+    if place.endswith(".onnx"):
+        default = Path(place).stem
+    elif module and factory.isidentifier():
+        default = f"{Path(module).stem if module.endswith('.py') else module}:{factory}"
+    else:
         raise ConfigError(f"--policy: got {word!r}, {EXPECTED}")
-    name = name if equals else f"{Path(module).stem if module.endswith('.py') else module}:{factory}"
+    name = name if equals else default
     if not re.fullmatch(r"[\w.:+-]+", name) or name.partition(":")[0] in TAKEN:
         raise ConfigError(
             f"--policy: name is {name!r}, expected letters, digits and any of _ . : + -, and none of {', '.join(TAKEN)}"
@@ -79,7 +84,11 @@ class BroughtPolicy(HostPolicy):
 
     def __init__(self, word: str, env: Any):
         self._name, _, place = word.partition("=")
-        self._act = self._call("factory", import_function(place, "--policy", EXPECTED, PolicyError), describe_env(env))
+        if place.endswith(".onnx"):
+            self._act: Any = OnnxPolicy(place, env)
+        else:
+            factory = import_function(place, "--policy", EXPECTED, PolicyError)
+            self._act = self._call("factory", factory, describe_env(env))
         if not callable(self._act):
             raise self._error(f"its factory returned type {type(self._act).__name__}, expected a callable")
         self._size = env.action_size

@@ -45,12 +45,13 @@ def read_episodes(paths: Sequence[str], most: int | None) -> tuple[EpisodeFile, 
 
 
 def _policies(arguments: Evaluate) -> tuple[str, ...]:
-    """Return what --policies names, then `name=module:factory` of each --policy."""
+    """Return what --policies names, then `name=PLACE` of each --policy; ONNX files have names in both."""
     brought = [named(given) for given in arguments.policy]
     given = arguments.policies
     if given is None:
         given = "" if brought else ",".join(POLICIES)
-    policies = tuple(dict.fromkeys(name for name in given.split(",") if name))
+    words = [named(name) if name.endswith(".onnx") else name for name in given.split(",") if name]
+    policies = tuple(dict.fromkeys(words))
     if not policies and not brought:
         raise ConfigError(f"--policies is {given!r}, expected at least one, such as {LEARNED}")
     names = [word.partition("=")[0] for word in (*policies, *brought)]
