@@ -196,6 +196,32 @@ class DDPGConfig(OffPolicyConfig):
 
 
 @dataclasses.dataclass(frozen=True)
+class CloneConfig(Settings):
+    """Behavioural cloning: PPO's policy network learns recorded actions by maximum likelihood."""
+
+    demonstrations: str = ""
+    """Parquet file that `python -m train.evaluate --demonstrations` wrote."""
+    episodes: Literal["successful", "all"] = "successful"
+    """Which episodes of it are learned from."""
+    num_envs: AtLeastOne | None = None
+    """Environments stepped together, to score the policy on the way."""
+    unroll_length: AtLeastOne | None = None
+    """Steps of every environment between two updates."""
+    grad_steps_per_update: AtLeastOne | None = None
+    """Gradient steps in one update."""
+    batch_size: AtLeastOne | None = None
+    """Recorded steps in one gradient step."""
+    learning_rate: Positive = 1e-3
+    """Adam's step size."""
+    max_grad_norm: Positive = 1.0
+    """Gradients are scaled down to this global norm."""
+    normalize_observations: bool = True
+    """Normalise observations by their mean and deviation in the file."""
+    policy_hidden_layer_sizes: tuple[AtLeastOne, ...] = (256, 256)
+    """Widths of the policy network, behind its encoder if there are images."""
+
+
+@dataclasses.dataclass(frozen=True)
 class RunConfig(Settings):
     """The run: how long, from which seed, what is written where."""
 
@@ -255,6 +281,8 @@ class TrainConfig(Settings):
     """Settings of SAC."""
     ddpg: DDPGConfig = dataclasses.field(default_factory=DDPGConfig)
     """Settings of DDPG."""
+    clone: CloneConfig = dataclasses.field(default_factory=CloneConfig)
+    """Settings of behavioural cloning."""
     run: RunConfig = dataclasses.field(default_factory=RunConfig)
     """The run."""
 

@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow.compute as pc
 
 from interactive_nav.physics import compiler_options
+from interactive_nav.sensing.description import KEY, describe, inputs_of, twist_matrix
 from interactive_nav.task.rollout import PolicyFn, episode_keys
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav_common.commands import Command, option, parse, word
@@ -30,7 +31,7 @@ from train.runs.run import build_env, config_to_play
 from train.runs.run_folder import RunFolder
 from train.scoring import LEARNED, SEED
 from train.scoring.evaluation import load_policy
-from train.scoring.onnx_policy import KEY, NEEDED, OnnxError, describe, inputs_of, twist_matrix
+from train.scoring.onnx_policy import NEEDED, OnnxError
 from train.scoring.session import ROWS
 
 OBSERVATIONS, ENVS = 1000, 20

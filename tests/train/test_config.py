@@ -95,7 +95,7 @@ def test_two_words_that_only_fit_together():
         ("env.k_int=-1", "env.k_int is -1.0, expected 0 or more"),
         ("env.segmentation_classes=6", "env.segmentation_classes is 6, expected one of 4, 5, all"),
         ("env.backend=wrap", "env.backend is 'wrap', expected one of"),
-        ("algorithm=pop", "algorithm is 'pop', expected one of ppo, sac, ddpg, did you mean 'ppo'?"),
+        ("algorithm=pop", "algorithm is 'pop', expected one of ppo, sac, ddpg, clone, did you mean 'ppo'?"),
         (
             "ppo.desired_kl=0.1",
             "ppo.desired_kl is 0.1, which changes nothing here: expected learning_rate_schedule adap",

@@ -15,6 +15,7 @@ import pytest
 
 import interactive_nav
 from interactive_nav.robots import get_robot
+from interactive_nav.sensing.description import KEY, describe
 from tests.train.toy_env import ToyConfig, ToyEnv
 from tests.train.toy_pixels import SMALL, ToyPixels
 from tests.train.toy_run import build_toy, toy_config
@@ -25,7 +26,7 @@ from train.learners.learner import Snapshot
 from train.runs import checkpoint
 from train.runs.checkpoint import CheckpointMeta
 from train.runs.run_folder import RunFolder
-from train.scoring.onnx_policy import KEY, OnnxError, OnnxPolicy, describe
+from train.scoring.onnx_policy import OnnxError, OnnxPolicy
 
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")

@@ -11,7 +11,7 @@ from brax.training import types
 
 from interactive_nav.task.wrappers import ShardedEnv
 from train.config import TrainConfig
-from train.learners import offpolicy, ppo
+from train.learners import clone, offpolicy, ppo
 from train.learners.actor_critic import DDPG, SAC, policy_part
 from train.learners.learner import Callbacks, Snapshot, TrainResult, Update, reset_envs, run_loop
 
@@ -39,7 +39,8 @@ class Algorithm:
         if snapshot.env_state is None:
             key = jax.random.fold_in(jax.random.PRNGKey(config.run.seed), snapshot.env_steps)
             fresh, data = reset_envs(agent, env, key), first.env_state
-            state = data.replace(env_state=fresh) if isinstance(data, offpolicy.OffPolicyData) else fresh
+            kept = isinstance(data, offpolicy.OffPolicyData | clone.CloneData)
+            state = data.replace(env_state=fresh) if kept else fresh
             snapshot = dataclasses.replace(snapshot, env_state=state)
         if isinstance(env, ShardedEnv):  # a checkpoint's arrays come from one device
             learner = jax.device_put(snapshot.learner, env.replicated)
@@ -61,4 +62,5 @@ ALGORITHMS = {
     "ppo": Algorithm(ppo.make_agent, ppo.start, ppo.update, ppo.policy_part),
     "sac": Algorithm(SAC.of, offpolicy.start, offpolicy.update, policy_part),
     "ddpg": Algorithm(DDPG.of, offpolicy.start, offpolicy.update, policy_part),
+    "clone": Algorithm(clone.make_agent, clone.start, clone.update, ppo.policy_part),
 }

@@ -267,6 +267,9 @@ def train_run(
         claim(folder.path)
         try:
             devices_here(config.run.devices)  # before tables are computed
+            if config.algorithm == "clone" and not Path(config.clone.demonstrations).is_file():
+                got = f"clone.demonstrations is {config.clone.demonstrations!r}"
+                raise ConfigError(f"{got}, expected the file that python -m train.evaluate --demonstrations FILE wrote")
             env = build_env(config.env)
             config = resolve(config, env.backend)
         except UserError:

@@ -46,6 +46,8 @@ class Evaluate(Command):
     """Parquet file of rows (default: RUN_DIR/evaluation/episodes.parquet)."""
     dataset: Annotated[Path | None, option(metavar="DIR")] = None
     """Add a file for each run and evaluation to this folder instead."""
+    demonstrations: Annotated[Path | None, option(metavar="FILE")] = None
+    """Also write every control step to this Parquet file, for algorithm=clone."""
 
     @classmethod
     def epilog(cls) -> str:

@@ -18,6 +18,7 @@ from interactive_nav_common.files import write_arrays
 from interactive_nav_common.jobs.progress import progress_bar
 from interactive_nav_common.versions import versions
 from train.config import TrainConfig
+from train.learners import demonstrations
 from train.learners.algorithms import ALGORITHMS
 from train.runs import checkpoint
 from train.runs.checkpoint import CheckpointMeta
@@ -46,8 +47,10 @@ RECORDERS = {
 class BatchPlayer(Player):
     """Plays episodes of one environment for their scores."""
 
-    def __init__(self, env: Any):
-        super().__init__(env, RECORDERS)
+    def __init__(self, env: Any, demonstrate: bool = False):
+        super().__init__(env, RECORDERS | (demonstrations.RECORDERS if demonstrate else {}))
+        self.demonstrate, self.played = demonstrate, None
+        """Whether all control steps are kept, and those of the last policy, a `Rollout`."""
         self.cached: dict[Any, Any] = {}
         """Functions of learned policies, by kind: see `load_policy`."""
 
@@ -59,8 +62,9 @@ class BatchPlayer(Player):
         **how: Any,
     ) -> PlayedEpisodes:
         """Play every episode to its end; `how` and the rest are as `Player.rollout` takes them."""
-        played = self.rollout(policy, keys, record=record, **how)
-        first, values, xy = played.first, played.values, played.values["robot_xy_w"]
+        played = self.rollout(policy, keys, record=None if self.demonstrate else record, **how)
+        first, values, xy = played.first, played.values, played.values["robot_xy_w"][:record]
+        self.played = played if self.demonstrate else None
         over = np.arange(xy.shape[1]) >= played.num_steps[:record, None]
         xy = np.where(over[..., None], np.float32(np.nan), xy)
         paths = Paths(

@@ -1,119 +1,20 @@
-"""Describe what a policy takes and gives, and play policies from ONNX files that carry such a description."""
+"""Play policies from ONNX files that describe themselves."""
 
 import json
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
-from interactive_nav.robots.spec import RobotSpec
-from interactive_nav.sensing.sensors import LIDAR_NEAR_M
+from interactive_nav.sensing.description import KEY, describe, difference, inputs_of
 from interactive_nav_common.errors import UserError, missing, optional, regular
-from scenes_mjcf.categories import SEGMENTATIONS
 
-KEY = "interactive_nav"
-"""Key of the description, as JSON, in the metadata of an ONNX file."""
 NEEDED = missing("an ONNX policy", "onnxruntime", "onnx")
-PARTS = {
-    "waypoints": ("m", "base", "x0, y0, x1, ... of points on the shortest path, the nearest first"),
-    "goal": ("m", "base", "x, y, z"),
-    "velocity": ("m/s, rad/s", "base", "linear x, y, z, then angular x, y, z"),
-    "localisation": ("m, rad", "map", "x, y, yaw"),
-    "odometry": ("m, rad", "base at the start of the episode", "x, y, yaw"),
-    "collision": ("0 or 1", "", "whether a movable object, a wall was touched since the last action"),
-    "joints": ("rad or m, rad/s or m/s", "joint", "positions in the robot model's order, then velocities"),
-    "lidar": ("m", "scanner", "distances, beams from right to left"),
-    "trail": ("m", "base", "x, y of where the robot was about 1, 2, 4, ..., 64 s ago"),
-    "depth": ("m", "camera", "distance along the optical axis; 0: nothing is met"),
-    "segmentation": ("class id", "camera", "as docs/sensors.md numbers them"),
-    "rgb": ("1", "camera", "colour"),
-    "normals": ("1", "camera", "unit vectors: right, up, towards the viewer; 0: nothing is met"),
-}
-"""Part of an observation -> its unit, its frame (base: x forward, y left, z up) and its numbers."""
-COMPARED = ("shape", "dtype", "unit", "scale", "frame")
-"""What of an input, and the rate apart, an environment must have as the file says."""
 
 
 class OnnxError(UserError):
     """An ONNX file that is damaged, or that belongs to another robot or to other observations."""
-
-
-def inputs_of(env: Any, observations: Any) -> dict[str, Any]:
-    """Return the inputs of a policy [..., n] by name: the parts of the vector in order, then the images."""
-    observations = observations if isinstance(observations, Mapping) else {"state": observations}
-    sizes = env.sensors.sizes if "state" in observations else {}
-    ends = np.cumsum([0, *sizes.values()]).tolist()
-    parts = {name: observations["state"][..., a:b] for name, a, b in zip(sizes, ends, ends[1:], strict=False)}
-    return parts | {name: value for name, value in observations.items() if name != "state"}
-
-
-def twist_matrix(robot: RobotSpec) -> np.ndarray:
-    """Return [2, A]: a base's velocity (m/s, rad/s) is its product with a command of the robot."""
-    assert robot.twist
-    return np.linalg.pinv(np.array(robot.twist.matrix))
-
-
-def describe(env: Any) -> dict[str, Any]:
-    """Describe what an environment's policy takes and gives, as JSON holds it."""
-    observations = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((2,), np.uint32)).obs
-    inputs = inputs_of(env, jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), observations))
-    robot, config, rate_hz = env.robot, env.config, 1.0 / env.config.control_dt_s
-    names = list(robot.action_names or robot.actuators)
-    outputs = {
-        "action": {"names": names, "unit": "1", "low": [-1.0] * len(names), "high": [1.0] * len(names)},
-        "command": {"names": names, "low": list(robot.action_low), "high": list(robot.action_high)},
-    }
-    if robot.twist:
-        ends = twist_matrix(robot) * np.array([robot.action_low, robot.action_high])[:, None]
-        limits = {"low": ends.min(0).sum(-1).tolist(), "high": ends.max(0).sum(-1).tolist()}
-        outputs["twist"] = {"names": ["linear.x m/s", "angular.z rad/s"], **limits, "frame": "base"}
-    about: dict[str, Any] = {
-        "robot": {"name": robot.name, "control_mode": robot.control_mode, "rate_hz": rate_hz},
-        "inputs": {name: _input(name, x, config) | {"rate_hz": rate_hz} for name, x in inputs.items()},
-        "outputs": {name: {"shape": [len(of["names"])], "dtype": "float32"} | of for name, of in outputs.items()},
-        "cameras": [_camera(camera, robot.camera.body) for camera in env.sensors.cameras],
-    }
-    if "lidar" in about["inputs"]:
-        fields = ("lidar_rays", "lidar_fov_deg", "lidar_range_m", "lidar_pos_m")
-        about["lidar"] = {name: getattr(config, name) for name in fields}
-    return json.loads(json.dumps(about))
-
-
-def _input(name: str, value: Any, config: Any) -> dict[str, Any]:
-    kind, steps = name.rpartition("/")[2], 255 if value.dtype == np.uint8 else 1
-    unit, frame, content = PARTS.get(kind, ("", "", "a term of the environment's"))
-    ranges = {"depth": config.depth_range_m, "lidar": config.lidar_range_m}
-    scale = ranges.get(kind, 1.0)
-    least, most = {"lidar": LIDAR_NEAR_M / scale, "normals": -1.0}.get(kind, 0.0), steps
-    if kind == "segmentation":
-        scale = SEGMENTATIONS[config.segmentation_classes].divisor
-    bounded = "/" in name or kind in ("lidar", "collision")
-    return {
-        "shape": value.shape,
-        "dtype": str(value.dtype),
-        "unit": unit,
-        "scale": scale / steps,  # an input times it is in the unit
-        "frame": frame,
-        "range": [least, most] if bounded else None,
-        "content": content,
-    }
-
-
-def _camera(camera: Any, body: str) -> dict[str, Any]:
-    x, y, z = map(float, camera.mount.forward_b)
-    return {
-        "inputs": f"pixels/{camera.prefix}",
-        "body": body,
-        "pos_m": camera.mount.pos_b.tolist(),
-        "yaw_deg": math.degrees(math.atan2(y, x)),
-        "pitch_down_deg": math.degrees(-math.asin(z)),
-        "vertical_fov_deg": camera.lens.fov_deg,
-        "width": camera.lens.width,
-        "height": camera.lens.height,
-    }
 
 
 class OnnxPolicy:
@@ -131,7 +32,7 @@ class OnnxPolicy:
         self._env, here = env, describe(env)
         try:
             about = json.loads(self._session.get_modelmeta().custom_metadata_map[KEY])
-            differs = _difference(about, here)
+            differs = difference(about, here)
         except (KeyError, TypeError, AttributeError, ValueError):
             raise OnnxError(f"{path}: has no description, expected a file of interactive-nav export") from None
         if differs:
@@ -140,14 +41,3 @@ class OnnxPolicy:
     def __call__(self, observations: Mapping[str, np.ndarray], first: Any) -> np.ndarray:
         """Return actions [B, A]."""
         return self._session.run(["action"], inputs_of(self._env, observations))[0]
-
-
-def _difference(file: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """Return what the file says otherwise than an environment, the first of it; empty: nothing."""
-    names = [{"names": list(about["inputs"])} for about in (file, here)]
-    groups = [("robot", file["robot"], here["robot"], ("name", "control_mode")), ("inputs", *names, ("names",))]
-    shared = [name for name in here["inputs"] if name in file["inputs"]]
-    groups += [(f"input {name}", file["inputs"][name], here["inputs"][name], COMPARED) for name in shared]
-    groups += [("command", file["outputs"]["command"], here["outputs"]["command"], ("names", "low", "high"))]
-    facts = [(f"{key} of {what}", a[key], b[key]) for what, a, b, keys in groups for key in keys]
-    return next((f"{name} in the file: {a!r}, in the environment: {b!r}" for name, a, b in facts if a != b), "")

@@ -19,6 +19,7 @@ from interactive_nav_common.signals import raise_stop
 from scenes_mjcf.sets import installed, scene_folders
 from train import config_io
 from train.config import EnvConfig, TrainConfig
+from train.learners.demonstrations import table_of, write_demonstrations
 from train.runs import run as runs
 from train.runs.run import config_to_play
 from train.runs.run_folder import EvaluationRequest, RunFolder, claim, paths_beside
@@ -107,6 +108,8 @@ def run(arguments: Evaluate, build_env: Callable[[EnvConfig], Any] | None, kept:
     folders = [RunFolder(Path(path)) for path in arguments.runs]
     if len(folders) > 1 and arguments.out:
         raise ConfigError("--out is for one run; several write into a folder: --dataset DIR")
+    if len(folders) > 1 and arguments.demonstrations:
+        raise ConfigError("--demonstrations is for one run; evaluate them one by one")
     folders = folders or [None]
     configs = [_wanted(folder, policies, arguments, console) for folder in folders]
     if arguments.policies is None and not all("waypoints" in c.env.observations for c in configs):
@@ -138,22 +141,29 @@ def run(arguments: Evaluate, build_env: Callable[[EnvConfig], Any] | None, kept:
             player = None  # the old one's memory goes before the new one's comes
             env = build_env(config.env)
             raise_stop()
-            player, built = BatchPlayer(env), kinds[i]
+            player, built = BatchPlayer(env, bool(arguments.demonstrations)), kinds[i]
         trained_steps = folder.origin().get("env_steps") if folder else None
         notes = {"asked": json.dumps(dataclasses.asdict(request)), "trained_steps": json.dumps(trained_steps)}
-        rows, stood = pa.table({}), out.exists()
+        rows, stood, steps = pa.table({}), out.exists(), []
         unfinished = out.with_name(f".unfinished-{out.name}")  # which figures and sweeps pass over
         for rows, played in evaluate(folder, config, player, request, arguments.record, console, file, arguments.batch):
             # A stopped evaluation keeps what has been played; only complete rows replace complete rows.
             place = out if len(played) == len(policies) or not stood else unfinished
             write_paths(paths_beside(place), played, player.env)  # first: rows are never without paths as new as they
             write_parquet(rows, place, notes)
+            if player.played and arguments.demonstrations:
+                name, first = list(played)[-1], len(steps) * request.episodes
+                steps.append(table_of(player.env, player.played, played[name].metrics["success"], name, first))
+                write_demonstrations(steps, player.env, arguments.demonstrations)
             kept[out] = f"rows of {', '.join(played)} in {place}"
             if place == unfinished:
                 console.print(f"until all have played: {place}; {out} stays as it is", highlight=False, soft_wrap=True)
         for path in (unfinished, paths_beside(unfinished)):
             path.unlink(missing_ok=True)
         _report(console, rows, config, player.env, out)
+        if steps:
+            text = f"demonstrations: {arguments.demonstrations}, {sum(map(len, steps)):,} control steps"
+            console.print(text, highlight=False, soft_wrap=True)
     return 0
 
 

@@ -49,7 +49,7 @@ def config_of(out_dir, updates):
 
 
 def test_every_algorithm_has_sizes_and_a_learner():
-    assert set(AUTO) == set(ALGORITHMS) == {"ppo", "sac", "ddpg"}
+    assert set(AUTO) == set(ALGORITHMS) == {"ppo", "sac", "ddpg", "clone"}
 
 
 def test_the_actor_is_delayed(added):
