@@ -10,6 +10,7 @@ from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError, reports_errors
 
 PROGRAMS = {
+    "demo": ("train.demo", "a film of a trained robot that pushes its way through a flat"),
     "train": ("train", "a policy, from a preset or a file"),
     "sweep": ("train.sweep", "trains and evaluates every run of a table"),
     "evaluate": ("train.evaluate", "plays episodes, with scores"),

@@ -57,7 +57,9 @@ def test_it_trains_and_is_scored_in_an_empty_folder(bare):
     assert (bare[1] / "runs" / "short" / "summary.json").is_file()
     scored = run(bare, "evaluate", "runs/short", "--episodes", "2", "--policies", "random")
     assert scored.returncode == 0 and "random" in scored.stdout, scored.stderr
-    assert sorted(path.name for path in bare[1].iterdir()) == ["runs"]
+    filmed = run(bare, "demo", "-o", "film")
+    assert filmed.returncode == 0 and (bare[1] / "film" / "demo.mp4").is_file(), filmed.stderr
+    assert sorted(path.name for path in bare[1].iterdir()) == ["film", "runs"]
 
 
 def test_what_it_knows_by_name(bare):
