@@ -33,7 +33,7 @@ def test_the_notebook_plays_the_packaged_policy_which_shoves_something_and_reach
     (path,) = tmp_path.glob("demo/turtlebot/replays/*.npz")
     played = load_replay(path)
     moved_m = np.linalg.norm(played.body_pos_w[-1] - played.body_pos_w[0], axis=-1)
-    assert moved_m[played.num_robot_bodies :].max() > 0.15, dict(zip(played.bodies, moved_m, strict=True))
+    assert moved_m[played.num_robot_bodies :].max() > 0.1, dict(zip(played.bodies, moved_m, strict=True))
     frames = imageio_ffmpeg.read_frames(str(tmp_path / "demo" / "demo.mp4"))
     assert next(frames)["size"] == (480, 420) and sum(1 for _ in frames) > len(played.body_pos_w)
     assert not list(demo.POLICY.rglob("*.npz"))  # the package stays as it is
