@@ -100,7 +100,9 @@ def whole_updates(steps: int, steps_per_update: int) -> int:
 def reset_envs(agent: Any, env: Env, key: jax.Array) -> PyTree:
     """Start a new episode in every environment."""
     number = agent.config.num_envs or 1
-    return jax.jit(lambda k: env.reset(jax.random.split(k, number)))(np.asarray(key))
+    # A program of several processes takes an array of none of their devices.
+    key = np.asarray(key) if jax.process_count() > 1 else key
+    return jax.jit(lambda k: env.reset(jax.random.split(k, number)))(key)
 
 
 def run_loop(
