@@ -15,6 +15,7 @@ PROGRAMS = {
     "sweep": ("train.sweep", "trains and evaluates every run of a table"),
     "evaluate": ("train.evaluate", "plays episodes, with scores"),
     "figures": ("train.figures", "curves, tables and pictures of runs and sweeps"),
+    "report": ("train.figures.report", "one HTML file of runs, sweeps and rows, to send"),
     "export": ("train.export", "a policy to an ONNX file"),
     "record": ("train.record", "a film of an episode"),
     "view": ("interactive_nav.view", "a scene and a robot, in a window or the browser"),

@@ -20,7 +20,8 @@ HELP, ERRORS = (Path(__file__).parent / "snapshots" / name for name in ("help.tx
 PROGRAMS = (
     "interactive_nav",
     *(f"interactive_nav.{name}" for name in ("view", "record", "topdown", "episodes", "robots")),
-    *("train", "train.sweep", "train.evaluate", "train.export", "train.figures", "train.record", "train.replay"),
+    *("train", "train.sweep", "train.evaluate", "train.export", "train.figures", "train.figures.report"),
+    *("train.record", "train.replay"),
     *("converters", "topological_nav", "topological_nav.ros", "benchmarks.steps_per_second", "benchmarks.startup"),
 )
 SCENE = "scenes_mjcf/apartment_0"
@@ -66,7 +67,9 @@ def test_help_is_that_of_the_snapshot(program):
         assert kept[words].rstrip() == body.rstrip(), words
 
 
-@pytest.mark.parametrize("program", ("train", "train.evaluate", "train.sweep", "train.figures", "converters"))
+@pytest.mark.parametrize(
+    "program", ("train", "train.evaluate", "train.sweep", "train.figures", "train.figures.report", "converters")
+)
 def test_help_comes_without_what_takes_seconds_to_import(program):
     script = (
         f"import importlib.util, runpy, sys; sys.argv = [{program!r}, '--help']\n"

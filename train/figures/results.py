@@ -29,12 +29,14 @@ class Results:
 
     def __init__(self, root: Path):
         self.root = root
-        logs = sorted([*root.rglob(METRICS), *root.rglob(PACKED_METRICS)])
-        self.curves = {log.parent: lines for log in logs if (lines := read_metrics(log))}
+        files = [root] if root.is_file() else sorted(root.rglob("*.*"))
         # Names with a dot in front are of unfinished files.
-        records = [path for path in sorted(root.rglob("[!.]*.npz")) if "checkpoints" not in path.parts]
+        files = [path for path in files if not path.name.startswith(".")]
+        logs = [path for path in files if path.name in (METRICS, PACKED_METRICS)]
+        self.curves = {log.parent: lines for log in logs if (lines := read_metrics(log))}
+        records = [path for path in files if path.suffix == ".npz" and "checkpoints" not in path.parts]
         self.records = [path for path in records if not path.parent.name.startswith("diverged-")]
-        self.tables = sorted(root.rglob("[!.]*.parquet"))
+        self.tables = [path for path in files if path.suffix == ".parquet"]
         if not self.curves and not self.records and not self.tables:
             raise FileError(
                 f"{root}: nothing to draw (no metrics.jsonl, no rows, no recorded paths); expected a run folder"
@@ -53,14 +55,14 @@ class Results:
             return None
 
 
-def figures_of(results: Path, split: str | None = "auto") -> Iterator[tuple[str, Callable[[], Figure]]]:
+def figures_of(results: Path | Results, split: str | None = "auto") -> Iterator[tuple[str, Callable[[], Figure]]]:
     """Yield every picture that the files under a folder give: (name, how to draw it).
 
     Args:
-        results: a run folder, a sweep's folder, or any folder of their files; one without any raises `FileError`.
+        results: a run folder, a sweep's folder, any folder of their files, or one file; without any, `FileError`.
         split: train or test scenes, None for all, auto: test where there are rows of them.
     """
-    files = Results(results)
+    files = results if isinstance(results, Results) else Results(results)
     facts = {run: fact for run in files.curves if (fact := files.facts(run))}
     if files.swept:
         yield from _of_sweep(files, chosen_split(files.rows, split))

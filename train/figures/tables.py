@@ -128,11 +128,11 @@ def provenance(rows: pa.Table) -> str:
     return markdown(header, lines) if lines else ""
 
 
-def document(rows: pa.Table, split: str | None) -> str:
-    """Return all tables, with what the numbers mean; without learned runs, those of the others."""
+def sections(rows: pa.Table, split: str | None) -> list[tuple[str, str, str]]:
+    """Return (heading, what the numbers mean, table) of all tables; without learned runs, those of the others."""
     shown = {"train": "training", "test": "unseen", None: "all"}[split]
     learned = bool(len(learned_rows(rows)))
-    sections = [
+    every = [
         (
             "Scores",
             "Mean over runs ± half of the 95 % t interval over seeds; a run's score is the mean over its fixed "
@@ -169,5 +169,10 @@ def document(rows: pa.Table, split: str | None) -> str:
         ("Policies that never learned", "Mean over episodes [95 % interval].", baselines(rows)),
         ("Runs", "", provenance(rows)),
     ]
-    parts = (part for heading, words, table in sections if table for part in (f"## {heading}", words, table) if part)
+    return [section for section in every if section[2]]
+
+
+def document(rows: pa.Table, split: str | None) -> str:
+    """Return all tables as one document in Markdown."""
+    parts = (part for heading, *text in sections(rows, split) for part in (f"## {heading}", *text) if part)
     return "\n\n".join(part.rstrip() for part in parts) + "\n"
