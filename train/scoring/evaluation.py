@@ -26,6 +26,7 @@ from train.runs.run import check_fits
 from train.runs.run_folder import EvaluationRequest, RunFolder
 from train.scoring import AUTO_BATCH, LEARNED
 from train.scoring.brought import BroughtPolicy
+from train.scoring.driver import Driver
 from train.scoring.policies import make_baseline
 from train.scoring.rows import Paths, PlayedEpisodes, episode_table
 
@@ -130,6 +131,8 @@ def make_policies(
     def build(name: str) -> tuple[Any, CheckpointMeta | None]:
         if name == LEARNED and folder:
             return load_policy(folder, config, env, which, deterministic, cached)
+        if name == "keyboard":
+            return Driver(env), None
         return BroughtPolicy(name, env) if "=" in name else make_baseline(name, env), None
 
     return {name.partition("=")[0]: build(name) for name in names}
