@@ -17,6 +17,7 @@ PROGRAMS = {
     "figures": ("train.figures", "curves, tables and pictures of runs and sweeps"),
     "report": ("train.figures.report", "one HTML file of runs, sweeps and rows, to send"),
     "export": ("train.export", "a policy to an ONNX file"),
+    "ros": ("interactive_nav.ros", "a policy, and a simulated robot, as nodes of ROS 2"),
     "record": ("train.record", "a film of an episode"),
     "view": ("interactive_nav.view", "a scene and a robot, in a window or the browser"),
     "robots": ("interactive_nav.robots", "those that come with it"),

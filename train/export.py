@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pyarrow.compute as pc
 
+from interactive_nav.interop.onnx_file import NEEDED, OnnxError
 from interactive_nav.physics import compiler_options
 from interactive_nav.sensing.description import KEY, describe, inputs_of, twist_matrix
 from interactive_nav.task.rollout import PolicyFn, episode_keys
@@ -31,7 +32,6 @@ from train.runs.run import build_env, config_to_play
 from train.runs.run_folder import RunFolder
 from train.scoring import LEARNED, SEED
 from train.scoring.evaluation import load_policy
-from train.scoring.onnx_policy import NEEDED, OnnxError
 from train.scoring.session import ROWS
 
 OBSERVATIONS, ENVS = 1000, 20

@@ -63,12 +63,16 @@ def describe(env: Any) -> dict[str, Any]:
         ends = twist_matrix(robot) * np.array([robot.action_low, robot.action_high])[:, None]
         limits = {"low": ends.min(0).sum(-1).tolist(), "high": ends.max(0).sum(-1).tolist()}
         outputs["twist"] = {"names": ["linear.x m/s", "angular.z rad/s"], **limits, "frame": "base"}
+    distance_m = config.success_distance_m or robot.body_width_m
+    placed = {"base_height_m": robot.spawn_height_m, "success_distance_m": distance_m}
     about: dict[str, Any] = {
-        "robot": {"name": robot.name, "control_mode": robot.control_mode, "rate_hz": rate_hz},
+        "robot": {"name": robot.name, "control_mode": robot.control_mode, "rate_hz": rate_hz, **placed},
         "inputs": {name: _input(name, x, config) | {"rate_hz": rate_hz} for name, x in inputs.items()},
         "outputs": {name: {"shape": [len(of["names"])], "dtype": "float32"} | of for name, of in outputs.items()},
         "cameras": [_camera(camera, robot.camera.body) for camera in env.sensors.cameras],
     }
+    if "waypoints" in about["inputs"]:
+        about["inputs"]["waypoints"]["spacing_m"] = config.waypoint_spacing_m
     if "lidar" in about["inputs"]:
         fields = ("lidar_rays", "lidar_fov_deg", "lidar_range_m", "lidar_pos_m")
         about["lidar"] = {name: getattr(config, name) for name in fields}

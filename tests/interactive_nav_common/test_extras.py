@@ -17,10 +17,10 @@ from docs.studies.pybullet_peer import BulletScene
 from interactive_nav import view
 from interactive_nav.interop.torch_bridge import to_torch
 from interactive_nav.physics import resolve_backend
+from interactive_nav.ros.__main__ import need_ros
 from interactive_nav_common.errors import UserError, optional
 from interactive_nav_common.jobs.on_ray import RayLauncher
 from interactive_nav_common.untrusted.guard import guarded_server
-from topological_nav.ros.__main__ import need_ros
 from topological_nav.scenes.rendering import need_engine
 from train.runs.tracking import import_wandb
 
@@ -35,7 +35,7 @@ USES: list[tuple[str, str, Callable[[], Any]]] = [
     ("gymnasium", "gymnasium", lambda: importlib.import_module("interactive_nav.interop.sb3_env")),
     ("pybullet", "pybullet", lambda: BulletScene(None, None)),  # type: ignore[arg-type]
     ("ray", "ray", lambda: RayLauncher("auto")),
-    ("ros2", "rclpy", need_ros),
+    ("ros2", "rclpy", lambda: need_ros("ros")),
     ("view", "mjviser", lambda: view.choose_viewer("browser")),
     ("wandb", "wandb", import_wandb),
     ("warp", "warp", lambda: resolve_backend("warp")),
@@ -48,7 +48,9 @@ GUARDED = {
     "interactive_nav/physics/warp_callbacks.py": {"warp"},  # after `resolve_backend`, as the next
     "interactive_nav/sensing/meshes.py": {"warp"},
     "benchmarks/steps_per_second.py": {"warp"},  # if it is in use
-    "topological_nav/ros/messages.py": {"rclpy"},  # after `need_ros`, as the next
+    "interactive_nav/ros/drive.py": {"rclpy"},  # after `need_ros`, as the next
+    "interactive_nav/ros/messages.py": {"rclpy"},
+    "interactive_nav/ros/nodes.py": {"rclpy"},
     "topological_nav/ros/nodes.py": {"rclpy"},
 }
 """File -> what it may import with a statement."""

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import interactive_nav
+from interactive_nav.interop.onnx_file import OnnxError
 from interactive_nav.robots import get_robot
 from interactive_nav.sensing.description import KEY, describe
 from tests.train.toy_env import ToyConfig, ToyEnv
@@ -26,7 +27,7 @@ from train.learners.learner import Snapshot
 from train.runs import checkpoint
 from train.runs.checkpoint import CheckpointMeta
 from train.runs.run_folder import RunFolder
-from train.scoring.onnx_policy import OnnxError, OnnxPolicy
+from train.scoring.onnx_policy import OnnxPolicy
 
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")

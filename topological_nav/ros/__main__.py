@@ -5,7 +5,6 @@ Exit codes: 0 done, 2 on a user's error or a failed node of `all` (one line on s
 
 import contextlib
 import dataclasses
-import json
 import os
 import shlex
 import signal
@@ -18,9 +17,10 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import UseAppendAction
 
-from interactive_nav_common.commands import Command, Flag, Words, option, parse, word
+from interactive_nav.ros.__main__ import Simulation, need_ros
+from interactive_nav_common.commands import Command, Words, option, parse, word
 from interactive_nav_common.config import overridden, refuse_unused, settings_help
-from interactive_nav_common.errors import UserError, missing, optional, reports_errors
+from interactive_nav_common.errors import UserError, reports_errors
 from interactive_nav_common.jobs.processes import GUARD
 from interactive_nav_common.jobs.progress import say
 from interactive_nav_common.signals import stop_signals
@@ -48,26 +48,8 @@ class All(Command):
 
 
 @dataclasses.dataclass(kw_only=True)
-class Sim(Command):
+class Sim(Simulation):
     """Run the simulator's node."""
-
-    scene: Annotated[Path, *word("SCENE")]
-    """Scene folder."""
-    settings: Words = ()
-    """Change settings, listed below."""
-    limit: Annotated[float, option(metavar="S")] = 1800.0
-    """Simulated seconds of an episode."""
-    lockstep: Flag = False
-    """Each picture waits for its velocity command."""
-    factor: float = 1.0
-    """Simulated seconds a second; 0: no waiting."""
-    bag: Annotated[Path | None, option(metavar="FOLDER")] = None
-    """Record all topics there (rosbag2)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.lockstep and self.factor != 1.0:
-            raise UserError("--factor has no effect with --lockstep; leave it out")
 
     @classmethod
     def epilog(cls) -> str:
@@ -131,14 +113,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 128 + stops[0] if stops else 0
 
 
-def need_ros() -> Any:
-    """Import rclpy, or say how to install it."""
-    line = missing("topological_nav.ros", "rclpy (wheels exist for Python 3.11)", "ros2")
-    for module in ("sensor_msgs.msg", "nav_msgs.msg", "geometry_msgs.msg", "rosgraph_msgs.msg", "std_msgs.msg"):
-        optional(module, line)
-    return optional("rclpy", line)
-
-
 def _networks(arguments: Navigator) -> Any:
     from topological_nav.weights.export import choose
 
@@ -151,7 +125,7 @@ def _networks(arguments: Navigator) -> Any:
 
 def _all(arguments: All, stops: list[int]) -> None:
     """Run both nodes until one ends; the other may then take `_GRACE_S` to end by itself."""
-    need_ros()
+    need_ros("topological_nav.ros")
     program = [sys.executable, "-c", GUARD, sys.executable, "-m", "topological_nav.ros"]
     bag = ["--bag", str(arguments.bag)] if arguments.bag else []
     words = {
@@ -185,27 +159,22 @@ def _all(arguments: All, stops: list[int]) -> None:
 
 def _sim(arguments: Sim, stops: list[int]) -> None:
     config = overridden(SimulatorConfig(), arguments.settings)
-    need_ros()
-    from topological_nav.ros.nodes import SimulatorNode, recording, ros_node
-    from topological_nav.ros.simulator import Pace, RosSimulator
 
-    with contextlib.redirect_stdout(sys.stderr):  # Warp prints its kernels
-        simulator = RosSimulator(arguments.scene, config)
-    pace = Pace(arguments.factor, arguments.lockstep, arguments.limit, arguments.bag is not None)
-    with contextlib.ExitStack() as stack:
-        node = stack.enter_context(ros_node("simulator"))
-        if arguments.bag is not None:
-            stack.enter_context(recording(stack.enter_context(ros_node("recorder")), arguments.bag))
-        tally = SimulatorNode(node, simulator, pace, say).run(lambda: bool(stops))
-        print(json.dumps(tally.row()), flush=True)
+    def build() -> Any:
+        from topological_nav.ros.simulator import build_simulator
+
+        return build_simulator(arguments.scene, config)
+
+    arguments.run(build, stops, "topological_nav.ros", "/camera/image_raw")
 
 
 def _navigator(arguments: Navigator, stops: list[int]) -> None:
     config = overridden(DRIVERS[arguments.driver](), arguments.settings)
     chosen = _networks(arguments) if arguments.driver == "topological" else None
-    need_ros()
+    need_ros("topological_nav.ros")
+    from interactive_nav.ros.nodes import ros_node
     from topological_nav.ros import drivers
-    from topological_nav.ros.nodes import NavigatorNode, ros_node
+    from topological_nav.ros.nodes import NavigatorNode
 
     if chosen is None:
         driver: drivers.Driver = drivers.HeadingDriver(config)
@@ -221,7 +190,7 @@ def _navigator(arguments: Navigator, stops: list[int]) -> None:
 
 def _check(arguments: Check, stops: list[int]) -> None:
     del arguments, stops
-    print(f"rclpy: {need_ros().__file__}")
+    print(f"rclpy: {need_ros('topological_nav.ros').__file__}")
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from interactive_nav import get_robot
+from interactive_nav.ros.messages import seen_through
 from interactive_nav_common.errors import ConfigError, UserError
 from scenes_mjcf.look import Lens
 from topological_nav.config import NavigatorConfig
@@ -20,7 +21,6 @@ from topological_nav.maps.build import NetworkSight
 from topological_nav.maps.graph import load_map
 from topological_nav.navigate.navigator import Navigator, State
 from topological_nav.ros.config import HeadingConfig
-from topological_nav.ros.messages import seen_through
 from topological_nav.weights.export import Choice
 
 

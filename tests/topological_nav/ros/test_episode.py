@@ -15,9 +15,9 @@ import pytest
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
+from interactive_nav.ros import messages
 from interactive_nav_common.config import overridden
 from tests.toys import write_room
-from topological_nav.ros import messages
 from topological_nav.ros.__main__ import main
 from topological_nav.ros.config import SimulatorConfig
 

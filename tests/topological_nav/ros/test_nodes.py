@@ -9,18 +9,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from interactive_nav.ros import messages, nodes
+from interactive_nav.ros.nodes import RosError, SimulatorNode, ros_node
+from interactive_nav.ros.simulator import Pace, Sensed
 from scenes_mjcf.look import Lens
-from topological_nav.ros import messages, nodes
-from topological_nav.ros.config import HeadingConfig, SimulatorConfig
+from topological_nav.ros import nodes as navigator_nodes
+from topological_nav.ros.config import HeadingConfig
 from topological_nav.ros.drivers import HeadingDriver, VelocityCommand
-from topological_nav.ros.nodes import NavigatorNode, RosError, SimulatorNode, ros_node
-from topological_nav.ros.simulator import Pace, Sensed
+from topological_nav.ros.nodes import Headings, NavigatorNode
 
 
 class Robot:
     """Has what `SimulatorNode` reads of a simulator; its world's frame is turned by a quarter from its start's."""
 
-    dt_s, config, lens = 0.1, SimulatorConfig(), Lens(8, 6, 90.0)
+    dt_s, lenses, odom_is_map, lidar_fov_deg, lidar_range_m = 0.1, {"": Lens(8, 6, 90.0)}, False, 240.0, 5.6
     range_min_m, lidar_pos_m, camera_pos_m = 0.05, (0.17, 0.0, 0.36), (0.1, 0.0, 1.02)
 
     def __init__(self):
@@ -36,8 +38,9 @@ class Robot:
         x, y, yaw = self.pose
         truth_w = np.array([-y, x, yaw + math.pi / 2])
         return Sensed(
-            0.1 * self.steps, np.full((6, 8, 3), self.steps % 256, np.uint8), np.ones(4, np.float32), self.pose.copy(),
-            np.zeros(3), np.zeros(3), yaw + math.pi / 2, bool(x > 0.5), False, 0.0, truth_w,
+            0.1 * self.steps, {"rgb": np.full((6, 8, 3), self.steps % 256, np.uint8)},
+            np.ones(4, np.float32), self.pose.copy(), np.zeros(3),
+            np.zeros(3), yaw + math.pi / 2, bool(x > 0.5), False, 0.0, truth_w,
         )  # fmt: skip
 
 
@@ -143,7 +146,7 @@ def test_simulated_time_follows_the_clock_by_its_factor(bus, monkeypatch):
 
 
 def test_without_a_navigator_lockstep_says_what_is_missing(monkeypatch):
-    monkeypatch.setattr(nodes, "_PATIENCE_S", 0.3)
+    monkeypatch.setattr(nodes, "PATIENCE_S", 0.3)
     with ros_node("alone") as node:
         simulator = SimulatorNode(node, Robot(), Pace(lockstep=True))  # type: ignore[arg-type]
         with pytest.raises(RosError, match="nobody joined /camera/image_raw, /cmd_vel: is the navigator running"):
@@ -180,7 +183,7 @@ def test_a_velocity_that_is_not_finite_stops_the_robot(bus):
 
 
 def test_a_lost_camera_stops_the_robot(bus, monkeypatch):
-    monkeypatch.setattr(nodes, "LOST_S", 0.3)
+    monkeypatch.setattr(navigator_nodes, "LOST_S", 0.3)
     said, stops = [], []
     navigator = NavigatorNode(bus.navigator, Watcher(None, 9), say=said.append)  # type: ignore[arg-type]
     thread = threading.Thread(target=lambda: navigator.run(lambda: bool(stops)))
@@ -191,10 +194,31 @@ def test_a_lost_camera_stops_the_robot(bus, monkeypatch):
     until(lambda: camera.get_subscription_count() == 2 and compass.get_subscription_count() == 2)
     head = messages.header(0.0, "base_link")
     compass.publish(messages.imu_message(0.0, np.zeros(3), head))
-    camera.publish(messages.image_message(robot.rgb, head))
+    camera.publish(messages.image_message(robot.images["rgb"], head))
     speeds = bus.of(messages.COMMAND)
     until(lambda: [m.linear.x for m in speeds] == [0.2, 0.0])
     assert said[-1] == "navigator: no picture came on /camera/image_raw for 0.3 s; the robot stops"
     stops.append(1)
     thread.join(5)
     assert not thread.is_alive()
+
+
+def test_headings_turn_the_short_way_between_two_tellings():
+    told = Headings()
+    with pytest.raises(ValueError, match="no heading"):
+        told.at(1.0)
+    told.add(1.0, math.radians(170))
+    told.add(2.0, math.radians(-170))
+    assert math.degrees(told.at(1.25)) == pytest.approx(175)
+    assert math.degrees(told.at(1.75)) == pytest.approx(-175)
+    assert math.degrees(told.at(0.0)) == pytest.approx(170) and math.degrees(told.at(9.0)) == pytest.approx(-170)
+    assert told.newest_s == 2.0
+    told.add(0.5, 0.25)  # a clock set back
+    assert told.at(2.0) == 0.25 and told.newest_s == 0.5
+
+
+def test_only_so_many_headings_are_kept():
+    told = Headings(kept=3)
+    for i in range(10):
+        told.add(float(i), 0.1 * i)
+    assert told.at(0.0) == pytest.approx(0.7)

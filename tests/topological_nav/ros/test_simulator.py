@@ -9,7 +9,7 @@ import pytest
 from interactive_nav_common.errors import UserError
 from tests.toys import write_room
 from topological_nav.ros.config import SimulatorConfig
-from topological_nav.ros.simulator import RosSimulator
+from topological_nav.ros.simulator import build_simulator
 
 CONFIG = SimulatorConfig(
     start=(-2.0, 1.0, 0.0), width=32, height=24, supersample=2, engine="rays", lidar_rays=4, lidar_fov_deg=360.0,
@@ -24,7 +24,7 @@ def room(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def simulator(room):
-    return RosSimulator(room, CONFIG)
+    return build_simulator(room, CONFIG)
 
 
 def test_it_drives_ahead_until_it_meets_the_wall(simulator):
@@ -33,7 +33,7 @@ def test_it_drives_ahead_until_it_meets_the_wall(simulator):
     assert first.odometry == pytest.approx([0, 0, 0])
     # The scanner is 0.17 m ahead: behind, to the right, ahead (out of range) and to the left.
     assert first.scan * 4.5 == pytest.approx([1.17, 3.0, 4.5, 1.0], abs=1e-4)
-    assert first.rgb.shape == (24, 32, 3) and first.rgb.std() > 5
+    assert first.images["rgb"].shape == (24, 32, 3) and first.images["rgb"].std() > 5
     for _ in range(20):
         now = simulator.step(0.5, 0.0)
     assert now.time_s == pytest.approx(2.0)
@@ -64,18 +64,18 @@ def test_it_turns_as_fast_as_it_is_told_and_pictures_change(simulator):
     assert turned == pytest.approx(1.0, abs=0.15)  # less what speeding up takes
     assert math.remainder(after.odometry[2] - after.heading_rad, math.tau) == pytest.approx(0.0, abs=1e-4)
     assert after.angular_b[2] == pytest.approx(0.5, abs=0.25)  # tyres that scrub sideways do it in jerks
-    assert np.abs(after.rgb.astype(float) - before.rgb).mean() > 2
+    assert np.abs(after.images["rgb"].astype(float) - before.images["rgb"]).mean() > 2
 
 
 def test_pictures_span_the_field_of_view_that_is_asked_for(room):
-    narrow = RosSimulator(room, dataclasses.replace(CONFIG, fov_deg=40.0)).sense().rgb
-    wide = RosSimulator(room, CONFIG).sense().rgb
+    narrow = build_simulator(room, dataclasses.replace(CONFIG, fov_deg=40.0)).sense().images["rgb"]
+    wide = build_simulator(room, CONFIG).sense().images["rgb"]
     assert np.abs(narrow.astype(float) - wide).mean() > 2
 
 
 def test_a_blocked_start_is_refused(room):
     with pytest.raises(UserError, match=r"start \(1.4, -0.5\) is 0.00 m from obstacles, expected at least"):
-        RosSimulator(room, SimulatorConfig(start=(1.4, -0.5, 0.0)))
+        build_simulator(room, SimulatorConfig(start=(1.4, -0.5, 0.0)))
 
 
 def test_settings_are_checked():

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from interactive_nav.ros import messages
 from scenes_mjcf.look import Lens
-from topological_nav.ros import messages
-from topological_nav.ros.nodes import Headings
 
 HEAD = messages.header(0.3, "base_link")
 
@@ -149,24 +148,3 @@ def test_the_optical_frame_looks_along_x_with_its_x_to_the_right():
 def test_times_are_whole_microseconds():
     stamps = [messages.stamp(time_s) for time_s in (0.3, 0.1 + 0.2, 1.9999999)]
     assert [(s.sec, s.nanosec) for s in stamps] == [(1, 300_000_000), (1, 300_000_000), (3, 0)]
-
-
-def test_headings_turn_the_short_way_between_two_tellings():
-    told = Headings()
-    with pytest.raises(ValueError, match="no heading"):
-        told.at(1.0)
-    told.add(1.0, math.radians(170))
-    told.add(2.0, math.radians(-170))
-    assert math.degrees(told.at(1.25)) == pytest.approx(175)
-    assert math.degrees(told.at(1.75)) == pytest.approx(-175)
-    assert math.degrees(told.at(0.0)) == pytest.approx(170) and math.degrees(told.at(9.0)) == pytest.approx(-170)
-    assert told.newest_s == 2.0
-    told.add(0.5, 0.25)  # a clock set back
-    assert told.at(2.0) == 0.25 and told.newest_s == 0.5
-
-
-def test_only_so_many_headings_are_kept():
-    told = Headings(kept=3)
-    for i in range(10):
-        told.add(float(i), 0.1 * i)
-    assert told.at(0.0) == pytest.approx(0.7)

@@ -6,6 +6,7 @@ forward, x right, y down. Frames are named as in REP 105, topics as in Nav2.
 
 import array
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import (
     Point,
     Pose,
+    PoseStamped,
     PoseWithCovariance,
     Quaternion,
     Transform,
@@ -21,11 +23,11 @@ from geometry_msgs.msg import (
     TwistWithCovariance,
     Vector3,
 )
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry, Path
 from PIL import Image as Pillow
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CameraInfo, Image, Imu, LaserScan
+from sensor_msgs.msg import CameraInfo, Image, Imu, Joy, LaserScan
 from std_msgs.msg import Bool, Float32, Header
 
 from interactive_nav_common.errors import UserError
@@ -41,6 +43,7 @@ IMAGE, INFO = "/camera/image_raw", "/camera/camera_info"
 SCAN, ODOMETRY, HEADING = "/scan", "/odom", "/imu/data"
 MOVABLE, STRUCTURE, FORCE = "/contacts/movable", "/contacts/structure", "/contacts/force"
 TF, TF_STATIC = "/tf", "/tf_static"
+GOAL, PLAN, JOY = "/goal_pose", "/plan", "/joy"
 FROM_ROBOT: dict[str, Any] = {
     **{CLOCK: Clock, IMAGE: Image, INFO: CameraInfo, SCAN: LaserScan, ODOMETRY: Odometry, HEADING: Imu},
     **{MOVABLE: Bool, STRUCTURE: Bool, FORCE: Float32},
@@ -48,14 +51,34 @@ FROM_ROBOT: dict[str, Any] = {
 }
 """Topics that the simulator publishes, and their types; a robot publishes the same apart from the clock."""
 TOPICS = {**FROM_ROBOT, COMMAND: Twist, DONE: Bool}
+REQUESTS: dict[str, Any] = {GOAL: PoseStamped, PLAN: Path, JOY: Joy}
+"""Topics by which people and planners steer a policy, and their types."""
 HEADING_TOPICS = {"imu": HEADING, "odom": ODOMETRY}
 """Where the navigator's heading may come from."""
 LATCHED = (TF_STATIC, DONE)
-ODOM, BASE, LIDAR, CAMERA, OPTICAL = "odom", "base_link", "lidar_link", "camera_link", "camera_optical_frame"
+MAP, ODOM, BASE, LIDAR, CAMERA, OPTICAL = (
+    "map",
+    "odom",
+    "base_link",
+    "lidar_link",
+    "camera_link",
+    "camera_optical_frame",
+)
 EPOCH_S = 1.0
 """First time of the simulated clock: ROS takes 0 as "not set"."""
-_ORDER = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2), "bgra8": (2, 1, 0)}
-"""Readable encodings -> the channels of red, green and blue."""
+CAMERA_TOPICS = {"rgb": "image_raw", "depth": "depth/image_raw", "segmentation": "segmentation/image_raw"}
+"""Kind of image -> its topic below the camera's."""
+_ENCODINGS: dict[str, dict[str, tuple[str, int, list[int]]]] = {
+    "rgb": {
+        "rgb8": ("u1", 3, [0, 1, 2]),
+        "bgr8": ("u1", 3, [2, 1, 0]),
+        "rgba8": ("u1", 4, [0, 1, 2]),
+        "bgra8": ("u1", 4, [2, 1, 0]),
+    },
+    "depth": {"32FC1": ("f4", 1, [0]), "16UC1": ("u2", 1, [0])},
+    "segmentation": {"mono8": ("u1", 1, [0]), "8UC1": ("u1", 1, [0])},
+}
+"""Kind of image -> readable encodings -> type, channels, and those that are read."""
 OPTICAL_QUAT = Quaternion(x=-0.5, y=0.5, z=-0.5, w=0.5)
 """A camera's optical frame in the frame that looks along its x axis."""
 
@@ -89,29 +112,39 @@ def header(time_s: float, frame: str) -> Header:
     return Header(stamp=stamp(time_s), frame_id=frame)
 
 
-def image_message(rgb: np.ndarray, head: Header) -> Image:
-    """Return a picture [H, W, 3] u8 as a message."""
-    height, width, channels = rgb.shape
-    assert channels == 3 and rgb.dtype == np.uint8
-    data = array.array("B", rgb.tobytes())
-    return Image(header=head, height=height, width=width, encoding="rgb8", step=3 * width, data=data)
+def camera_topic(image: str, topic: str = "") -> str:
+    """Return the topic of an image, such as `depth` or `left/depth`, or another topic of its camera."""
+    prefix, _, kind = image.rpartition("/")
+    return "/".join(["/camera", *([prefix] if prefix else []), topic or CAMERA_TOPICS[kind]])
 
 
-def image_array(message: Image) -> np.ndarray:
-    """Return [H, W, 3] u8 RGB of a picture; rows may be padded."""
-    order = _ORDER.get(message.encoding)
-    if order is None:
-        raise MessageError(f"image encoding is '{message.encoding}', expected one of {', '.join(_ORDER)}")
-    channels = 4 if "a" in message.encoding else 3
+def image_message(image: np.ndarray, head: Header) -> Image:
+    """Return colours [H, W, 3] u8, class ids [H, W] u8 or depth [H, W] f32, m, as a message."""
+    height, width, *_ = image.shape
+    encoding = "rgb8" if image.ndim == 3 else {"uint8": "mono8", "float32": "32FC1"}[image.dtype.name]
+    step, data = image[0].nbytes, array.array("B", image.tobytes())
+    return Image(header=head, height=height, width=width, encoding=encoding, step=step, data=data)
+
+
+def image_array(message: Image, kind: str = "rgb") -> np.ndarray:
+    """Return colours [H, W, 3] u8, depth [H, W] f32, m, or class ids [H, W] u8 of a picture; rows may be padded."""
+    if message.encoding not in _ENCODINGS[kind]:
+        raise MessageError(f"image encoding is '{message.encoding}', expected one of {', '.join(_ENCODINGS[kind])}")
+    dtype, channels, order = _ENCODINGS[kind][message.encoding]
+    pixel = np.dtype(dtype).newbyteorder(">" if message.is_bigendian else "<")
     height, width, step = message.height, message.width, message.step
-    data = np.frombuffer(message.data, np.uint8)
-    if step < channels * width or len(data) != step * height:
+    data, row = np.frombuffer(message.data, np.uint8), pixel.itemsize * channels * width
+    if step < row or len(data) != step * height:
         raise MessageError(
             f"image of {width} x {height} ({message.encoding}) has {len(data)} bytes in rows of {step}, "
-            f"expected {channels * width * height} in rows of {channels * width} or padded ones"
+            f"expected {row * height} in rows of {row} or padded ones"
         )
-    rows = data.reshape(height, step)[:, : channels * width]
-    return np.ascontiguousarray(rows.reshape(height, width, channels)[..., list(order)])
+    rows = np.ascontiguousarray(data.reshape(height, step)[:, :row]).view(pixel)
+    image = np.ascontiguousarray(rows.reshape(height, width, channels)[..., order])
+    if kind != "depth":
+        return image if kind == "rgb" else image[..., 0]
+    depth = image[..., 0].astype(np.float32) * (0.001 if dtype == "u2" else 1.0)  # REP 118: mm or m
+    return np.where(np.isfinite(depth), depth, 0.0)
 
 
 def info_message(lens: Lens, head: Header) -> CameraInfo:
@@ -141,12 +174,12 @@ def info_lens(message: CameraInfo) -> Lens:
     return Lens(message.width, message.height, math.degrees(2 * math.atan(message.height / 2 / fy)))
 
 
-def seen_through(rgb: np.ndarray, fov_deg: float, lens: Lens) -> np.ndarray:
-    """Return what a narrower or coarser pinhole lens on the same axis would show of a picture [H, W, 3] u8.
+def seen_through(image: np.ndarray, fov_deg: float, lens: Lens) -> np.ndarray:
+    """Return what a narrower or coarser pinhole lens on the same axis would show of a picture [H, W, ...].
 
-    It is [h, w, 3] u8: the middle of the picture, averaged over each wanted pixel.
+    It is [h, w, ...], the middle of the picture: colours averaged over each wanted pixel, else the nearest pixel's.
     """
-    height, width, _ = rgb.shape
+    height, width, *channels = image.shape
     have = Lens(width, height, fov_deg)
     # In pixels of the picture: what the wanted lens covers.
     rows = 2 * lens.half_height / have.pixel
@@ -158,7 +191,8 @@ def seen_through(rgb: np.ndarray, fov_deg: float, lens: Lens) -> np.ndarray:
         )
     rows, columns = min(rows, height), min(columns, width)
     box = ((width - columns) / 2, (height - rows) / 2, (width + columns) / 2, (height + rows) / 2)
-    return np.asarray(Pillow.fromarray(rgb).resize((lens.width, lens.height), Pillow.Resampling.BOX, box=box))
+    how = Pillow.Resampling.BOX if channels else Pillow.Resampling.NEAREST
+    return np.asarray(Pillow.fromarray(image).resize((lens.width, lens.height), how, box=box))
 
 
 def scan_message(
@@ -183,6 +217,21 @@ def scan_message(
     )
 
 
+def scan_readings(message: LaserScan, rays: int, fov_deg: float, range_max_m: float) -> np.ndarray:
+    """Return [rays] f32 in [0, 1], as `scan_message` has them, from the nearest beams of a scan that covers as much."""
+    ranges, step = np.asarray(message.ranges, np.float64), abs(message.angle_increment)
+    if np.isnan(ranges).any() or not (len(ranges) and step > 0.0):
+        raise MessageError(f"{np.isnan(ranges).sum()} of {len(ranges)} ranges are NaN, expected none (REP 117)")
+    wanted = np.radians(fov_deg * (np.arange(rays) / rays - 0.5))
+    turned = (wanted - message.angle_min) * math.copysign(1.0, message.angle_increment)
+    beams = np.floor((turned + step / 2) % math.tau / step).astype(int)
+    if (beams >= len(ranges)).any():
+        covered = math.degrees(step * len(ranges))
+        raise MessageError(f"scan covers {covered:.0f} degrees, expected those that the policy sees ({fov_deg:.0f})")
+    near = np.maximum(ranges, message.range_min)[beams]  # -inf: too near (REP 117)
+    return np.clip(near / range_max_m, 0.0, 1.0).astype(np.float32)
+
+
 def yaw_quat(yaw_rad: float) -> Quaternion:
     """Return a turn about z."""
     return Quaternion(z=math.sin(yaw_rad / 2), w=math.cos(yaw_rad / 2))
@@ -204,6 +253,24 @@ def odometry_message(pose: np.ndarray, linear_b: np.ndarray, angular_b: np.ndarr
     there = Pose(position=Point(x=x, y=y), orientation=yaw_quat(yaw))
     moving = TwistWithCovariance(twist=Twist(linear=_vector(linear_b), angular=_vector(angular_b)))
     return Odometry(header=head, child_frame_id=BASE, pose=PoseWithCovariance(pose=there), twist=moving)
+
+
+def odometry_values(message: Odometry) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pose (3,), x, y (m) and yaw (rad), and the linear and angular velocity (6,) in the robot's frame."""
+    at, moving = message.pose.pose, message.twist.twist
+    pose = np.array([at.position.x, at.position.y, quat_yaw(at.orientation)])
+    velocity = np.array([getattr(v, axis) for v in (moving.linear, moving.angular) for axis in "xyz"])
+    if not (np.isfinite(pose).all() and np.isfinite(velocity).all()):
+        raise MessageError("odometry has numbers that are not finite")
+    return pose, velocity
+
+
+def path_points(poses: Sequence[Pose], frame: str) -> np.ndarray:
+    """Return [p, 2], m, of poses in the map's or the odometry's frame."""
+    points = np.array([(pose.position.x, pose.position.y) for pose in poses]).reshape(-1, 2)
+    if frame not in (MAP, ODOM) or not np.isfinite(points).all():
+        raise MessageError(f"frame is '{frame}', expected '{MAP}' or '{ODOM}', and finite positions")
+    return points
 
 
 def imu_message(yaw_rad: float, angular_b: np.ndarray, head: Header) -> Imu:

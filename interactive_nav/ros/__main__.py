@@ -1,0 +1,178 @@
+"""Run `interactive-nav ros drive|simulate`: a policy and a simulated robot as ROS 2 nodes.
+
+Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when stopped.
+"""
+
+import contextlib
+import dataclasses
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from interactive_nav.config import make_config
+from interactive_nav_common.commands import Command, Flag, Words, option, parse, word
+from interactive_nav_common.config import overridden, settings_help
+from interactive_nav_common.errors import UserError, missing, optional, reports_errors
+from interactive_nav_common.jobs.progress import say
+from interactive_nav_common.signals import stop_signals
+
+
+@dataclasses.dataclass(kw_only=True)
+class Simulation(Command):
+    """Run a simulated robot's node."""
+
+    scene: Annotated[Path, *word("SCENE")]
+    """Scene folder."""
+    settings: Words = ()
+    """Change settings, listed below."""
+    limit: Annotated[float, option(metavar="S")] = 1800.0
+    """Simulated seconds of an episode."""
+    lockstep: Flag = False
+    """Each picture waits for its velocity command."""
+    factor: float = 1.0
+    """Simulated seconds a second; 0: no waiting."""
+    bag: Annotated[Path | None, option(metavar="FOLDER")] = None
+    """Record all topics there (rosbag2)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.lockstep and self.factor != 1.0:
+            raise UserError("--factor has no effect with --lockstep; leave it out")
+
+    def run(self, build: Callable[[], Any], stops: list[int], program: str, awaited: str) -> None:
+        """Run the node of the simulator that `build` returns, and print its tally; in lockstep it starts when somebody
+        reads the topic `awaited`."""
+        need_ros(program)
+        from interactive_nav.ros.nodes import SimulatorNode, recording, ros_node
+        from interactive_nav.ros.simulator import Pace
+
+        with contextlib.redirect_stdout(sys.stderr):  # Warp prints its kernels
+            simulator = build()
+        pace = Pace(self.factor, self.lockstep, self.limit, self.bag is not None)
+        with contextlib.ExitStack() as stack:
+            node = stack.enter_context(ros_node("simulator"))
+            if self.bag is not None:
+                stack.enter_context(recording(stack.enter_context(ros_node("recorder")), self.bag))
+            tally = SimulatorNode(node, simulator, pace, say, awaited).run(lambda: bool(stops))
+            print(json.dumps(tally.row()), flush=True)
+
+
+DEFAULTS = {"observations": ("depth", "segmentation", "rgb"), "episode_steps": 10**8, "backend": "native"}
+"""Of `simulate`, where they differ from the environment's."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Simulate(Simulation):
+    """Run a simulated robot in a scene: sensors on topics, driven by cmd_vel. The odometry begins at the robot's pose
+    in the map."""
+
+    robot: Annotated[str, option(metavar="NAME")] = "turtlebot"
+    """Robot, or its file."""
+    start: Annotated[str | None, option(metavar="X,Y,YAW")] = None
+    """In m and rad, map (default: drawn)."""
+    seed: int = 0
+    """Of the start, small objects and noise."""
+
+    @classmethod
+    def epilog(cls) -> str:
+        """Return the settings."""
+        return f"settings (key=default):\n{settings_help(make_config(**DEFAULTS))}"
+
+
+@dataclasses.dataclass(kw_only=True)
+class Drive(Command):
+    """Drive a robot by a policy: cmd_vel from odom and the scan, contacts and cameras that the policy needs. It goes
+    along plan, or to goal_pose: by the shortest path in --map, without one straight ahead, whatever stands there."""
+
+    policy: Annotated[Path, *word("POLICY.onnx")]
+    """File of interactive-nav export."""
+    robot: Annotated[str | None, option(metavar="NAME")] = None
+    """Refuse a policy of another robot."""
+    map: Annotated[Path | None, option(metavar="SCENE")] = None
+    """Scene folder, for shortest paths."""
+    odom_in_map: Annotated[str, option(metavar="X,Y,YAW")] = "0,0,0"
+    """Pose of the odometry's frame in the map, m and rad, until /tf has one."""
+    max_linear: Annotated[float | None, option(metavar="M/S")] = None
+    """Limit of the speed (default: the policy's)."""
+    max_angular: Annotated[float | None, option(metavar="RAD/S")] = None
+    """Limit of the turn rate (default: the policy's)."""
+    silence: Annotated[float, option(metavar="S")] = 1.0
+    """Stop when a needed topic is silent for so long."""
+    dead_man: Annotated[int | None, option(metavar="BUTTON")] = None
+    """Drive only while this button of joy is held."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("max_linear", "max_angular", "silence"):
+            if not (getattr(self, name) is None or getattr(self, name) > 0.0):
+                raise UserError(f"--{name.replace('_', '-')} is {getattr(self, name)}, expected more than 0")
+
+
+COMMANDS = {kind.__name__.lower(): kind for kind in (Drive, Simulate)}
+
+
+@reports_errors("interactive_nav.ros")
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command."""
+    run = {Drive: _drive, Simulate: _simulate}
+    with stop_signals() as stops:
+        arguments = parse(COMMANDS, "python -m interactive_nav.ros", argv)
+        run[type(arguments)](arguments, stops)
+        return 128 + stops[0] if stops else 0
+
+
+def need_ros(program: str) -> Any:
+    """Import rclpy, or say how to install it."""
+    line = missing(program, "rclpy (wheels exist for Python 3.11)", "ros2")
+    for module in ("sensor_msgs.msg", "nav_msgs.msg", "geometry_msgs.msg", "rosgraph_msgs.msg", "std_msgs.msg"):
+        optional(module, line)
+    return optional("rclpy", line)
+
+
+def _pose(text: str, name: str) -> tuple[float, ...]:
+    try:
+        x, y, yaw = map(float, text.split(","))
+    except ValueError:
+        raise UserError(f"{name} is {text!r}, expected X,Y,YAW, such as 1.0,-0.5,0") from None
+    return x, y, yaw
+
+
+def _simulate(arguments: Simulate, stops: list[int]) -> None:
+    config = overridden(make_config(**DEFAULTS), arguments.settings)
+    start = _pose(arguments.start, "--start") if arguments.start else ()
+
+    def build() -> Any:
+        from interactive_nav import InteractiveNav, get_robot, load_scene
+        from interactive_nav.ros.simulator import NEEDED, RosSimulator
+
+        observed = tuple(dict.fromkeys((*config.observations, *NEEDED)))
+        robot = get_robot(arguments.robot, config.control_mode)
+        env = InteractiveNav(robot, (load_scene(arguments.scene),), dataclasses.replace(config, observations=observed))
+        return RosSimulator(env, arguments.seed, start)
+
+    arguments.run(build, stops, "interactive_nav.ros", "/odom")
+
+
+def _drive(arguments: Drive, stops: list[int]) -> None:
+    from interactive_nav.interop.onnx_file import OnnxFile
+    from interactive_nav.ros.pilot import Pilot, scene_path
+
+    policy = OnnxFile(arguments.policy)
+    name = policy.about["robot"]["name"]
+    if arguments.robot not in (None, name):
+        raise UserError(f"{arguments.policy}: the policy is for robot '{name}', expected '{arguments.robot}'")
+    path = scene_path(policy.about, arguments.map) if arguments.map else None
+    limits = arguments.max_linear, arguments.max_angular
+    pilot = Pilot(policy, limits, _pose(arguments.odom_in_map, "--odom-in-map"), path)
+    need_ros("interactive_nav.ros")
+    from interactive_nav.ros.drive import DriveNode
+    from interactive_nav.ros.nodes import ros_node
+
+    with ros_node("policy") as node:
+        DriveNode(node, pilot, arguments.silence, arguments.dead_man, say).run(lambda: bool(stops))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,178 @@
+"""Simulate a robot's sensors in a scene under velocity commands; without ROS."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from interactive_nav.navigation.lookup import all_free
+from interactive_nav.sensing.sensors import LIDAR_NEAR_M
+from interactive_nav_common.errors import UserError
+from scenes_mjcf.categories import SEGMENTATIONS
+
+NEEDED = ("velocity", "localisation", "odometry", "lidar")
+"""Observations of the environment that are sent on topics other than a camera's."""
+Images = Mapping[str, np.ndarray]
+"""By kind, such as `rgb` or `left/depth`: colours [H, W, 3] u8, depth [H, W] f32 in m, class ids [H, W] u8."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensed:
+    """Hold one moment as sensors measure it, and the ground truth for scoring."""
+
+    time_s: float
+    images: Images
+    scan: np.ndarray
+    """[lidar_rays] f32 in [0, 1], from the right on; 1: nothing within range."""
+    odometry: np.ndarray
+    """(3,) x, y (m), yaw (rad) in the odometry's frame."""
+    linear_b: np.ndarray
+    """(3,) m/s, robot frame."""
+    angular_b: np.ndarray
+    """(3,) rad/s, robot frame."""
+    heading_rad: float
+    """Yaw in the world's frame."""
+    touches_movable: bool
+    touches_structure: bool
+    force_n: float
+    """Mean over the last control step of what the robot pushes with."""
+    truth_w: np.ndarray
+    """(3,) x, y (m), yaw (rad), world: no sensor measures it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pace:
+    """Set how simulated time runs."""
+
+    factor: float = 1.0
+    """Simulated seconds per second; 0: as fast as possible."""
+    lockstep: bool = False
+    """Each picture waits for its command, so that nothing depends on the computer's speed."""
+    limit_s: float = 1800.0
+    """Simulated seconds until the episode is over."""
+    recorded: bool = False
+    """Start when every topic has a listener, and the picture has two."""
+
+
+@dataclasses.dataclass
+class Tally:
+    """Sum up an episode, from the simulator's ground truth."""
+
+    seconds: float = 0.0
+    path_m: float = 0.0
+    movable_s: float = 0.0
+    structure_s: float = 0.0
+    done: bool = False
+    """The navigator declared the episode over, within the limit."""
+    end_w: tuple[float, ...] = ()
+    """x, y (m), yaw (rad), world."""
+
+    def add(self, before: Sensed, after: Sensed) -> None:
+        """Add a control step."""
+        step = after.time_s - before.time_s
+        self.seconds += step
+        self.path_m += float(np.linalg.norm(after.truth_w[:2] - before.truth_w[:2]))
+        self.movable_s += step * after.touches_movable
+        self.structure_s += step * after.touches_structure
+        self.end_w = tuple(round(float(v), 4) for v in after.truth_w)
+
+    def row(self) -> dict[str, Any]:
+        """Return the totals as JSON holds them."""
+        return {k: round(v, 4) if isinstance(v, float) else v for k, v in dataclasses.asdict(self).items()}
+
+
+class RosSimulator:
+    """Simulate one robot in one environment, which observes `NEEDED` and takes velocity commands."""
+
+    range_min_m = LIDAR_NEAR_M
+
+    def __init__(
+        self,
+        env: Any,
+        seed: int = 0,
+        start: tuple[float, ...] = (),
+        odom_is_map: bool = True,
+        pictures: Callable[[Any], Images] | None = None,
+    ):
+        """Place the robot and compile.
+
+        Args:
+            start: x, y (m) and yaw (rad), world; empty: drawn.
+            odom_is_map: the odometry begins at the robot's pose in the world, not at zero.
+            pictures: what cameras see of a state; None: as the environment observes it.
+        """
+        self._env, self._pictures, config = env, pictures or self._observed, env.config
+        twist = env.robot.twist
+        if twist is None:
+            env.robot.drive(0.0, 0.0)  # says which modes take a velocity
+        self.lidar_fov_deg, self.lidar_range_m = config.lidar_fov_deg, config.lidar_range_m
+        self.lidar_pos_m, self.dt_s = config.lidar_pos_m, env.dt
+        self.lenses = {camera.prefix: camera.lens for camera in env.sensors.cameras}
+        self._step = jax.jit(env.step)
+        key = jax.random.PRNGKey(seed)
+        begin = env.draw_start(key)
+        if start:
+            x, y, yaw = start
+            if not bool(all_free(env.tables, jnp.int32(0), jnp.asarray([[x, y]], jnp.float32))):
+                raise UserError(f"start ({x}, {y}) is not where the robot has room; choose another")
+            begin = begin.replace(start_xy_w=jnp.asarray([x, y], jnp.float32), start_yaw_rad=jnp.float32(yaw))
+        self._state = jax.jit(env.reset_to)(begin, jax.random.fold_in(key, 1))
+        self._force_before, self._origin, self.odom_is_map = 0.0, np.zeros(3), odom_is_map
+        if odom_is_map:
+            self._origin = self.sense().truth_w
+        jax.block_until_ready(self._step(self._state, jnp.zeros(env.action_size)))  # compiled before it counts
+
+    @property
+    def camera_pos_m(self) -> tuple[float, float, float]:
+        """Return the camera's position in the base's frame."""
+        return self._env.robot.camera.pos_m
+
+    def step(self, linear_mps: float, angular_radps: float) -> Sensed:
+        """Drive for one control step; commands beyond the robot's limits are clipped."""
+        self._force_before = float(self._state.info["nav"].memory["force_sum_n"])
+        action = self._env.robot.drive(jnp.float32(linear_mps), jnp.float32(angular_radps), jnp)
+        self._state = self._step(self._state, action)
+        if float(self._state.metrics["nonfinite"]) > 0:
+            raise UserError("the physics broke down (non-finite state); start again, with another seed")
+        return self.sense()
+
+    def sense(self) -> Sensed:
+        """Return what the sensors measure now."""
+        nav, sizes, obs = self._state.info["nav"], self._env.sensors.sizes, self._state.obs
+        vector = np.asarray(obs["state"] if isinstance(obs, Mapping) else obs)
+        values: Any = dict(zip(sizes, np.split(vector, np.cumsum(list(sizes.values()))[:-1]), strict=True))
+        movable, structure = (bool(t) for t in np.asarray(nav.memory["touching"]))
+        return Sensed(
+            time_s=int(nav.step_count) * self.dt_s,
+            images=self._pictures(self._state),
+            scan=values["lidar"],
+            odometry=compose(self._origin, values["odometry"]),
+            linear_b=values["velocity"][:3],
+            angular_b=values["velocity"][3:],
+            heading_rad=float(values["localisation"][2]),
+            touches_movable=movable,
+            touches_structure=structure,
+            force_n=float(nav.memory["force_sum_n"]) - self._force_before,
+            truth_w=values["localisation"],
+        )
+
+    def _observed(self, state: Any) -> Images:
+        config, pixels = self._env.config, "pixels/"
+        divisor = SEGMENTATIONS[config.segmentation_classes].divisor
+        factors = {"rgb": 255, "depth": np.float32(config.depth_range_m), "segmentation": divisor}
+        images = {name.removeprefix(pixels): np.asarray(x) for name, x in state.obs.items() if name.startswith(pixels)}
+        whole = {name: x / np.float32(255 if x.dtype == np.uint8 else 1) for name, x in images.items()}
+        scaled = {name: x * factors[kind] for name, x in whole.items() if (kind := name.rpartition("/")[2]) in factors}
+        return {
+            name: x[..., 0] if name.endswith("depth") else np.squeeze(np.round(x).astype(np.uint8))
+            for name, x in scaled.items()
+        }
+
+
+def compose(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
+    """Return a pose (3,), x, y (m), yaw (rad), of a frame at the pose `outer`, in that one's frame."""
+    cos, sin = np.cos(outer[2]), np.sin(outer[2])
+    return outer + np.array([cos * inner[0] - sin * inner[1], sin * inner[0] + cos * inner[1], inner[2]])
