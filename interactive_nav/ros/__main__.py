@@ -3,61 +3,19 @@
 Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when stopped.
 """
 
-import contextlib
 import dataclasses
-import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 from interactive_nav.config import make_config
-from interactive_nav_common.commands import Command, Flag, Words, option, parse, word
+from interactive_nav.ros.commands import Simulation, need_ros
+from interactive_nav_common.commands import Command, option, parse, word
 from interactive_nav_common.config import overridden, settings_help
-from interactive_nav_common.errors import UserError, missing, optional, reports_errors
+from interactive_nav_common.errors import UserError, reports_errors
 from interactive_nav_common.jobs.progress import say
 from interactive_nav_common.signals import stop_signals
-
-
-@dataclasses.dataclass(kw_only=True)
-class Simulation(Command):
-    """Run a simulated robot's node."""
-
-    scene: Annotated[Path, *word("SCENE")]
-    """Scene folder."""
-    settings: Words = ()
-    """Change settings, listed below."""
-    limit: Annotated[float, option(metavar="S")] = 1800.0
-    """Simulated seconds of an episode."""
-    lockstep: Flag = False
-    """Each picture waits for its velocity command."""
-    factor: float = 1.0
-    """Simulated seconds a second; 0: no waiting."""
-    bag: Annotated[Path | None, option(metavar="FOLDER")] = None
-    """Record all topics there (rosbag2)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.lockstep and self.factor != 1.0:
-            raise UserError("--factor has no effect with --lockstep; leave it out")
-
-    def run(self, build: Callable[[], Any], stops: list[int], program: str, awaited: str) -> None:
-        """Run the node of the simulator that `build` returns, and print its tally; in lockstep it starts when somebody
-        reads the topic `awaited`."""
-        need_ros(program)
-        from interactive_nav.ros.nodes import SimulatorNode, recording, ros_node
-        from interactive_nav.ros.simulator import Pace
-
-        with contextlib.redirect_stdout(sys.stderr):  # Warp prints its kernels
-            simulator = build()
-        pace = Pace(self.factor, self.lockstep, self.limit, self.bag is not None)
-        with contextlib.ExitStack() as stack:
-            node = stack.enter_context(ros_node("simulator"))
-            if self.bag is not None:
-                stack.enter_context(recording(stack.enter_context(ros_node("recorder")), self.bag))
-            tally = SimulatorNode(node, simulator, pace, say, awaited).run(lambda: bool(stops))
-            print(json.dumps(tally.row()), flush=True)
-
 
 DEFAULTS = {"observations": ("depth", "segmentation", "rgb"), "episode_steps": 10**8, "backend": "native"}
 """Of `simulate`, where they differ from the environment's."""
@@ -121,14 +79,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = parse(COMMANDS, "python -m interactive_nav.ros", argv)
         run[type(arguments)](arguments, stops)
         return 128 + stops[0] if stops else 0
-
-
-def need_ros(program: str) -> Any:
-    """Import rclpy, or say how to install it."""
-    line = missing(program, "rclpy (wheels exist for Python 3.11)", "ros2")
-    for module in ("sensor_msgs.msg", "nav_msgs.msg", "geometry_msgs.msg", "rosgraph_msgs.msg", "std_msgs.msg"):
-        optional(module, line)
-    return optional("rclpy", line)
 
 
 def _pose(text: str, name: str) -> tuple[float, ...]:

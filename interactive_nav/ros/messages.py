@@ -6,7 +6,7 @@ forward, x right, y down. Frames are named as in REP 105, topics as in Nav2.
 
 import array
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -116,6 +116,13 @@ def camera_topic(image: str, topic: str = "") -> str:
     """Return the topic of an image, such as `depth` or `left/depth`, or another topic of its camera."""
     prefix, _, kind = image.rpartition("/")
     return "/".join(["/camera", *([prefix] if prefix else []), topic or CAMERA_TOPICS[kind]])
+
+
+def camera_topics(images: Iterable[str]) -> dict[str, Any]:
+    """Return the topics that images are sent on, and their types."""
+    return {
+        camera_topic(*of): kind for name in images for *of, kind in ((name, Image), (name, "camera_info", CameraInfo))
+    }
 
 
 def image_message(image: np.ndarray, head: Header) -> Image:

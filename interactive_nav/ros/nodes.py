@@ -3,7 +3,7 @@
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -70,9 +70,7 @@ class SimulatorNode:
         self._node, self._simulator, self._pace, self._say = node, simulator, pace, say
         self._news = threading.Condition()
         self._command, self._commands, self._done = (0.0, 0.0), 0, False
-        images = simulator.sense().images
-        topics = ros.FROM_ROBOT | {ros.camera_topic(name): ros.Image for name in images}
-        topics |= {ros.camera_topic(name, "camera_info"): ros.CameraInfo for name in images}
+        topics = ros.FROM_ROBOT | ros.camera_topics(simulator.sense().images)
         self._out = {name: node.create_publisher(kind, name, ros.qos(name)) for name, kind in topics.items()}
         self._awaited = awaited
         for name, heard in ((ros.COMMAND, self._on_command), (ros.DONE, self._on_done)):
@@ -189,8 +187,8 @@ class SimulatorNode:
 
 
 @contextlib.contextmanager
-def recording(node: Node, path: Path) -> Iterator[None]:
-    """Record all topics in a rosbag2 folder (MCAP); a message's time is the last one of the simulated clock."""
+def recording(node: Node, path: Path, topics: Mapping[str, Any] = ros.TOPICS) -> Iterator[None]:
+    """Record topics in a rosbag2 folder (MCAP); a message's time is the last one of the simulated clock."""
     rosbag2 = optional("rosbags.rosbag2", missing("--bag", "rosbags", "ros2"))
     typesys = optional("rosbags.typesys", missing("--bag", "rosbags", "ros2"))
     store, now_ns = typesys.get_typestore(typesys.Stores.ROS2_KILTED), 0
@@ -215,7 +213,7 @@ def recording(node: Node, path: Path) -> Iterator[None]:
 
         node.create_subscription(kind, topic, heard, ros.qos(topic, 1000, reading=True), raw=True)
 
-    for topic, kind in ros.TOPICS.items():
+    for topic, kind in topics.items():
         add(topic, kind)
     try:
         yield

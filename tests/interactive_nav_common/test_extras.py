@@ -17,7 +17,7 @@ from docs.studies.pybullet_peer import BulletScene
 from interactive_nav import view
 from interactive_nav.interop.torch_bridge import to_torch
 from interactive_nav.physics import resolve_backend
-from interactive_nav.ros.__main__ import need_ros
+from interactive_nav.ros.commands import need_ros
 from interactive_nav_common.errors import UserError, optional
 from interactive_nav_common.jobs.on_ray import RayLauncher
 from interactive_nav_common.untrusted.guard import guarded_server

@@ -114,7 +114,9 @@ def test_the_graph_gives_the_actions_of_jax_and_the_robots_units(exported, batch
 def test_the_file_says_what_it_takes_and_gives(run):
     folder, path = run
     got = about(path)
-    assert got["robot"] == {"name": "turtlebot", "control_mode": "native", "rate_hz": 10.0}
+    named = {"name": "turtlebot", "control_mode": "native", "rate_hz": 10.0}
+    assert got["robot"] == named | {"base_height_m": 0.0, "success_distance_m": 0.333}
+    assert got["inputs"]["waypoints"]["spacing_m"] == 0.2
     assert list(got["inputs"]) == ["waypoints", "goal", "velocity"]
     assert got["inputs"]["velocity"] == {
         **{"shape": [6], "dtype": "float32", "unit": "m/s, rad/s", "scale": 1.0, "frame": "base", "range": None},

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import UseAppendAction
 
-from interactive_nav.ros.__main__ import Simulation, need_ros
+from interactive_nav.ros.commands import Simulation, need_ros
 from interactive_nav_common.commands import Command, Words, option, parse, word
 from interactive_nav_common.config import overridden, refuse_unused, settings_help
 from interactive_nav_common.errors import UserError, reports_errors

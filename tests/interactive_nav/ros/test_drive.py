@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -59,7 +60,7 @@ def write_policy(path, about=ABOUT):
     return path
 
 
-def recording(about=ABOUT, twist=(0.1, 0.2)):
+def recording(about=ABOUT, twist=(0.1, 0.2)) -> Any:
     """A policy that keeps what it is given."""
     kept = []
 
