@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from interactive_nav.interop.onnx_file import KEY, OnnxError, OnnxFile
+from interactive_nav.interop.onnx_file import OnnxError, OnnxFile
 from interactive_nav.ros import drive, messages, nodes
 from interactive_nav.ros.__main__ import main
 from interactive_nav.ros.drive import DriveNode
 from interactive_nav.ros.nodes import RosError, SimulatorNode, ros_node
 from interactive_nav.ros.pilot import Pilot, encoded, remaining, resampled
 from interactive_nav.ros.simulator import Pace, Sensed
+from interactive_nav.sensing.description import KEY
 from scenes_mjcf.look import Lens
 
 onnx = pytest.importorskip("onnx")
