@@ -15,6 +15,7 @@ import pytest
 from converters.read.datasets.scanned import read_scan
 from docs.studies.pybullet_peer import BulletScene
 from interactive_nav import view
+from interactive_nav.interop.onnx_file import OnnxFile
 from interactive_nav.interop.torch_bridge import to_torch
 from interactive_nav.physics import resolve_backend
 from interactive_nav.ros.commands import need_ros
@@ -33,6 +34,7 @@ USES: list[tuple[str, str, Callable[[], Any]]] = [
     ("datasets", "scenezoo", lambda: read_scan("3rscan", ROOT / "docs")),
     ("gymnasium", "gymnasium", lambda: importlib.import_module(GYM_ENV)),
     ("gymnasium", "gymnasium", lambda: importlib.import_module("interactive_nav.interop.sb3_env")),
+    ("onnx", "onnxruntime", lambda: OnnxFile("policy.onnx")),
     ("pybullet", "pybullet", lambda: BulletScene(None, None)),  # type: ignore[arg-type]
     ("ray", "ray", lambda: RayLauncher("auto")),
     ("ros2", "rclpy", lambda: need_ros("ros")),
