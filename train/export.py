@@ -37,7 +37,7 @@ from train.scoring.session import ROWS
 OBSERVATIONS, ENVS = 1000, 20
 """Recorded for the comparison with JAX, and the environments that they come from."""
 TOLERANCE = 1e-5
-"""Of each output, absolute up to 1 and relative above."""
+"""Of each output, absolute up to 1 and above, relative to its largest number."""
 SCORES = ("success", "path_efficiency", "effort_efficiency", "ins_0.5")
 
 
@@ -99,7 +99,7 @@ def convert(env: Any, policy: PolicyFn, observations: Any, about: Mapping[str, A
     expected = [actions, commands := env.robot.command(actions)]
     expected += [commands @ twist_matrix(env.robot).T] if env.robot.twist else []
     for name, a, b in zip(outputs, session.run(outputs, inputs), expected, strict=True):
-        difference = np.max(np.abs(a - b) / np.maximum(1.0, np.abs(b)))
+        difference = np.max(np.abs(a - b)) / max(1.0, np.max(np.abs(b)))
         if not difference <= TOLERANCE:
             raise OnnxError(
                 f"output {name} differs by {difference:.1e} between ONNX and JAX over {len(a)} observations, "
