@@ -19,7 +19,7 @@ from interactive_nav.physics import compiler_options
 from interactive_nav.sensing.description import KEY, describe, inputs_of, twist_matrix
 from interactive_nav.task.rollout import PolicyFn, episode_keys
 from interactive_nav.task.wrappers import AutoResetEnv
-from interactive_nav_common.commands import Command, option, parse, word
+from interactive_nav_common.commands import Command, Words, option, parse, word
 from interactive_nav_common.errors import ConfigError, missing, optional, reports_errors
 from interactive_nav_common.files import whole_file, writing
 from interactive_nav_common.jobs.progress import SafeConsole
@@ -51,6 +51,8 @@ class Export(Command):
     """The file to write."""
     checkpoint: Annotated[str, option(metavar="best|last|STEPS")] = "best"
     """Which checkpoint is exported."""
+    settings: Words = ()
+    """Environment settings to change: env.NAME=VALUE, as the homes that observations are recorded in (env.scenes)."""
 
 
 def outputs_of(env: Any, policy: PolicyFn, names: Sequence[str], *inputs: jax.Array) -> tuple[jax.Array, ...]:
@@ -131,7 +133,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
     if arguments.out.suffix != ".onnx":
         raise ConfigError(f"--out is {str(arguments.out)!r}, expected a file that ends in .onnx")
     folder = RunFolder(arguments.run)
-    config = config_to_play(folder, ["env.backend=native"], None, console)
+    config = config_to_play(folder, ["env.backend=native", *arguments.settings], None, console)
     config = dataclasses.replace(config, network=dataclasses.replace(config.network, compute_dtype="float32"))
     env = build_env(config.env)
     policy, meta = load_policy(folder, config, env, arguments.checkpoint, deterministic=True)
