@@ -101,8 +101,8 @@ def reset_envs(agent: Any, env: Env, key: jax.Array) -> PyTree:
     """Start a new episode in every environment."""
     number = agent.config.num_envs or 1
     # A program of several processes takes an array of none of their devices.
-    key = np.asarray(key) if jax.process_count() > 1 else key
-    return jax.jit(lambda k: env.reset(jax.random.split(k, number)))(key)
+    begin = np.asarray(key) if jax.process_count() > 1 else key
+    return jax.jit(lambda k: env.reset(jax.random.split(k, number)))(begin)
 
 
 def run_loop(
