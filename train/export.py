@@ -37,7 +37,7 @@ from train.scoring.session import ROWS
 OBSERVATIONS, ENVS = 1000, 20
 """Recorded for the comparison with JAX, and the environments that they come from."""
 TOLERANCE = 1e-5
-"""Of each output, absolute up to 1 and above, relative to its largest number."""
+"""Largest difference of each output: of its largest number, or of 1 where all are smaller."""
 SCORES = ("success", "path_efficiency", "effort_efficiency", "ins_0.5")
 
 
