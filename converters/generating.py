@@ -12,7 +12,6 @@ from rich.console import Console
 from interactive_nav_common.commands import Command as AnyCommand
 from interactive_nav_common.commands import Flag, Words, option, word
 from interactive_nav_common.config import AtLeastOne, Positive, read_words, refuse_unused
-from interactive_nav_common.errors import FileError
 from interactive_nav_common.jobs.progress import stage_progress
 from scenes_mjcf.sets import HERE, PACKAGED, in_cache, is_listed, packaged_set
 
@@ -249,14 +248,12 @@ class Build(Command):
 
     def run(self, console: Console) -> None:
         """Run the command."""
-        from converters.library.build import FILES, build, library_folder
+        from converters.library.build import FILES, build, checked, library_folder
 
         given = self.given or library_folder()
         files = [given / f"{name}.sh3f" for name in FILES]
-        if not all(path.is_file() for path in files):
-            raise FileError(
-                f"{given}: lacks furniture libraries; run 'python -m converters library get sweethome3d' first"
-            )
+        for path in files:
+            checked(given, path.stem, path.read_bytes() if path.is_file() else None)
         with stage_progress(console) as report:
             count = build(files, self.out, self.jobs, report)
         console.print(f"{self.out}: {count} models with their hulls, and ATTRIBUTION.md", soft_wrap=True)

@@ -23,6 +23,7 @@ import numpy as np
 from PIL import Image
 
 from interactive_nav_common.errors import UserError
+from interactive_nav_common.rotations import matrix_from_quat
 from interactive_nav_common.untrusted.reading import read_npz
 from scenes_mjcf.agreement import light_evenly
 from scenes_mjcf.schema import SceneError
@@ -156,9 +157,8 @@ def _take_faces(mesh: mujoco.MjsMesh, model: mujoco.MjModel, uv: np.ndarray, cho
     mesh.uservert, mesh.userface = vertices[used].ravel(), index.ravel().astype(np.int32)
     mesh.usertexcoord, mesh.userfacetexcoord = uv[chosen].ravel(), corners
     if (normals := mesh_normals(model, 0)) is not None:
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, model.geom_quat[0])
-        mesh.usernormal, mesh.userfacenormal = (normals[chosen] @ turn.reshape(3, 3).T).ravel(), corners
+        turned = normals[chosen] @ matrix_from_quat(model.geom_quat[0]).T
+        mesh.usernormal, mesh.userfacenormal = turned.ravel(), corners
 
 
 def look_along(pos_w: Any, forward_w: Any) -> CameraPose:
@@ -252,9 +252,8 @@ def mesh_normals(model: mujoco.MjModel, mesh: int) -> np.ndarray | None:
 
 def geom_mesh(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices [n, 3] f64 (m, in the body's frame) and faces [m, 3] i64 of a mesh geom."""
-    (vertices, faces, _), turn = mesh_of(model, model.geom_dataid[geom]), np.zeros(9)
-    mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-    return vertices.astype(float) @ turn.reshape(3, 3).T + model.geom_pos[geom], faces.astype(np.int64)
+    (vertices, faces, _), turn = mesh_of(model, model.geom_dataid[geom]), matrix_from_quat(model.geom_quat[geom])
+    return vertices.astype(float) @ turn.T + model.geom_pos[geom], faces.astype(np.int64)
 
 
 def geom_image(model: mujoco.MjModel, geom: int) -> np.ndarray | None:

@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 
 from converters.annotate.session import Item, Session, Store, step_of
-from converters.bodies.alignment import MIN_POINTS, Alignment, AlignmentError, apply_alignment, gross_outliers
+from converters.bodies.alignment import MIN_POINTS, Alignment, AlignmentError, apply_alignment
 from converters.check.pictures import camera_axes, mesh_picture
 from converters.propose.pieces import Proposal, bounds
 from converters.propose.proposals import floor_of
@@ -308,7 +308,7 @@ class Page:
         if cad is None or item.pairs < MIN_POINTS:
             return
         try:
-            fit, out = item.fit(), np.flatnonzero(gross_outliers(*item.points(), item.symmetry)) + 1
+            out = np.flatnonzero((fit := item.fit()).outliers) + 1
             left = f", without pair {', '.join(map(str, out))}" if len(out) else ""
             self._fit.content = f"**Residual {100 * fit.rms_m:.1f} cm** over {item.pairs} pairs{left}"
             points, paint = apply_alignment(fit, cad.vertices), {"color": FITTED, "opacity": 0.6, "side": "double"}

@@ -52,6 +52,8 @@ class Alignment:
     """rad, counter-clockwise from above."""
     rms_m: float
     """Root mean square point-to-point distance of the fit; nan where nothing was fitted."""
+    outliers: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, bool))
+    """(k,) bool: the pairs that `solve_alignment` left out; empty where it was not asked."""
 
 
 def _check_spread(points: np.ndarray) -> None:
@@ -240,19 +242,10 @@ def solve_alignment(cad_points: np.ndarray, scan_points: np.ndarray, symmetry: s
     return dataclasses.replace(best, scale=best.scale[[1, 0, 2]] if swapped else best.scale, yaw=yaw)
 
 
-def gross_outliers(cad_points: np.ndarray, scan_points: np.ndarray, symmetry: str = "__SYM_NONE") -> np.ndarray:
-    """Return (k,) bool: the pairs that `solve_alignment` leaves out (same arguments)."""
-    fit = solve_alignment(cad_points, scan_points, symmetry)
-    p, period = np.asarray(cad_points, float), SYMMETRY_PERIOD_RAD[symmetry]
-    if period and period < 6:
-        p = _equivalents(p, np.asarray(scan_points, float), fit, round(2 * math.pi / period))
-    return ~_inliers(p, np.asarray(scan_points, float), period == 0.0)
-
-
 def _robust_fit(p: np.ndarray, q: np.ndarray, round_model: bool) -> Alignment:
     _check_spread(p)
     keep = _inliers(p, q, round_model)
-    return least_squares(p[keep], q[keep], round_model)
+    return dataclasses.replace(least_squares(p[keep], q[keep], round_model), outliers=~keep)
 
 
 def _equivalents(p: np.ndarray, q: np.ndarray, fit: Alignment, folds: int) -> np.ndarray:

@@ -13,7 +13,7 @@ import trimesh
 from converters.bodies import alignment
 from converters.bodies.alignment import Alignment
 from converters.geometry.boxes import MAX_PIECES, Hull, OrientedBox, convex_hull, fit_box
-from converters.records.raw import Annotation, CadModel, RawScene, TexturedMesh
+from converters.records.raw import UP, Annotation, CadModel, RawScene, ScannedHinge, TexturedMesh
 from interactive_nav_common.rotations import matrix_from_quat, transformed, wrap_angle, yaw_matrix
 from scenes_mjcf.categories import TABLE
 
@@ -21,20 +21,6 @@ FOOT_M = 0.02
 ROUND_FILL = 0.9
 """Outlines that fill less of their smallest box are round: that box then stands along the walls."""
 MATERIALS = {category.name: category.material for category in TABLE if category.material is not None}
-
-
-@dataclasses.dataclass(frozen=True)
-class BodyHinge:
-    """Describe a hinge, or a slide, in the body frame."""
-
-    origin_b: np.ndarray
-    """(3,) m."""
-    range_rad: tuple[float, float]
-    """About the axis, 0 is the pose as scanned; or m, of a slide."""
-    assumed: bool
-    axis_b: np.ndarray = dataclasses.field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
-    """(3,) unit; a door's is the vertical."""
-    slides: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +41,8 @@ class PlacedObject:
     """(3,) m."""
     quaternion_w: np.ndarray = dataclasses.field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
     """(4,) w x y z."""
-    hinge: BodyHinge | None = None
+    hinge: ScannedHinge | None = None
+    """Body frame."""
     surface_b: TexturedMesh | None = None
     """What the model looks like, where it has more than the colours of its faces."""
 
@@ -96,7 +83,7 @@ def with_feet(hulls: tuple[Hull, ...], vertices: np.ndarray) -> tuple[Hull, ...]
 
 def _body_hinge(
     annotation: Annotation, scale: np.ndarray, base_cad: np.ndarray, extent: np.ndarray
-) -> BodyHinge | None:
+) -> ScannedHinge | None:
     """Return the body's hinge or slide in its frame; assume one at the edge of a door's leaf that has none."""
     hinge = annotation.hinge
     if hinge is None and annotation.category != "door":
@@ -105,13 +92,13 @@ def _body_hinge(
         along = int(np.argmax(extent[:2]))
         origin = np.zeros(3)
         origin[along] = -extent[along] / 2
-        return BodyHinge(origin, (-math.pi / 2, math.pi / 2), True)
+        return ScannedHinge(origin, UP, (-math.pi / 2, math.pi / 2), True)
     origin = scale * hinge.origin - base_cad
     if annotation.category != "door":
-        return BodyHinge(origin, hinge.range_rad, hinge.assumed, hinge.axis, hinge.slides)
+        return dataclasses.replace(hinge, origin=origin)
     low, high = sorted(float(np.sign(hinge.axis[2])) * v for v in hinge.range_rad)
     origin[2] = 0.0
-    return BodyHinge(origin, (low, high), hinge.assumed)
+    return ScannedHinge(origin, UP, (low, high), hinge.assumed)
 
 
 def place_object(
@@ -235,13 +222,12 @@ def compare(
         row["annotated_rms_m"] = round(float(np.sqrt(distance2.mean())), 5)
     try:
         solved = alignment.solve_alignment(annotation.keypoints_cad, annotation.keypoints_scan, annotation.symmetry)
-        outliers = alignment.gross_outliers(annotation.keypoints_cad, annotation.keypoints_scan, annotation.symmetry)
     except alignment.AlignmentError as error:
         return row | {"solved": False, "reason": str(error)}
     difference = pose_difference(solved, placed, pivot_cad, annotation.symmetry)
     return row | {
         "solved": True,
-        "n_outliers": int(outliers.sum()),
+        "n_outliers": int(solved.outliers.sum()),
         "rms_m": round(solved.rms_m, 5),
         "translation_difference_m": round(difference.translation_m, 5),
         "yaw_difference_deg": round(math.degrees(difference.yaw_rad), 3),

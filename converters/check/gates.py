@@ -17,6 +17,7 @@ from converters.records.errors import Gate, Limit
 from converters.structure.walls import border_cells
 from interactive_nav_common.grids import clearance, largest_component
 from interactive_nav_common.records import read_packaged
+from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.agreement import differences, sliding_friction
 from scenes_mjcf.categories import ANY_MASS_KG, TABLE
 from scenes_mjcf.look import geom_mesh
@@ -266,11 +267,10 @@ def wall_values(model: mujoco.MjModel, maps: SceneMaps) -> dict[str, float]:
     structure = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "structure")
     for geom in np.flatnonzero(model.geom_bodyid == structure):
         if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX and model.geom_contype[geom]:
-            turn = np.zeros(9)
-            mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-            level, middle, size = turn.reshape(3, 3)[:2, :2], model.geom_pos[geom, :2], model.geom_size[geom, :2]
+            turn = matrix_from_quat(model.geom_quat[geom])
+            level, middle, size = turn[:2, :2], model.geom_pos[geom, :2], model.geom_size[geom, :2]
             # Only cells about the box; about a tilted one, all.
-            reach = np.abs(level) @ (size + 2 * side) if turn[8] > 1 - 1e-9 else np.inf
+            reach = np.abs(level) @ (size + 2 * side) if turn[2, 2] > 1 - 1e-9 else np.inf
             ends = (np.stack([middle - reach, middle + reach]) - maps.origin_w) / side + pad
             (c0, r0), (c1, r1) = np.clip(ends + [[0], [1]], 0, free.shape[::-1]).astype(int)
             beyond = np.abs((points[r0:r1, c0:c1] - middle) @ level) - size

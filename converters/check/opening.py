@@ -3,6 +3,8 @@
 import mujoco
 import numpy as np
 
+from scenes_mjcf.look import mesh_of
+
 STEPS, HIT_M, CELL_M = 8, 0.03, 0.055
 """Positions in which a front is looked at, and how deep it may then overlap furniture and walls, which are in cells."""
 CABINET_M = 0.06
@@ -44,11 +46,9 @@ def _points_w(model: mujoco.MjModel, data: mujoco.MjData, body: int, value: floa
     points = []
     for geom in np.flatnonzero(model.geom_bodyid == body):
         if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH and "_hull_" in model.geom(geom).name:
-            mesh = model.mesh(model.geom_dataid[geom])
-            corners = model.mesh_vert[mesh.vertadr[0] :][model.mesh_face[mesh.faceadr[0] :][: mesh.facenum[0]]]
-            points.append(
-                (WITHIN @ corners).reshape(-1, 3) @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
-            )
+            vertices, faces, _ = mesh_of(model, model.geom_dataid[geom])
+            within = (WITHIN @ vertices[faces]).reshape(-1, 3)
+            points.append(within @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
     return np.concatenate(points)
 
 

@@ -5,7 +5,6 @@ import io
 import zipfile
 from pathlib import Path
 
-import mujoco
 import numpy as np
 from PIL import Image
 
@@ -17,22 +16,29 @@ from converters.generate.design.space import floor_maps
 from converters.generate.design.sparse import make_plan
 from converters.generate.homes.design import design_home
 from converters.generate.models.cad import CLOTH, LOOKS, cad_model
-from converters.generate.surface import write as surface_files
 from converters.generate.surface.modelled import model_building
 from converters.generate.surface.scan import Scan, scan_building
 from converters.generate.surface.texture import Atlas, make_atlas
-from converters.generate.surface.write import LICENCE, annotate_items, write_cad, write_json, write_png, write_scan
+from converters.generate.surface.write import (
+    LICENCE,
+    annotate_items,
+    write_cad,
+    write_json,
+    write_npz,
+    write_png,
+    write_scan,
+)
 from converters.library.store import attribution, read_index
 from converters.records.raw import ATTRIBUTION, WINDOWS
 from interactive_nav_common.files import part_folder, publish, write_text
-from scenes_mjcf.look import LOOK, UV_STEPS, geom_mesh, mesh_of
+from scenes_mjcf.look import LOOK, UV_STEPS
 
 __all__ = ["Building", "BuildingConfig", "GenerationError", "HomeConfig", "design_building", "generate_building"]
 
 GENERATOR_VERSION = 7
 """Raised whenever the same seed would give other bytes."""
-LOOK_TEXELS, LOOK_QUALITY, COPY_QUALITY = 1024, 30, 60
-"""Side and quality of the image that `write_look` writes; quality of one that `copy_look` does."""
+LOOK_TEXELS, LOOK_QUALITY = 1024, 30
+"""Side and quality of the image that `write_look` writes."""
 
 
 def _streams(seed: int) -> list[np.random.Generator]:
@@ -158,32 +164,13 @@ def write_look(folder: Path, seed: int, config: BuildingConfig) -> None:
     uses = ("",) * len(building.plan.rooms)
     scan, atlas = model_building(building.plan, building.items, uses, _streams(seed)[2], (LOOK_TEXELS,))
     corners = np.unique(scan.faces[:, 0], return_counts=True)[1] + 2  # each polygon is a fan
-    uv = atlas.uv * [1, -1] + [0, 1]
-    _write_look(folder, corners, scan.vertices, uv, Image.fromarray(atlas.image).reduce(2), LOOK_QUALITY)
-
-
-def copy_look(folder: Path, other: Path) -> None:
-    """Give a scene folder the structure of another conversion of the same home, for pictures for people."""
-    model = mujoco.MjModel.from_xml_path(str(other / "scene.xml"))
-    geom = model.geom("structure_visual").id
-    (vertices, faces), uv = geom_mesh(model, geom), mesh_of(model, model.geom_dataid[geom])[2]
-    assert uv is not None
-    image = Image.open(other / "assets" / "structure.png").convert("RGB")
-    corners = np.full(len(faces), 3)
-    _write_look(folder, corners, vertices[faces.ravel()], uv.reshape(-1, 2), image, COPY_QUALITY)
-
-
-def _write_look(
-    folder: Path, corners: np.ndarray, vertices: np.ndarray, uv: np.ndarray, image: Image.Image, quality: int
-) -> None:
-    assert corners.sum() == len(vertices) == len(uv)
     packed = io.BytesIO()
-    image.save(packed, "WEBP", quality=quality, method=6)
-    surface_files.write_npz(
+    Image.fromarray(atlas.image).reduce(2).save(packed, "WEBP", quality=LOOK_QUALITY, method=6)
+    write_npz(
         folder / "assets" / LOOK,
         zipfile.ZIP_LZMA,
         corners=corners.astype(np.uint8),
-        vertices_mm=np.round(1000 * vertices.T).astype(np.int16),
-        uv=np.round(UV_STEPS * uv.T).astype(np.uint16),
+        vertices_mm=np.round(1000 * scan.vertices.T).astype(np.int16),
+        uv=np.round(UV_STEPS * (atlas.uv * [1, -1] + [0, 1]).T).astype(np.uint16),
         image=np.frombuffer(packed.getvalue(), np.uint8),
     )

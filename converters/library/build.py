@@ -9,7 +9,6 @@ import dataclasses
 import functools
 import hashlib
 import io
-import math
 import multiprocessing
 import re
 import shutil
@@ -33,7 +32,7 @@ from converters.geometry.faces import (
     surface_loss,
 )
 from converters.library.store import Credit, Model, Shape, attribution, write_library
-from converters.read.files import SourceFolder, as_number
+from converters.read.files import SourceFolder
 from converters.read.meshes import colours_of_faces, read_surface
 from converters.read.obj import join_meshes
 from converters.records.errors import SceneRejected, StageFailed
@@ -45,9 +44,6 @@ from interactive_nav_common.records import Reader
 from scenes_mjcf.categories import CATEGORIES
 
 PROPERTIES = "PluginFurnitureCatalog.properties"
-MOST_BYTES = 256 * 2**20
-"""Of one model with its textures, unpacked."""
-LARGEST_M = 50.0
 PACKAGE = "sweethome3d-furniture"
 VERSION = "1.8"
 FILES = {
@@ -96,60 +92,32 @@ def parse_properties(data: bytes) -> dict[str, str]:
     return values
 
 
-def _number(of: dict[str, str], key: str, where: str) -> float:
-    text = of.get(key)
-    value = as_number(text)
-    if not math.isfinite(value):
-        raise SceneRejected(f"{where}: {key} is {text!r}, expected a number of centimetres; fetch the library again")
-    return value
-
-
-def _piece(library: Path, licence: str, of: dict[str, str], where: str, names: set[str]) -> CatalogueModel:
-    model = of.get("model", "").lstrip("/")
-    if model not in names:
-        raise SceneRejected(f"{where}: its model '{model}' is not in the archive; fetch the library again")
-    width, depth, height = (_number(of, key, where) / 100 for key in ("width", "depth", "height"))
-    if not all(0 < side < LARGEST_M for side in (width, depth, height)):
-        raise SceneRejected(
-            f"{where}: is {100 * width:g} x {100 * depth:g} x {100 * height:g} cm, expected sides above 0 and below "
-            f"{LARGEST_M:g} m"
-        )
-    words = of.get("modelRotation", "1 0 0 0 1 0 0 0 1").split()
-    turn = np.array([_number({"modelRotation": w}, "modelRotation", where) for w in words])
-    if turn.shape != (9,) or not np.allclose(turn.reshape(3, 3) @ turn.reshape(3, 3).T, np.eye(3), atol=1e-3):
-        raise SceneRejected(f"{where}: modelRotation is {of['modelRotation']!r}, expected the 9 numbers of a rotation")
+def _piece(library: Path, licence: str, of: dict[str, str]) -> CatalogueModel:
+    width, depth, height = (float(of[key]) / 100 for key in ("width", "depth", "height"))
+    turn = np.array(of.get("modelRotation", "1 0 0 0 1 0 0 0 1").split(), float).reshape(3, 3)
     name, creator = (of.get(key, "") for key in ("name", "creator"))
-    return CatalogueModel(library, licence, name, model, (width, height, depth), turn.reshape(3, 3), creator)
+    return CatalogueModel(library, licence, name, of["model"].lstrip("/"), (width, height, depth), turn, creator)
 
 
 def read_catalogue(path: Path) -> tuple[CatalogueModel, ...]:
-    """Read the pieces of a `.sh3f` file."""
-    if not path.is_file():
-        raise SceneRejected(f"{path}: no such file; fetch it again")
+    """Read the pieces of a `.sh3f` file, one of those whose digests `checked` knows."""
     with readable(path, SceneRejected, "fetch it again", " as a furniture library"), zipfile.ZipFile(path) as archive:
-        names, data = set(archive.namelist()), archive.read(PROPERTIES)
+        whole = parse_properties(archive.read(PROPERTIES))
     of: dict[int, dict[str, str]] = {}
-    whole = parse_properties(data)
     for key, value in whole.items():
         name, _, number = key.partition("#")
-        if number.isdecimal() and len(number) < 9:
+        if number:
             of.setdefault(int(number), {})[name] = value
-    if not of:
-        raise SceneRejected(f"{path}: {PROPERTIES} lists no piece; fetch the library again")
-    licence, called = whole.get("license", ""), {k: f"{path}: piece {k} ({of[k].get('name', '')})" for k in sorted(of)}
-    return tuple(_piece(path, licence, of[k], where, names) for k, where in called.items())
+    return tuple(_piece(path, whole.get("license", ""), of[k]) for k in sorted(of))
 
 
 def unpack_model(piece: CatalogueModel, folder: Path) -> Path:
     """Write a piece's model with what lies beside it into an empty folder; return the model's path."""
     home = PurePosixPath(piece.model).parent
-    remedy = f"fetch the library again ({piece.model} is damaged)"
-    with readable(piece.library, SceneRejected, remedy), zipfile.ZipFile(piece.library) as archive:
-        inside = [i for i in archive.infolist() if PurePosixPath(i.filename).parent == home and not i.is_dir()]
-        if sum(i.file_size for i in inside) > MOST_BYTES:
-            raise SceneRejected(f"{piece.library}: {piece.model} unpacks to over {MOST_BYTES >> 20} MiB")
-        for item in inside:  # by its bare name: no path of the archive leads anywhere else
-            (folder / PurePosixPath(item.filename).name).write_bytes(archive.read(item))
+    with zipfile.ZipFile(piece.library) as archive:
+        for item in archive.infolist():  # by its bare name: no path of the archive leads anywhere else
+            if PurePosixPath(item.filename).parent == home and not item.is_dir():
+                (folder / PurePosixPath(item.filename).name).write_bytes(archive.read(item))
     return folder / PurePosixPath(piece.model).name
 
 
@@ -202,14 +170,9 @@ def read_selection(pieces: Sequence[CatalogueModel], path: Path = SELECTION) -> 
 
 def as_catalogued(surface: TexturedMesh, piece: CatalogueModel) -> TexturedMesh:
     """Return the surface turned and scaled as its catalogue says, the middle of its base at the origin."""
-    where = f"{piece.library}: {piece.model}"
-    if not len(surface.faces):
-        raise SceneRejected(f"{where}: has no face; choose another model")
     vertices, faces = compacted(surface.vertices, surface.faces)
     vertices = vertices @ piece.rotation.T
     low, span = vertices.min(axis=0), np.ptp(vertices, axis=0)
-    if not np.isfinite(span).all() or (span < 1e-9 * max(float(span.max()), 1e-12)).any():
-        raise SceneRejected(f"{where}: its surface has the size {span}, expected one in each direction")
     vertices = (vertices - low - span * [0.5, 0.0, 0.5]) * (np.array(piece.size_m) / span)
     return dataclasses.replace(surface, vertices=vertices, faces=faces)
 
@@ -297,6 +260,15 @@ def library_folder() -> Path:
     return cache_folder().parent / "library" / f"sweethome3d-{VERSION}"
 
 
+def checked(place: Path, name: str, data: bytes | None) -> bytes:
+    """Return the content of a library if it is that of version `VERSION`; `place` is named in errors."""
+    if data is None:
+        raise FileError(f"{place}: holds no {name}.sh3f; {REMEDY}")
+    if hashlib.sha256(data).hexdigest() != FILES[name]:
+        raise FileError(f"{place}: {name}.sh3f is not that of version {VERSION} (sha256 differs); {REMEDY}")
+    return data
+
+
 def fetch(given: Path | None, target: Path, overwrite: bool = False) -> tuple[Path, ...]:
     """Put the libraries into a folder, all or none, and return their paths.
 
@@ -315,13 +287,8 @@ def fetch(given: Path | None, target: Path, overwrite: bool = False) -> tuple[Pa
             place = packages[0]
         files = {path.stem: path for path in sorted(place.rglob("*.sh3f")) if path.stem in FILES}
         libraries = {k: p.read_bytes() for k, p in files.items()} if place.is_dir() else _of_package(place)
-        for name, digest in FILES.items():
-            data = libraries.get(name)
-            if data is None:
-                raise FileError(f"{place}: holds no {name}.sh3f; {REMEDY}")
-            if hashlib.sha256(data).hexdigest() != digest:
-                raise FileError(f"{place}: {name}.sh3f is not that of version {VERSION} (sha256 differs); {REMEDY}")
-            (folder / f"{name}.sh3f").write_bytes(data)
+        for name in FILES:
+            (folder / f"{name}.sh3f").write_bytes(checked(place, name, libraries.get(name)))
     return tuple(target / f"{name}.sh3f" for name in FILES)
 
 

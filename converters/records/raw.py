@@ -131,7 +131,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @dataclasses.dataclass(frozen=True)
 class ScannedHinge:
-    """A hinge, or a slide, in the CAD frame; 0 is the pose as scanned."""
+    """A hinge, or a slide, in the frame of what hangs on it; 0 is the pose as scanned."""
 
     origin: np.ndarray
     """(3,) a point on the axis."""

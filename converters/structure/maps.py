@@ -140,7 +140,7 @@ def swept_by_door(grid: Grid, placed: PlacedObject, margin_m: float = LEAF_MARGI
     flat = np.vstack([h.vertices for h in placed.hulls_b])
     low, high = placed.hinge.range_rad
     for angle in np.linspace(low, high, max(int((high - low) / math.radians(3)), 2)):
-        turned = (flat - placed.hinge.origin_b) @ yaw_matrix(angle).T + placed.hinge.origin_b
+        turned = (flat - placed.hinge.origin) @ yaw_matrix(angle).T + placed.hinge.origin
         grid.add_below(mask, to_world(placed, turned), margin_m)
     return mask
 

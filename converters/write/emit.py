@@ -11,10 +11,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from converters.bodies.objects import BodyHinge, Physical, PlacedObject
+from converters.bodies.objects import Physical, PlacedObject
 from converters.geometry.boxes import OrientedBox, least_turned
 from converters.geometry.faces import corner_normals, unit_normals
-from converters.records.raw import VisualMesh, Window
+from converters.records.raw import ScannedHinge, VisualMesh, Window
 from converters.write.texture import as_png, quantise, share_plain
 from interactive_nav_common.rotations import yaw_matrix
 from scenes_mjcf.agreement import light_evenly
@@ -114,14 +114,14 @@ def _add_movable(
         _add_box(spec, body, "box", f"{placed.name}_box_{i}", box, friction)
 
 
-def _add_hinge(spec: mujoco.MjSpec, body: mujoco.MjsBody, placed: PlacedObject, hinge: BodyHinge) -> None:
+def _add_hinge(spec: mujoco.MjSpec, body: mujoco.MjsBody, placed: PlacedObject, hinge: ScannedHinge) -> None:
     """Add the joint of a body that opens; a door's leaf keeps clear of the walls, other fronts lie in their cabinet."""
     kind = "slide" if hinge.slides else "hinge"
     damping, friction = HINGES.get(placed.category, SLIDING if hinge.slides else HINGED)
-    if not hinge.slides and abs(hinge.axis_b[2]) < 0.99:
+    if not hinge.slides and abs(hinge.axis[2]) < 0.99:
         body.gravcomp = 1.0  # a flap is balanced by springs: it stays where it is put
     joint = body.add_joint(name=f"{placed.name}_{kind}", type=getattr(mujoco.mjtJoint, f"mjJNT_{kind.upper()}"))
-    joint.axis, joint.pos, joint.range = _tidy(hinge.axis_b), _tidy(hinge.origin_b), np.round(hinge.range_rad, 6)
+    joint.axis, joint.pos, joint.range = _tidy(hinge.axis), _tidy(hinge.origin), np.round(hinge.range_rad, 6)
     joint.damping, joint.frictionloss, joint.armature = [damping, 0, 0], friction, 0.01
     if placed.category != "door":
         spec.add_exclude(bodyname1=placed.name, bodyname2="structure")

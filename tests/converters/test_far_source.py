@@ -31,7 +31,7 @@ def write_room(path: Path, low_m: np.ndarray) -> Path:
 
 
 def test_a_georeferenced_scan_gives_the_scene_of_the_same_scan_at_the_origin(tmp_path):
-    config = ConvertConfig(up="z")
+    config = ConvertConfig(up="z", structure_texture=64)
     far = convert(write_room(tmp_path / "far.obj", UTM_M), tmp_path / "far", config)
     # Its middle, (448264.02, 5411933.52), is moved by whole metres to (0.02, -0.48).
     near = convert(write_room(tmp_path / "near.obj", np.array([-1.98, -1.98, 0.0])), tmp_path / "near", config)

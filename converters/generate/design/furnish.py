@@ -15,7 +15,8 @@ import shapely
 from converters.generate.design.config import BuildingConfig, GenerationError
 from converters.generate.design.plan import Doorway, Plan, doorway_zone
 from converters.generate.design.space import GRID_M, free_grid, passes, room_mask, rooms_joined, without
-from converters.generate.models.cad import CadModel, Instance, LeafHinge, Models, place, stand_at
+from converters.generate.models.cad import CadModel, Instance, Models, place, stand_at
+from converters.records.raw import ScannedHinge
 from interactive_nav_common.grids import clearance
 
 DOOR_GAP_M = 0.02
@@ -57,7 +58,8 @@ def door_leaf(
     face_z = float(float(slab.mean()) - sign * float(np.ptp(slab) / 2))
     origin = (float(model.bounds[0, 0]), float(model.bounds[0, 1]), face_z)
     swing = (-open_rad, most - open_rad) if sign > 0 else (-(most - open_rad), open_rad)
-    closed_rad, joint = math.atan2(closed[1], closed[0]), LeafHinge((0.0, 1.0, 0.0), origin, swing)
+    closed_rad = math.atan2(closed[1], closed[0])
+    joint = ScannedHinge(np.array(origin), np.array([0.0, 1.0, 0.0]), swing)
     leaf = stand_at(model, scale, closed_rad + sign * open_rad, np.array(origin), hinge, lift_m)
     angles = closed_rad + sign * np.linspace(0.0, most, 24)
     fan = hinge + (width + 0.04) * np.stack([np.cos(angles), np.sin(angles)], axis=1)

@@ -9,8 +9,8 @@ import shapely
 from converters.generate.design.config import GenerationError
 from converters.generate.design.plan import Plan
 from converters.generate.homes.arrange import TABLES
-from converters.generate.models.cad import Instance, LeafHinge
-from converters.generate.models.fronts import Front, carcass, opened, openings
+from converters.generate.models.cad import Instance
+from converters.generate.models.fronts import carcass, opened, openings
 
 KITCHEN = ("counter", "sink", "fridge", "stove")
 """Categories whose fronts open where the setting `opening` is `kitchen`."""
@@ -24,10 +24,10 @@ Slab = tuple[shapely.Geometry, float, float]
 """An outline from above, its lowest and its highest point."""
 
 
-def _reach(item: Instance, front: Front, around: Sequence[Slab]) -> float:
+def _reach(front: Instance, around: Sequence[Slab]) -> float:
     """Return the share of its range by which a front opens without hitting what stands around."""
     for step in range(1, STEPS + 1):
-        for points in opened(item, front, step / STEPS):
+        for points in opened(front, step / STEPS):
             outline = shapely.MultiPoint(points[:, :2]).convex_hull.buffer(-TOUCH_M)
             low, high = points[:, 2].min() + TOUCH_M, points[:, 2].max() - TOUCH_M
             if any(base < high and top > low and outline.intersects(shape) for shape, base, top in around):
@@ -54,12 +54,12 @@ def open_fronts(
         around = [*walls, *(slab for other in heavy if other is not item for slab in other.slabs)] if opens else []
         around = [slab for slab in around if far.intersects(slab[0])]
         for part in openings(item.model.name) if opens else ():
-            hinge: LeafHinge = part.front.hinge
-            limit = round(_reach(item, part.front, around) * hinge.range_rad[1], 4)
+            hinge, front = part.hinge, dataclasses.replace(item, model=part.model, hinge=part.hinge)
+            limit = round(_reach(front, around) * hinge.range_rad[1], 4)
             if limit >= min(LEAST_M if hinge.slides else LEAST_RAD, hinge.range_rad[1]) - 1e-3:
                 cut.append(part)
                 hinge = dataclasses.replace(hinge, range_rad=(0.0, limit))
-                fronts.append(dataclasses.replace(item, model=part.front.model, hinge=hinge))
+                fronts.append(dataclasses.replace(front, hinge=hinge))
             elif item.model.category in KITCHEN:
                 raise GenerationError(
                     f"a front of the {item.model.category} {item.model.name} opens by {limit:.2f} "

@@ -26,7 +26,7 @@ from converters.geometry.faces import face_vectors, stacked
 from converters.library.store import read_image, read_index, read_meshes, read_shape
 from converters.read.annotations import MOST_PIECES, SLACK
 from converters.read.obj import texels
-from converters.records.raw import VisualMesh
+from converters.records.raw import ScannedHinge, VisualMesh
 from interactive_nav_common.records import read_packaged
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, transformed, yaw_matrix
 from scenes_mjcf.categories import CATEGORIES
@@ -333,17 +333,6 @@ class Models:
 
 
 @dataclasses.dataclass(frozen=True)
-class LeafHinge:
-    """Describe how a door leaf or front turns or slides; CAD frame, 0 is the pose as placed."""
-
-    axis: tuple[float, float, float]
-    origin: tuple[float, float, float]
-    range_rad: tuple[float, float]
-    """Or m, of a slide."""
-    slides: bool = False
-
-
-@dataclasses.dataclass(frozen=True)
 class Instance:
     """Place one piece of furniture: scan x, y; heights above the floor; metres."""
 
@@ -354,7 +343,8 @@ class Instance:
     """About the vertical; at 0 the CAD's +z shows along -y of the scan frame."""
     position: np.ndarray
     """(3,) of the CAD origin; z above the floor."""
-    hinge: LeafHinge | None = None
+    hinge: ScannedHinge | None = None
+    """What a door leaf or front opens on, CAD frame; a slide's range is in m all the same."""
 
     @functools.cached_property
     def matrix(self) -> np.ndarray:

@@ -12,10 +12,11 @@ import math
 
 import numpy as np
 
-from converters.generate.models.cad import CadModel, Instance, LeafHinge, as_drawn, cad_model
+from converters.generate.models.cad import CadModel, Instance, as_drawn, cad_model
 from converters.generate.models.parts import Part, box
 from converters.geometry.faces import compacted, loose_parts
-from converters.records.raw import VisualMesh
+from converters.records.raw import UP, ScannedHinge, VisualMesh
+from interactive_nav_common.rotations import transformed
 from scenes_mjcf.categories import CATEGORIES
 
 PANEL_M = (0.18, 0.11, 0.08)
@@ -41,20 +42,14 @@ Bounds = np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
-class Front:
-    """Describe one front of a model; CAD frame as the model's."""
-
-    model: CadModel
-    hinge: LeafHinge
-
-
-@dataclasses.dataclass(frozen=True)
 class Opening:
     """Hold a model's carcass when some of its fronts are cut out, and these."""
 
     pieces: tuple[int, ...]
     """Of the model, which go with the front."""
-    front: Front
+    model: CadModel
+    """The front, in the model's CAD frame."""
+    hinge: ScannedHinge
     recess: Part
     """A dark plate in the carcass where a drawn front was; models of the library are hollow."""
 
@@ -89,25 +84,27 @@ def _handle(panel: Bounds, with_it: list[Bounds]) -> float:
     return float((np.mean(middles) - panel[:, 0].mean()) / np.ptp(panel[:, 0]))
 
 
-def _hinge(panel: Bounds, handle: float, category: str, rear: float, panels: list[Bounds]) -> LeafHinge | None:
+def _hinge(panel: Bounds, handle: float, category: str, rear: float, panels: list[Bounds]) -> ScannedHinge | None:
     """Return how a panel opens, in metres, front along +z; None: it does not. `rear`: the model's back."""
     low, high = panel
     if abs(handle) > ASIDE:
         # About its front edge, so that it sweeps nothing but the room before it.
         x, turn = (low[0], -1.0) if handle > 0 else (high[0], 1.0)
-        return LeafHinge((0.0, turn, 0.0), (x, low[1], high[2]), (0.0, math.pi / 2))
-    middle = tuple(panel.mean(axis=0).tolist())
+        return ScannedHinge(np.array([x, low[1], high[2]]), np.array([0.0, turn, 0.0]), (0.0, math.pi / 2))
+    middle = panel.mean(axis=0)
     depth = min(DEEP_M, low[2] - rear - BEHIND_M)
     if high[1] - low[1] <= DRAWER_M:
         deep = depth >= LEAST_DEEP_M and category != "shower"  # a curtain's valance is none
-        return LeafHinge((0.0, 0.0, 1.0), middle, (0.0, round(PULLED * float(depth), 3)), slides=True) if deep else None
+        pulled = 0.0, round(PULLED * float(depth), 3)
+        return ScannedHinge(middle, UP, pulled, slides=True) if deep else None
     if category == "stove":
-        return LeafHinge((1.0, 0.0, 0.0), (0.0, low[1], high[2]), (0.0, math.pi / 2))
+        return ScannedHinge(np.array([0.0, low[1], high[2]]), np.array([1.0, 0.0, 0.0]), (0.0, math.pi / 2))
     for other in panels if category == "wardrobe" else ():
         lapped = min(high[0], other[1, 0]) - max(low[0], other[0, 0])
         if other is not panel and lapped > LAPPED_M and np.ptp(other[:, 0]) > lapped + LAPPED_M:
             way = math.copysign(1.0, other[:, 0].mean() - panel[:, 0].mean())
-            return LeafHinge((way, 0.0, 0.0), middle, (0.0, round(float(np.ptp(other[:, 0]) - lapped), 3)), slides=True)
+            reach = 0.0, round(float(np.ptp(other[:, 0]) - lapped), 3)
+            return ScannedHinge(middle, np.array([way, 0.0, 0.0]), reach, slides=True)
     return None
 
 
@@ -139,12 +136,12 @@ def openings(name: str) -> tuple[Opening, ...]:
             mine = [j for j in range(len(bounds)) if j not in taken | {k} and _inside(bounds[j], bounds[k], True)]
         taken |= {k, *mine}
         front, recess = _front(model, len(found), of, bounds, (k, *mine), hinge, rear), bounds[k].copy()
-        if any(_overlap(p, q) for o in found for p in o.front.model.solids for q in front.model.solids):
+        if any(_overlap(p, q) for o in found for p in o.model.solids for q in front[0].solids):
             taken -= {k, *mine}  # such as two leaves with one handle
             continue
         recess[1, 2] = recess[0, 2] + 0.6 * np.ptp(recess[:, 2])  # hidden in the panel while it is shut
         recess[:, :2] += np.outer([1, -1], [SIDE_M, SIDE_M])
-        found.append(Opening((k, *mine), front, _normalised([_block(recess, "charcoal")], model)[0]))
+        found.append(Opening((k, *mine), *front, _normalised([_block(recess, "charcoal")], model)[0]))
     return tuple(found)
 
 
@@ -154,10 +151,10 @@ def _front(
     of: np.ndarray,
     bounds: list[Bounds],
     pieces: tuple[int, ...],
-    hinge: LeafHinge,
+    hinge: ScannedHinge,
     rear: float,
-) -> Front:
-    """Return a front: its pieces, and where it is a drawer a box behind its panel."""
+) -> tuple[CadModel, ScannedHinge]:
+    """Return a front (its pieces, and where it is a drawer a box behind its panel) and its hinge, CAD frame."""
     panel = bounds[pieces[0]]
     out = [bounds[j] for j in pieces[1:] if bounds[j][1, 2] > panel[1, 2] + 0.004]
     # The inner edge of a door's free end comes out farther than its outer one: two doors side by side would jam.
@@ -190,9 +187,8 @@ def _front(
         "solids": _normalised(solids, model),
         "look": surface and functools.partial(as_drawn, surface),
     }
-    axis, origin = np.array(hinge.axis) * scale * model.unit_m, np.array(hinge.origin) * scale
-    hinge = dataclasses.replace(hinge, axis=tuple(axis.tolist()), origin=tuple(origin.tolist()))
-    return Front(dataclasses.replace(model, **about), hinge)
+    hinge = dataclasses.replace(hinge, axis=hinge.axis * scale * model.unit_m, origin=hinge.origin * scale)
+    return dataclasses.replace(model, **about), hinge
 
 
 def _normalised(parts: list[Part], model: CadModel) -> tuple[Part, ...]:
@@ -250,14 +246,8 @@ def carcass(model: CadModel, cut: tuple[Opening, ...]) -> CadModel:
     return dataclasses.replace(model, parts=(*parts, *(opening.recess for opening in cut)))
 
 
-def opened(item: Instance, front: Front, share: float) -> list[np.ndarray]:
+def opened(item: Instance, share: float) -> list[np.ndarray]:
     """Return the corners (n, 3) of a front's solids, scan x, y and height, with it open by a share of its range."""
-    hinge, value = front.hinge, share * front.hinge.range_rad[1]
-    placed = [item.to_floor(part.vertices) for part in front.model.solids]
-    base, tip = item.to_floor(np.array([hinge.origin, np.array(hinge.origin) + hinge.axis]))
-    axis = (tip - base) / np.linalg.norm(tip - base)
-    if hinge.slides:
-        return [points + value * axis for points in placed]
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    turn = np.eye(3) + math.sin(value) * cross + (1 - math.cos(value)) * cross @ cross
-    return [(points - base) @ turn.T + base for points in placed]
+    assert item.hinge is not None
+    motion = item.hinge.moved(item.matrix).motion(share * item.hinge.range_rad[1])
+    return [transformed(item.to_floor(part.vertices), motion) for part in item.model.solids]

@@ -186,8 +186,8 @@ def annotate_items(
         if item.hinge is not None:
             entry["articulation"] = {
                 "type": "slide" if item.hinge.slides else "hinge",
-                "axis": list(item.hinge.axis),
-                "origin": list(item.hinge.origin),
+                "axis": item.hinge.axis.tolist(),
+                "origin": item.hinge.origin.tolist(),
                 "range_m" if item.hinge.slides else "range_rad": [float(v) for v in item.hinge.range_rad],
             }
         models.append(entry)

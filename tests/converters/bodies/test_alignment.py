@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from converters.bodies.alignment import Alignment, AlignmentError, gross_outliers, solve_alignment
+from converters.bodies.alignment import Alignment, AlignmentError, solve_alignment
 from converters.bodies.objects import compare, pose_difference, upright
 from converters.records.raw import Annotation
 from interactive_nav_common.rotations import wrap_angle, yaw_matrix
@@ -148,7 +148,7 @@ def test_one_gross_outlier_in_eight_is_left_out(count):
         wrong = rng.choice(count, max(count // 8, 1), replace=False)
         expected = solve_alignment(np.delete(cad, wrong, 0), np.delete(scan, wrong, 0)) if count > 6 else None
         scan[wrong] += rng.choice([-1.0, 1.0], (len(wrong), 3)) * 0.4
-        np.testing.assert_array_equal(np.flatnonzero(gross_outliers(cad, scan)), np.sort(wrong))
+        np.testing.assert_array_equal(np.flatnonzero(solve_alignment(cad, scan).outliers), np.sort(wrong))
         found = solve_alignment(cad, scan)
         if expected is not None:
             np.testing.assert_allclose(found.scale, expected.scale, atol=1e-9)
@@ -170,13 +170,13 @@ def test_sound_noisy_pairs_are_all_kept():
     # OUTLIER_P is a chance of 1 in 1,000 a set: none in 60 sets.
     for seed in range(60):
         cad, scan, *_ = made_pairs(seed, 6 + seed % 6, 0.03)
-        assert not gross_outliers(cad, scan).any()
+        assert not solve_alignment(cad, scan).outliers.any()
 
 
 def test_eight_outliers_among_sixty_four():
     cad, scan, scale, yaw, _ = made_pairs(3, 64, 0.01)
     scan[5:13] += np.random.default_rng(9).normal(0, 1.0, (8, 3))
-    np.testing.assert_array_equal(np.flatnonzero(gross_outliers(cad, scan)), np.arange(5, 13))
+    np.testing.assert_array_equal(np.flatnonzero(solve_alignment(cad, scan).outliers), np.arange(5, 13))
     found = solve_alignment(cad, scan)
     np.testing.assert_allclose(found.scale, scale, rtol=0.03)
     assert abs(wrap_angle(found.yaw - yaw)) < 0.03

@@ -4,9 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from converters.bodies.objects import BodyHinge, PlacedObject, physical_properties
+from converters.bodies.objects import PlacedObject, physical_properties
 from converters.check.opening import blocked_fronts, held_bodies
 from converters.geometry.boxes import OrientedBox, convex_hull
+from converters.records.raw import ScannedHinge
 from converters.write.emit import SceneParts, build_spec
 
 
@@ -35,10 +36,10 @@ def _piece(y, kg):
     return placed, physical_properties("box", (hull,), kg)
 
 
-SLIDE = BodyHinge(np.zeros(3), (0.0, 0.3), False, np.array([0.0, -1.0, 0.0]), slides=True)
-DOOR = BodyHinge(np.array([-0.25, 0.0, 0.0]), (0.0, np.pi / 2), False, np.array([0.0, 0.0, -1.0]))
-FLAP = BodyHinge(np.zeros(3), (0.0, np.pi / 2), False, np.array([1.0, 0.0, 0.0]))
-ASIDE = BodyHinge(np.zeros(3), (0.0, 0.4), False, np.array([1.0, 0.0, 0.0]), slides=True)
+SLIDE = ScannedHinge(np.zeros(3), np.array([0.0, -1.0, 0.0]), (0.0, 0.3), slides=True)
+DOOR = ScannedHinge(np.array([-0.25, 0.0, 0.0]), np.array([0.0, 0.0, -1.0]), (0.0, np.pi / 2))
+FLAP = ScannedHinge(np.zeros(3), np.array([1.0, 0.0, 0.0]), (0.0, np.pi / 2))
+ASIDE = ScannedHinge(np.zeros(3), np.array([1.0, 0.0, 0.0]), (0.0, 0.4), slides=True)
 CABINET = _box((0, 0.3, 0.4), (0.3, 0.295, 0.4))
 
 

@@ -29,17 +29,17 @@ OF = [
 
 @pytest.mark.parametrize(("name", "kinds"), OF)
 def test_what_opens_of_a_model(name, kinds):
-    assert [o.front.model.category for o in openings(name)] == kinds
+    assert [o.model.category for o in openings(name)] == kinds
     model, cut = cad_model(name), openings(name)
     left = carcass(model, cut)
     if model.surface is None:
         assert len(left.parts) == len(model.parts) - sum(len(o.pieces) for o in cut) + len(cut)
     else:
-        trays = sum(12 * 4 for o in cut if o.front.model.category == "drawer")
+        trays = sum(12 * 4 for o in cut if o.model.category == "drawer")
         assert left.surface is not None
-        shown = sum(len(o.front.model.surface.faces) for o in cut if o.front.model.surface is not None)
+        shown = sum(len(o.model.surface.faces) for o in cut if o.model.surface is not None)
         assert len(left.surface.faces) + shown == len(model.surface.faces) + trays
-    ids = {o.front.model.id_cad for o in cut} | {model.id_cad}
+    ids = {o.model.id_cad for o in cut} | {model.id_cad}
     assert len(ids) == len(cut) + 1
 
 
@@ -55,7 +55,8 @@ def test_fronts_come_forward_and_keep_to_their_own_width():
         item = place(model, np.full(3, model.unit_m), np.zeros(2), 0.0)
         x0, y0, _, y1 = item.footprint.bounds
         for opening in openings(name):
-            shut, wide = (np.concatenate(opened(item, opening.front, share)) for share in (0.0, 1.0))
+            front = dataclasses.replace(item, model=opening.model, hinge=opening.hinge)
+            shut, wide = (np.concatenate(opened(front, share)) for share in (0.0, 1.0))
             assert wide[:, 0].max() > shut[:, 0].max() + 0.2 and wide[:, 2].min() > -1e-6
             assert wide[:, 1].min() > y0 - 0.06 and wide[:, 1].max() < y1 + 0.06 and wide[:, 0].min() > x0
 
@@ -64,10 +65,10 @@ def test_sliding_doors_slide_one_before_the_other():
     """Each of two that lap by 11 cm slides by the other's width less that, and leaves its half of the wardrobe open."""
     model = cad_model("BlendSwap-CC-0/wardrobeWithSlidingDoors")
     item = place(model, np.full(3, model.unit_m), np.zeros(2), 0.0)  # its right is +y
-    one, two = openings(model.name)
-    for front, other in ((one.front, two.front), (two.front, one.front)):
+    one, two = (dataclasses.replace(item, model=o.model, hinge=o.hinge) for o in openings(model.name))
+    for front, other in ((one, two), (two, one)):
         assert front.hinge.slides and front.hinge.range_rad[1] == pytest.approx(1.055 - 0.112, abs=2e-3)
-        shut, wide, beside = (np.concatenate(opened(item, f, s)) for f, s in ((front, 0), (front, 1), (other, 0)))
+        shut, wide, beside = (np.concatenate(opened(f, s)) for f, s in ((front, 0), (front, 1), (other, 0)))
         np.testing.assert_allclose(wide[:, [0, 2]], shut[:, [0, 2]], atol=1e-6)
         assert wide[:, 1].mean() == pytest.approx(beside[:, 1].mean(), abs=5e-3)
         assert shut[:, 0].min() > beside[:, 0].max() or shut[:, 0].max() < beside[:, 0].min()
@@ -90,6 +91,5 @@ def test_a_kitchen_front_before_a_wall_refuses_the_plan():
         for front in out:
             assert front.hinge is not None and 0.2 <= front.hinge.range_rad[1] <= 0.338
             assert reach_m is None or front.hinge.range_rad[1] == pytest.approx(reach_m)
-            cut = dataclasses.replace(openings(model.name)[0].front, model=front.model, hinge=front.hinge)
-            assert max(p[:, 0].max() for p in opened(item, cut, 1.0)) <= x + gap_m
+            assert max(p[:, 0].max() for p in opened(front, 1.0)) <= x + gap_m
     assert open_fronts(plan, (item,), (), "none") == ((item,), ())

@@ -140,7 +140,7 @@ def test_door_hangs_at_a_jamb_and_swings_from_closed_to_the_wall(seed):
     for item in [i for i in b.items if i.hinge is not None]:
         assert item.hinge is not None
         low, high = item.hinge.range_rad
-        assert item.hinge.axis == (0.0, 1.0, 0.0) and low < 0 < high
+        assert item.hinge.axis.tolist() == [0.0, 1.0, 0.0] and low < 0 < high
         hinge = item.to_floor(np.array([item.hinge.origin]))[0]
         # The hinge line: DOOR_GAP_M from the jamb, on the face of the wall.
         doorway = min(b.plan.doorways, key=lambda d: polygon(d.rect).distance(shapely.Point(hinge[:2])))

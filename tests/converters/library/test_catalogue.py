@@ -50,37 +50,12 @@ def test_a_piece_is_read_in_metres(tmp_path):
     ]
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"width": "0"}, "is 0 x 60.5 x 90 cm, expected sides above 0"),
-        ({"width": None}, "width is None, expected a number"),
-        ({"height": "nan"}, "height is 'nan', expected a number"),
-        ({"depth": "9999"}, "expected sides above 0 and below 50 m"),
-        ({"model": "/../secret.obj"}, "its model '../secret.obj' is not in the archive"),
-        ({"modelRotation": "1 0 0"}, "expected the 9 numbers of a rotation"),
-        ({"modelRotation": "2 0 0 0 1 0 0 0 1"}, "expected the 9 numbers of a rotation"),
-    ],
-)
-def test_a_piece_that_cannot_be_used_is_one_line(tmp_path, changes, message):
-    with pytest.raises(SceneRejected) as refused:
-        read_catalogue(write_library(tmp_path / "Small.sh3f", **changes))
-    assert message in str(refused.value) and "piece 1" in str(refused.value) and "\n" not in str(refused.value)
-
-
 def test_a_broken_archive_is_one_line(tmp_path):
-    path = write_library(tmp_path / "Small.sh3f")
-    (piece,), data = read_catalogue(path), path.read_bytes()
+    data = write_library(tmp_path / "Small.sh3f").read_bytes()
     for broken in (b"", data[:100], b"PK" + data[2:60]):
         (tmp_path / "broken.sh3f").write_bytes(broken)
         with pytest.raises(SceneRejected, match="not readable as a furniture library"):
             read_catalogue(tmp_path / "broken.sh3f")
-    at = data.index(b"v 2 0 0")
-    path.write_bytes(data[:at] + b"x" + data[at + 1 :])
-    with pytest.raises(SceneRejected, match="chair.obj is damaged"):
-        unpack_model(piece, tmp_path)
-    with pytest.raises(SceneRejected, match="no such file"):
-        read_catalogue(tmp_path / "absent.sh3f")
 
 
 def test_libraries_are_fetched_whole_and_checked(tmp_path, monkeypatch):

@@ -11,10 +11,10 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 
-from converters.bodies.objects import BodyHinge, PlacedObject
+from converters.bodies.objects import PlacedObject
 from converters.geometry.boxes import convex_hull
 from converters.geometry.faces import sample_faces
-from converters.records.raw import CEILING, FLOOR, WALL, GivenMap
+from converters.records.raw import CEILING, FLOOR, UP, WALL, GivenMap, ScannedHinge
 from converters.structure.maps import Grid, make_floor_plan, resample
 from converters.structure.walls import border_cells, cover_rectangles, main_direction, wall_boxes
 from interactive_nav_common.rotations import yaw_matrix
@@ -219,7 +219,7 @@ def test_the_sources_map_adds_floor_that_the_scan_missed():
 def door_at_the_wall(x_m: float = 0.43) -> PlacedObject:
     """A leaf of 0.8 x 0.04 m, square to the wall x = 0, its hinge in it, that turns flat against it both ways."""
     leaf = convex_hull(np.array([(x, y, z) for x in (-0.4, 0.4) for y in (-0.02, 0.02) for z in (0.0, 1.4)]))
-    hinge = BodyHinge(np.array([-0.4, 0.0, 0.0]), (-math.pi / 2, math.pi / 2), False)
+    hinge = ScannedHinge(np.array([-0.4, 0.0, 0.0]), UP, (-math.pi / 2, math.pi / 2))
     place = np.array([x_m, 1.25, 0.0])
     colours = np.zeros((len(leaf.faces), 3), np.uint8)
     turn = np.array([1.0, 0, 0, 0])
@@ -239,7 +239,7 @@ def test_walls_beside_a_doors_sweep_stay_and_the_leaf_meets_no_box(x_m, exact):
     leaf = leaf + 0.01 * exact * np.sign(leaf) * [1, 1, 0]  # so far may a leaf's box stand out of it
     side = np.linspace(0, 1, 30)[:, None]
     for angle in np.linspace(*door.hinge.range_rad, 25):
-        turned = (leaf - door.hinge.origin_b) @ yaw_matrix(angle).T + door.hinge.origin_b + door.position_w
+        turned = (leaf - door.hinge.origin) @ yaw_matrix(angle).T + door.hinge.origin + door.position_w
         ends = turned[np.argsort(turned[:, 2])[:4], :2]
         points = np.vstack([a * (1 - side) + b * side for a in ends for b in ends])
         for box in boxes:
