@@ -37,7 +37,6 @@ from interactive_nav.types import FAILURES
 from interactive_nav_common.commands import Command, option, parse
 from interactive_nav_common.config import AtLeastOne
 from interactive_nav_common.errors import reports_errors
-from interactive_nav_common.jobs.gpus import gpu_listing
 from interactive_nav_common.versions import commit, package_versions
 from train import config_io
 from train.runs.processes import one_for_each_gpu
@@ -109,12 +108,6 @@ SETTINGS |= {"slide": "active_doors"}
 def _make(robot: str, scenes: tuple[str, ...], backend: str, settings: str):
     """Build the environment; keep it for the next mode, since the tables of many large scenes take a minute."""
     return interactive_nav.make(robot, scenes, backend=backend, **json.loads(settings))
-
-
-def _gpu_memory_mib() -> float | None:
-    """Memory in use on the first GPU, by everything (Warp allocates beside JAX), or None without one."""
-    used = gpu_listing("memory.used").split()
-    return float(used[0]) if used and used[0].isdecimal() else None
 
 
 def _peak_memory_mib() -> dict[str, float] | None:
@@ -205,14 +198,11 @@ def simulation(
     program = jax.jit(random_driving(step, (num_envs, env.action_size), CHUNK))
     (state, _), compile_s = timed(program, state, keys[1])
     rates, totals = [], {name: 0.0 for name in (*FAILURES, "episodes", "nonfinite_observations")}
-    memory = [_gpu_memory_mib()]
-    for i, key in enumerate(keys[2:]):
+    for key in keys[2:]:
         (state, seen), took_s = timed(program, state, key)
         rates.append(CHUNK * num_envs / took_s)
         for name in totals:
             totals[name] += float(seen[name].sum())
-        if i % 10 == 0:
-            memory.append(_gpu_memory_mib())
     nav, physics = state.info["nav"], env.physics
     window = getattr(physics, "window", None)
     rate, clock = statistics.median(rates), env.config
@@ -225,7 +215,6 @@ def simulation(
         **totals,
         "running": {name: int(nav.memory[name].sum()) for name in FAILURES if name in nav.memory},
         "peak_memory_mib": _peak_memory_mib(),
-        "gpu_memory_mib": [m for m in (memory[0], memory[1], memory[-1]) if m is not None],
         "nv": window.model.nv if window else physics.nv,
         **{name: getattr(physics, name, None) for name in ("active_dofs", "contacts_per_env", "constraints_per_env")},
         "movables": int(env.world.slots.occupied.sum(1).max()),

@@ -97,25 +97,15 @@ class Generate(Command):
 
     def run(self, console: Console) -> None:
         """Run the command."""
-        from converters.generate import GenerationError, HomeConfig, generate_building
-        from converters.recipes import MOST_SEEDS, NEXT_SEED, building_of
+        from converters.generate import generate_building
+        from converters.recipes import building_of, with_seeds
 
         settings = read_words(self.settings, "floor_area_m2=80")
         config = building_of(self.tier, settings, self.split, "settings")
-        seeds = [self.seed + k * NEXT_SEED for k in range(MOST_SEEDS if isinstance(config, HomeConfig) else 1)]
-        refused: list[GenerationError] = []
         with stage_progress(console) as report:
-            for seed in seeds:
-                try:
-                    generate_building(self.out, seed, report, config)
-                    break
-                except GenerationError as error:
-                    refused.append(error)
-                    if seed == seeds[-1] or not str(error).startswith(f"seed {seed}: "):
-                        raise refused[0] from error
-        instead = f" in place of {str(refused[0]).removeprefix('seed ')}" if refused else ""
+            _, seed = with_seeds(self.seed, config, lambda seed: generate_building(self.out, seed, report, config))
         console.print(
-            f"{self.out}: building of seed {seed}{instead}; convert it with "
+            f"{self.out}: building of {seed}; convert it with "
             f"'python -m converters convert {shlex.quote(str(self.out))} SCENE_DIR'",
             soft_wrap=True,
         )

@@ -8,7 +8,7 @@ import dataclasses
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from converters.check.preview import preview
 from converters.clock import Report
@@ -31,6 +31,7 @@ from interactive_nav_common.files import check_name, part_folder, publish
 from interactive_nav_common.records import Reader
 from interactive_nav_common.untrusted.reading import read_bytes
 
+T = TypeVar("T")
 _CONVERSION = ("structure_faces", "object_faces", "structure_texture", "object_texture", "seed")
 MOST_SEEDS, NEXT_SEED = 5, 1_000_000
 """Seeds that a home's recipe stands for, and between them: of six one gives no plan that meets its shares."""
@@ -170,31 +171,41 @@ def missed(building: BuildingConfig | HomeConfig, result: Converted) -> str:
     return ""
 
 
-def _generated(recipe: SceneRecipe, config: ConvertConfig, work: Path, report: Report) -> tuple[Converted, str]:
-    """Generate and convert the recipe's building; return it, and its seed in words.
+def with_seeds(seed: int, building: BuildingConfig | HomeConfig, attempt: Callable[[int], T]) -> tuple[T, str]:
+    """Return the result of an attempt with the first seed that suits, and that seed in words; a home has several.
 
-    A home takes the next of its seeds where one gives no plan that can be furnished so, or `missed` once converted.
+    An attempt raises a `GenerationError` that names its seed where the next one should be taken.
     """
-    words = f"seed {recipe.seed}"
-    tries = MOST_SEEDS if isinstance(recipe.building, HomeConfig) else 1
-    for k in range(tries):
-        raw, scene = work / "raw", work / recipe.name
+    words, tries = f"seed {seed}", MOST_SEEDS if isinstance(building, HomeConfig) else 1
+    refused = None
+    for one in range(seed, seed + tries * NEXT_SEED, NEXT_SEED):
+        try:
+            return attempt(one), words
+        except GenerationError as error:
+            refused, reason = error, str(error).removeprefix(f"seed {one}: ")
+            if tries == 1 or reason == str(error):
+                raise
+            words = f"seed {one + NEXT_SEED} in place of {seed} ({reason})"
+    raise GenerationError(f"none of {tries} seeds: {refused}") from refused
+
+
+def _generated(recipe: SceneRecipe, config: ConvertConfig, work: Path, report: Report) -> tuple[Converted, str]:
+    """Generate and convert the recipe's building; return it, and its seed in words."""
+    raw, scene = work / "raw", work / recipe.name
+
+    def attempt(seed: int) -> Converted:
         for folder in (raw, scene):
             shutil.rmtree(folder, ignore_errors=True)
-        try:
-            seed = recipe.seed + k * NEXT_SEED
-            generate_building(raw, seed, lambda s, share: report(s, GENERATE * share), recipe.building)
-            result = convert(raw, scene, config, lambda s, share: report(s, GENERATE + CONVERT * share))
-            if why := missed(recipe.building, result):
-                raise GenerationError(why)
-        except GenerationError as error:
-            if k == tries - 1:
-                raise GenerationError(f"{recipe.name}: none of {tries} seeds: {error}") from error
-            reason = str(error).removeprefix(f"seed {seed}: ")
-            words = f"seed {seed + NEXT_SEED} in place of {recipe.seed} ({reason})"
-        else:
-            return result, words
-    raise AssertionError("unreachable: the last try returns or raises")
+        generate_building(raw, seed, lambda s, share: report(s, GENERATE * share), recipe.building)
+        result = convert(raw, scene, config, lambda s, share: report(s, GENERATE + CONVERT * share))
+        if why := missed(recipe.building, result):
+            raise GenerationError(f"seed {seed}: {why}")
+        return result
+
+    try:
+        return with_seeds(recipe.seed, recipe.building, attempt)
+    except GenerationError as error:
+        raise GenerationError(f"{recipe.name}: {error}") from error
 
 
 def make_scene(

@@ -4,13 +4,12 @@ One archive, `models.zip`: `index.json`, and for each model its arrays and its t
 front along +z, the middle of its base at the origin.
 """
 
-import contextlib
 import dataclasses
 import functools
 import io
 import json
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +29,7 @@ COLOURS = 96
 """Of a model's image, as it is given out: so that scenes keep it in a palette."""
 QUALITY = 80
 """Of an image as it is packaged, in WebP's scale: off by about two levels of 256."""
+REINSTALL = "install the package again"
 _DAY = (1980, 1, 1, 0, 0, 0)
 
 
@@ -154,14 +154,14 @@ def _archive(path: Path) -> zipfile.ZipFile:
 
 
 def _member(path: Path, name: str) -> bytes:
-    with readable(path, FileError, "install the package again"):
+    with readable(path, FileError, REINSTALL):
         return _archive(path).read(name)
 
 
 @functools.cache
 def read_index(path: Path = PACKED) -> dict[str, Model]:
     """Return name -> model, in the archive's order."""
-    reader = Reader(FileError, "install the package again")
+    reader = Reader(FileError, REINSTALL)
     rows = reader.decoded(_member(path, "index.json"), "JSON", str(path))
     return {model.name: model for model in reader.typed(rows, tuple[Model, ...], str(path))}
 
@@ -169,16 +169,11 @@ def read_index(path: Path = PACKED) -> dict[str, Model]:
 @functools.cache
 def read_image(name: str, path: Path = PACKED) -> Image.Image:
     """Read a model's texture, in all its colours."""
-    with _damage(name, path), Image.open(io.BytesIO(_member(path, f"{name}.webp"))) as picture:
+    with (
+        readable(path, FileError, REINSTALL, f": {name}"),
+        Image.open(io.BytesIO(_member(path, f"{name}.webp"))) as picture,
+    ):
         return picture.convert("RGB")
-
-
-@contextlib.contextmanager
-def _damage(name: str, path: Path) -> Iterator[None]:
-    try:
-        yield
-    except (OSError, ValueError, EOFError) as error:
-        raise FileError(f"{path}: {name} is damaged ({' '.join(str(error).split())}); install it again") from None
 
 
 def read_shape(name: str, path: Path = PACKED) -> Shape:
@@ -192,7 +187,7 @@ def read_shape(name: str, path: Path = PACKED) -> Shape:
 def read_meshes(name: str, path: Path = PACKED) -> tuple[VisualMesh, tuple[Hull, ...]]:
     """Read what `read_shape` does, with a surface of one grey pixel: decoding images takes longest."""
     buffer = io.BytesIO(_member(path, f"{name}.arrays"))
-    with _damage(name, path):
+    with readable(path, FileError, REINSTALL, f": {name}"):
         bounds, *planes = (np.lib.format.read_array(buffer, allow_pickle=False) for _ in range(8))
         vertices, behind, uv, uv_behind, hull_vertices, hull_faces, counts = map(_table, planes)
 

@@ -176,9 +176,7 @@ def score_points(surface: Surface, floors_m: tuple[float, ...], scores: Scores, 
     out, of = np.zeros((len(surface.points), len(NAMES)), np.float32), storey_of(surface.points[:, 2], floors_m)
     for k, floor_m in enumerate(floors_m):
         mine = np.flatnonzero(of == k)
-        colours = None if surface.colours is None else surface.colours[mine]
-        part = Surface(surface.points[mine], surface.normals[mine], colours, surface.face[mine])
-        voxels = voxelise(part, floor_m)
+        voxels = voxelise(surface.rows(mine), floor_m)
         scored = score_voxels(voxels, scores, lambda share, k=k: report("segment", (k + share) / len(floors_m)))
         inside = voxels.of_point >= 0
         out[mine[inside]] = scored[voxels.of_point[inside]]

@@ -91,11 +91,6 @@ def _recoloured(colours: np.ndarray | None, rng: np.random.Generator) -> np.ndar
     return 255 * np.clip(c + rng.normal(0, rng.uniform(0, 0.06), c.shape) + rng.normal(0, 0.04), 0, 1)
 
 
-def _rows(surface: Surface, rows: np.ndarray) -> Surface:
-    columns = (surface.points, surface.normals, surface.colours, surface.face)
-    return Surface(*(None if column is None else column[rows] for column in columns))  # type: ignore[arg-type]
-
-
 def worn(surface: Surface, classes: np.ndarray, rng: np.random.Generator, side_m: float) -> tuple[Surface, np.ndarray]:
     """Turn, mirror and badly scan a square column of a building around its middle, which is at x = y = 0."""
     floor = np.flatnonzero((classes == NAMES.index("floor")) & (surface.normals[:, 2] > 0.9))
@@ -109,7 +104,7 @@ def worn(surface: Surface, classes: np.ndarray, rng: np.random.Generator, side_m
         keep &= classes != NAMES.index("ceiling")
     if rng.random() < 0.5:
         keep &= points[:, 2] < rng.uniform(1.1, 2.6)
-    out = _rows(dataclasses.replace(surface, points=points, normals=surface.normals @ turn.T), keep)
+    out = dataclasses.replace(surface, points=points, normals=surface.normals @ turn.T).rows(keep)
     points, normals, classes = out.points, out.normals, classes[keep]
     if not len(points):
         return out, classes
@@ -126,7 +121,7 @@ def worn(surface: Surface, classes: np.ndarray, rng: np.random.Generator, side_m
     out = Surface(points, normals, _recoloured(out.colours, rng), out.face)
     if rng.random() < 0.7:
         left &= _visible(out, rng, side_m)
-    return _rows(out, left), classes[left]
+    return out.rows(left), classes[left]
 
 
 def make_crop(surface: Surface, classes: np.ndarray, rng: np.random.Generator, side: int) -> Crop:

@@ -46,6 +46,11 @@ class Surface:
     face: np.ndarray
     """(n,) the face that each lies on."""
 
+    def rows(self, chosen: np.ndarray) -> "Surface":
+        """Return some of the points."""
+        colours = None if self.colours is None else self.colours[chosen]
+        return Surface(self.points[chosen], self.normals[chosen], colours, self.face[chosen])
+
 
 @dataclasses.dataclass(frozen=True)
 class Voxels:

@@ -159,7 +159,7 @@ def test_a_home_without_a_plan_or_with_other_shares_takes_the_next_of_its_seeds(
     shares, broken = dict.fromkeys(range(9), 0.9), set()
     assert made(plain)[1] == "seed 3"  # a sparse building asks for no share
     with pytest.raises(
-        GenerationError, match="a: none of 5 seeds: must_push_fetch is 0.9 once converted: expected 0.0"
+        GenerationError, match="a: none of 5 seeds: seed 4000003: must_push_fetch is 0.9 once converted: expected 0.0"
     ):
         made(home)
     for recipe, count in ((home, 5), (plain, 1)):
@@ -358,7 +358,7 @@ def test_a_home_of_a_seed_that_gives_none_is_another_seeds_and_says_so(tmp_path,
     monkeypatch.setattr(generate, "generate_building", refuse)
     assert main(["generate", str(tmp_path / "a"), "--seed", "5", "--tier", "furnished"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert tried == [5, 1_000_005, 2_000_005] and "building of seed 2000005 in place of 5: no room; convert" in printed
+    assert tried == [5, 1_000_005, 2_000_005] and "building of seed 2000005 in place of 5 (no room); convert" in printed
     tried.clear()
     assert main(["generate", str(tmp_path / "a"), "--seed", "5"]) == 2 and tried == [5]  # of a sparse building
     tried.clear()

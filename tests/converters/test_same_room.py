@@ -12,7 +12,7 @@ from PIL import Image
 from converters.pipeline import ConvertConfig, convert
 from scenes_mjcf.schema import load_maps
 
-SMALL = {"structure_texture": 64}
+TEXELS = 64
 """No test here looks at the picture."""
 LEG_M = 0.04
 """A side of a leg, cut at 0.4 m, has 0.004 to 0.016 m2: less than what a cut may leave hanging."""
@@ -67,7 +67,7 @@ def reference(tmp_path_factory):
     result = convert(
         written(room(), folder / "merged.ply"),
         folder / "merged",
-        ConvertConfig(up="z", **SMALL),
+        ConvertConfig(up="z", structure_texture=TEXELS),
         cache=folder / "cache",
     )
     return result, load_maps(folder / "merged")
@@ -79,7 +79,7 @@ def test_a_room_is_the_same_however_its_vertices_are_shared(reference, tmp_path,
     result = convert(
         written(split(room(), how), tmp_path / f"room.{ending}"),
         tmp_path / "out",
-        ConvertConfig(up="y" if ending == "glb" else "z", **SMALL),
+        ConvertConfig(up="y" if ending == "glb" else "z", structure_texture=TEXELS),
     )
     maps = load_maps(tmp_path / "out")
     np.testing.assert_array_equal(maps.traversable, reference[1].traversable)

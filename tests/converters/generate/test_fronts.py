@@ -67,7 +67,8 @@ def test_sliding_doors_slide_one_before_the_other():
     item = place(model, np.full(3, model.unit_m), np.zeros(2), 0.0)  # its right is +y
     one, two = (dataclasses.replace(item, model=o.model, hinge=o.hinge) for o in openings(model.name))
     for front, other in ((one, two), (two, one)):
-        assert front.hinge.slides and front.hinge.range_rad[1] == pytest.approx(1.055 - 0.112, abs=2e-3)
+        assert front.hinge is not None and front.hinge.slides
+        assert front.hinge.range_rad[1] == pytest.approx(1.055 - 0.112, abs=2e-3)
         shut, wide, beside = (np.concatenate(opened(f, s)) for f, s in ((front, 0), (front, 1), (other, 0)))
         np.testing.assert_allclose(wide[:, [0, 2]], shut[:, [0, 2]], atol=1e-6)
         assert wide[:, 1].mean() == pytest.approx(beside[:, 1].mean(), abs=5e-3)
