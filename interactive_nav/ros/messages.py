@@ -56,14 +56,7 @@ REQUESTS: dict[str, Any] = {GOAL: PoseStamped, PLAN: Path, JOY: Joy}
 HEADING_TOPICS = {"imu": HEADING, "odom": ODOMETRY}
 """Where the navigator's heading may come from."""
 LATCHED = (TF_STATIC, DONE)
-MAP, ODOM, BASE, LIDAR, CAMERA, OPTICAL = (
-    "map",
-    "odom",
-    "base_link",
-    "lidar_link",
-    "camera_link",
-    "camera_optical_frame",
-)
+MAP, ODOM, BASE, LIDAR = "map", "odom", "base_link", "lidar_link"
 EPOCH_S = 1.0
 """First time of the simulated clock: ROS takes 0 as "not set"."""
 CAMERA_TOPICS = {"rgb": "image_raw", "depth": "depth/image_raw", "segmentation": "segmentation/image_raw"}
@@ -87,11 +80,16 @@ class MessageError(UserError):
     """Report a message that cannot be read."""
 
 
-def qos(topic: str, depth: int = 10, reading: bool = False) -> QoSProfile:
-    """Return how a topic is published, or read: from best-effort publishers, too."""
+def qos(topic: str, depth: int = 10, reading: bool = False, lossless: bool = False) -> QoSProfile:
+    """Return how a topic is published or read: sensors' data best effort, unless all of it must be `lossless`.
+
+    The odometry and contacts are published reliably and read as some robots offer them, best effort.
+    """
+    lossy = topic.startswith("/camera/") or topic in (SCAN, HEADING)
+    lossy |= reading and topic in (ODOMETRY, MOVABLE, STRUCTURE, FORCE)
     return QoSProfile(
         depth=depth,
-        reliability=ReliabilityPolicy.BEST_AVAILABLE if reading else ReliabilityPolicy.RELIABLE,
+        reliability=ReliabilityPolicy.BEST_EFFORT if lossy and not lossless else ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if topic in LATCHED else DurabilityPolicy.VOLATILE,
     )
 
@@ -116,6 +114,12 @@ def camera_topic(image: str, topic: str = "") -> str:
     """Return the topic of an image, such as `depth` or `left/depth`, or another topic of its camera."""
     prefix, _, kind = image.rpartition("/")
     return "/".join(["/camera", *([prefix] if prefix else []), topic or CAMERA_TOPICS[kind]])
+
+
+def camera_frames(prefix: str) -> tuple[str, str]:
+    """Return the frame that looks along a camera's axis with x, and its optical frame; `prefix` as `left/`."""
+    link = f"{prefix.replace('/', '_')}camera_link"
+    return link, link.replace("link", "optical_frame")
 
 
 def camera_topics(images: Iterable[str]) -> dict[str, Any]:
@@ -239,9 +243,10 @@ def scan_readings(message: LaserScan, rays: int, fov_deg: float, range_max_m: fl
     return np.clip(near / range_max_m, 0.0, 1.0).astype(np.float32)
 
 
-def yaw_quat(yaw_rad: float) -> Quaternion:
-    """Return a turn about z."""
-    return Quaternion(z=math.sin(yaw_rad / 2), w=math.cos(yaw_rad / 2))
+def yaw_quat(yaw_rad: float, pitch_rad: float = 0.0) -> Quaternion:
+    """Return a turn about z, after one about y: positive lowers x."""
+    (sin, cos), (down, level) = ((math.sin(a / 2), math.cos(a / 2)) for a in (yaw_rad, pitch_rad))
+    return Quaternion(x=-sin * down, y=cos * down, z=sin * level, w=cos * level)
 
 
 def quat_yaw(quat: Quaternion) -> float:
@@ -300,10 +305,12 @@ def twist_command(message: Twist) -> tuple[float, float]:
     return command
 
 
-def transform(head: Header, child: str, pos_m: Any, quat: Quaternion) -> TransformStamped:
-    """Return where the child's frame is in the header's frame."""
-    placed = Transform(translation=_vector(np.asarray(pos_m)), rotation=quat)
-    return TransformStamped(header=head, child_frame_id=child, transform=placed)
+def transform(
+    frame: str, child: str, pos_m: Any, quat: Quaternion | None = None, time_s: float = 0.0
+) -> TransformStamped:
+    """Return where the child's frame is in another one; without a quaternion it is not turned."""
+    placed = Transform(translation=_vector(np.asarray(pos_m)), rotation=quat or yaw_quat(0.0))
+    return TransformStamped(header=header(time_s, frame), child_frame_id=child, transform=placed)
 
 
 def _vector(values: np.ndarray) -> Vector3:

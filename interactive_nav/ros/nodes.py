@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -15,7 +16,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Bool, Float32
 
 from interactive_nav.ros import messages as ros
-from interactive_nav.ros.simulator import Pace, RosSimulator, Sensed, Tally
+from interactive_nav.ros.simulator import CameraPoses, Pace, Sensed, Tally
 from interactive_nav_common.errors import UserError, missing, optional
 
 COMMAND_HOLDS_S = 0.5
@@ -63,55 +64,80 @@ class SimulatorNode:
     """Publish the sensors of a simulated robot, and drive it by velocity commands."""
 
     def __init__(
-        self, node: Node, simulator: RosSimulator, pace: Pace, say: Say = lambda _: None, awaited: str = ros.IMAGE
+        self,
+        node: Node,
+        robot: Any,
+        pace: Pace,
+        say: Say = lambda _: None,
+        awaited: str = ros.IMAGE,
     ):
-        """Create its publishers and subscriptions on a node of `ros_node`; in lockstep it starts when somebody reads
-        the topic `awaited`."""
-        self._node, self._simulator, self._pace, self._say = node, simulator, pace, say
+        """Subscribe on a node of `ros_node`; in lockstep it starts when somebody reads the topic `awaited`.
+
+        `robot` is a `RosSimulator`, or a `RosSensors` of states that somebody else steps.
+        """
+        self._node, self._robot, self._pace, self._say = node, robot, pace, say
         self._news = threading.Condition()
         self._command, self._commands, self._done = (0.0, 0.0), 0, False
-        topics = ros.FROM_ROBOT | ros.camera_topics(simulator.sense().images)
-        self._out = {name: node.create_publisher(kind, name, ros.qos(name)) for name, kind in topics.items()}
+        self._out: dict[str, Any] = {}
         self._awaited = awaited
         for name, heard in ((ros.COMMAND, self._on_command), (ros.DONE, self._on_done)):
             node.create_subscription(ros.TOPICS[name], name, heard, ros.qos(name, reading=True))
 
     def run(self, stop: Stop) -> Tally:
         """Simulate until the navigator is done, the limit is reached or `stop` returns True."""
-        pace, tally = self._pace, Tally()
-        if pace.lockstep or pace.recorded:
-            self._wait_for_others(stop)
-        self._send_frames()
-        now = self._simulator.sense()
+        pace, tally, simulator = self._pace, Tally(), self._robot
+        now = simulator.sense()
+        self.begin(now, simulator.cameras, stop)
         held, obeyed = 0.0, 0
         due = time.perf_counter()
         while not stop():
-            with self._news:
-                before_this = self._commands
-            self._publish(now)
+            before_this = self.publish(now)
             if tally.seconds >= pace.limit_s - 1e-6:
                 break
             if pace.lockstep:
-                lacking = f"no command came on {ros.COMMAND}: has the navigator ended?"
-                wait_for(self._news, lambda n=before_this: self._commands > n or self._done, stop, lambda: lacking)  # noqa: B023
+                self.answer(before_this, stop)
             elif pace.factor:
-                due = max(due + self._simulator.dt_s / pace.factor, time.perf_counter() - 1.0)
+                due = max(due + simulator.dt_s / pace.factor, time.perf_counter() - 1.0)
                 time.sleep(max(due - time.perf_counter(), 0.0))
             with self._news:
                 linear, angular = self._command
-                held = 0.0 if self._commands > obeyed else held + self._simulator.dt_s
+                held = 0.0 if self._commands > obeyed else held + simulator.dt_s
                 obeyed = self._commands
                 if self._done:
                     tally.done = True
                     break
             if held > COMMAND_HOLDS_S + 1e-6:
                 linear = angular = 0.0
-            before, now = now, self._simulator.step(linear, angular)
+            before, now = now, simulator.step(linear, angular)
             tally.add(before, now)
             if int(now.time_s) > int(before.time_s) and int(now.time_s) % 10 == 0:
                 x, y, _ = now.truth_w
                 self._say(f"simulator: {now.time_s:.0f} s of at most {pace.limit_s:.0f} s, at ({x:.2f}, {y:.2f})")
         return tally
+
+    def begin(self, now: Sensed, cameras: CameraPoses, stop: Stop) -> None:
+        """Create publishers of what is sensed, wait in lockstep for the other nodes, and publish fixed frames."""
+        topics, lossless = ros.FROM_ROBOT | ros.camera_topics(now.images), self._pace.recorded
+        self._out = {
+            name: self._node.create_publisher(kind, name, ros.qos(name, lossless=lossless))
+            for name, kind in topics.items()
+        }
+        if self._pace.lockstep or lossless:
+            self._wait_for_others(stop)
+        links = [ros.transform(ros.BASE, ros.LIDAR, self._robot.lidar_pos_m)]
+        for prefix, (pos_m, yaw, pitch) in cameras.items():
+            camera, optical = ros.camera_frames(prefix)
+            links.append(ros.transform(ros.BASE, camera, pos_m, ros.yaw_quat(yaw, pitch)))
+            links.append(ros.transform(camera, optical, np.zeros(3), ros.OPTICAL_QUAT))
+        if self._robot.odom_is_map:
+            links.append(ros.transform(ros.MAP, ros.ODOM, np.zeros(3)))
+        self._send({ros.TF_STATIC: ros.TFMessage and ros.TFMessage(transforms=links)})
+
+    def answer(self, before: int, stop: Stop) -> tuple[float, float]:
+        """Wait for another velocity command than the first `before`; return the last, m/s and rad/s."""
+        lacking = f"no command came on {ros.COMMAND}: has the navigator ended?"
+        wait_for(self._news, lambda: self._commands > before or self._done, stop, lambda: lacking)
+        return self._command
 
     def _on_command(self, message: Any) -> None:
         try:
@@ -143,31 +169,21 @@ class SimulatorNode:
             lambda: f"nobody joined {', '.join(lacking())}: is the navigator running?",
         )
 
-    def _send_frames(self) -> None:
-        base, camera = ros.header(0.0, ros.BASE), ros.header(0.0, ros.CAMERA)
-        links = [
-            ros.transform(base, ros.LIDAR, self._simulator.lidar_pos_m, ros.yaw_quat(0.0)),
-            ros.transform(base, ros.CAMERA, self._simulator.camera_pos_m, ros.yaw_quat(0.0)),
-            ros.transform(camera, ros.OPTICAL, (0.0, 0.0, 0.0), ros.OPTICAL_QUAT),
-        ]
-        if self._simulator.odom_is_map:
-            links.append(ros.transform(ros.header(0.0, ros.MAP), ros.ODOM, (0.0, 0.0, 0.0), ros.yaw_quat(0.0)))
-        self._send({ros.TF_STATIC: ros.TFMessage and ros.TFMessage(transforms=links)})
-
     def _send(self, by_topic: dict[str, Any]) -> None:
         for topic, message in by_topic.items():
-            if topic in self._out:
+            if message is not None and topic in self._out:
                 self._out[topic].publish(message)
 
-    def _publish(self, now: Sensed) -> None:
-        """Publish one moment; pictures last, because the navigator waits for them."""
-        simulator = self._simulator
-        base, odom, lidar, optical = (
-            ros.header(now.time_s, frame) for frame in (ros.BASE, ros.ODOM, ros.LIDAR, ros.OPTICAL)
-        )
+    def publish(self, now: Sensed) -> int:
+        """Publish one moment, pictures last, because the navigator waits for them; return how many velocity commands
+        came before."""
+        with self._news:
+            before = self._commands
+        robot = self._robot
+        base, odom, lidar = (ros.header(now.time_s, frame) for frame in (ros.BASE, ros.ODOM, ros.LIDAR))
         x, y, yaw = (float(v) for v in now.odometry)
-        link = ros.transform(odom, ros.BASE, (x, y, 0.0), ros.yaw_quat(yaw))
-        scanner = simulator.lidar_fov_deg, simulator.range_min_m, simulator.lidar_range_m, simulator.dt_s
+        link = ros.transform(ros.ODOM, ros.BASE, np.array([x, y, 0.0]), ros.yaw_quat(yaw), now.time_s)
+        scanner = robot.lidar_fov_deg, robot.range_min_m, robot.lidar_range_m, robot.dt_s
         self._send(
             {
                 ros.CLOCK: Clock(clock=ros.stamp(now.time_s)),
@@ -177,13 +193,15 @@ class SimulatorNode:
                 ros.FORCE: Float32(data=now.force_n),
                 ros.HEADING: ros.imu_message(now.heading_rad, now.angular_b, base),
                 ros.ODOMETRY: ros.odometry_message(now.odometry, now.linear_b, now.angular_b, odom),
-                ros.SCAN: ros.scan_message(now.scan, *scanner, lidar),
+                ros.SCAN: ros.scan_message(now.scan, *scanner, lidar) if len(now.scan) else None,
             }
         )
         for name, image in now.images.items():
-            lens = simulator.lenses[name[: name.rfind("/") + 1]]
-            self._send({ros.camera_topic(name, "camera_info"): ros.info_message(lens, optical)})
+            prefix = name[: name.rfind("/") + 1]
+            optical = ros.header(now.time_s, ros.camera_frames(prefix)[1])
+            self._send({ros.camera_topic(name, "camera_info"): ros.info_message(robot.lenses[prefix], optical)})
             self._send({ros.camera_topic(name): ros.image_message(image, optical)})
+        return before
 
 
 @contextlib.contextmanager
@@ -211,7 +229,7 @@ def recording(node: Node, path: Path, topics: Mapping[str, Any] = ros.TOPICS) ->
                     now_ns = clock.sec * 10**9 + clock.nanosec
                 writer.write(connection, now_ns, raw)
 
-        node.create_subscription(kind, topic, heard, ros.qos(topic, 1000, reading=True), raw=True)
+        node.create_subscription(kind, topic, heard, ros.qos(topic, 1000, lossless=True), raw=True)
 
     for topic, kind in topics.items():
         add(topic, kind)

@@ -1,6 +1,7 @@
 """Simulate a robot's sensors in a scene under velocity commands; without ROS."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -11,12 +12,18 @@ import numpy as np
 from interactive_nav.navigation.lookup import all_free
 from interactive_nav.sensing.sensors import LIDAR_NEAR_M
 from interactive_nav_common.errors import UserError
+from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.categories import SEGMENTATIONS
 
-NEEDED = ("velocity", "localisation", "odometry", "lidar")
+NEEDED = ("velocity", "odometry", "lidar")
 """Observations of the environment that are sent on topics other than a camera's."""
 Images = Mapping[str, np.ndarray]
 """By kind, such as `rgb` or `left/depth`: colours [H, W, 3] u8, depth [H, W] f32 in m, class ids [H, W] u8."""
+
+
+CameraPoses = Mapping[str, tuple[np.ndarray, float, float]]
+"""By the prefix of its images where each camera is, (3,) m, and the yaw and the pitch (positive looks down), rad, that
+it looks along, in the base's frame."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +33,7 @@ class Sensed:
     time_s: float
     images: Images
     scan: np.ndarray
-    """[lidar_rays] f32 in [0, 1], from the right on; 1: nothing within range."""
+    """[lidar_rays] f32 in [0, 1], from the right on; 1: nothing within range. Empty: no scanner."""
     odometry: np.ndarray
     """(3,) x, y (m), yaw (rad) in the odometry's frame."""
     linear_b: np.ndarray
@@ -84,10 +91,78 @@ class Tally:
         return {k: round(v, 4) if isinstance(v, float) else v for k, v in dataclasses.asdict(self).items()}
 
 
-class RosSimulator:
-    """Simulate one robot in one environment, which observes `NEEDED` and takes velocity commands."""
+class RosSensors:
+    """Read from an environment's states what a robot's sensors measure; its odometry's frame is the map.
+
+    A scan and velocities are read where the environment observes `lidar` and `velocity`.
+    """
 
     range_min_m = LIDAR_NEAR_M
+
+    def __init__(self, env: Any, pictures: Callable[[Any], Images] | None = None):
+        """Take an environment that velocities drive, and what cameras see of a state; None: as it observes it."""
+        self._env, self._pictures, config = env, pictures or self._observed, env.config
+        if env.robot.twist is None:
+            env.robot.drive(0.0, 0.0)  # says which modes take a velocity
+        self.lidar_fov_deg, self.lidar_range_m = config.lidar_fov_deg, config.lidar_range_m
+        self.lidar_pos_m, self.dt_s, self.odom_is_map = config.lidar_pos_m, env.dt, True
+        self.lenses = {camera.prefix: camera.lens for camera in env.sensors.cameras}
+
+    def camera_poses(self, state: Any) -> CameraPoses:
+        """Return the poses of the robot's cameras in a state."""
+        sensors, qpos = self._env.sensors, np.asarray(state.pipeline_state.qpos)
+        at = self._env.world.layout.robot_qpos
+        into_base = np.asarray(matrix_from_quat(qpos[at + 3 : at + 7])).T
+        poses = {}
+        for prefix, mount in {c.prefix: c.mount for c in sensors.cameras}.items() or [("", sensors.mount)]:
+            pose = mount.pose(jnp.asarray(qpos))
+            x, y, z = into_base @ np.asarray(pose.axes_w)[:, 0]
+            place = into_base @ (np.asarray(pose.pos_w) - qpos[at : at + 3])
+            poses[prefix] = place, math.atan2(y, x), -math.atan2(z, math.hypot(x, y))
+        return poses
+
+    def read(self, state: Any, time_s: float, force_n: float = 0.0) -> Sensed:
+        """Return what the sensors measure of a state."""
+        nav, sizes, obs = state.info["nav"], self._env.sensors.sizes, state.obs
+        vector = np.asarray(obs["state"] if isinstance(obs, Mapping) else obs)
+        values: Any = dict(zip(sizes, np.split(vector, np.cumsum(list(sizes.values()))[:-1]), strict=True))
+        movable, structure = (bool(t) for t in np.asarray(nav.memory["touching"]))
+        velocity = values.get("velocity", np.zeros(6))
+        truth_w = np.append(np.asarray(nav.robot_pos_w)[:2], nav.yaw_rad)
+        return Sensed(
+            time_s=time_s,
+            images=self._pictures(state),
+            scan=values.get("lidar", np.zeros(0)),
+            odometry=self._odometry(values, truth_w),
+            linear_b=velocity[:3],
+            angular_b=velocity[3:],
+            heading_rad=float(nav.yaw_rad),
+            touches_movable=movable,
+            touches_structure=structure,
+            force_n=force_n,
+            truth_w=truth_w,
+        )
+
+    def _odometry(self, values: Mapping[str, np.ndarray], truth_w: np.ndarray) -> np.ndarray:
+        return truth_w
+
+    def _observed(self, state: Any) -> Images:
+        config, pixels = self._env.config, "pixels/"
+        divisor = SEGMENTATIONS[config.segmentation_classes].divisor
+        factors = {"rgb": 255, "depth": np.float32(config.depth_range_m), "segmentation": divisor}
+        if not isinstance(state.obs, Mapping):
+            return {}
+        images = {name.removeprefix(pixels): np.asarray(x) for name, x in state.obs.items() if name.startswith(pixels)}
+        whole = {name: x / np.float32(255 if x.dtype == np.uint8 else 1) for name, x in images.items()}
+        scaled = {name: x * factors[kind] for name, x in whole.items() if (kind := name.rpartition("/")[2]) in factors}
+        return {
+            name: x[..., 0] if name.endswith("depth") else np.squeeze(np.round(x).astype(np.uint8))
+            for name, x in scaled.items()
+        }
+
+
+class RosSimulator(RosSensors):
+    """Simulate one robot in one environment, which observes `NEEDED` and takes velocity commands."""
 
     def __init__(
         self,
@@ -102,15 +177,9 @@ class RosSimulator:
         Args:
             start: x, y (m) and yaw (rad), world; empty: drawn.
             odom_is_map: the odometry begins at the robot's pose in the world, not at zero.
-            pictures: what cameras see of a state; None: as the environment observes it.
+            pictures: of `RosSensors`.
         """
-        self._env, self._pictures, config = env, pictures or self._observed, env.config
-        twist = env.robot.twist
-        if twist is None:
-            env.robot.drive(0.0, 0.0)  # says which modes take a velocity
-        self.lidar_fov_deg, self.lidar_range_m = config.lidar_fov_deg, config.lidar_range_m
-        self.lidar_pos_m, self.dt_s = config.lidar_pos_m, env.dt
-        self.lenses = {camera.prefix: camera.lens for camera in env.sensors.cameras}
+        super().__init__(env, pictures)
         self._step = jax.jit(env.step)
         key = jax.random.PRNGKey(seed)
         begin = env.draw_start(key)
@@ -120,15 +189,10 @@ class RosSimulator:
                 raise UserError(f"start ({x}, {y}) is not where the robot has room; choose another")
             begin = begin.replace(start_xy_w=jnp.asarray([x, y], jnp.float32), start_yaw_rad=jnp.float32(yaw))
         self._state = jax.jit(env.reset_to)(begin, jax.random.fold_in(key, 1))
-        self._force_before, self._origin, self.odom_is_map = 0.0, np.zeros(3), odom_is_map
-        if odom_is_map:
-            self._origin = self.sense().truth_w
+        self._force_before, self.odom_is_map = 0.0, odom_is_map
+        self._origin = np.array([*begin.start_xy_w, begin.start_yaw_rad]) if odom_is_map else np.zeros(3)
+        self.cameras = self.camera_poses(self._state)
         jax.block_until_ready(self._step(self._state, jnp.zeros(env.action_size)))  # compiled before it counts
-
-    @property
-    def camera_pos_m(self) -> tuple[float, float, float]:
-        """Return the camera's position in the base's frame."""
-        return self._env.robot.camera.pos_m
 
     def step(self, linear_mps: float, angular_radps: float) -> Sensed:
         """Drive for one control step; commands beyond the robot's limits are clipped."""
@@ -141,35 +205,12 @@ class RosSimulator:
 
     def sense(self) -> Sensed:
         """Return what the sensors measure now."""
-        nav, sizes, obs = self._state.info["nav"], self._env.sensors.sizes, self._state.obs
-        vector = np.asarray(obs["state"] if isinstance(obs, Mapping) else obs)
-        values: Any = dict(zip(sizes, np.split(vector, np.cumsum(list(sizes.values()))[:-1]), strict=True))
-        movable, structure = (bool(t) for t in np.asarray(nav.memory["touching"]))
-        return Sensed(
-            time_s=int(nav.step_count) * self.dt_s,
-            images=self._pictures(self._state),
-            scan=values["lidar"],
-            odometry=compose(self._origin, values["odometry"]),
-            linear_b=values["velocity"][:3],
-            angular_b=values["velocity"][3:],
-            heading_rad=float(values["localisation"][2]),
-            touches_movable=movable,
-            touches_structure=structure,
-            force_n=float(nav.memory["force_sum_n"]) - self._force_before,
-            truth_w=values["localisation"],
-        )
+        nav = self._state.info["nav"]
+        force_n = float(nav.memory["force_sum_n"]) - self._force_before
+        return self.read(self._state, int(nav.step_count) * self.dt_s, force_n)
 
-    def _observed(self, state: Any) -> Images:
-        config, pixels = self._env.config, "pixels/"
-        divisor = SEGMENTATIONS[config.segmentation_classes].divisor
-        factors = {"rgb": 255, "depth": np.float32(config.depth_range_m), "segmentation": divisor}
-        images = {name.removeprefix(pixels): np.asarray(x) for name, x in state.obs.items() if name.startswith(pixels)}
-        whole = {name: x / np.float32(255 if x.dtype == np.uint8 else 1) for name, x in images.items()}
-        scaled = {name: x * factors[kind] for name, x in whole.items() if (kind := name.rpartition("/")[2]) in factors}
-        return {
-            name: x[..., 0] if name.endswith("depth") else np.squeeze(np.round(x).astype(np.uint8))
-            for name, x in scaled.items()
-        }
+    def _odometry(self, values: Mapping[str, np.ndarray], truth_w: np.ndarray) -> np.ndarray:
+        return compose(self._origin, values["odometry"])
 
 
 def compose(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:

@@ -51,6 +51,7 @@ GUARDED = {
     "interactive_nav/sensing/meshes.py": {"warp"},
     "benchmarks/steps_per_second.py": {"warp"},  # if it is in use
     "interactive_nav/ros/drive.py": {"rclpy"},  # after `need_ros`, as the next
+    "interactive_nav/ros/driving.py": {"rclpy"},
     "interactive_nav/ros/messages.py": {"rclpy"},
     "interactive_nav/ros/nodes.py": {"rclpy"},
     "topological_nav/ros/nodes.py": {"rclpy"},

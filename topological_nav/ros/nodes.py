@@ -1,8 +1,6 @@
 """Connect a driver to topics."""
 
-import functools
 import math
-import threading
 import time
 from collections import deque
 from typing import Any
@@ -12,12 +10,14 @@ from rclpy.node import Node
 from std_msgs.msg import Bool
 
 from interactive_nav.ros import messages as ros
-from interactive_nav.ros.nodes import PATIENCE_S, RosError, Say, Stop, wait_for
-from scenes_mjcf.look import Lens
-from topological_nav.ros.drivers import Driver, VelocityCommand
+from interactive_nav.ros.driving import DrivingNode
+from interactive_nav.ros.nodes import Say
+from topological_nav.ros.drivers import Driver
 
-LOST_S = 1.0
-"""Wall-clock time without a picture after which the navigator stops the robot."""
+SILENCE_S = 1.0
+"""Wall-clock time without a picture or a heading after which the navigator stops the robot."""
+_HEADING_LATE_S = 0.2
+"""Wall-clock time to wait for a heading that is not older than a picture."""
 
 
 class Headings:
@@ -45,7 +45,7 @@ class Headings:
         return math.remainder(np.interp(time_s, times, np.unwrap(yaws)), math.tau)
 
 
-class NavigatorNode:
+class NavigatorNode(DrivingNode):
     """Hand each picture and its heading to a driver, and publish the driver's commands.
 
     It does not know whether a robot or a simulator is behind the topics: time is that of the pictures.
@@ -59,95 +59,51 @@ class NavigatorNode:
         heading_offset_rad: float = 0.0,
         say: Say = lambda _: None,
     ):
-        """Create its publishers and subscriptions on a node of `ros_node`.
+        """Create its subscriptions on a node of `ros_node`.
 
         The offset is the yaw of the heading sensor's frame in the map's, added to the heading.
         """
-        self._driver, self._offset, self._say = driver, heading_offset_rad, say
-        self._news = threading.Condition()
-        self._headings, self._image, self._lens = Headings(), None, None
-        self._command, self._done = (
-            node.create_publisher(ros.TOPICS[name], name, ros.qos(name)) for name in (ros.COMMAND, ros.DONE)
-        )
-        self._heading_topic = ros.HEADING_TOPICS[heading_from]
-        for name in (self._heading_topic, ros.INFO, ros.IMAGE):
-            heard = functools.partial(self._on_message, name)
-            node.create_subscription(ros.TOPICS[name], name, heard, ros.qos(name, reading=True))
+        super().__init__(node, "navigator", SILENCE_S, say)
+        self._driver, self._offset = driver, heading_offset_rad
+        self._headings, self._image, self._said_s = Headings(), np.zeros(0), -math.inf
+        self._used_s = -math.inf
+        self._done = node.create_publisher(Bool, ros.DONE, ros.qos(ros.DONE))
+        heading = ros.HEADING_TOPICS[heading_from]
+        self._need(ros.Image, ros.IMAGE, self._on_image)
+        self._need(ros.TOPICS[heading], heading, self._on_heading)
+        if driver.lens is not None:
+            self._need_lens("rgb")
 
-    def run(self, stop: Stop) -> bool:
-        """Drive until the driver is done (True) or `stop` returns True; the robot is stopped at the end."""
-        last_s, said_s, came = -math.inf, -math.inf, time.monotonic()
-        moving = False
-        try:
-            while not stop():
-                with self._news:
-                    self._news.wait_for(lambda: self._image is not None or stop(), 0.2)
-                    message, self._image = self._image, None
-                if message is None:
-                    silent_s = time.monotonic() - came
-                    if moving and silent_s > LOST_S:
-                        self._say(f"navigator: no picture came on {ros.IMAGE} for {LOST_S:g} s; the robot stops")
-                        self._send(VelocityCommand(0.0, 0.0))
-                        moving = False
-                    if silent_s > PATIENCE_S:
-                        raise RosError(f"waited {PATIENCE_S:.0f} s: no picture came on {ros.IMAGE}")
-                    continue
-                came = time.monotonic()
-                time_s = ros.seconds(message.header.stamp)
-                if time_s < last_s:
-                    continue
-                last_s = time_s
-                heading = self._heading_at(time_s, stop)
-                if heading is None:
-                    break
-                image = ros.image_array(message)
-                if self._driver.lens is not None:
-                    image = ros.seen_through(image, self._fov_deg(stop), self._driver.lens)
-                command = self._driver.step(image, heading, time_s)
-                self._send(command)
-                moving = True
-                if time_s - said_s >= 10.0:
-                    said_s = time_s
-                    self._say(
-                        f"navigator: {time_s:.1f} s, heading {math.degrees(heading):.0f} degrees, "
-                        f"{command.linear_mps:.2f} m/s, {command.angular_radps:.2f} rad/s"
-                    )
-                if command.done:
-                    return True
+    def _complete(self) -> bool:
+        time_s = self._stamps.get(ros.IMAGE, -math.inf)
+        if time_s <= self._used_s or (self._driver.lens is not None and not self._lenses):
             return False
-        finally:
-            self._send(VelocityCommand(0.0, 0.0))
+        late = math.isfinite(self._headings.newest_s) and time.monotonic() - self._came[ros.IMAGE] > _HEADING_LATE_S
+        return late or self._headings.newest_s >= time_s - 1e-6
 
-    def _send(self, command: VelocityCommand) -> None:
-        # Whether it is done comes first: in lockstep the simulator goes on with the command.
-        if command.done:
+    def _decide(self) -> tuple[tuple[float, float], bool]:
+        time_s = self._used_s = self._stamps[ros.IMAGE]
+        heading = math.remainder(self._headings.at(time_s) + self._offset, math.tau)
+        lens = self._driver.lens
+        image = self._image if lens is None else self._seen("rgb", self._image, lens)
+        command = self._driver.step(image, heading, time_s)
+        if time_s - self._said_s >= 10.0:
+            self._said_s = time_s
+            self._say(
+                f"navigator: {time_s:.1f} s, heading {math.degrees(heading):.0f} degrees, "
+                f"{command.linear_mps:.2f} m/s, {command.angular_radps:.2f} rad/s"
+            )
+        if command.done:  # before the command, with which the simulator goes on in lockstep
             self._done.publish(Bool(data=True))
-        self._command.publish(ros.twist_message(command.linear_mps, command.angular_radps))
+        return (command.linear_mps, command.angular_radps), command.done
 
-    def _heading_at(self, time_s: float, stop: Stop) -> float | None:
-        """Return the heading when a picture was taken; wait a little for one that is not older."""
-        with self._news:
-            self._news.wait_for(lambda: self._headings.newest_s >= time_s - 1e-6, 0.2)
-            lacking = f"no heading came on {self._heading_topic}"
-            if not wait_for(self._news, lambda: math.isfinite(self._headings.newest_s), stop, lambda: lacking):
-                return None
-            return math.remainder(self._headings.at(time_s) + self._offset, math.tau)
+    def _forget(self) -> str:
+        self._used_s = self._said_s = -math.inf
+        return super()._forget()
 
-    def _fov_deg(self, stop: Stop) -> float:
-        wait_for(self._news, lambda: self._lens is not None, stop, lambda: f"no camera_info came on {ros.INFO}")
-        lens = self._lens
-        return lens.fov_deg if isinstance(lens, Lens) else math.nan
+    def _on_image(self, message: Any) -> None:
+        self._image = ros.image_array(message)
 
-    def _on_message(self, topic: str, message: Any) -> None:
-        with self._news:
-            try:
-                if topic == ros.IMAGE:
-                    self._image = message
-                elif topic == ros.INFO:
-                    self._lens = ros.info_lens(message)
-                else:
-                    quat = message.orientation if topic == ros.HEADING else message.pose.pose.orientation
-                    self._headings.add(ros.seconds(message.header.stamp), ros.quat_yaw(quat))
-                self._news.notify_all()
-            except ros.MessageError as error:
-                self._say(f"navigator: {topic}: {error}")
+    def _on_heading(self, message: Any) -> None:
+        quat = message.orientation if isinstance(message, ros.Imu) else message.pose.pose.orientation
+        self._headings.add(ros.seconds(message.header.stamp), ros.quat_yaw(quat))

@@ -15,7 +15,7 @@ from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.imports import first_line, import_function
 from train.scoring.onnx_policy import OnnxPolicy
 
-TAKEN = ("learned", "random", "follower", "avoider", "namo", "keyboard")
+TAKEN = ("learned", "random", "follower", "avoider", "namo", "keyboard", "ros")
 EXPECTED = "expected [name=]module:factory, [name=]path/to/file.py:factory or [name=]policy.onnx"
 
 

@@ -27,7 +27,8 @@ class Evaluate(Command):
     balanced: Flag = False
     """Scenes take turns; otherwise each episode draws one."""
     policies: Annotated[str | None, option(metavar="NAME,...")] = None
-    """Policies and planners to play, or keyboard: you drive (default: all policies; with --policy none)."""
+    """Policies and planners to play, keyboard: you drive, or ros: a ROS 2 node (default: all policies; with --policy
+    none)."""
     policy: Annotated[Repeated, option(metavar="[NAME=]MODULE:FACTORY")] = ()
     """Also play what this function of your module, or of path/to/file.py, returns."""
     scenes: Annotated[tuple[str, ...], option(metavar="SCENE_DIR")] = ()

@@ -12,6 +12,7 @@ import pyarrow as pa
 from rich.console import Console
 
 from interactive_nav.episodes import EpisodeFile, starts_of
+from interactive_nav.ros.commands import need_ros
 from interactive_nav.task.rollout import HostPolicy, Player, PolicyFn, Recorder, episode_keys
 from interactive_nav.types import OF_OBJECTS
 from interactive_nav_common.files import write_arrays
@@ -133,6 +134,11 @@ def make_policies(
             return load_policy(folder, config, env, which, deterministic, cached)
         if name == "keyboard":
             return Driver(env), None
+        if name == "ros":
+            need_ros("policy ros")
+            from interactive_nav.ros.remote import RosPolicy
+
+            return RosPolicy(env), None
         return BroughtPolicy(name, env) if "=" in name else make_baseline(name, env), None
 
     return {name.partition("=")[0]: build(name) for name in names}

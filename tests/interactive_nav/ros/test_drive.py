@@ -8,18 +8,25 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import interactive_nav
 from interactive_nav.interop.onnx_file import OnnxError, OnnxFile
-from interactive_nav.ros import drive, messages, nodes
+from interactive_nav.ros import driving as shared
+from interactive_nav.ros import messages, nodes
 from interactive_nav.ros.__main__ import main
 from interactive_nav.ros.drive import DriveNode
 from interactive_nav.ros.nodes import RosError, SimulatorNode, ros_node
-from interactive_nav.ros.pilot import Pilot, encoded, remaining, resampled
+from interactive_nav.ros.pilot import Pilot, encoded, remaining, resampled, scene_path
+from interactive_nav.ros.remote import RosPolicy
 from interactive_nav.ros.simulator import Pace, Sensed
 from interactive_nav.sensing.description import KEY
+from interactive_nav.task.rollout import Player, Recorder, episode_keys
+from interactive_nav_common.errors import UserError
 from scenes_mjcf.look import Lens
+from tests.toys import write_room
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -44,10 +51,10 @@ def changed(**parts):
     return {**json.loads(json.dumps(ABOUT)), **parts}
 
 
-def write_policy(path, about=ABOUT):
+def write_policy(path, about=ABOUT, gains=(1.0, 4.0)):
     """Twist = (x of the last waypoint, 4 times its y): ahead where the path runs, turning towards it."""
     gain = np.zeros((6, 2), np.float32)
-    gain[4, 0], gain[5, 1] = 1.0, 4.0
+    gain[4, 0], gain[5, 1] = gains
     values = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["batch", *of["shape"]])
               for name, of in about["inputs"].items()]  # fmt: skip
     graph = onnx.helper.make_graph(
@@ -184,7 +191,7 @@ class Robot:
     """What `SimulatorNode` reads of a simulator: a robot that does at once what it is commanded."""
 
     dt_s, lenses, odom_is_map, lidar_fov_deg, lidar_range_m = 0.1, {"": Lens(8, 6, 90.0)}, True, 360.0, 5.6
-    range_min_m, lidar_pos_m, camera_pos_m = 0.05, (0.0, 0.0, 0.3), (0.1, 0.0, 1.0)
+    range_min_m, lidar_pos_m, cameras = 0.05, (0.0, 0.0, 0.3), {"": (np.array([0.1, 0.0, 1.0]), 0.0, 0.0)}
 
     def __init__(self):
         self.steps, self.pose, self.blind, self.passed = 0, np.zeros(3), False, []
@@ -277,6 +284,32 @@ def test_a_policy_drives_to_three_goals_through_topics(tmp_path, quick):
     assert not bus.errors
 
 
+def test_episodes_over_topics_are_those_of_the_same_policy_without(tmp_path, quick):
+    room = write_room(tmp_path / "room", (6.0, 4.0), (("chair", 1.4, -1.5, 5.0, 0.5),))
+    few: dict[str, Any] = {"num_objects": 0, "num_waypoints": 3, "episode_steps": 60}
+    env = interactive_nav.make("turtlebot", [room], backend="native", observations=("waypoints",), **few)
+    about = changed(inputs={"waypoints": ABOUT["inputs"]["waypoints"]})
+    del about["lidar"]
+    file = OnnxFile(write_policy(tmp_path / "policy.onnx", about | {"cameras": []}, gains=(0.5, 2.0)))
+    recorders = {"at_w": Recorder(lambda state, action: state.info["nav"].robot_pos_w),
+                 "success": Recorder(lambda state, action: state.metrics["success"])}  # fmt: skip
+    player, keys = Player(env, recorders), episode_keys(0, 2)
+    alone = player.rollout(lambda obs, key: env.robot.drive(0.5 * obs[4], 2.0 * obs[5], jnp), keys, batch=1)
+    stops = []
+    with ros_node("policy") as node, contextlib.closing(RosPolicy(env)) as policy:
+        drive = DriveNode(node, Pilot(file, scene=scene_path(about, room)), silence_s=60.0)
+        thread = threading.Thread(target=lambda: drive.run(lambda: bool(stops)))
+        thread.start()
+        behind = player.rollout(policy, keys, batch=1)
+        stops.append(1)
+        thread.join(10)
+        with pytest.raises(UserError, match="policy ros: one episode at a time can be driven; set --batch 1"):
+            policy.act(None, np.arange(2), np.ones(2, bool), 0)
+    assert behind.num_steps.tolist() == alone.num_steps.tolist()
+    assert behind.values["success"].tolist() == alone.values["success"].tolist()
+    assert behind.values["at_w"] == pytest.approx(alone.values["at_w"], abs=1e-3)
+
+
 def test_a_lost_camera_stops_the_robot_and_it_goes_on_with_the_next_picture(tmp_path, quick):
     robot = Robot()
     with driving(write_policy(tmp_path / "policy.onnx"), robot, Pace(), silence_s=1.0) as bus:
@@ -342,7 +375,7 @@ def test_nan_and_a_clock_that_jumps_back_are_refused(alone):
 
 def test_goals_in_the_odometrys_frame_and_frames_of_tf(alone):
     driver, heard = alone.driver, alone.heard
-    link = messages.transform(messages.header(0.0, "map"), "odom", (2.0, 1.0, 0.0), messages.yaw_quat(math.pi / 2))
+    link = messages.transform("map", "odom", (2.0, 1.0, 0.0), messages.yaw_quat(math.pi / 2))
     driver._on_frames(SimpleNamespace(transforms=[link]))
     heard[messages.GOAL](goal(1.0, 0.0, "odom"))
     assert driver._pilot.goal == pytest.approx([2.0, 2.0])
@@ -350,7 +383,7 @@ def test_goals_in_the_odometrys_frame_and_frames_of_tf(alone):
 
 def test_the_dead_mans_button_must_be_held(alone, monkeypatch):
     driver, now = alone.driver, [100.0]
-    monkeypatch.setattr(drive, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(shared, "time", SimpleNamespace(monotonic=lambda: now[0]))
     assert driver._released() == "button 1 of /joy is not held"
     alone.heard[messages.JOY](messages.Joy(buttons=[0, 1]))
     assert driver._released() == ""

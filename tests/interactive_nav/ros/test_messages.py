@@ -148,3 +148,13 @@ def test_the_optical_frame_looks_along_x_with_its_x_to_the_right():
 def test_times_are_whole_microseconds():
     stamps = [messages.stamp(time_s) for time_s in (0.3, 0.1 + 0.2, 1.9999999)]
     assert [(s.sec, s.nanosec) for s in stamps] == [(1, 300_000_000), (1, 300_000_000), (3, 0)]
+
+
+def test_sensors_data_may_be_lost_and_commands_may_not():
+    best, sure = messages.ReliabilityPolicy.BEST_EFFORT, messages.ReliabilityPolicy.RELIABLE
+    for topic in (messages.IMAGE, messages.INFO, messages.SCAN, messages.HEADING, "/camera/left/depth/image_raw"):
+        assert messages.qos(topic).reliability == messages.qos(topic, reading=True).reliability == best
+        assert messages.qos(topic, lossless=True).reliability == sure
+    assert messages.qos(messages.ODOMETRY).reliability == messages.qos(messages.COMMAND).reliability == sure
+    assert messages.qos(messages.COMMAND, reading=True).reliability == sure
+    assert messages.qos(messages.ODOMETRY, reading=True).reliability == best

@@ -1,6 +1,7 @@
 """The nodes on real topics of this process, with a robot that does at once what it is commanded."""
 
 import contextlib
+import dataclasses
 import math
 import threading
 import time
@@ -22,11 +23,14 @@ from topological_nav.ros.nodes import Headings, NavigatorNode
 class Robot:
     """Has what `SimulatorNode` reads of a simulator; its world's frame is turned by a quarter from its start's."""
 
-    dt_s, lenses, odom_is_map, lidar_fov_deg, lidar_range_m = 0.1, {"": Lens(8, 6, 90.0)}, False, 240.0, 5.6
-    range_min_m, lidar_pos_m, camera_pos_m = 0.05, (0.17, 0.0, 0.36), (0.1, 0.0, 1.02)
+    dt_s, odom_is_map, lidar_fov_deg, lidar_range_m, range_min_m, lidar_pos_m = (
+        *(0.1, False, 240.0, 5.6, 0.05),
+        (0.17, 0.0, 0.36),
+    )
 
     def __init__(self):
         self.steps, self.pose = 0, np.zeros(3)
+        self.lenses, self.cameras = {"": Lens(8, 6, 90.0)}, {"": (np.array([0.1, 0.0, 1.02]), 0.0, 0.0)}
 
     def step(self, linear, angular):
         self.steps += 1
@@ -102,15 +106,33 @@ def test_frames_hang_together(bus, monkeypatch):
     """tf2_msgs is in no wheel: a stand-in of one field is sent to a stand-in for the publisher."""
     sent = {messages.TF: [], messages.TF_STATIC: []}
     monkeypatch.setattr(messages, "TFMessage", SimpleNamespace)
-    node = SimulatorNode(bus.simulator, Robot(), Pace(factor=0.0, limit_s=0.0))  # type: ignore[arg-type]
-    node._out |= {name: SimpleNamespace(publish=kept.append) for name, kept in sent.items()}
+    robot = Robot()
+    robot.cameras |= {"left/": (np.array([0.0, 0.2, 0.9]), math.pi / 2, 0.4)}
+    robot.lenses |= {"left/": Lens(4, 3, 60.0)}
+    sense = robot.sense
+    robot.sense = lambda: dataclasses.replace(sense(), images={"left/rgb": np.zeros((3, 4, 3), np.uint8)})
+    node = SimulatorNode(bus.simulator, robot, Pace(factor=0.0, limit_s=0.0))  # type: ignore[arg-type]
+    monkeypatch.setattr(
+        node,
+        "_send",
+        lambda by_topic: [sent.setdefault(topic, []).append(message) for topic, message in by_topic.items()],
+    )
     node.run(never)
-    links = [(t.header.frame_id, t.child_frame_id) for m in sent[messages.TF_STATIC] for t in m.transforms]
-    assert links == [
+    fixed = [t for m in sent[messages.TF_STATIC] for t in m.transforms]
+    assert [(t.header.frame_id, t.child_frame_id) for t in fixed] == [
         ("base_link", "lidar_link"),
         ("base_link", "camera_link"),
         ("camera_link", "camera_optical_frame"),
+        ("base_link", "left_camera_link"),
+        ("left_camera_link", "left_camera_optical_frame"),
     ]
+    # The left camera's x axis points to the left and 0.4 rad down.
+    quat = fixed[3].transform.rotation
+    x, y, z, w = quat.x, quat.y, quat.z, quat.w
+    ahead = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)
+    assert ahead == pytest.approx((0.0, math.cos(0.4), -math.sin(0.4)))
+    (picture,) = sent["/camera/left/image_raw"]
+    assert picture.header.frame_id == "left_camera_optical_frame"
     (moving,) = sent[messages.TF][0].transforms
     assert (moving.header.frame_id, moving.child_frame_id) == ("odom", "base_link")
 
@@ -183,7 +205,7 @@ def test_a_velocity_that_is_not_finite_stops_the_robot(bus):
 
 
 def test_a_lost_camera_stops_the_robot(bus, monkeypatch):
-    monkeypatch.setattr(navigator_nodes, "LOST_S", 0.3)
+    monkeypatch.setattr(navigator_nodes, "SILENCE_S", 0.3)
     said, stops = [], []
     navigator = NavigatorNode(bus.navigator, Watcher(None, 9), say=said.append)  # type: ignore[arg-type]
     thread = threading.Thread(target=lambda: navigator.run(lambda: bool(stops)))
@@ -192,12 +214,13 @@ def test_a_lost_camera_stops_the_robot(bus, monkeypatch):
     camera = bus.simulator.create_publisher(messages.Image, messages.IMAGE, messages.qos(messages.IMAGE))
     compass = bus.simulator.create_publisher(messages.Imu, messages.HEADING, messages.qos(messages.HEADING))
     until(lambda: camera.get_subscription_count() == 2 and compass.get_subscription_count() == 2)
+    until(lambda: navigator._command and navigator._command.get_subscription_count())
     head = messages.header(0.0, "base_link")
     compass.publish(messages.imu_message(0.0, np.zeros(3), head))
     camera.publish(messages.image_message(robot.images["rgb"], head))
     speeds = bus.of(messages.COMMAND)
     until(lambda: [m.linear.x for m in speeds] == [0.2, 0.0])
-    assert said[-1] == "navigator: no picture came on /camera/image_raw for 0.3 s; the robot stops"
+    assert said[-1] == "navigator: nothing came on /camera/image_raw for 0.3 s; the robot stops"
     stops.append(1)
     thread.join(5)
     assert not thread.is_alive()
