@@ -23,7 +23,7 @@ import interactive_nav
 from interactive_nav.pictures.camera import ThirdPerson
 from interactive_nav.robots import robot_names
 from interactive_nav.task.env import InteractiveNav
-from interactive_nav.task.wrappers import NONFINITE_ACTIONS, reset_all, reset_where, scene_of_slot, step_all
+from interactive_nav.task.wrappers import NONFINITE_ACTIONS, reset_all, reset_where, step_all
 from interactive_nav_common.errors import ConfigError, MissingPackage, missing
 from scenes_mjcf.robot_facts import title
 
@@ -119,105 +119,7 @@ def _to_numpy(tree: Any) -> Any:
     return jax.tree.map(np.array, tree)
 
 
-class _Playing:
-    """Holds what one environment and a batch have alike: the environment, its camera and the present state."""
-
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
-    _state: Any = None
-
-    def _make(self, robot: str, scenes: Sequence[str], render_mode: str | None, settings: dict[str, Any]) -> None:
-        self.env = interactive_nav.make(robot, scenes, **settings)
-        modes = self.metadata["render_modes"]
-        if render_mode is not None and render_mode not in modes:
-            raise ConfigError(f"render_mode is {render_mode!r}, expected one of {', '.join(modes)} or none")
-        self.render_mode, self._camera = render_mode, ThirdPerson(self.env)
-        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.env.dt)}
-
-    def _check_begun(self) -> None:
-        _refuse_fork()
-        if self._state is None:
-            raise gymnasium.error.ResetNeeded("step was called before reset")
-
-    def _frames(self) -> tuple[np.ndarray, ...] | None:
-        rendered = self.render_mode is not None and self._state is not None
-        return self._camera.frames(self._state) if rendered else None
-
-
-class InteractiveNavEnv(_Playing, gymnasium.Env):
-    """One environment.
-
-    Observation: float32 (29,) by default, see `interactive_nav.sensing.observation`; a dictionary where it has images.
-    Action: float32 (A,) in [-1, 1].
-    `terminated` on success or a state that is no longer finite, `truncated` at the time limit.
-    `info` holds the step's reward terms (`reward/...`), how many entries of the action were not finite and counted as
-    0 (`nonfinite_actions`) and, on an episode's last step, its scores
-    (`env.metric_names`: success, path_efficiency, effort_efficiency, ins_0.5, ...).
-    `reset(options={"start": EpisodeStart})` plays a given episode.
-    """
-
-    def __init__(
-        self,
-        robot: str,
-        scenes: Sequence[str] = SCENES,
-        render_mode: str | None = None,
-        slot: int | None = None,
-        **settings: Any,
-    ):
-        """Build it.
-
-        Args:
-            robot: a name from `robot_names()`, or a file (see `docs/add-a-robot.md`).
-            scenes: scene folders; each episode draws one.
-            render_mode: none, or "rgb_array": `render` returns a third-person view.
-            slot: with `scene_choice="slot"`, this environment's number in a batch: which scene it keeps.
-            **settings: of `NavConfig`'s parts.
-
-        Raises:
-            ConfigError: as `interactive_nav.make`, or a slot without that choice or that choice without a slot.
-        """
-        if _forked() and _SPACES:  # Gymnasium's worker passes on what its first `reset` raises, but nothing from here
-            self.render_mode = render_mode
-            self.observation_space, self.action_space = _SPACES  # pyright: ignore[reportAttributeAccessIssue]
-            return
-        _refuse_fork()
-        self._make(robot, scenes, render_mode, settings)
-        kept = _checked_slot(self.env, slot)
-        self.observation_space = observation_space_of(self.env)
-        self.action_space = action_space_of(self.env)
-        _SPACES[:] = self.observation_space, self.action_space
-        self._reset = jax.jit(lambda key: self.env.reset(key, kept))
-        self._reset_to = jax.jit(self.env.reset_to)
-        self._step = jax.jit(self.env.step)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Draw an episode, with a seed always the same ones from here on; an unknown option raises `ConfigError`."""
-        _refuse_fork()
-        super().reset(seed=seed)
-        given = _check_options(options, ("start",))
-        fresh = seed is not None or self._state is None
-        key = jnp.asarray(_key(self.np_random)) if fresh else self._state.info["rng"]  # pyright: ignore[reportOptionalMemberAccess]
-        self._state = self._reset_to(given["start"], key) if "start" in given else self._reset(key)
-        return _to_numpy(self._state.obs), {}
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Advance by one control period; raise `gymnasium.error.ResetNeeded` before the first `reset`."""
-        self._check_begun()
-        action = np.asarray(action, np.float32)
-        self._state = state = self._step(self._state, jnp.asarray(action))
-        done, truncated = bool(state.done > 0), bool(state.info["truncation"] > 0)
-        info = {name: float(state.metrics[name]) for name in self.env.reward_names}
-        info[NONFINITE_ACTIONS] = float((~np.isfinite(action)).sum())
-        if done:
-            info |= {name: float(state.metrics[name]) for name in self.env.metric_names}
-        return _to_numpy(state.obs), float(state.reward), done and not truncated, truncated, info
-
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """Return a (rows, columns, 3) u8 third-person view of the present state; None without a render mode."""
-        frames = self._frames()
-        return frames[0] if frames else None
-
-
-class InteractiveNavVectorEnv(_Playing, VectorEnv):
+class InteractiveNavVectorEnv(VectorEnv):
     """N environments stepped by one compiled program.
 
     `autoreset_mode` says what follows an episode's end (https://farama.org/Vector-Autoreset-Mode):
@@ -227,6 +129,11 @@ class InteractiveNavVectorEnv(_Playing, VectorEnv):
 
     Learners whose tensors stay on the device take `interactive_nav.interop.torch_bridge.TorchVectorEnv` instead.
     """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
+    _state: Any = None
+    slots: jax.Array | None = None
+    """Numbers [N] of the environments, with `scene_choice="slot"`; None: 0 to N - 1."""
 
     def __init__(
         self,
@@ -252,10 +159,14 @@ class InteractiveNavVectorEnv(_Playing, VectorEnv):
         """
         if num_envs < 1:
             raise ConfigError(f"num_envs is {num_envs}, expected at least 1")
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self._make(robot, scenes, render_mode, settings)
-        self.num_envs = num_envs
-        self.metadata["autoreset_mode"] = self.autoreset_mode
+        modes = self.metadata["render_modes"]
+        if render_mode is not None and render_mode not in modes:
+            raise ConfigError(f"render_mode is {render_mode!r}, expected one of {', '.join(modes)} or none")
+        self.num_envs, self.autoreset_mode, self.render_mode = num_envs, AutoresetMode(autoreset_mode), render_mode
+        self.env = interactive_nav.make(robot, scenes, **settings)
+        self._camera = ThirdPerson(self.env)
+        rate = round(1.0 / self.env.dt)
+        self.metadata = {**self.metadata, "render_fps": rate, "autoreset_mode": self.autoreset_mode}
         self.single_observation_space = observation_space_of(self.env)
         self.single_action_space = action_space_of(self.env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -292,13 +203,15 @@ class InteractiveNavVectorEnv(_Playing, VectorEnv):
             self._state = self._reset_where(self._state, keys, mask)
             self._ended = self._ended & ~mask
         else:
-            self._state = self._reset_to(given["start"], keys) if "start" in given else self._reset(keys)
+            self._state = self._reset_to(given["start"], keys) if "start" in given else self._reset(keys, self.slots)
             self._ended = jnp.zeros(self.num_envs, bool)
         return _to_numpy(self._state.obs), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Advance by one control period; see the class for what follows an episode's end."""
-        self._check_begun()
+        _refuse_fork()
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("step was called before reset")
         if self.autoreset_mode is AutoresetMode.DISABLED and bool(self._ended.any()):
             raise gymnasium.error.ResetNeeded(
                 f"episodes of environments {np.flatnonzero(self._ended).tolist()} are over: "
@@ -313,7 +226,8 @@ class InteractiveNavVectorEnv(_Playing, VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return a third-person view of each environment; None without a render mode."""
-        return self._frames()
+        rendered = self.render_mode is not None and self._state is not None
+        return self._camera.frames(self._state) if rendered else None
 
     def _keys(self, seed: int | Sequence[int | None] | None) -> jax.Array:
         n = self.num_envs
@@ -350,6 +264,74 @@ class InteractiveNavVectorEnv(_Playing, VectorEnv):
         return {**info, "final_obs": final_obs, "final_info": final_info, **masks}
 
 
+class InteractiveNavEnv(gymnasium.Env):
+    """One environment: a batch of one, whose values have no batch axis.
+
+    Observation: float32 (29,) by default, see `interactive_nav.sensing.observation`; a dictionary where it has images.
+    Action: float32 (A,) in [-1, 1].
+    `terminated` on success or a state that is no longer finite, `truncated` at the time limit.
+    `info` holds the step's reward terms (`reward/...`), how many entries of the action were not finite and counted as
+    0 (`nonfinite_actions`) and, on an episode's last step, its scores
+    (`env.metric_names`: success, path_efficiency, effort_efficiency, ins_0.5, ...).
+    `reset(options={"start": EpisodeStart})` plays a given episode.
+    """
+
+    metadata = InteractiveNavVectorEnv.metadata
+
+    def __init__(
+        self,
+        robot: str,
+        scenes: Sequence[str] = SCENES,
+        render_mode: str | None = None,
+        slot: int | None = None,
+        **settings: Any,
+    ):
+        """Build it.
+
+        Args:
+            robot: a name from `robot_names()`, or a file (see `docs/add-a-robot.md`).
+            scenes: scene folders; each episode draws one.
+            render_mode: none, or "rgb_array": `render` returns a third-person view.
+            slot: with `scene_choice="slot"`, this environment's number in a batch: which scene it keeps.
+            **settings: of `NavConfig`'s parts.
+
+        Raises:
+            ConfigError: as `interactive_nav.make`, or a slot without that choice or that choice without a slot.
+        """
+        self.render_mode = render_mode
+        if not (_forked() and _SPACES):  # Gymnasium's worker passes on what its first `reset` raises, nothing from here
+            _refuse_fork()
+            self.batch = InteractiveNavVectorEnv(robot, scenes, 1, AutoresetMode.DISABLED, render_mode, **settings)
+            self.env, self.batch.slots = self.batch.env, _checked_slot(self.batch.env, slot)
+            self.metadata = {**self.metadata, "render_fps": self.batch.metadata["render_fps"]}
+            _SPACES[:] = self.batch.single_observation_space, self.batch.single_action_space
+        self.observation_space, self.action_space = _SPACES  # pyright: ignore[reportAttributeAccessIssue]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Draw an episode, with a seed always the same ones from here on; an unknown option raises `ConfigError`."""
+        _refuse_fork()
+        super().reset(seed=seed)
+        given = jax.tree.map(lambda x: jnp.asarray(x)[None], _check_options(options, ("start",)))
+        obs, info = self.batch.reset(seed=seed, options=given)
+        return _first(obs), info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Advance by one control period; raise `gymnasium.error.ResetNeeded` before `reset` and after an end."""
+        obs, *values, info = self.batch.step(np.asarray(action, np.float32)[None])
+        reward, terminated, truncated = (value[0].item() for value in values)
+        info = {name: float(value[0]) for name, value in info.items() if not name.startswith("_")}
+        return _first(obs), reward, terminated, truncated, info
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """Return a (rows, columns, 3) u8 third-person view of the present state; None without a render mode."""
+        frames = self.batch.render()
+        return frames[0] if frames else None
+
+
+def _first(tree: Any) -> Any:
+    return jax.tree.map(lambda x: x[0], tree)
+
+
 def _masked(values: Mapping[str, jax.Array], mask: np.ndarray) -> dict[str, np.ndarray]:
     """Return name -> values, 0 outside the mask, and _name -> mask; nothing where the mask is empty."""
     if not mask.any():
@@ -360,8 +342,8 @@ def _masked(values: Mapping[str, jax.Array], mask: np.ndarray) -> dict[str, np.n
     return out
 
 
-def _checked_slot(env: InteractiveNav, slot: int | None) -> jax.Array | None:
-    """Return the scene that a single environment keeps; None: each episode draws one."""
+def _checked_slot(env: InteractiveNav, slot: int | None) -> jax.Array:
+    """Return the number [1] that a single environment has in a batch."""
     chosen, count = env.config.scene_choice == "slot", len(env.scenes)
     if slot is not None and (not chosen or slot < 0):
         raise ConfigError(
@@ -372,7 +354,7 @@ def _checked_slot(env: InteractiveNav, slot: int | None) -> jax.Array | None:
             f"scene_choice is 'slot' for one environment of {count} scenes, expected its number in a batch: give "
             "slot=I, make a batch (gymnasium.make_vec), or set scene_choice='episode'"
         )
-    return scene_of_slot(env, jnp.asarray(slot or 0, jnp.int32))
+    return jnp.asarray([slot or 0], jnp.int32)
 
 
 register_envs()

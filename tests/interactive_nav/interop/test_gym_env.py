@@ -110,8 +110,9 @@ def test_the_batch_equals_gymnasiums_own_vector_of_single_environments(settings,
     base = single.unwrapped
 
     def clone():
-        copy = object.__new__(type(base))
-        copy.__dict__.update(base.__dict__, _state=None, _np_random=None)
+        copy, copy.batch = (object.__new__(type(env)) for env in (base, base.batch))
+        copy.__dict__.update({**base.__dict__, "batch": copy.batch, "_np_random": None})
+        copy.batch.__dict__.update(base.batch.__dict__, _state=None, _np_random=None)
         return copy
 
     oracle = SyncVectorEnv([clone] * N, autoreset_mode=mode)
@@ -248,7 +249,7 @@ def test_each_environment_of_a_batch_keeps_its_scene(room, two_rooms):
     one = gym_env.InteractiveNavEnv("turtlebot", slot=1, **settings)
     for seed in range(3):
         one.reset(seed=seed)
-        assert one._state.info["nav"].scene_index == 1
+        assert one.batch._state.info["nav"].scene_index == 1
     with pytest.raises(ConfigError, match="scene_choice is 'slot' for one environment of 2 scenes"):
         gym_env.InteractiveNavEnv("turtlebot", **settings)
     with pytest.raises(ConfigError, match="slot is 1 with scene_choice='episode'"):

@@ -46,7 +46,7 @@ def start(world, x_m: float) -> PhysicsState:
 
 def test_what_moves_or_may_be_touched_is_awake(world):
     window, radius_m = PhysicsWindow(world, ALL), world.robot.footprint_radius_m
-    touching = 0.6 - HALF_M - radius_m
+    touching, measure = 0.6 - HALF_M - radius_m, jax.jit(window.measure)
     for x_m, speed, awake in (
         (touching - AWAKE_M - 0.01, 0.0, []),
         (touching - AWAKE_M + 0.01, 0.0, [FIRST]),
@@ -55,7 +55,7 @@ def test_what_moves_or_may_be_touched_is_awake(world):
     ):
         state = start(world, x_m)
         state = state.replace(qvel=state.qvel.at[world.layout.slot_qvel[SECOND]].set(speed))
-        measured = window.measure(jnp.int32(0), state)
+        measured = measure(jnp.int32(0), state)
         chosen, _, _ = window.select(measured)
         slots = np.concatenate([g.slots[np.asarray(i)] for g, i in zip(window.groups, chosen, strict=True)])
         assert slots[np.asarray(window.awake(measured, chosen))].tolist() == awake, x_m
@@ -77,7 +77,7 @@ def test_a_coasting_door_and_a_tipping_chair_are_not_at_rest(room, category, spe
     state, slot = start(room, -3.0), room.layout.slot_kind.index("hinge" if category == "door" else "free")
     at = room.layout.slot_qvel[slot]
     state = state.replace(qvel=state.qvel.at[at].set(speed), qacc_warmstart=state.qvel.at[at].set(acceleration))
-    _, moving, _ = Nearness(room).measure(jnp.int32(0), state, 0.6)
+    _, moving, _ = jax.jit(Nearness(room).measure)(jnp.int32(0), state, 0.6)
     assert np.flatnonzero(moving).tolist() == ([slot] if moves else [])
 
 
@@ -91,12 +91,15 @@ def test_room_is_measured_for_what_is_awake(world):
     assert whole[0] - some[0] == 2 * 4 and some[0] >= 4 + 24 and whole[1] > some[1]
 
 
-def driven(world, **settings) -> tuple[np.ndarray, list]:
-    """Return [STEPS, 4, 2] m of the robot and the three pieces, pushed ahead for three seconds, and the signals."""
-    config = dataclasses.replace(ALL, **settings)
-    step, state, out, all_signals = jax.jit(make_physics(world, config).step), start(world, 0.0), [], []
+def driven(step, world, table_rad_s: float = 0.0) -> tuple[np.ndarray, list]:
+    """Return [STEPS, 4, 2] m of the robot and the three pieces, pushed ahead for three seconds, and the signals.
+
+    The table is turned again before each step."""
+    state, out, all_signals = start(world, 0.0), [], []
+    turn = world.layout.slot_qvel[TABLE] + 5
     places = np.concatenate([[world.layout.robot_qpos], world.layout.slot_qpos[:3]])[:, None] + np.arange(2)
     for k in range(STEPS):
+        state = state.replace(qvel=state.qvel.at[turn].set(table_rad_s))
         state, signals = step(jnp.int32(0), state, jnp.full(2, 0.35 / 0.036, jnp.float32), 0.1 * k)
         out.append(np.asarray(state.qpos)[places])
         all_signals.append(jax.tree.map(np.asarray, signals))
@@ -106,12 +109,14 @@ def driven(world, **settings) -> tuple[np.ndarray, list]:
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="needs the package warp-lang")
 def test_a_chain_of_pushes_is_c_mujocos(world):
-    c, _ = driven(world, backend="native")
-    warp, signals = driven(world, backend="warp", active_dofs=20)
+    configs = [dataclasses.replace(ALL, backend="native"), dataclasses.replace(ALL, backend="warp", active_dofs=20)]
+    on_c, on_warp = (jax.jit(make_physics(world, config).step) for config in configs)
+    c, _ = driven(on_c, world)
+    warp, signals = driven(on_warp, world)
     moved = np.linalg.norm(c[-1] - c[0], axis=-1)
     assert moved[1 + FIRST] > 0.3 and moved[1 + SECOND] > 0.2, "the first chair pushes the second"
     np.testing.assert_allclose(np.linalg.norm(warp[-1] - warp[0], axis=-1), moved, rtol=0.1, atol=1e-3)
     assert (warp[:, 1 + TABLE] == warp[0, 1 + TABLE]).all(), "nothing meets the table"
     assert sum(int(s.crowded) for s in signals) == 0, "the robot and two chairs are 20 degrees of freedom"
-    _, signals = driven(world, backend="warp", active_dofs=14)
-    assert sum(int(s.crowded) for s in signals) > 5, "two chairs are awake, and there is room for one"
+    _, signals = driven(on_warp, world, table_rad_s=0.5)
+    assert sum(int(s.crowded) for s in signals) > 5, "the table turns as well, and there is room for two"

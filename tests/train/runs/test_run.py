@@ -356,19 +356,23 @@ def _wait_for_checkpoint(folder: RunFolder, after: int, process: subprocess.Pope
 
 
 @pytest.mark.slow
-def test_sigterm_saves_and_kill_loses_one_interval_at_most(tmp_path):
-    folder = RunFolder(tmp_path / "toy")
-    process = _start(tmp_path)
-    try:
-        _wait_for_checkpoint(folder, 0, process)
-        process.send_signal(signal.SIGTERM)
-        out, err = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    assert process.returncode == 128 + signal.SIGTERM, err
+def test_sigterm_saves_and_kill_loses_one_interval_at_most(tmp_path, monkeypatch):
+    usual = run.FolderCallbacks.on_update
+
+    def signalled(self, env_steps):
+        usual(self, env_steps)
+        if env_steps == 3 * UPDATE_STEPS:
+            signal.raise_signal(signal.SIGTERM)
+
+    console = quiet()
+    with monkeypatch.context() as patch:
+        patch.setattr(run.FolderCallbacks, "on_update", signalled)
+        _, folder, stopped_by = train_run(toy_config(tmp_path, updates=10_000), console, build_env=build_toy)
+    assert stopped_by == signal.SIGTERM
+    out = console.file.getvalue()  # type: ignore[attr-defined]
     assert "stopped at" in out and "the same command continues" in out
     lines, saved = read_metrics(folder.metrics), checkpoint.list_checkpoints(folder.checkpoints)
-    assert saved[-1].env_steps == lines[-1]["env_steps"]
+    assert saved[-1].env_steps == lines[-1]["env_steps"] == 3 * UPDATE_STEPS
     assert json.loads((folder.path / "summary.json").read_text())["completed"] is False
 
     # Killed without warning: what is lost lies after the last checkpoint, at most two updates of 256.
