@@ -89,7 +89,7 @@ def made(painted, shared) -> Made:
         assert main(["data", str(painted), "-o", str(out.data), *WORDS]) == 0
         learn = ["--data", str(out.data)]
         assert main(["train", "rooms", *learn, "-o", str(out.rooms), "epochs=6", "batch=32", *TRAINED]) == 0
-        words = ["network=alexnet", "epochs=80", "batch=16", "width=8", "learning_rate=1e-3"]
+        words = ["network=alexnet", "epochs=40", "batch=16", "width=8", "learning_rate=1e-3"]
         assert main(["train", "passages", *learn, "-o", str(out.passages), *words]) == 0
         runs = ["--localiser", str(out.rooms), "--detector", str(out.passages)]
         assert main(["map", str(painted), *runs, "-o", str(out.map), "--route", "0", "1"]) == 0

@@ -200,7 +200,7 @@ def test_the_force_on_a_pushed_block_on_warp(world, mjx_warp):
     [
         "native",
         pytest.param("jax", marks=pytest.mark.heavy),
-        pytest.param("warp", marks=[pytest.mark.slow, pytest.mark.skipif(not HAS_WARP, reason="no warp-lang")]),
+        pytest.param("warp", marks=[pytest.mark.heavy, pytest.mark.skipif(not HAS_WARP, reason="no warp-lang")]),
     ],
 )
 def test_the_chosen_force_is_what_the_signals_hold(world, native, backend):

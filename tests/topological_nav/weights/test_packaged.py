@@ -20,7 +20,7 @@ from topological_nav.config import RUNS, DataConfig
 from topological_nav.data.dataset import draw_passages
 from topological_nav.drives.driving import load_policy
 from topological_nav.learn.training import load_networks
-from topological_nav.maps.build import renderer_of
+from topological_nav.maps.build import drawn_for, renderer_of
 from topological_nav.maps.graph import load_map, save_map
 from topological_nav.ros.__main__ import COMMANDS, _networks
 from topological_nav.scenes.rendering import camera_pose
@@ -229,7 +229,7 @@ def test_the_packaged_networks_tell_free_ways_from_blocked_ones():
         ]
     )
     pose = camera_pose(robot, ways.xy_w[picked], ways.heading_rad[picked], np.zeros(len(picked)))
-    images = renderer_of(scene, data).draw(pose)
+    images = renderer_of(scene, drawn_for(data, None)).draw(pose)
     embedded = networks[0].embed(images)
     width = networks[0].about["width"]
     assert embedded.shape == (len(picked), 10 * width)  # 2 and 8 times the width: after the stages 3 and 5
