@@ -136,21 +136,14 @@ def meant(word: str) -> str:
     return f", did you mean {places[near[0]]!r}?" if near else ""
 
 
-def _file_of(name: str) -> Path | None:
-    """Return the file that describes a set: in a folder of that name, or in the package."""
-    for path in (Path(name) / FILE, HERE / name / FILE, COMMITTED / f"{name}.json"):
-        if os.path.isfile(path):
-            return path
-    return None
-
-
 def _members(word: str) -> list[str] | None:
     """Folders of a set or of a set's split; None where the word names neither."""
     head, _, last = word.rstrip("/").rpartition("/")
     for name, split in ((word.rstrip("/"), ""), (head, last)):
         if not name or (split and split not in SPLITS):
             continue
-        file = _file_of(name)
+        files = (Path(name) / FILE, HERE / name / FILE, COMMITTED / f"{name}.json")  # in a folder, or in the package
+        file = next((path for path in files if os.path.isfile(path)), None)
         if file is None:
             continue
         scenes = read_set(file)

@@ -5,6 +5,7 @@ Every change is in the `Session`, and is saved before it is shown: closing the p
 
 import concurrent.futures
 import contextlib
+import dataclasses
 import functools
 import math
 import threading
@@ -151,7 +152,7 @@ class Page:
             # Values that the page sets raise an event too, without a client.
             handle.on_update(lambda event: event.client_id is not None and self.do(action(handle.value)))
 
-        choose(self._object, lambda word: lambda s: s.at_object(int(word.split()[0]) - 1))
+        choose(self._object, lambda word: lambda s: dataclasses.replace(s, at=int(word.split()[0]) - 1))
         choose(self._class, lambda word: lambda s: s.changed(category=word, cad_id="", model=(), state="open"))
         choose(self._symmetry, lambda word: lambda s: s.changed(symmetry=SYMMETRIES[word], state="open"))
         self._pick.on_click(lambda event: self._picked(event.target.value))

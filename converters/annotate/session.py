@@ -122,10 +122,6 @@ class Session:
         order = [(self.at + k) % len(self.items) for k in range(len(self.items))]
         return dataclasses.replace(self, at=next((k for k in order if self.items[k].state == "open"), self.at))
 
-    def at_object(self, index: int) -> Session:
-        """Go to an object."""
-        return dataclasses.replace(self, at=index)
-
     def added(self, category: str, centre: np.ndarray) -> Session:
         """Add an object that nobody proposed, and work on it."""
         item = Item(category, _point(centre), (1.0, 1.0, 1.0), 0.0, 0)

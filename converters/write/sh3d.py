@@ -102,6 +102,8 @@ class _Export:
         self.high = [w for w in self.walls if w.height > self.low_m]
         self.stands = shapely.union_all([w.polygon() for w in self.high])
         self.cloud = self._cloud()
+        places: Any = shapely.points(self.cloud.points[:, :2])
+        self.plan = shapely.STRtree(places)
         lines, doors, pieces = ["left out: textures of walls and floors, lamps' light, and masses"], 0, 0
         if len(self.high) < len(self.walls):
             lines.append("built-in furniture is drawn as low walls")
@@ -166,16 +168,12 @@ class _Export:
 
     def _colour(self, default: str, plan: Any, out: np.ndarray, low_m: float, high_m: float) -> str:
         """Return the structure's median colour over a plan, between two heights, facing (2,) `out` or, if 0, up."""
-        cloud, towards = self.cloud, np.array([*out, 0.0 if out.any() else 1.0])
-        near = (cloud.normals @ towards > FACING) & (
-            np.abs(cloud.points[:, 2] - (low_m + high_m) / 2) < (high_m - low_m) / 2
-        )
-        near[near] = shapely.contains_xy(plan, *cloud.points[near, :2].T)
-        return (
-            f"FF{bytes(np.median(cloud.colours[near], axis=0).astype(np.uint8)).hex().upper()}"
-            if near.any()
-            else default
-        )
+        near, towards = self.plan.query(plan), np.array([*out, 0.0 if out.any() else 1.0])
+        points, normals = self.cloud.points[near], self.cloud.normals[near]
+        here = (normals @ towards > FACING) & (np.abs(points[:, 2] - (low_m + high_m) / 2) < (high_m - low_m) / 2)
+        near = near[here & shapely.contains_xy(plan, *points[:, :2].T)]
+        colour = np.median(self.cloud.colours[near], axis=0) if len(near) else None
+        return default if colour is None else f"FF{bytes(colour.astype(np.uint8)).hex().upper()}"
 
     def _mesh(self, body: Any) -> Mesh | None:
         """Return what shows a body; None where nothing does."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import json
 import math
@@ -106,7 +107,7 @@ def click_six_pairs(page: Page, browser: Tab, k: int) -> int:
     truth, boxes = page.raw.annotations[k], [bounds(p.points) for p in page._proposals]
     own = bounds(annotated_vertices(truth, page.raw.cads))
     at = max(range(len(boxes)), key=lambda i: box_iou(own, boxes[i]))
-    page.do(lambda s: s.at_object(at))
+    page.do(lambda s: dataclasses.replace(s, at=at))
     page._pool.submit(int).result(120)  # the ranking is done: until then candidates change places
     number = page.candidates().index(truth.cad_id)
     for _ in range(number // 4):
