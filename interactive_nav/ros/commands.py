@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from interactive_nav_common.commands import Command, Flag, Words, option, word
 from interactive_nav_common.errors import UserError, missing, optional
 from interactive_nav_common.jobs.progress import say
+from scenes_mjcf.sets import installed
 
 
 def need_ros(program: str) -> Any:
@@ -46,6 +47,8 @@ class Simulation(Command):
     def run(self, build: Callable[[], Any], stops: list[int], program: str, awaited: str) -> None:
         """Run the node of the simulator that `build` returns, and print its tally; in lockstep it starts when somebody
         reads the topic `awaited`."""
+        if not (installed(self.scene) / "scene.json").is_file():  # before what takes long to import
+            raise UserError(f"{self.scene}: no scene folder (no scene.json in it)")
         need_ros(program)
         from interactive_nav.ros import messages as ros
         from interactive_nav.ros.nodes import SimulatorNode, recording, ros_node

@@ -36,7 +36,7 @@ class RosPolicy(HostPolicy):
         self._env, self._sensors, self._node = env, RosSensors(env), nodes.enter_context(ros_node("evaluate"))
         self._goal = self._node.create_publisher(ros.PoseStamped, ros.GOAL, ros.qos(ros.GOAL))
         self._topics = SimulatorNode(self._node, self._sensors, Pace(lockstep=True), say, ros.ODOMETRY)
-        self._steps = 0
+        self._steps, self._stop = 0, lambda: bool(raise_stop())
 
     def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> np.ndarray:
         """Return the action [1, A] of one control step, when its command has come."""
@@ -45,17 +45,12 @@ class RosPolicy(HostPolicy):
         one = jax.tree.map(operator.itemgetter(0), jax.tree.map(np.asarray, state))
         now = self._sensors.read(one, self._steps * self._sensors.dt_s)
         if not self._steps:
-            self._topics.begin(now, self._sensors.camera_poses(one), _stop)
+            self._topics.begin(now, self._sensors.camera_poses(one), self._stop)
         if step == 0:
             x, y = map(float, one.info["nav"].goal_xy_w)
             pose = ros.Pose(position=ros.Point(x=x, y=y), orientation=ros.yaw_quat(0.0))
             self._goal.publish(ros.PoseStamped(header=ros.header(now.time_s, ros.MAP), pose=pose))
             time.sleep(_GOAL_ARRIVES_S)
         self._steps += 1
-        linear, angular = self._topics.answer(self._topics.publish(now), _stop)
+        linear, angular = self._topics.answer(self._topics.publish(now), self._stop)
         return np.asarray(self._env.robot.drive(np.array([linear]), np.array([angular]), np), np.float32)
-
-
-def _stop() -> bool:
-    raise_stop()
-    return False

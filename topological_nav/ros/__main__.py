@@ -1,4 +1,4 @@
-"""Run `python -m topological_nav.ros all|sim|navigator|check`: the simulator and the navigator as ROS 2 nodes.
+"""Run `python -m topological_nav.ros all|sim|navigator`: the simulator and the navigator as ROS 2 nodes.
 
 Exit codes: 0 done, 2 on a user's error or a failed node of `all` (one line on stderr), 128 + signal when stopped.
 """
@@ -29,6 +29,8 @@ from topological_nav.ros.config import HeadingConfig, SimulatorConfig
 
 DRIVERS = {"heading": HeadingConfig, "topological": NavigatorConfig}
 """Driver -> its settings."""
+PROGRAM = [sys.executable, "-c", GUARD, sys.executable, "-m", "topological_nav.ros"]
+"""Of each node of `all`."""
 _GRACE_S = 10.0
 """Time for a node of `all` to end after the other one has."""
 
@@ -95,18 +97,13 @@ class Navigator(Command):
         return "\n".join(f"settings of driver {name} (key=default):\n{settings_help(of())}" for name, of in drivers)
 
 
-@dataclasses.dataclass
-class Check(Command):
-    """Report whether ROS 2 can be used here."""
-
-
-COMMANDS = {kind.__name__.lower(): kind for kind in (All, Sim, Navigator, Check)}
+COMMANDS = {kind.__name__.lower(): kind for kind in (All, Sim, Navigator)}
 
 
 @reports_errors("topological_nav.ros")
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command."""
-    run = {All: _all, Sim: _sim, Navigator: _navigator, Check: _check}
+    run = {All: _all, Sim: _sim, Navigator: _navigator}
     with stop_signals() as stops:
         arguments = parse(COMMANDS, "python -m topological_nav.ros", argv)
         run[type(arguments)](arguments, stops)
@@ -126,7 +123,6 @@ def _networks(arguments: Navigator) -> Any:
 def _all(arguments: All, stops: list[int]) -> None:
     """Run both nodes until one ends; the other may then take `_GRACE_S` to end by itself."""
     need_ros("topological_nav.ros")
-    program = [sys.executable, "-c", GUARD, sys.executable, "-m", "topological_nav.ros"]
     bag = ["--bag", str(arguments.bag)] if arguments.bag else []
     words = {
         "simulator": ["sim", str(arguments.scene), *bag, *shlex.split(arguments.sim)],
@@ -134,7 +130,7 @@ def _all(arguments: All, stops: list[int]) -> None:
     }
     here = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", **os.environ}
     nodes = {
-        name: subprocess.Popen([*program, *of], env=here, start_new_session=True)  # Ctrl-C is for us
+        name: subprocess.Popen([*PROGRAM, *of], env=here, start_new_session=True)  # Ctrl-C is for us
         for name, of in words.items()
     }
     try:
@@ -186,11 +182,6 @@ def _navigator(arguments: Navigator, stops: list[int]) -> None:
         navigator = NavigatorNode(node, driver, arguments.heading_from, arguments.heading_offset, say)
         done = navigator.run(lambda: bool(stops))
         say(f"navigator: {'done' if done else 'stopped'}")
-
-
-def _check(arguments: Check, stops: list[int]) -> None:
-    del arguments, stops
-    print(f"rclpy: {need_ros('topological_nav.ros').__file__}")
 
 
 if __name__ == "__main__":

@@ -22,20 +22,27 @@ from topological_nav.ros.__main__ import main
 from topological_nav.ros.config import SimulatorConfig
 
 PROGRAM = [sys.executable, "-m", "topological_nav.ros"]
+LIGHT = '''
+import sys
+from topological_nav.ros import __main__ as program
+node = """if True:
+    import signal, sys, time
+    if sys.argv[1:] == ["sim", "nowhere"]:
+        from topological_nav.ros.__main__ import main
+        sys.exit(main())
+    signal.signal(15, lambda *_: sys.exit(0))
+    time.sleep(60)
+"""
+program.PROGRAM = [sys.executable, "-c", node]
+sys.exit(program.main(sys.argv[1:]))
+'''
+"""The same program with nodes that only wait for SIGTERM; the simulator of `nowhere` is the real one."""
 START = (-2.0, 0.5, 0.8)
-
-
-def begin_all(base, *words):
-    """Start `all` in `base`."""
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen([*PROGRAM, "all", *map(str, words)], cwd=base, **pipes)
 
 
 def run_all(base, *words):
     """Run `all` to its end."""
-    begun = begin_all(base, *words)
-    out, err = begun.communicate()
-    return subprocess.CompletedProcess(words, begun.returncode, out, err)
+    return subprocess.run([*PROGRAM, "all", *map(str, words)], cwd=base, capture_output=True, text=True)
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +122,7 @@ def test_pictures_scans_and_clock_hold_what_was_sensed(episode):
 
 @pytest.mark.slow
 def test_a_failed_node_is_in_the_exit_code(tmp_path):
-    ran = run_all(tmp_path, "nowhere")
+    ran = subprocess.run([sys.executable, "-c", LIGHT, "all", "nowhere"], cwd=tmp_path, capture_output=True, text=True)
     last = ran.stderr.splitlines()[-1]
     assert ran.returncode == 2 and last.startswith("topological_nav.ros: "), ran.stderr
     assert "simulator ended with exit code 2; its message is above" in last
@@ -125,13 +132,12 @@ def test_a_failed_node_is_in_the_exit_code(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stop_is_in_the_exit_code_and_ends_both_nodes(number, tmp_path):
-    room = write_room(tmp_path / "room", (6.0, 4.0), (("chair", 1.4, -0.5, 5.0, 0.5),))
-    begun = begin_all(tmp_path, room, "--sim", "engine=rays width=64 height=48 supersample=1")
+    begun = subprocess.Popen([sys.executable, "-c", LIGHT, "all", "room"], cwd=tmp_path)
     children = Path(f"/proc/{begun.pid}/task/{begun.pid}/children")
     while len(nodes := children.read_text().split()) < 2:
-        assert begun.poll() is None, begun.communicate()
+        assert begun.poll() is None
         time.sleep(0.05)
-    time.sleep(1.0)  # so that their handlers are there
+    time.sleep(0.3)  # so that their handlers are there
     begun.send_signal(number)
     begun.communicate(timeout=60)
     assert begun.returncode == 128 + number
@@ -154,7 +160,7 @@ def test_mistakes_are_one_line(words, told, capsys):
 
 def test_without_rclpy_the_command_that_installs_it_is_named(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "rclpy", None)
-    assert main(["check"]) == 2
+    assert main(["all", "room"]) == 2
     error = capsys.readouterr().err
     assert "needs rclpy" in error and "pip install 'interactive-nav[ros2]'" in error and error.count("\n") == 1
 
