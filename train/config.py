@@ -126,8 +126,6 @@ class OffPolicyConfig(Settings):
     """Transitions to keep, rounded down to the same number for each environment."""
     replay_limit_gb: Positive = 16.0
     """A replay that would take more device memory (1e9 bytes) is refused."""
-    replay_dtype: Literal["float32", "float16"] = "float32"
-    """How vectors are stored; images keep their type (env.image_dtype)."""
     n_steps: AtLeastOne = 1
     """Rewards summed before the critic's estimate takes over."""
     discounting: Share = 0.99

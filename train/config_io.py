@@ -32,15 +32,16 @@ def from_dict(plain: Any, base: TrainConfig | None = None, where: str = "config"
     return overlay(base or TrainConfig(), plain, where, elsewhere=list(flatten(TrainConfig())))
 
 
-GONE = ("windows",)
-"""Settings of environments that older runs wrote: they sized what was simulated, not what happens."""
+GONE = {"env": {"windows"}, "sac": {"replay_dtype"}, "ddpg": {"replay_dtype"}}
+"""Section -> settings that older runs wrote: they sized what was simulated or stored, not what happens."""
 
 
 def from_yaml(text: str, where: str = "config") -> TrainConfig:
     """Return the config that a run wrote as YAML, as `from_dict`, without settings that are gone."""
     values = _parsed(text, where)
-    if isinstance(values, dict) and isinstance(env := values.get("env"), dict):
-        values = values | {"env": {name: value for name, value in env.items() if name not in GONE}}
+    for section, names in GONE.items() if isinstance(values, dict) else ():
+        if isinstance(plain := values.get(section), dict):
+            values = values | {section: {name: value for name, value in plain.items() if name not in names}}
     return from_dict(values, where=where)
 
 

@@ -29,11 +29,16 @@ def test_round_trip_of_every_kind_of_value():
     assert from_yaml("") == TrainConfig()
 
 
-def test_a_run_of_an_older_version_is_read_without_settings_that_are_gone():
-    older = to_yaml(TrainConfig()).replace("  active_walls:", "  windows: [0.7 2 1 1 9]\n  active_walls:", 1)
-    assert "windows" in older and from_yaml(older) == TrainConfig()
-    with pytest.raises(ConfigError, match="unknown key 'env.windows'"):
-        from_dict({"env": {"windows": []}})
+@pytest.mark.parametrize(
+    ("section", "before", "name", "count"),
+    [("env", "active_walls", "windows", 1), ("sac", "replay_limit_gb", "replay_dtype", 2)],
+)
+def test_a_run_of_an_older_version_is_read_without_settings_that_are_gone(section, before, name, count):
+    """Both off-policy learners had a `replay_dtype`; on a command line a setting that is gone is an error."""
+    older = to_yaml(TrainConfig()).replace(f"  {before}:", f"  {name}: float32\n  {before}:")
+    assert older.count(f"  {name}:") == count and from_yaml(older) == TrainConfig()
+    with pytest.raises(ConfigError, match=f"unknown key '{section}.{name}'"):
+        from_dict({section: {name: "float32"}})
 
 
 @pytest.mark.parametrize("name", config_io.preset_names())

@@ -38,7 +38,7 @@ class ReplayBuffer:
     """The ring."""
 
     observation: Any
-    """[slots, envs, ...] before the step; images in their type, vectors as configured."""
+    """[slots, envs, ...] before the step, in the environments' types."""
     action: jax.Array
     """[slots, envs, A]."""
     reward: jax.Array
@@ -53,11 +53,11 @@ class ReplayBuffer:
     """() i32: slots written so far, at most all."""
 
 
-def empty_replay(slots: int, observation: Any, action_size: int, vector_dtype: str = "float32") -> ReplayBuffer:
-    """Return an empty ring for observations shaped as [envs, ...], with vectors in float32 or float16."""
+def empty_replay(slots: int, observation: Any, action_size: int) -> ReplayBuffer:
+    """Return an empty ring for observations shaped as [envs, ...]."""
     envs = jax.tree.leaves(observation)[0].shape[0]
     return ReplayBuffer(
-        observation=_cast(jax.tree.map(lambda x: jnp.zeros((slots, *x.shape), x.dtype), observation), vector_dtype),
+        observation=jax.tree.map(lambda x: jnp.zeros((slots, *x.shape), x.dtype), observation),
         action=jnp.zeros((slots, envs, action_size)),
         reward=jnp.zeros((slots, envs)),
         done=jnp.zeros((slots, envs), bool),
@@ -93,8 +93,6 @@ def insert(
     at, slots = replay.position, replay.reward.shape[0]
 
     def write(ring: jax.Array, x: jax.Array) -> jax.Array:
-        if ring.dtype == jnp.float16:  # beyond its range: its largest number, not infinity
-            x = jnp.clip(x, -65504.0, 65504.0)
         return ring.at[at].set(x.astype(ring.dtype))
 
     return ReplayBuffer(
@@ -120,8 +118,7 @@ def sample(replay: ReplayBuffer, key: jax.Array, batch_size: int, n_steps: int, 
     reward r_1 + g r_2 + ... + g^(m-1) r_m and discount g^(m-1), or 0 where the last one is a failure or success:
     Brax's losses multiply by the last g themselves. At a time limit there is no observation of what comes after
     (the next slot shows a new episode): a window that meets one ends before that step and bootstraps from the
-    observation there; a window that begins with it has truncation 1, and the losses leave it out, as Brax's do. Vectors
-    are f32, images as stored.
+    observation there; a window that begins with it has truncation 1, and the losses leave it out, as Brax's do.
     """
     slots, envs = replay.reward.shape
     key_age, key_env = jax.random.split(key)
@@ -139,7 +136,7 @@ def sample(replay: ReplayBuffer, key: jax.Array, batch_size: int, n_steps: int, 
     alive = ~jnp.any(counts & done, 1)
 
     def at(slot: jax.Array) -> Any:
-        return _cast(jax.tree.map(lambda ring: ring[slot % slots, env], replay.observation), "float32")
+        return jax.tree.map(lambda ring: ring[slot % slots, env], replay.observation)
 
     return types.Transition(  # type: ignore[call-arg]
         observation=at(first),
@@ -149,12 +146,6 @@ def sample(replay: ReplayBuffer, key: jax.Array, batch_size: int, n_steps: int, 
         next_observation=at(first + length),
         extras={"policy_extras": {}, "state_extras": {"truncation": truncated[:, 0].astype(jnp.float32)}},  # type: ignore
     )
-
-
-def _cast(observation: Any, dtype: str) -> Any:
-    """Return the observation with its vectors in another type; images pass."""
-    vectors = jax.tree.map(lambda x: x.astype(dtype), networks.vector_part(observation))
-    return {**observation, **vectors} if isinstance(observation, Mapping) else vectors
 
 
 @flax.struct.dataclass
@@ -270,7 +261,7 @@ def start(agent: ActorCritic, env: Env, seed: int) -> Snapshot:
     c = agent.config
     key_networks, key_env, key_updates = jax.random.split(jax.random.PRNGKey(seed), 3)
     env_state = reset_envs(agent, env, key_env)
-    make_replay = functools.partial(empty_replay, c.replay_slots, env_state.obs, env.action_size, c.replay_dtype)
+    make_replay = functools.partial(empty_replay, c.replay_slots, env_state.obs, env.action_size)
     check_memory(c, jax.eval_shape(make_replay), agent.section)
     data = OffPolicyData(env_state, make_replay(), agent.init_noise())
     return Snapshot(0, jax.jit(agent.init)(key_networks, key_updates), data)
@@ -279,9 +270,10 @@ def start(agent: ActorCritic, env: Env, seed: int) -> Snapshot:
 def check_memory(config: OffPolicyConfig, replay: ReplayBuffer, section: str) -> None:
     """Raise `ConfigError` where the replay, or one of such shapes, takes more than `replay_limit_gb`."""
     if nbytes(replay) > config.replay_limit_gb * 1e9:
-        images = isinstance(replay.observation, Mapping)
-        smaller = "env.image_dtype=uint8" if images else f"{section}.replay_dtype=float16"
+        smaller = (
+            "choose env.image_dtype=uint8 if it is not chosen yet, " if isinstance(replay.observation, Mapping) else ""
+        )
         raise ConfigError(
             f"{section}.replay_limit_gb is {config.replay_limit_gb:g}, but the {describe(replay)}; lower "
-            f"{section}.max_replay_size, choose {smaller} if it is not chosen yet, or raise the limit"
+            f"{section}.max_replay_size, {smaller}or raise the limit"
         )
