@@ -62,7 +62,7 @@ def append_row(path: Path, row: dict[str, Any], hidden: Sequence[str] | None = (
     """Adds a row to a file of JSON lines, and prints it without the hidden columns (None: all)."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "a", encoding="utf-8") as out:
-        out.write(json.dumps(row) + "\n")
+        out.write(json.dumps(row, separators=(",", ":")) + "\n")
     if hidden is not None:
         print(json.dumps({name: value for name, value in row.items() if name not in hidden}), flush=True)
 
@@ -112,7 +112,7 @@ def _make(robot: str, scenes: tuple[str, ...], backend: str, settings: str):
 
 def _peak_memory_mib() -> dict[str, float] | None:
     """Most memory that this process has held on its first GPU: JAX's arrays, and Warp's beside them."""
-    device = jax.devices()[0]
+    device = jax.local_devices()[0]
     if device.platform == "cpu":
         return None
     stats = device.memory_stats() or {}

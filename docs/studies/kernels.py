@@ -153,7 +153,7 @@ def profile(program: Any, state: Any, num_envs: int, steps: int) -> dict[str, An
         "parts_ms": {k: round(v / steps / 1e6, 3) for k, v in sorted(parts.items(), key=lambda kv: -kv[1])},
         "kernels": [
             {"name": k, "part": part_of(k), "ms": round(v / steps / 1e6, 4), "launches": round(launched[k] / steps, 1)}
-            for k, v in sorted(spent.items(), key=lambda kv: -kv[1])[:60]
+            for k, v in sorted(spent.items(), key=lambda kv: -kv[1])[:25]
         ],
     }
 
@@ -183,7 +183,7 @@ def main(argv: list[str] | None = None) -> int:
     append_row(args.out, row, hidden=None)
     console = Console(width=120)
     table = Table("kernel", "part", "ms a step", "launches a step", title=f"{row['device_ms_per_step']} ms a step")
-    for kernel in row["kernels"][:25]:
+    for kernel in row["kernels"]:
         table.add_row(kernel["name"], kernel["part"], f"{kernel['ms']:.3f}", f"{kernel['launches']:.1f}")
     console.print(table)
     for part, ms in row["parts_ms"].items():

@@ -62,8 +62,9 @@ def one_for_each_gpu(devices: int, command: Sequence[str]) -> Iterator[None]:
         os._exit(130)
     finally:
         jax.distributed.shutdown()  # at which all wait for each other
-        for other in others:
-            other.wait()
+        codes = [other.wait() for other in others]
+    if any(code == 1 or code < 0 for code in codes):
+        raise ConfigError("another process ended with an error, which it prints above")
 
 
 @contextlib.contextmanager

@@ -93,6 +93,14 @@ def train_toy(folder: Path, updates: int, gpus: int = 0, seed: int = 0) -> None:
         np.savez(folder / "learned.npz", *map(np.asarray, jax.tree.leaves(result.snapshot.learner)))
 
 
+def lose_the_second_process() -> None:
+    """Join two processes, of which the second ends with an error."""
+    processes.find_gpus = lambda: [Gpu(str(i), 80.0) for i in range(2)]
+    with processes.one_for_each_gpu(2, sys.orig_argv):
+        if os.environ[processes.INDEX] == "1":
+            raise RuntimeError("no memory statistics")
+
+
 def start(call: str, devices: int, **variables: str) -> subprocess.Popen[str]:
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"
     return subprocess.Popen(
@@ -139,6 +147,14 @@ def test_a_signal_to_one_of_two_processes_stops_both_and_an_error_of_one_ends_bo
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 1 and "has run.seed = 0, this one 7" in errors
     assert "Check failure" not in errors and "another process" not in errors
+
+
+@pytest.mark.heavy
+def test_an_error_of_another_process_at_the_end_is_in_the_exit_code():
+    process = start("lose_the_second_process()", 1)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 1 and "RuntimeError: no memory statistics" in errors
+    assert "ConfigError: another process ended with an error, which it prints above" in errors
 
 
 def next_file(folder: Path, name: str, process: subprocess.Popen[str]) -> Path:
