@@ -3,35 +3,59 @@
 Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when stopped.
 """
 
+import contextlib
 import dataclasses
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Literal
 
 from interactive_nav.config import make_config
-from interactive_nav.ros.commands import Simulation, need_ros
-from interactive_nav_common.commands import Command, option, parse, word
+from interactive_nav.ros.commands import beside, need_ros
+from interactive_nav_common.commands import Command, Flag, Words, option, parse, word
 from interactive_nav_common.config import overridden, settings_help
 from interactive_nav_common.errors import UserError, reports_errors
 from interactive_nav_common.jobs.progress import say
 from interactive_nav_common.signals import stop_signals
+from scenes_mjcf.sets import installed
 
 DEFAULTS = {"observations": ("depth", "segmentation", "rgb"), "episode_steps": 10**8, "backend": "native"}
 """Of `simulate`, where they differ from the environment's."""
 
 
 @dataclasses.dataclass(kw_only=True)
-class Simulate(Simulation):
+class Simulate(Command):
     """Run a simulated robot in a scene: sensors on topics, driven by cmd_vel. The odometry begins at the robot's pose
     in the map."""
 
+    scene: Annotated[Path, *word("SCENE")]
+    """Scene folder."""
+    settings: Words = ()
+    """Change settings, listed below."""
     robot: Annotated[str, option(metavar="NAME")] = "turtlebot"
     """Robot, or its file."""
     start: Annotated[str | None, option(metavar="X,Y,YAW")] = None
     """In m and rad, map (default: drawn)."""
     seed: int = 0
     """Of the start, small objects and noise."""
+    engine: Literal["gl", "warp", "rays"] | None = None
+    """Draw colours as films do, which the topological networks know (warp; default: as observed)."""
+    limit: Annotated[float, option(metavar="S")] = 1800.0
+    """Simulated seconds of an episode."""
+    lockstep: Flag = False
+    """Each picture waits for its velocity command."""
+    factor: float = 1.0
+    """Simulated seconds a second; 0: no waiting."""
+    bag: Annotated[Path | None, option(metavar="FOLDER")] = None
+    """Record all topics there (rosbag2)."""
+    run: Annotated[str | None, option(metavar="COMMAND")] = None
+    """Run a node beside, such as 'interactive-nav ros drive policy.onnx', and end with it."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.lockstep and self.factor != 1.0:
+            raise UserError("--factor has no effect with --lockstep; leave it out")
 
     @classmethod
     def epilog(cls) -> str:
@@ -92,17 +116,29 @@ def _pose(text: str, name: str) -> tuple[float, ...]:
 def _simulate(arguments: Simulate, stops: list[int]) -> None:
     config = overridden(make_config(**DEFAULTS), arguments.settings)
     start = _pose(arguments.start, "--start") if arguments.start else ()
+    if not (installed(arguments.scene) / "scene.json").is_file():  # before what takes long to import
+        raise UserError(f"{arguments.scene}: no scene folder (no scene.json in it)")
+    need_ros("interactive_nav.ros")
+    from interactive_nav import InteractiveNav, get_robot, load_scene
+    from interactive_nav.ros import messages as ros
+    from interactive_nav.ros.nodes import SimulatorNode, recording, ros_node
+    from interactive_nav.ros.simulator import NEEDED, Pace, RosSimulator
 
-    def build() -> Any:
-        from interactive_nav import InteractiveNav, get_robot, load_scene
-        from interactive_nav.ros.simulator import NEEDED, RosSimulator
-
-        observed = tuple(dict.fromkeys((*config.observations, *NEEDED)))
-        robot = get_robot(arguments.robot, config.control_mode)
-        env = InteractiveNav(robot, (load_scene(arguments.scene),), dataclasses.replace(config, observations=observed))
-        return RosSimulator(env, arguments.seed, start)
-
-    arguments.run(build, stops, "interactive_nav.ros", "/odom")
+    with contextlib.ExitStack() as stack:
+        stop = stack.enter_context(beside(arguments.run, stops)) if arguments.run else lambda: bool(stops)
+        with contextlib.redirect_stdout(sys.stderr):  # Warp prints its kernels
+            observed = tuple(dict.fromkeys((*config.observations, *NEEDED)))
+            config = dataclasses.replace(config, observations=observed)
+            env = InteractiveNav(
+                get_robot(arguments.robot, config.control_mode), (load_scene(arguments.scene),), config
+            )
+            simulator = RosSimulator(env, arguments.seed, start, arguments.engine)
+            topics = ros.TOPICS | ros.camera_topics(simulator.sense().images)
+        node = stack.enter_context(ros_node("simulator"))
+        if arguments.bag is not None:
+            stack.enter_context(recording(stack.enter_context(ros_node("recorder")), arguments.bag, topics))
+        pace = Pace(arguments.factor, arguments.lockstep, arguments.limit, arguments.bag is not None)
+        print(json.dumps(SimulatorNode(node, simulator, pace, say).run(stop).row()), flush=True)
 
 
 def _drive(arguments: Drive, stops: list[int]) -> None:

@@ -1,17 +1,19 @@
 """Define what commands of ROS 2 nodes share."""
 
 import contextlib
-import dataclasses
-import json
+import os
+import shlex
+import shutil
+import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
-from typing import Annotated, Any
+from collections.abc import Callable, Iterator
+from typing import Any
 
-from interactive_nav_common.commands import Command, Flag, Words, option, word
 from interactive_nav_common.errors import UserError, missing, optional
-from interactive_nav_common.jobs.progress import say
-from scenes_mjcf.sets import installed
+from interactive_nav_common.jobs.processes import GUARD
+
+_GRACE_S = 10.0
+"""Time for a command to end by itself, and again after SIGTERM."""
 
 
 def need_ros(program: str) -> Any:
@@ -22,45 +24,30 @@ def need_ros(program: str) -> Any:
     return optional("rclpy", line)
 
 
-@dataclasses.dataclass(kw_only=True)
-class Simulation(Command):
-    """Run a simulated robot's node."""
+@contextlib.contextmanager
+def beside(command: str, stops: list[int]) -> Iterator[Callable[[], bool]]:
+    """Run a command in a process of its own, and yield whether to stop: after a signal, or when the command failed.
 
-    scene: Annotated[Path, *word("SCENE")]
-    """Scene folder."""
-    settings: Words = ()
-    """Change settings, listed below."""
-    limit: Annotated[float, option(metavar="S")] = 1800.0
-    """Simulated seconds of an episode."""
-    lockstep: Flag = False
-    """Each picture waits for its velocity command."""
-    factor: float = 1.0
-    """Simulated seconds a second; 0: no waiting."""
-    bag: Annotated[Path | None, option(metavar="FOLDER")] = None
-    """Record all topics there (rosbag2)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.lockstep and self.factor != 1.0:
-            raise UserError("--factor has no effect with --lockstep; leave it out")
-
-    def run(self, build: Callable[[], Any], stops: list[int], program: str, awaited: str) -> None:
-        """Run the node of the simulator that `build` returns, and print its tally; in lockstep it starts when somebody
-        reads the topic `awaited`."""
-        if not (installed(self.scene) / "scene.json").is_file():  # before what takes long to import
-            raise UserError(f"{self.scene}: no scene folder (no scene.json in it)")
-        need_ros(program)
-        from interactive_nav.ros import messages as ros
-        from interactive_nav.ros.nodes import SimulatorNode, recording, ros_node
-        from interactive_nav.ros.simulator import Pace
-
-        with contextlib.redirect_stdout(sys.stderr):  # Warp prints its kernels
-            simulator = build()
-        pace = Pace(self.factor, self.lockstep, self.limit, self.bag is not None)
-        with contextlib.ExitStack() as stack:
-            node = stack.enter_context(ros_node("simulator"))
-            if self.bag is not None:
-                topics = ros.TOPICS | ros.camera_topics(simulator.sense().images)
-                stack.enter_context(recording(stack.enter_context(ros_node("recorder")), self.bag, topics))
-            tally = SimulatorNode(node, simulator, pace, say, awaited).run(lambda: bool(stops))
-            print(json.dumps(tally.row()), flush=True)
+    Topics stay on this machine unless ROS_AUTOMATIC_DISCOVERY_RANGE says otherwise.
+    """
+    words = shlex.split(command)
+    program = shutil.which("".join(words[:1]))
+    if program is None:
+        raise UserError(f"--run is {command!r}, expected a program that can be run, with its words")
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    guarded = [sys.executable, "-c", GUARD, program, *words[1:]]
+    process = subprocess.Popen(guarded, start_new_session=True)  # Ctrl-C is for us
+    try:
+        yield lambda: bool(stops or process.poll())
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(0.0 if stops else _GRACE_S)
+        failed = process.poll()
+    finally:
+        if process.poll() is None:
+            process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_GRACE_S)
+        process.kill()
+        process.wait()  # gone before this command ends
+    if failed and not stops:
+        raise UserError(f"{words[0]} ended with exit code {failed}; its message is above")

@@ -24,7 +24,7 @@ COMMAND_HOLDS_S = 0.5
 PATIENCE_S = 180.0
 """Wall-clock time to wait for other nodes."""
 _DELIVERY_S = 1.0
-"""Between the last message and the end of a node: DDS sends in other threads."""
+"""For messages that other threads of DDS still send before a node ends, and for news of its subscriptions."""
 Stop = Callable[[], bool]
 """Returns whether to stop."""
 Say = Callable[[str], None]
@@ -63,15 +63,8 @@ def ros_node(name: str) -> Iterator[Node]:
 class SimulatorNode:
     """Publish the sensors of a simulated robot, and drive it by velocity commands."""
 
-    def __init__(
-        self,
-        node: Node,
-        robot: Any,
-        pace: Pace,
-        say: Say = lambda _: None,
-        awaited: str = ros.IMAGE,
-    ):
-        """Subscribe on a node of `ros_node`; in lockstep it starts when somebody reads the topic `awaited`.
+    def __init__(self, node: Node, robot: Any, pace: Pace, say: Say = lambda _: None):
+        """Subscribe on a node of `ros_node`; in lockstep it starts when somebody reads pictures or the odometry.
 
         `robot` is a `RosSimulator`, or a `RosSensors` of states that somebody else steps.
         """
@@ -79,7 +72,6 @@ class SimulatorNode:
         self._news = threading.Condition()
         self._command, self._commands, self._done = (0.0, 0.0), 0, False
         self._out: dict[str, Any] = {}
-        self._awaited = awaited
         for name, heard in ((ros.COMMAND, self._on_command), (ros.DONE, self._on_done)):
             node.create_subscription(ros.TOPICS[name], name, heard, ros.qos(name, reading=True))
 
@@ -129,8 +121,7 @@ class SimulatorNode:
             camera, optical = ros.camera_frames(prefix)
             links.append(ros.transform(ros.BASE, camera, pos_m, ros.yaw_quat(yaw, pitch)))
             links.append(ros.transform(camera, optical, np.zeros(3), ros.OPTICAL_QUAT))
-        if self._robot.odom_is_map:
-            links.append(ros.transform(ros.MAP, ros.ODOM, np.zeros(3)))
+        links.append(ros.transform(ros.MAP, ros.ODOM, np.zeros(3)))
         self._send({ros.TF_STATIC: ros.TFMessage and ros.TFMessage(transforms=links)})
 
     def answer(self, before: int, stop: Stop) -> tuple[float, float]:
@@ -155,11 +146,12 @@ class SimulatorNode:
             self._news.notify_all()
 
     def _wait_for_others(self, stop: Stop) -> None:
-        listeners = dict.fromkeys(ros.FROM_ROBOT, 1) if self._pace.recorded else {}
-        listeners[self._awaited] = 2 if self._pace.recorded else 1
+        recorded, read = self._pace.recorded, (ros.IMAGE, ros.ODOMETRY)
 
         def lacking() -> list[str]:
-            out = [name for name, least in listeners.items() if self._out[name].get_subscription_count() < least]
+            count = {name: out.get_subscription_count() for name, out in self._out.items()}
+            out = [name for name in ros.FROM_ROBOT if recorded and not count[name]]
+            out += [] if max(count[name] for name in read) > recorded else [" or ".join(read)]
             return out if self._node.count_publishers(ros.COMMAND) else [*out, ros.COMMAND]
 
         wait_for(
@@ -168,6 +160,7 @@ class SimulatorNode:
             stop,
             lambda: f"nobody joined {', '.join(lacking())}: is the navigator running?",
         )
+        time.sleep(_DELIVERY_S)  # its other subscriptions may be announced later
 
     def _send(self, by_topic: dict[str, Any]) -> None:
         for topic, message in by_topic.items():

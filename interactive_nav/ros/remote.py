@@ -35,7 +35,7 @@ class RosPolicy(HostPolicy):
         atexit.register(self.close)
         self._env, self._sensors, self._node = env, RosSensors(env), nodes.enter_context(ros_node("evaluate"))
         self._goal = self._node.create_publisher(ros.PoseStamped, ros.GOAL, ros.qos(ros.GOAL))
-        self._topics = SimulatorNode(self._node, self._sensors, Pace(lockstep=True), say, ros.ODOMETRY)
+        self._topics = SimulatorNode(self._node, self._sensors, Pace(lockstep=True), say)
         self._steps, self._stop = 0, lambda: bool(raise_stop())
 
     def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.navigation.lookup import all_free
+from interactive_nav.pictures.camera import PictureCamera
 from interactive_nav.sensing.sensors import LIDAR_NEAR_M
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.rotations import matrix_from_quat
@@ -99,14 +100,14 @@ class RosSensors:
 
     range_min_m = LIDAR_NEAR_M
 
-    def __init__(self, env: Any, pictures: Callable[[Any], Images] | None = None):
-        """Take an environment that velocities drive, and what cameras see of a state; None: as it observes it."""
-        self._env, self._pictures, config = env, pictures or self._observed, env.config
+    def __init__(self, env: Any):
+        """Take an environment that velocities drive."""
+        self._env, config = env, env.config
         if env.robot.twist is None:
             env.robot.drive(0.0, 0.0)  # says which modes take a velocity
         self.lidar_fov_deg, self.lidar_range_m = config.lidar_fov_deg, config.lidar_range_m
-        self.lidar_pos_m, self.dt_s, self.odom_is_map = config.lidar_pos_m, env.dt, True
-        self.lenses = {camera.prefix: camera.lens for camera in env.sensors.cameras}
+        self.lidar_pos_m, self.dt_s = config.lidar_pos_m, env.dt
+        self.lenses = {"": env.sensors.lens} | {camera.prefix: camera.lens for camera in env.sensors.cameras}
 
     def camera_poses(self, state: Any) -> CameraPoses:
         """Return the poses of the robot's cameras in a state."""
@@ -114,7 +115,7 @@ class RosSensors:
         at = self._env.world.layout.robot_qpos
         into_base = np.asarray(matrix_from_quat(qpos[at + 3 : at + 7])).T
         poses = {}
-        for prefix, mount in {c.prefix: c.mount for c in sensors.cameras}.items() or [("", sensors.mount)]:
+        for prefix, mount in {"": sensors.mount, **{c.prefix: c.mount for c in sensors.cameras}}.items():
             pose = mount.pose(jnp.asarray(qpos))
             x, y, z = into_base @ np.asarray(pose.axes_w)[:, 0]
             place = into_base @ (np.asarray(pose.pos_w) - qpos[at : at + 3])
@@ -131,7 +132,7 @@ class RosSensors:
         truth_w = np.append(np.asarray(nav.robot_pos_w)[:2], nav.yaw_rad)
         return Sensed(
             time_s=time_s,
-            images=self._pictures(state),
+            images=self._images(state),
             scan=values.get("lidar", np.zeros(0)),
             odometry=self._odometry(values, truth_w),
             linear_b=velocity[:3],
@@ -146,7 +147,7 @@ class RosSensors:
     def _odometry(self, values: Mapping[str, np.ndarray], truth_w: np.ndarray) -> np.ndarray:
         return truth_w
 
-    def _observed(self, state: Any) -> Images:
+    def _images(self, state: Any) -> Images:
         config, pixels = self._env.config, "pixels/"
         divisor = SEGMENTATIONS[config.segmentation_classes].divisor
         factors = {"rgb": 255, "depth": np.float32(config.depth_range_m), "segmentation": divisor}
@@ -169,17 +170,16 @@ class RosSimulator(RosSensors):
         env: Any,
         seed: int = 0,
         start: tuple[float, ...] = (),
-        odom_is_map: bool = True,
-        pictures: Callable[[Any], Images] | None = None,
+        engine: str | None = None,
     ):
         """Place the robot and compile.
 
         Args:
             start: x, y (m) and yaw (rad), world; empty: drawn.
-            odom_is_map: the odometry begins at the robot's pose in the world, not at zero.
-            pictures: of `RosSensors`.
+            engine: of `PictureCamera`, to draw the robot's camera's colours; None: as the environment observes.
         """
-        super().__init__(env, pictures)
+        super().__init__(env)
+        self._camera = PictureCamera(env, engine) if engine else None
         self._step = jax.jit(env.step)
         key = jax.random.PRNGKey(seed)
         begin = env.draw_start(key)
@@ -189,8 +189,8 @@ class RosSimulator(RosSensors):
                 raise UserError(f"start ({x}, {y}) is not where the robot has room; choose another")
             begin = begin.replace(start_xy_w=jnp.asarray([x, y], jnp.float32), start_yaw_rad=jnp.float32(yaw))
         self._state = jax.jit(env.reset_to)(begin, jax.random.fold_in(key, 1))
-        self._force_before, self.odom_is_map = 0.0, odom_is_map
-        self._origin = np.array([*begin.start_xy_w, begin.start_yaw_rad]) if odom_is_map else np.zeros(3)
+        self._force_before = 0.0
+        self._origin = np.array([*begin.start_xy_w, begin.start_yaw_rad])
         self.cameras = self.camera_poses(self._state)
         jax.block_until_ready(self._step(self._state, jnp.zeros(env.action_size)))  # compiled before it counts
 
@@ -211,6 +211,11 @@ class RosSimulator(RosSensors):
 
     def _odometry(self, values: Mapping[str, np.ndarray], truth_w: np.ndarray) -> np.ndarray:
         return compose(self._origin, values["odometry"])
+
+    def _images(self, state: Any) -> Images:
+        lens = self.lenses[""]
+        drawn = self._camera.frame(state, lens.width, lens.height) if self._camera else {}
+        return {**super()._images(state), **drawn}
 
 
 def compose(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:

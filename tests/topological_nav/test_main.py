@@ -140,20 +140,15 @@ def test_what_would_change_nothing_is_refused(words, unused, capsys):
 @pytest.mark.parametrize(
     ("words", "unused"),
     [
-        (["navigator", "--map", "M"], "--map"),
-        (["navigator", "--goal", "G"], "--goal"),
-        (["navigator", "--policy", "passage"], "--policy"),
+        (["--map", "M"], "--map"),
+        (["--goal", "G"], "--goal"),
+        (["--policy", "passage"], "--policy"),
     ],
 )
 def test_what_a_node_would_not_look_at_is_refused(words, unused, capsys):
     assert nodes(words) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"topological_nav.ros: {unused} has no effect ") and error.count("\n") == 1
-
-
-def test_the_check_has_no_settings(capsys):
-    assert nodes(["check", "seed=1"]) == 2
-    assert capsys.readouterr().err == "topological_nav.ros: unrecognized seed=1 (--help lists all)\n"
 
 
 def test_a_stop_before_the_work_begins_is_one_line(monkeypatch, capsys):

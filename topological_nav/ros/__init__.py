@@ -1,4 +1,1 @@
-"""Run the simulator and the navigator as ROS 2 nodes.
-
-Only this package needs ROS, and only when a node starts: `pip install 'interactive-nav[ros2]'`. See `docs/ros.md`.
-"""
+"""Run the navigator as a ROS 2 node: `pip install 'interactive-nav[ros2]'`; see `docs/ros.md`."""

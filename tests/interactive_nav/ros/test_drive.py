@@ -190,7 +190,7 @@ def test_mistakes_are_one_line(tmp_path, capsys):
 class Robot:
     """What `SimulatorNode` reads of a simulator: a robot that does at once what it is commanded."""
 
-    dt_s, lenses, odom_is_map, lidar_fov_deg, lidar_range_m = 0.1, {"": Lens(8, 6, 90.0)}, True, 360.0, 5.6
+    dt_s, lenses, lidar_fov_deg, lidar_range_m = 0.1, {"": Lens(8, 6, 90.0)}, 360.0, 5.6
     range_min_m, lidar_pos_m, cameras = 0.05, (0.0, 0.0, 0.3), {"": (np.array([0.1, 0.0, 1.0]), 0.0, 0.0)}
 
     def __init__(self):
@@ -231,7 +231,7 @@ def driving(policy, robot, pace, **settings):
             except RosError as error:
                 errors.append(str(error))
 
-        simulator = SimulatorNode(theirs, robot, pace, awaited=messages.ODOMETRY)
+        simulator = SimulatorNode(theirs, robot, pace)
         runs = [simulator, DriveNode(ours, Pilot(OnnxFile(policy)), say=said.append, **settings)]
         threads = [threading.Thread(target=run, args=[node]) for node in runs]
         for thread in threads:

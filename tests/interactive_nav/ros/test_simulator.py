@@ -1,4 +1,4 @@
-"""A TurtleBot in a bare toy room of 6 x 4 m: pictures, scans and odometry by hand."""
+"""A TurtleBot and a TTbot in a bare toy room of 6 x 4 m: pictures, scans, odometry and touches by hand."""
 
 import math
 
@@ -16,8 +16,12 @@ CHAIR = 2
 
 
 @pytest.fixture(scope="module")
-def env(tmp_path_factory):
-    room = write_room(tmp_path_factory.mktemp("ros") / "room", (6.0, 4.0), (("chair", 1.4, -1.5, 5.0, 0.5),))
+def room(tmp_path_factory):
+    return write_room(tmp_path_factory.mktemp("ros") / "room", (6.0, 4.0), (("chair", 1.4, -1.5, 5.0, 0.5),))
+
+
+@pytest.fixture(scope="module")
+def env(room):
     observed = ("depth", "segmentation", "rgb", *NEEDED)
     sizes = {"image_size": 33, "lidar_rays": 4, "lidar_fov_deg": 360.0, "num_objects": 0}
     return interactive_nav.make("turtlebot", [room], backend="native", observations=observed, **sizes)
@@ -44,6 +48,57 @@ def test_sensors_are_those_of_the_environment_in_si_units(env):
     for _ in range(10):
         now = simulator.step(0.3, 0.0)
     assert now.odometry == pytest.approx(now.truth_w, abs=1e-3) and now.truth_w[1] > 0.6
+
+
+def ttbot(room, **settings):
+    """A TTbot at x = -2 m, y = 1 m, along x, whose camera draws flat colours; it is commanded a velocity."""
+    lidar = {"lidar_rays": 4, "lidar_fov_deg": 360.0, "lidar_range_m": 4.5, "lidar_pos_m": (0.17, 0.0, 0.36)}
+    fixed = {"observations": ("depth", *NEEDED), "image_size": 32, "num_objects": 0, "control_mode": "twist"}
+    env = interactive_nav.make("ttbot", [room], backend="native", **fixed, **lidar, **settings)
+    return RosSimulator(env, 0, (-2.0, 1.0, 0.0), "rays")
+
+
+def test_it_drives_ahead_until_it_meets_the_wall_and_turns(room):
+    simulator = ttbot(room)
+    first = simulator.sense()
+    assert first.time_s == 0.0 and first.truth_w == pytest.approx([-2.0, 1.0, 0.0])
+    # The scanner is 0.17 m ahead: behind, to the right, ahead (out of range) and to the left.
+    assert first.scan * 4.5 == pytest.approx([1.17, 3.0, 4.5, 1.0], abs=1e-4)
+    assert first.images["rgb"].shape == (32, 32, 3) and first.images["rgb"].std() > 5
+    assert first.images["depth"].shape == (32, 32)
+    for _ in range(20):
+        now = simulator.step(0.5, 0.0)
+    assert now.time_s == pytest.approx(2.0)
+    assert now.odometry == pytest.approx(now.truth_w, abs=2e-3)
+    assert 0.85 < now.odometry[0] + 2.0 < 1.0  # a metre, less what speeding up takes
+    assert now.linear_b == pytest.approx([0.5, 0, 0], abs=0.02)
+    assert now.scan[0] * 4.5 == pytest.approx(3.17 + now.odometry[0], abs=2e-3)
+    assert not now.touches_structure and now.force_n == 0.0
+    for _ in range(60):
+        if now.touches_structure:
+            break
+        now = simulator.step(1.0, 0.0)
+    # Its chassis ends 0.25 m ahead of its middle.
+    assert now.touches_structure and not now.touches_movable and now.force_n > 1.0
+    assert now.truth_w[0] == pytest.approx(2.75, abs=0.06)
+    for _ in range(11):
+        back = simulator.step(-0.5, 0.0)
+    assert not back.touches_structure and back.truth_w[0] < now.truth_w[0] - 0.2
+    for _ in range(5):
+        before = simulator.step(0.0, 0.0)
+    for _ in range(20):
+        after = simulator.step(0.0, 0.5)
+    turned = math.remainder(after.heading_rad - before.heading_rad, math.tau)
+    assert turned == pytest.approx(1.0, abs=0.15)  # less what speeding up takes
+    assert math.remainder(after.odometry[2] - after.heading_rad, math.tau) == pytest.approx(0.0, abs=1e-4)
+    assert after.angular_b[2] == pytest.approx(0.5, abs=0.25)  # tyres that scrub sideways do it in jerks
+    assert np.abs(after.images["rgb"].astype(float) - before.images["rgb"]).mean() > 2
+
+
+def test_pictures_span_the_field_of_view_of_the_settings(room):
+    wide, narrow = (ttbot(room, image_fov_deg=fov_deg) for fov_deg in (120.0, 40.0))
+    assert narrow.lenses[""].fov_deg == 40.0
+    assert np.abs(narrow.sense().images["rgb"].astype(float) - wide.sense().images["rgb"]).mean() > 2
 
 
 def test_a_start_in_a_wall_is_refused(env):

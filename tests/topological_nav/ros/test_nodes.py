@@ -23,10 +23,7 @@ from topological_nav.ros.nodes import Headings, NavigatorNode
 class Robot:
     """Has what `SimulatorNode` reads of a simulator; its world's frame is turned by a quarter from its start's."""
 
-    dt_s, odom_is_map, lidar_fov_deg, lidar_range_m, range_min_m, lidar_pos_m = (
-        *(0.1, False, 240.0, 5.6, 0.05),
-        (0.17, 0.0, 0.36),
-    )
+    dt_s, lidar_fov_deg, lidar_range_m, range_min_m, lidar_pos_m = 0.1, 240.0, 5.6, 0.05, (0.17, 0.0, 0.36)
 
     def __init__(self):
         self.steps, self.pose = 0, np.zeros(3)
@@ -125,6 +122,7 @@ def test_frames_hang_together(bus, monkeypatch):
         ("camera_link", "camera_optical_frame"),
         ("base_link", "left_camera_link"),
         ("left_camera_link", "left_camera_optical_frame"),
+        ("map", "odom"),
     ]
     # The left camera's x axis points to the left and 0.4 rad down.
     quat = fixed[3].transform.rotation
@@ -171,7 +169,9 @@ def test_without_a_navigator_lockstep_says_what_is_missing(monkeypatch):
     monkeypatch.setattr(nodes, "PATIENCE_S", 0.3)
     with ros_node("alone") as node:
         simulator = SimulatorNode(node, Robot(), Pace(lockstep=True))  # type: ignore[arg-type]
-        with pytest.raises(RosError, match="nobody joined /camera/image_raw, /cmd_vel: is the navigator running"):
+        with pytest.raises(
+            RosError, match="nobody joined /camera/image_raw or /odom, /cmd_vel: is the navigator running"
+        ):
             simulator.run(never)
 
 

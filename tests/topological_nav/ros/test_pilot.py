@@ -12,7 +12,7 @@ from topological_nav.config import NavigatorConfig
 from topological_nav.data.dataset import load_rooms
 from topological_nav.learn.training import load_trained
 from topological_nav.maps.graph import load_map
-from topological_nav.ros.__main__ import COMMANDS, _networks, main
+from topological_nav.ros.__main__ import Navigator, main
 from topological_nav.ros.drivers import topological_driver
 from topological_nav.weights.export import choose
 
@@ -51,7 +51,7 @@ def test_out_of_time_it_is_done(made, goal):
 
 def test_networks_are_read_from_words(made):
     words = ["--map", str(made.map), "--localiser", str(made.rooms), "--detector", str(made.passages)]
-    chosen = _networks(parse(COMMANDS, "", ["navigator", "--driver", "topological", *words, "--policy", "passage"]))
+    chosen = parse(Navigator, "", ["--driver", "topological", *words, "--policy", "passage"]).choose()
     assert (chosen.localiser, chosen.detector, chosen.policy) == (made.rooms, made.passages, "passage")
 
 
@@ -61,5 +61,5 @@ def test_what_is_missing_is_told(made, tmp_path, capsys):
     (tmp_path / "goal.png").write_text("no")
     with pytest.raises(ConfigError, match="is no picture that can be read"):
         topological_driver(made.map, seeing(made), (tmp_path / "goal.png",), 0.0, NavigatorConfig())
-    assert main(["navigator", "--driver", "topological"]) == 2
+    assert main(["--driver", "topological"]) == 2
     assert "needs a map: --map PATH" in capsys.readouterr().err

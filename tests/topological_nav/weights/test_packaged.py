@@ -22,7 +22,7 @@ from topological_nav.drives.driving import load_policy
 from topological_nav.learn.training import load_networks
 from topological_nav.maps.build import drawn_for, renderer_of
 from topological_nav.maps.graph import load_map, save_map
-from topological_nav.ros.__main__ import COMMANDS, _networks
+from topological_nav.ros.__main__ import Navigator
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.space import find_rooms, free_space, recorded_rooms
 from topological_nav.weights import export as packaged
@@ -182,8 +182,7 @@ def test_rows_of_exported_networks_are_not_those_of_the_runs(made, exported):
 @pytest.mark.heavy
 def test_the_robots_navigator_uses_the_package_too(made, exported, here, capsys):
     shutil.copytree(exported, here)
-    words = ["navigator", "--driver", "topological", "--map", str(made.map)]
-    chosen = _networks(parse(COMMANDS, "", words))
+    chosen = parse(Navigator, "", ["--driver", "topological", "--map", str(made.map)]).choose()
     assert (chosen.localiser, chosen.detector) == (here / "rooms", here / "passages")
     assert chosen.policy == str(here / "policy") and "of the package" in capsys.readouterr().err
 
