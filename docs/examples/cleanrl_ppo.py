@@ -28,9 +28,10 @@ def train(envs: TorchVectorEnv, iterations: int, steps: int = 32, gamma: float =
                 new, reward, terminated, truncated, info = envs.step(action)
                 if info:  # a time limit is no end: what would have followed is worth its value
                     reward = reward + gamma * truncated * critic(info["final_obs"])[:, 0]
-                    scores.append(info["episode"]["success"])
-                rows.append((obs, action, policy.log_prob(action).sum(-1), value, reward, terminated | truncated))
-                obs = new
+                    scores.append(info["episode"]["success"].clone())
+                log = policy.log_prob(action).sum(-1)
+                rows.append((obs.clone(), action, log, value, reward.clone(), terminated | truncated))
+                obs = new  # what is kept is a clone: MJX-Warp is slow where results come to new addresses
             advantage, next_value, returns = torch.zeros_like(reward), critic(obs)[:, 0], []
             for _, _, _, value, reward, done in reversed(rows):
                 advantage = reward + ~done * gamma * (next_value + lam * advantage) - value
