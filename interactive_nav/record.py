@@ -2,7 +2,7 @@
 
 The picture: the robot from behind, its goal and path painted on the floor; beside it what the robot's camera
 sees, as colour, depth and class mask; below, the step and its reward, force and touches. Or, with `--views`, the home
-with its textures from where somebody would film it.
+with its textures from where somebody would film it. `--rerun` writes what can be looked at from anywhere, in Rerun.
 
 Playing a policy is for `train` to do: `python -m train.record RUN` plays an episode of a run, and has it drawn here.
 """
@@ -32,11 +32,12 @@ from interactive_nav.pictures.camera import (
     robot_camera,
 )
 from interactive_nav.pictures.replay import Replay, ReplayError, load_replay, replay_path
+from interactive_nav.pictures.rerun_file import need_rerun, write_recording
 from interactive_nav.pictures.scene_model import ROBOT, SCENE, clear_way
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.commands import Command, option, parse, word
-from interactive_nav_common.config import AtLeastOne, Natural
+from interactive_nav_common.config import AtLeastOne, Natural, refuse_unused
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.jobs.progress import SafeConsole, progress_bar
@@ -278,6 +279,8 @@ class Picture(Command):
     """A policy of `train.evaluate`."""
     out: Annotated[Path, option("-o", metavar="PATH")] = Path("episode.mp4")
     """The video: .mp4, .gif or .webp."""
+    rerun: Annotated[Path | None, option(metavar="FILE.rrd")] = None
+    """Write a Rerun recording instead."""
     height: int = 360
     """Rows of the view from behind."""
     views: Annotated[tuple[Literal["eye", "follow", "above"], ...], option()] = ()
@@ -289,14 +292,23 @@ class Picture(Command):
         super().__post_init__()
         check_format(self.out)
         check_height(self.height)
+        if self.rerun:
+            need_rerun()
+            refuse_unused(self, "--views", "with --rerun, which makes no video")
 
     def record(self, source: Path, console: Console) -> None:
         """Draw a replay."""
         replay = load_replay(source)
         compositor = Compositor(replay, load_scene(replay.scene), self.height, self.views)
         with progress_bar(console, "frames", -(-replay.num_steps // self.every) + 1, transient=True) as update:
-            frames = write_video(compositor, self.out, self.every, lambda n: update(completed=n))
-        console.print(f"{self.out}: {frames} frames of {replay.policy}, episode {replay.episode}; replay: {source}")
+            how: Any = self.every, lambda n: update(completed=n)
+            if self.rerun:
+                frames = write_recording(replay, compositor._view, self.rerun, self.height // 3, *how)
+            else:
+                frames = write_video(compositor, self.out, *how)
+        console.print(
+            f"{self.rerun or self.out}: {frames} frames of {replay.policy}, episode {replay.episode}; replay: {source}"
+        )
 
 
 @dataclasses.dataclass(kw_only=True)

@@ -25,7 +25,8 @@ from scenes_mjcf.sets import installed
 from train.config import EnvConfig
 from train.runs.run import build_env, config_to_play
 from train.runs.run_folder import RunFolder, claim
-from train.scoring import POLICIES, SEED
+from train.scoring import SEED
+from train.scoring.brought import named
 from train.scoring.evaluation import make_policies
 
 
@@ -73,11 +74,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
             raise ConfigError(f"--episodes has {max(episodes)}, expected less than the file's {len(file.episodes)}")
         seed, starts = file.seed, starts_of(file, env, "--episode-file")
     keys = episode_keys(seed, max(episodes) + 1)
-    names = list(dict.fromkeys(arguments.policies.split(",")))
-    for name in names:
-        if name not in POLICIES:
-            choices = ", ".join(POLICIES)
-            raise ConfigError(f"--policies: got {name!r}, expected a choice from {choices}")
+    names = [named(name) if name.endswith(".onnx") else name for name in arguments.policies.split(",")]
     policies = make_policies(names, folder, config, env, arguments.checkpoint, not arguments.stochastic)
     for name, (policy, meta) in policies.items():
         label = f"{config.run.name}, {meta.env_steps:,} steps" if meta else ""

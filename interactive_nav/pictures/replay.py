@@ -81,6 +81,12 @@ class Replay:
     """Of the goal; None, in older files: the robot's width is taken."""
     image_fov_deg: float | None = None
     """Vertical, of the robot's camera as the episode had it; None: the robot's."""
+    waypoints_b: np.ndarray | None = None
+    """[T + 1, W, 2] f32, m: in the frame of the robot's base."""
+    reward_names: tuple[str, ...] = ()
+    """`reward/...`, of each of the K terms."""
+    reward_terms: np.ndarray | None = None
+    """[T, K] f32."""
 
     @property
     def small(self) -> tuple[SmallObject, ...]:
@@ -98,13 +104,15 @@ class Replay:
         return self.body_pos_w[:, 0, :2]
 
 
-_ARRAYS = tuple(field.name for field in dataclasses.fields(Replay) if field.type is np.ndarray)
+_LATER = tuple(field.name for field in dataclasses.fields(Replay) if field.type == np.ndarray | None)
+_ARRAYS = tuple(field.name for field in dataclasses.fields(Replay) if field.type is np.ndarray) + _LATER
 
 
-def _read(state: Any, action: jax.Array) -> dict[str, jax.Array]:
-    memory, counts = state.info["nav"].memory, ("force_sum_n", "interaction_steps", "structure_steps")
-    values = {"qpos": state.pipeline_state.qpos, "action": action, "reward": state.reward}
-    return values | {name: memory[name] for name in counts}
+def _read(state: Any, action: jax.Array) -> dict[str, Any]:
+    nav, counts = state.info["nav"], ("force_sum_n", "interaction_steps", "structure_steps")
+    values = {"qpos": state.pipeline_state.qpos, "action": action, "reward": state.reward, "waypoints": nav.waypoints_b}
+    terms = {name: value for name, value in state.metrics.items() if name.startswith("reward/")}
+    return values | terms | {name: nav.memory[name] for name in counts}
 
 
 class EpisodePlayer(Player):
@@ -171,19 +179,25 @@ def _replay_of(player: EpisodePlayer, episode: int, first: Any, values: dict[str
         segmentation_classes=env.config.segmentation_classes,
         success_distance_m=env.success_distance_m,
         image_fov_deg=env.sensors.lens.fov_deg,
+        waypoints_b=np.concatenate([first.waypoints_b[None], joined["waypoints"]]),
+        reward_names=env.reward_names,
+        reward_terms=np.stack([joined[name] for name in env.reward_names], -1),
     )
 
 
 def replay_path(run: Path, policy: str, episode: int) -> Path:
-    """Return where a run keeps a replay."""
-    return run / "replays" / f"{policy}-episode{episode}.npz"
+    """Return where a run keeps a replay; `policy` as in `train.record --policy`, where a file has its stem as name."""
+    name, equals, _ = policy.partition("=")
+    name = Path(name).stem if name.endswith(".onnx") and not equals else name
+    return run / "replays" / f"{name}-episode{episode}.npz"
 
 
 def save_replay(replay: Replay, path: str | Path) -> None:
     """Write a replay as npz, whole or not at all."""
     fields = {f.name: getattr(replay, f.name) for f in dataclasses.fields(Replay)}
     header = {name: value for name, value in fields.items() if name not in _ARRAYS} | {"format": FORMAT}
-    write_arrays(path, header=np.array(json.dumps(header)), **{name: fields[name] for name in _ARRAYS})
+    arrays = {name: fields[name] for name in _ARRAYS if fields[name] is not None}
+    write_arrays(path, header=np.array(json.dumps(header)), **arrays)
 
 
 def load_replay(path: str | Path) -> Replay:
@@ -199,12 +213,12 @@ def load_replay(path: str | Path) -> Replay:
                 "(python -m train.replay RUN_DIR)"
             )
         header = json.loads(str(stored["header"]))
-        arrays = {name: stored[name] for name in _ARRAYS}
+        arrays = {name: stored[name] for name in _ARRAYS if name in stored.files or name not in _LATER}
     if header.pop("format", None) != FORMAT:
         raise ReplayError(f"{path}: is of another format than {FORMAT}; record the episode again")
     robot, moved = Path(header["robot"]), path.parent.parent / "robot" / Path(header["robot"]).name
     if robot.is_absolute() and not robot.is_file() and moved.is_file():
         header["robot"] = str(moved)  # the run's folder is elsewhere now
-    for name in ("bodies", "objects"):
+    for name in ("bodies", "objects", "reward_names"):
         header[name] = tuple(header.get(name, ()))
     return Replay(**header, **arrays)

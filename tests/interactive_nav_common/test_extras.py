@@ -18,6 +18,7 @@ from interactive_nav import view
 from interactive_nav.interop.onnx_file import OnnxFile
 from interactive_nav.interop.torch_bridge import to_torch
 from interactive_nav.physics import resolve_backend
+from interactive_nav.record import Picture
 from interactive_nav.ros.commands import need_ros
 from interactive_nav_common.errors import UserError, optional
 from interactive_nav_common.jobs.on_ray import RayLauncher
@@ -37,6 +38,7 @@ USES: list[tuple[str, str, Callable[[], Any]]] = [
     ("onnx", "onnxruntime", lambda: OnnxFile("policy.onnx")),
     ("pybullet", "pybullet", lambda: BulletScene(None, None)),  # type: ignore[arg-type]
     ("ray", "ray", lambda: RayLauncher("auto")),
+    ("rerun", "rerun", lambda: Picture(rerun=Path("episode.rrd"))),
     ("ros2", "rclpy", lambda: need_ros("ros")),
     ("view", "mjviser", lambda: view.choose_viewer("browser")),
     ("wandb", "wandb", import_wandb),

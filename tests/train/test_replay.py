@@ -18,6 +18,7 @@ from train import record
 from train import replay as program
 from train.config import EnvConfig, resolve
 from train.runs.run_folder import RunFolder
+from train.scoring import brought
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +49,22 @@ def test_one_command_makes_a_video_of_a_run(run, tmp_path, capsys):
     out.unlink()
     assert interactive_nav.record.main([*asked, *pictures]) == 0  # the replay is there now
     assert out.stat().st_size == size
+
+
+def test_planners_and_files_are_played_by_the_names_that_evaluations_have(run, tmp_path, monkeypatch, capsys):
+    """An ONNX file is known by its stem; what plays it is tested with `train.export`."""
+    assert (
+        record.main([str(run), "--policy", "namo:0.5", "--height", "120", "--every", "15", "-o", f"{tmp_path}/a.gif"])
+        == 0
+    )
+    assert replay.load_replay(replay.replay_path(run, "namo:0.5", 0)).policy == "namo:0.5"
+    monkeypatch.setattr(brought, "OnnxPolicy", lambda place, env: lambda observations, first: np.zeros((len(first), 2)))
+    words = ["--policy", "given/straight.onnx", "--height", "120", "--every", "15", "-o", f"{tmp_path}/b.gif"]
+    assert interactive_nav.record.main([str(run), *words]) == 2
+    assert "python -m train.record" in capsys.readouterr().err
+    assert record.main([str(run), *words]) == 0
+    kept = replay.load_replay(run / "replays" / "straight-episode0.npz")
+    assert kept.policy == "straight" and not kept.action.any()
 
 
 def test_what_cannot_be_drawn_is_not_played(run, tmp_path, capsys):

@@ -214,12 +214,13 @@ def test_a_policy_draws_from_another_key_than_the_environment(env):
 
 def test_a_replay_of_before_can_be_read(played, tmp_path):
     fields = {f.name: getattr(played, f.name) for f in dataclasses.fields(played)}
-    later = ("small_objects", "segmentation_classes", "success_distance_m", "image_fov_deg")
+    later = ("small_objects", "segmentation_classes", "success_distance_m", "image_fov_deg", "reward_names")
     header = {n: v for n, v in fields.items() if n not in (*replay._ARRAYS, *later)} | {"format": 1}
-    arrays = {name: fields[name] for name in replay._ARRAYS}
+    arrays = {name: fields[name] for name in replay._ARRAYS if name not in replay._LATER}
     np.savez(tmp_path / "old.npz", header=np.array(json.dumps(header)), **arrays)
     old = replay.load_replay(tmp_path / "old.npz")
     assert (old.small_objects, old.segmentation_classes, old.success_distance_m) == ("train", 4, None)
+    assert old.reward_names == () and old.reward_terms is old.waypoints_b is None
 
 
 def test_importing_and_drawing_leave_matplotlibs_backend_alone():

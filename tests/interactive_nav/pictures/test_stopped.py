@@ -16,6 +16,7 @@ from interactive_nav.task import rollout
 class Nav(NamedTuple):
     step_count: jax.Array
     memory: dict[str, jax.Array]
+    waypoints_b: jax.Array
 
 
 class Pose(NamedTuple):
@@ -29,7 +30,8 @@ class OnHost:
 
     def reset(self, key):
         zero, count = jnp.zeros(()), jnp.zeros((), jnp.int32)
-        nav = Nav(count, {"force_sum_n": zero, "interaction_steps": count, "structure_steps": count})
+        memory = {"force_sum_n": zero, "interaction_steps": count, "structure_steps": count}
+        nav = Nav(count, memory, jnp.zeros((0, 2)))
         return State(Pose(jnp.zeros(3)), jnp.zeros(2), zero, zero, {}, {"nav": nav})  # pyright: ignore[reportArgumentType]
 
     def reset_to(self, start, key):
