@@ -82,14 +82,14 @@ class ObjectConfig(Decomposing):
 
 @dataclasses.dataclass(kw_only=True)
 class Generate(Command):
-    """Write a synthetic building in the raw Gibson layout."""
+    """Write a synthetic home in the raw Gibson layout."""
 
     out: Annotated[Path, *word("OUT")]
     """Folder to create."""
     settings: Words = ()
-    """Settings of the tier's buildings, such as floor_area_m2=80."""
+    """Settings of the tier's homes, such as floor_area_m2=80."""
     seed: Annotated[int, option(metavar="N")]
-    """Same seed, same building. A home that cannot be furnished takes another seed, which is printed."""
+    """Same seed, same home. One that cannot be furnished takes another seed, which is printed."""
     tier: str = "sparse"
     """sparse, furnished or cluttered."""
     split: Literal["train", "test"] = "train"
@@ -103,7 +103,7 @@ class Generate(Command):
         settings = read_words(self.settings, "floor_area_m2=80")
         config = building_of(self.tier, settings, self.split, "settings")
         with stage_progress(console) as report:
-            _, seed = with_seeds(self.seed, config, lambda seed: generate_building(self.out, seed, report, config))
+            _, seed = with_seeds(self.seed, lambda seed: generate_building(self.out, seed, report, config))
         console.print(
             f"{self.out}: building of {seed}; convert it with "
             f"'python -m converters convert {shlex.quote(str(self.out))} SCENE_DIR'",

@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 import yaml
 
 from converters.clock import STAGES, Report, peak_memory_mib
-from converters.generate.design.config import GenerationError
+from converters.generate.homes.config import GenerationError
 from converters.pipeline import ConvertConfig, Converted, convert_building
 from converters.read.source import root_of
 from converters.recipes import KEPT, PASSED, Recipes, chosen, load_recipes, make_scenes, parse_recipes
@@ -223,7 +223,7 @@ def list_set(recipes: Recipes, out: Path, log: Callable[[str], None] = lambda li
                 measures = load_manifest(out / recipe.name).measures
                 listed = dataclasses.replace(listed, digest=digest, measures=measures)
         members[recipe.name] = listed
-    tiers = {recipe.tier for recipe in recipes.scenes}
+    tiers = {recipe.building.tier for recipe in recipes.scenes}
     scenes = SceneSet(tiers.pop() if len(tiers) == 1 else "mixed", members)
     write_set(scenes, path)
     return scenes

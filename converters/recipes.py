@@ -8,15 +8,15 @@ import dataclasses
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from converters.check.preview import preview
 from converters.clock import Report
-from converters.generate import generate_building, write_look
-from converters.generate.design.config import (
+from converters.generate import generate_building
+from converters.generate.homes.config import (
     SHARE_TOLERANCE,
+    SPARSE,
     TIERS,
-    BuildingConfig,
     GenerationError,
     HomeConfig,
     home_config,
@@ -35,8 +35,6 @@ T = TypeVar("T")
 _CONVERSION = ("structure_faces", "object_faces", "structure_texture", "object_texture", "seed")
 MOST_SEEDS, NEXT_SEED = 5, 1_000_000
 """Seeds that a home's recipe stands for, and between them: of six one gives no plan that meets its shares."""
-SPARSE = "sparse"
-"""Tier of buildings that `BuildingConfig` describes: a recipe's, where it names none."""
 PASSED, KEPT = "every gate passes", "is there, kept"
 """Ends of the lines about scenes that are as they should be."""
 GENERATE, CONVERT = 0.55, 0.35
@@ -50,12 +48,7 @@ class SceneRecipe:
     name: str
     split: Literal["train", "test"]
     seed: int
-    building: BuildingConfig | HomeConfig
-
-    @property
-    def tier(self) -> str:
-        """Return how full the building is."""
-        return self.building.tier if isinstance(self.building, HomeConfig) else SPARSE
+    building: HomeConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +79,7 @@ class _File:
     shared: Any = None
 
 
-_RECIPES = Reader(GenerationError, "scenes_mjcf/recipes.yaml shows the form")
+_RECIPES = Reader(GenerationError, "scenes_mjcf/cluttered/recipes.yaml shows the form")
 
 
 def _refuse_unknown(given: Iterable[str], fields: Iterable[str], where: str) -> None:
@@ -103,21 +96,18 @@ def _value(value: Any, hint: Any, where: str) -> Any:
     return _RECIPES.typed([value, value] if one else value, hint, where)
 
 
-def building_of(tier: str, settings: dict[str, Any], split: str, where: str) -> BuildingConfig | HomeConfig:
-    """Return what to build, from a tier (`sparse` or one of `TIERS`) and settings as a recipe or command gives them.
+def building_of(tier: str, settings: dict[str, Any], split: str, where: str) -> HomeConfig:
+    """Return what to build, from one of `TIERS` and settings of `HomeConfig` as a recipe or command gives them.
 
-    Settings are those of `BuildingConfig`, or of `HomeConfig` and its shell; the split decides the CAD models.
+    The split decides the CAD models.
     """
-    if tier not in (SPARSE, *TIERS):
-        raise GenerationError(f"{where}: tier is {tier!r}, expected one of {', '.join((SPARSE, *TIERS))}")
-    sparse = {name: hint for name, hint in get_type_hints(BuildingConfig).items() if name != "models"}
-    fields = sparse if tier == SPARSE else home_fields()
+    if tier not in TIERS:
+        raise GenerationError(f"{where}: tier is {tier!r}, expected one of {', '.join(TIERS)}")
+    fields = home_fields()
     _refuse_unknown(settings, fields, where)
     values = {key: _value(value, fields[key], f"{where}: {key}") for key, value in settings.items()}
     try:
-        if tier == SPARSE:
-            return BuildingConfig(**values, models=MODELS[split][0])
-        return home_config(tier, values, MODELS[split][1])
+        return home_config(tier, values, MODELS[split])
     except ConfigError as error:
         raise GenerationError(f"{where}: {error}") from error
 
@@ -155,13 +145,11 @@ def load_recipes(path: Path) -> Recipes:
     return parse_recipes(_RECIPES.decoded(text, "YAML", str(path)), str(path))
 
 
-def missed(building: BuildingConfig | HomeConfig, result: Converted) -> str:
+def missed(building: HomeConfig, result: Converted) -> str:
     """Return which share a converted home should have and lacks, or which gates it fails; empty: none.
 
     Things stand as coacd's boxes let them, not as they were placed: a passage may have closed.
     """
-    if not isinstance(building, HomeConfig):
-        return ""
     if failed := [gate.name for gate in result.gates if not gate.passed]:
         return f"gates that fail once converted: {', '.join(failed)}"
     for robot, (low, high) in building.must_push.items():
@@ -171,22 +159,21 @@ def missed(building: BuildingConfig | HomeConfig, result: Converted) -> str:
     return ""
 
 
-def with_seeds(seed: int, building: BuildingConfig | HomeConfig, attempt: Callable[[int], T]) -> tuple[T, str]:
-    """Return the result of an attempt with the first seed that suits, and that seed in words; a home has several.
+def with_seeds(seed: int, attempt: Callable[[int], T]) -> tuple[T, str]:
+    """Return the result of an attempt with the first seed that suits, and that seed in words.
 
     An attempt raises a `GenerationError` that names its seed where the next one should be taken.
     """
-    words, tries = f"seed {seed}", MOST_SEEDS if isinstance(building, HomeConfig) else 1
-    refused = None
-    for one in range(seed, seed + tries * NEXT_SEED, NEXT_SEED):
+    words, refused = f"seed {seed}", None
+    for one in range(seed, seed + MOST_SEEDS * NEXT_SEED, NEXT_SEED):
         try:
             return attempt(one), words
         except GenerationError as error:
             refused, reason = error, str(error).removeprefix(f"seed {one}: ")
-            if tries == 1 or reason == str(error):
+            if reason == str(error):
                 raise
             words = f"seed {one + NEXT_SEED} in place of {seed} ({reason})"
-    raise GenerationError(f"none of {tries} seeds: {refused}") from refused
+    raise GenerationError(f"none of {MOST_SEEDS} seeds: {refused}") from refused
 
 
 def _generated(recipe: SceneRecipe, config: ConvertConfig, work: Path, report: Report) -> tuple[Converted, str]:
@@ -203,7 +190,7 @@ def _generated(recipe: SceneRecipe, config: ConvertConfig, work: Path, report: R
         return result
 
     try:
-        return with_seeds(recipe.seed, recipe.building, attempt)
+        return with_seeds(recipe.seed, attempt)
     except GenerationError as error:
         raise GenerationError(f"{recipe.name}: {error}") from error
 
@@ -219,8 +206,6 @@ def make_scene(
     with part_folder(folder, overwrite=True) as work:
         config = ConvertConfig(format="gibson", split=recipe.split, jobs=jobs, keep=False, **conversion)
         (result, seed), scene = _generated(recipe, config, work, report), work / recipe.name
-        if isinstance(recipe.building, BuildingConfig):
-            write_look(scene, recipe.seed, recipe.building)
         report("drawing", GENERATE + CONVERT)
         preview(scene, scene / "preview.png")
         publish({scene: folder})

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from converters.generate import BuildingConfig, design_building, write_look
-from converters.generate.design.space import floor_maps
+from converters.generate.homes.space import floor_maps
 from interactive_nav.pictures.scene_model import picture_spec
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.grids import cell_centres, clearance

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from converters.__main__ import main
-from converters.generate.design.config import TIERS, HomeConfig
+from converters.generate.homes.config import TIERS, HomeConfig
 from converters.recipes import load_recipes
 from interactive_nav.episodes import load_episode_file
 from interactive_nav.scenes.scene import load_scene

@@ -1,20 +1,15 @@
-"""Generate a raw building folder from a seed: a synthetic apartment in the raw Gibson layout."""
+"""Generate a raw building folder from a seed: a synthetic home in the raw Gibson layout."""
 
 import dataclasses
-import io
-import zipfile
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from converters.clock import Report
-from converters.generate.design.config import BuildingConfig, GenerationError, HomeConfig
-from converters.generate.design.furnish import Effort, furnish_plan, no_place
-from converters.generate.design.plan import Building
-from converters.generate.design.space import floor_maps
-from converters.generate.design.sparse import make_plan
+from converters.generate.homes.building import Building
+from converters.generate.homes.config import GenerationError, HomeConfig
 from converters.generate.homes.design import design_home
+from converters.generate.homes.space import floor_maps
 from converters.generate.models.cad import CLOTH, LOOKS, cad_model
 from converters.generate.surface.modelled import model_building
 from converters.generate.surface.scan import Scan, scan_building
@@ -24,21 +19,17 @@ from converters.generate.surface.write import (
     annotate_items,
     write_cad,
     write_json,
-    write_npz,
     write_png,
     write_scan,
 )
 from converters.library.store import attribution, read_index
 from converters.records.raw import ATTRIBUTION, WINDOWS
 from interactive_nav_common.files import part_folder, publish, write_text
-from scenes_mjcf.look import LOOK, UV_STEPS
 
-__all__ = ["Building", "BuildingConfig", "GenerationError", "HomeConfig", "design_building", "generate_building"]
+__all__ = ["Building", "GenerationError", "HomeConfig", "design_building", "generate_building"]
 
 GENERATOR_VERSION = 7
 """Raised whenever the same seed would give other bytes."""
-LOOK_TEXELS, LOOK_QUALITY = 1024, 30
-"""Side and quality of the image that `write_look` writes."""
 
 
 def _streams(seed: int) -> list[np.random.Generator]:
@@ -60,39 +51,23 @@ def _in_palette(home: Building, seed: int) -> Building:
     return dataclasses.replace(home, items=tuple(items))
 
 
-def design_building(seed: int, config: BuildingConfig | HomeConfig | None = None, max_plans: int = 40) -> Building:
+def design_building(seed: int, config: HomeConfig | None = None) -> Building:
     """Draw plan and furniture; the same seed gives the same building."""
     if seed < 0:
         raise GenerationError(f"seed is {seed}: expected a whole number of 0 or more")
-    cfg = config or BuildingConfig()
-    rng = _streams(seed)[0]
-    if isinstance(cfg, HomeConfig):
-        try:
-            return _in_palette(design_home(cfg, rng), seed)
-        except GenerationError as error:
-            raise GenerationError(f"seed {seed}: {error}") from error
-    floor_height_m = round(float(rng.uniform(*cfg.floor_height_m)), 3)
-    effort = Effort()
-    for _ in range(max_plans):
-        plan = make_plan(cfg, rng)
-        items = furnish_plan(plan, cfg, rng, effort)
-        if items is not None:
-            return Building(plan, tuple(items), floor_height_m)
-        if effort.places <= 0:
-            break
-    raise no_place(cfg, seed)
+    try:
+        return _in_palette(design_home(config or HomeConfig(), _streams(seed)[0]), seed)
+    except GenerationError as error:
+        raise GenerationError(f"seed {seed}: {error}") from error
 
 
-def render_building(
-    building: Building, seed: int, config: BuildingConfig | HomeConfig, progress: Report
-) -> tuple[Scan, Atlas]:
-    """Scan and paint a building; of a home without artefacts its exact structure."""
+def render_building(building: Building, seed: int, config: HomeConfig, progress: Report) -> tuple[Scan, Atlas]:
+    """Scan and paint a building; without artefacts its exact structure."""
     streams = _streams(seed)
-    if isinstance(config, HomeConfig) and config.artefacts == "none":
+    if config.artefacts == "none":
         progress("painting", 0.1)
         palette = LOOKS.palettes[seed % len(LOOKS.palettes)]
-        return model_building(building.plan, building.items, building.uses, streams[2], palette=palette)
-    config = config.shell if isinstance(config, HomeConfig) else config
+        return model_building(building.plan, building.items, building.uses, streams[2], palette)
     progress("scanning", 0.1)
     scan = scan_building(building.plan, list(building.items), config, streams[1])
     progress("painting", 0.6)
@@ -100,7 +75,7 @@ def render_building(
 
 
 def generate_building(
-    out_dir: Path, seed: int, progress: Report | None = None, config: BuildingConfig | HomeConfig | None = None
+    out_dir: Path, seed: int, progress: Report | None = None, config: HomeConfig | None = None
 ) -> None:
     """Write a raw building folder, whole or not at all; the same seed and configuration give the same bytes.
 
@@ -113,7 +88,7 @@ def generate_building(
     if not existing.is_dir():
         raise GenerationError(f"{out_dir}: {existing} is a file, expected a folder; name a place inside a folder")
     report = progress or (lambda stage, share: None)
-    cfg = config or BuildingConfig()
+    cfg = config or HomeConfig()
     with part_folder(out_dir, overwrite=True) as work:
         report("drawing the plan", 0.0)
         building = design_building(seed, cfg)
@@ -124,9 +99,7 @@ def generate_building(
     report("done", 1.0)
 
 
-def _write(
-    folder: Path, building: Building, scan: Scan, atlas: Atlas, seed: int, cfg: BuildingConfig | HomeConfig
-) -> None:
+def _write(folder: Path, building: Building, scan: Scan, atlas: Atlas, seed: int, cfg: HomeConfig) -> None:
     write_scan(folder, scan, atlas, building.floor_height_m)
     (folder / "floors.txt").write_text(f"{building.floor_height_m}\n", encoding="ascii")
     if building.plan.windows:
@@ -135,42 +108,24 @@ def _write(
     obstacles, traversable = floor_maps(building.plan)
     write_png(folder / "floor_0.png", obstacles)
     write_png(folder / "floor_trav_0.png", traversable)
-    items = list(building.items)
-    shell = cfg.shell if isinstance(cfg, HomeConfig) else cfg
     rng = _streams(seed)[3]
-    write_json(folder / "alignments.json", annotate_items(items, scan, building.floor_height_m, shell, seed, rng))
-    for model in {item.model.name: item.model for item in items}.values():
-        write_cad(folder / "cad", model, pieces=isinstance(cfg, HomeConfig))
+    write_json(
+        folder / "alignments.json", annotate_items(list(building.items), scan, building.floor_height_m, cfg, seed, rng)
+    )
+    for model in {item.model.name: item.model for item in building.items}.values():
+        write_cad(folder / "cad", model)
     about = {
         "generator": "converters.generate",
         "version": GENERATOR_VERSION,
         "seed": seed,
         "config": dataclasses.asdict(cfg),
+        "rooms": list(building.uses),
+        "measured": building.measured,
     }
-    if building.uses:
-        about |= {"rooms": list(building.uses), "measured": building.measured}
     write_json(folder / "generator.json", about)
-    names = {item.model.name.partition("~")[0] for item in (*items, *building.plan.built_in)}
+    names = {item.model.name.partition("~")[0] for item in (*building.items, *building.plan.built_in)}
     used = [model for name, model in read_index().items() if name in names]
     if used:
         write_text(folder / ATTRIBUTION, attribution(used))
     of_others = f"Of others, under their licences: the furniture that {ATTRIBUTION} lists.\n\n" if used else ""
     (folder / "LICENCE").write_text(of_others + LICENCE, encoding="ascii")
-
-
-def write_look(folder: Path, seed: int, config: BuildingConfig) -> None:
-    """Write the exact structure of a building that was scanned into its scene folder, for pictures for people."""
-    building = design_building(seed, config)
-    uses = ("",) * len(building.plan.rooms)
-    scan, atlas = model_building(building.plan, building.items, uses, _streams(seed)[2], (LOOK_TEXELS,))
-    corners = np.unique(scan.faces[:, 0], return_counts=True)[1] + 2  # each polygon is a fan
-    packed = io.BytesIO()
-    Image.fromarray(atlas.image).reduce(2).save(packed, "WEBP", quality=LOOK_QUALITY, method=6)
-    write_npz(
-        folder / "assets" / LOOK,
-        zipfile.ZIP_LZMA,
-        corners=corners.astype(np.uint8),
-        vertices_mm=np.round(1000 * scan.vertices.T).astype(np.int16),
-        uv=np.round(UV_STEPS * (atlas.uv * [1, -1] + [0, 1]).T).astype(np.uint16),
-        image=np.frombuffer(packed.getvalue(), np.uint8),
-    )

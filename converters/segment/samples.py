@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.generate import BuildingConfig, GenerationError, HomeConfig, design_building, render_building
-from converters.generate.design.config import home_config
+from converters.generate import GenerationError, design_building, render_building
+from converters.generate.homes.config import home_config
 from converters.generate.models.cad import MODELS, Instance
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.scan import NYU40 as LABELS
@@ -52,16 +52,14 @@ def _of_item(item: Instance) -> list[Surface]:
 def building_surface(seed: int, tier: str, split: str) -> tuple[Surface, np.ndarray]:
     """Return the surface of a generated building's structure and furniture, with the class of each point."""
     # Not `recipes.building_of`, whose imports a machine for training alone lacks.
-    sparse, homes = MODELS[split]
-    config = BuildingConfig(models=sparse) if tier == "sparse" else home_config(tier, {}, homes)
+    config = home_config(tier, {}, MODELS[split])
     building = design_building(seed, config)
     scan, atlas = render_building(building, seed, config, lambda stage, share: None)
     labels = scan.labels.astype(int)
-    home = isinstance(config, HomeConfig)
-    labels[np.isin(labels, OTHER) & home] = 40
+    labels[np.isin(labels, OTHER)] = 40
     surfaces = [sample_surface(TexturedMesh(scan.vertices, scan.faces, atlas.uv[atlas.face_uv], atlas.image))]
     classes = [classes_of(labels)[scan.faces[surfaces[0].face, 0]]]
-    for item in building.items if home else ():
+    for item in building.items if config.artefacts == "none" else ():
         category = item.model.category
         label = 39 if category in BASKETS else 40 if LABELS[category] in OTHER else LABELS[category]
         surfaces += (new := _of_item(item))

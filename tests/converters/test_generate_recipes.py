@@ -16,8 +16,8 @@ import shapely
 from converters import recipes
 from converters.__main__ import main
 from converters.generate import Building, GenerationError, HomeConfig, design_building
-from converters.generate.design.furnish import SIDE_WALL_M, wall_behind_m
-from converters.generate.design.space import GRID_M, passes, room_mask, static_grid, without
+from converters.generate.homes.doors import SIDE_WALL_M, wall_behind_m
+from converters.generate.homes.space import GRID_M, passes, room_mask, static_grid, without
 from converters.generate.models.cad import HOME_TEST_MODELS, TEST_MODELS, TRAIN_MODELS
 from converters.pipeline import ConvertConfig
 from converters.recipes import chosen, load_recipes, make_scenes, parse_recipes

@@ -14,7 +14,7 @@ import yaml
 
 from converters import many
 from converters.__main__ import main
-from converters.generate.design.config import GenerationError
+from converters.generate.homes.config import GenerationError
 from converters.generating import GenerateScenes
 from converters.recipes import load_recipes
 from interactive_nav_common.jobs.processes import Job, LocalLauncher

@@ -12,10 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from converters.generate.design.config import SHARE_TOLERANCE, GenerationError, HomeConfig, Range
-from converters.generate.design.plan import Building
-from converters.generate.design.space import rooms_joined, static_grid
 from converters.generate.homes.arrange import TABLES, Arrangement, GroupMember, anchored, group_of, least_of
+from converters.generate.homes.building import Building
+from converters.generate.homes.config import SHARE_TOLERANCE, GenerationError, HomeConfig, Range
 from converters.generate.homes.floor import CELL_M, Standing
 from converters.generate.homes.furnish import (
     WIDE_M,
@@ -29,6 +28,7 @@ from converters.generate.homes.furnish import (
 )
 from converters.generate.homes.opening import open_fronts
 from converters.generate.homes.plans import home_plan
+from converters.generate.homes.space import rooms_joined, static_grid
 from converters.generate.models.cad import place
 from converters.geometry.density import ROBOTS, Ways, must_push_shares
 from interactive_nav_common.grids import clearance
@@ -278,11 +278,11 @@ MOST_FULL, LARGE_M2 = 2, 150.0
 
 def design_home(cfg: HomeConfig, rng: np.random.Generator) -> Building:
     """Draw and furnish a home, its shares as the configuration demands."""
-    floor_height_m = round(float(rng.uniform(*cfg.shell.floor_height_m)), 3)
+    floor_height_m = round(float(rng.uniform(*cfg.floor_height_m)), 3)
     refused: GenerationError | None = None
     full = 0
     for _ in range(MOST_PLANS):
-        plan, uses = home_plan(cfg.shell, rng)
+        plan, uses = home_plan(cfg, rng)
         try:
             home = furnish_home(plan, uses, cfg, rng)
             shares = adjust(home)

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import shapely
 
-from converters.generate.design.plan import Plan, Rect, doorway_zone
 from converters.generate.homes.arrange import LOW_M, Arrangement
+from converters.generate.homes.building import Plan, Rect, doorway_zone
 from converters.generate.models.cad import Instance
 from converters.geometry.density import ROBOTS
 from interactive_nav_common.grids import clearance, label

@@ -9,9 +9,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.generate.design.config import SHARE_TOLERANCE, GenerationError, HomeConfig
-from converters.generate.design.furnish import hang_doors
-from converters.generate.design.plan import Plan, Rect
 from converters.generate.homes.arrange import (
     PLENTY_M2,
     TABLES,
@@ -23,6 +20,9 @@ from converters.generate.homes.arrange import (
     on_floor,
     stand,
 )
+from converters.generate.homes.building import Plan, Rect
+from converters.generate.homes.config import SHARE_TOLERANCE, GenerationError, HomeConfig
+from converters.generate.homes.doors import hang_doors
 from converters.generate.homes.floor import CELL_M, STRANDED_M2, Floor, Places
 from converters.generate.models.cad import Models
 from converters.geometry.density import ROBOTS
@@ -69,7 +69,7 @@ class Home:
     @property
     def narrow_m(self) -> float:
         """Return the radius of the disc that gets to every room with the furniture as it stands."""
-        return self.cfg.shell.robot_radius_m + 0.02
+        return self.cfg.robot_radius_m + 0.02
 
     def fresh(self) -> Models:
         """Return the models, without those that stand in the home as often as people have the same thing."""
@@ -303,14 +303,14 @@ def furnish_home(plan: Plan, uses: list[str], cfg: HomeConfig, rng: np.random.Ge
     lacking = ""
     for _ in range(MOST_BASES):
         private, bathrooms = ([k for k, use in enumerate(uses) if use in some] for some in (PRIVATE, ("bathroom",)))
-        doors = hang_doors(plan, cfg.shell, rng, private, bathrooms)
+        doors = hang_doors(plan, cfg, rng, private, bathrooms)
         if doors is None:
             raise GenerationError(
-                f"n_doors is {cfg.shell.n_doors}: too few doorways have a wall for a leaf to rest at, or a bathroom's "
+                f"n_doors is {cfg.n_doors}: too few doorways have a wall for a leaf to rest at, or a bathroom's "
                 "door has no room to open; ask for more area or fewer rooms"
             )
         leaves, sweeps = doors
-        models = Models(cfg.shell.models, cfg.shell.scale_jitter, home=True)
+        models = Models(cfg.models, cfg.scale_jitter)
         home = Home(cfg, plan, uses, Floor(plan, sweeps), models, rng)
         for leaf, room in leaves:
             home.floor.add(leaf, room, "door")

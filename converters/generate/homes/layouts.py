@@ -1,6 +1,6 @@
 """Lay out a home: an outline, a corridor or hall, rooms of given weights and the walls between and around them.
 
-Frame and units as in `converters.generate.design.plan`.
+Frame and units as in `converters.generate.homes.building`.
 """
 
 import dataclasses
@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from converters.generate.design.config import BuildingConfig
-from converters.generate.design.plan import CM, Rect, Wall, cut, draw_outline, snap, split
+from converters.generate.homes.building import CM, Rect, Wall, cut, draw_outline, snap, split
+from converters.generate.homes.config import HomeConfig
 
 SPREAD = 0.06
 """A cut is up to this share of the side away from where the weights have it."""
@@ -45,7 +45,7 @@ class Layout:
 class _Cutter:
     """Cut rectangles into rooms and gather the walls. Mutable, private to one layout."""
 
-    def __init__(self, cfg: BuildingConfig, rng: np.random.Generator):
+    def __init__(self, cfg: HomeConfig, rng: np.random.Generator):
         self.cfg, self.rng = cfg, rng
         self.rooms: list[Rect] = []
         self.walls: list[Wall] = []
@@ -120,7 +120,7 @@ def _wing(main: Rect, area_m2: float, form: str, cut_m: float, rng: np.random.Ge
 
 
 def lay_out(
-    cfg: BuildingConfig, rng: np.random.Generator, weights: Sequence[float], area_m2: float, corridor: bool
+    cfg: HomeConfig, rng: np.random.Generator, weights: Sequence[float], area_m2: float, corridor: bool
 ) -> Layout | None:
     """Draw rooms of these weights, in the order in which they lie; return None where one is too narrow."""
     form = _chosen(OUTLINES, rng) if len(weights) > 3 else "rectangle"

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import shapely
 
-from converters.generate.design.config import GenerationError
-from converters.generate.design.plan import Plan
 from converters.generate.homes.arrange import TABLES
+from converters.generate.homes.building import Plan
+from converters.generate.homes.config import GenerationError
 from converters.generate.models.cad import Instance
 from converters.generate.models.fronts import carcass, opened, openings
 

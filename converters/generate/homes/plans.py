@@ -1,6 +1,6 @@
 """Draw the plan of a home: an outline, rooms with uses, doorways that suit the uses, a front door and windows.
 
-Frame and units as in `converters.generate.design.plan`.
+Frame and units as in `converters.generate.homes.building`.
 """
 
 import dataclasses
@@ -12,8 +12,7 @@ from pathlib import Path
 import networkx as nx
 import numpy as np
 
-from converters.generate.design.config import BuildingConfig, GenerationError
-from converters.generate.design.plan import (
+from converters.generate.homes.building import (
     CM,
     DOORWAY_MARGIN_M,
     ENTRANCE_FREE_M,
@@ -27,6 +26,7 @@ from converters.generate.design.plan import (
     snap,
     wall_boxes,
 )
+from converters.generate.homes.config import GenerationError, HomeConfig
 from converters.generate.homes.layouts import Layout, Stretch, lay_out, outer_stretches, outer_walls
 from interactive_nav_common.records import read_packaged
 
@@ -182,7 +182,7 @@ def _doorways(
     layout: Layout,
     uses: Sequence[str],
     shared: dict[tuple[int, int], Wall],
-    cfg: BuildingConfig,
+    cfg: HomeConfig,
     rng: np.random.Generator,
 ) -> list[Doorway]:
     """Draw the doorways; those of rooms that people do not walk through are narrow enough for a leaf, in a corner."""
@@ -229,7 +229,7 @@ def _windows(
     uses: Sequence[str],
     entrance: Doorway | None,
     thick: float,
-    cfg: BuildingConfig,
+    cfg: HomeConfig,
     rng: np.random.Generator,
 ) -> list[PlanBox]:
     """Draw windows: one for each room that needs one, then others until there are as many as wanted."""
@@ -262,7 +262,7 @@ def _built(
     layout: Layout,
     uses: Sequence[str],
     shared: dict[tuple[int, int], Wall],
-    cfg: BuildingConfig,
+    cfg: HomeConfig,
     rng: np.random.Generator,
 ) -> Plan | None:
     """Return the plan of a layout whose rooms have these uses; None where no outer wall takes the front door."""
@@ -279,10 +279,10 @@ def _built(
     windows = _windows(layout, uses, entrance, thick, cfg, rng)
     rooms, panes = tuple(layout.rooms), tuple(windows)
     outer = Rect(x0, y0, x1, y1)
-    return Plan(rooms, outer, tuple(boxes), tuple(doorways), panes, (), layout.corridor, height, entrance=entrance)
+    return Plan(rooms, outer, tuple(boxes), tuple(doorways), panes, layout.corridor, height, entrance=entrance)
 
 
-def home_plan(cfg: BuildingConfig, rng: np.random.Generator) -> tuple[Plan, list[str]]:
+def home_plan(cfg: HomeConfig, rng: np.random.Generator) -> tuple[Plan, list[str]]:
     """Draw the plan of a home, and the use of each of its rooms."""
     drawn: list[tuple[float, int, Layout, list[str], dict[tuple[int, int], Wall]]] = []
     need = cfg.doorway_width_m[1] + 2 * DOORWAY_MARGIN_M

@@ -68,7 +68,8 @@ def _shape(row: list[Any]) -> Any:
     return getattr(shapes, name)(*values, **named)
 
 
-_TABLES = read_packaged(Path(__file__).with_name("drawings.yaml"), dict[str, dict[str, Drawing]])
+DRAWN = read_packaged(Path(__file__).with_name("drawings.yaml"), dict[str, Drawing])
+"""Model name -> how it is drawn, of those that are no library models."""
 FITTED = {
     "counter": "kitchen",
     "sink": "kitchen",
@@ -78,10 +79,6 @@ FITTED = {
     "tub": "bath",
 }
 """Category -> what of a home is in one tint."""
-SPARSE: dict[str, Drawing] = _TABLES["sparse"]
-"""Model name -> how it is drawn, of what sparse homes have."""
-DRAWN: dict[str, Drawing] = SPARSE | _TABLES["furnished"]
-"""The same of all homes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,28 +164,12 @@ LIBRARY: dict[str, Drawing] = {
 }
 """Model name -> how it is drawn."""
 
-TEST_MODELS = (
-    *("chair_ladder", "chair_shell", "chair_spindle", "table_trestle", "table_panel", "table_tripod", "desk_hutch"),
-    *("desk_pedestals", "sofa_club", "sofa_chaise", "door_dark", "door_battens"),
+HOME_TRAIN_MODELS, HOME_TEST_MODELS = (
+    tuple(name for name, drawing in (_PACKAGED | DRAWN).items() if drawing.held_out == test) for test in (False, True)
 )
-"""Held out: no sparse training building uses them."""
-
-TRAIN_MODELS = tuple(name for name in SPARSE if name not in TEST_MODELS)
-"""All others of sparse buildings."""
-
-
-def _home_models(test: bool) -> tuple[str, ...]:
-    """Return the library's models of a split and those drawn for homes, and sparse homes' of the kinds it lacks."""
-    packaged = {name: d for name, d in _PACKAGED.items() if d.held_out == test}
-    have = {d.category for d in packaged.values()}
-    drawn = {n: d for n, d in DRAWN.items() if (d.held_out or n in TEST_MODELS) == test}
-    return (*packaged, *(n for n, d in drawn.items() if n not in SPARSE or d.category not in have))
-
-
-HOME_TEST_MODELS, HOME_TRAIN_MODELS = _home_models(test=True), _home_models(test=False)
-"""Those of homes; no furnished training home uses the former."""
-MODELS = {"train": (TRAIN_MODELS, HOME_TRAIN_MODELS), "test": (TEST_MODELS, HOME_TEST_MODELS)}
-"""Split -> models of sparse buildings and of homes: held-out models are held out here."""
+"""Models of homes to train in, and those held out for homes to test in."""
+MODELS = {"train": HOME_TRAIN_MODELS, "test": HOME_TEST_MODELS}
+"""Split -> models of its homes."""
 
 
 @functools.cache
@@ -208,8 +189,7 @@ def cad_model(name: str) -> CadModel:
 def _empty(name: str) -> CadModel:
     """Return a model that holds nothing, without a tint."""
     drawing = LIBRARY[name]
-    parts = _library_parts(name) if name in _PACKAGED else drawing.draw()
-    parts = parts if name in SPARSE or name in _PACKAGED else on_floor(parts)
+    parts = _library_parts(name) if name in _PACKAGED else on_floor(drawing.draw())
     if drawing.front < 0:
         flip = np.diag([-1.0, 1.0, -1.0])
         parts = [dataclasses.replace(p, vertices=p.vertices @ flip) for p in parts]
@@ -295,18 +275,17 @@ def tints(name: str) -> tuple[str, ...]:
 
 
 class Models:
-    """Draw CAD models that a building may use, the least drawn first. Mutable, private to one building."""
+    """Draw CAD models that a home may use, the least drawn first. Mutable, private to one home."""
 
-    def __init__(self, names: tuple[str, ...], jitter: float, home: bool = False):
-        """Take keys of `LIBRARY`, each scaled per axis by up to a fraction; a `home` has roles and tints."""
+    def __init__(self, names: tuple[str, ...], jitter: float):
+        """Take keys of `LIBRARY`, which come in all tints, each scaled per axis by up to a fraction."""
         self._jitter, self._drawn = jitter, Counter[str]()
         self._fitted: dict[str, str] = {}
         self.spent: Set[str] = frozenset()
         """Models that are not drawn any more."""
         self._models: dict[tuple[str, str], list[str]] = {}
         for name in names:
-            key = LIBRARY[name].category, LIBRARY[name].role if home else ""
-            self._models.setdefault(key, []).extend(tints(name) if home else [name])
+            self._models.setdefault((LIBRARY[name].category, LIBRARY[name].role), []).extend(tints(name))
 
     def _left(self, category: str, role: str) -> list[str]:
         return [name for name in self._models.get((category, role), ()) if name not in self.spent]
@@ -315,11 +294,9 @@ class Models:
         """Return whether there is a model of it."""
         return bool(self._left(category, role))
 
-    def draw(
-        self, category: str, rng: np.random.Generator, among: tuple[str, ...] = (), role: str = ""
-    ) -> tuple[CadModel, np.ndarray]:
-        """Draw a model of a category, or one of those `among` it, and its scale (CAD units -> metres)."""
-        names = among or self._left(category, role)
+    def draw(self, category: str, rng: np.random.Generator, role: str = "") -> tuple[CadModel, np.ndarray]:
+        """Draw a model of a category and its scale (CAD units -> metres)."""
+        names = self._left(category, role)
         fitted = self._fitted.get(FITTED.get(category, ""))
         names = [name for name in names if name.partition("~")[2] == fitted] or names
         worn = {name: (self._drawn[name.partition("~")[0] + "~"], self._drawn[name]) for name in names}

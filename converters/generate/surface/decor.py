@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 import shapely
 
-from converters.generate.design.plan import PlanBox
+from converters.generate.homes.building import PlanBox
 from converters.generate.models.cad import LOOKS, Instance, drawn_parts
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.finishes import Colouring

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from converters.generate.design.plan import Rect
+from converters.generate.homes.building import Rect
 
 Colouring = Callable[[np.ndarray], np.ndarray]
 """(n, 3) places in the building -> (n, 3) colours in 0..1."""
@@ -171,7 +171,7 @@ def _wall(room: Rect, use: str, rng: np.random.Generator, pictured: bool) -> Col
     tiled_from = 0.85 if use == "kitchen" else 0.0
     papered = use in ("bedroom", "living", "dining") and rng.random() < 0.4
     stripe, accent = rng.uniform(0.08, 0.2), base * rng.uniform(0.88, 0.96, 3)
-    pictures = 0 if use in ("", "bathroom", "storage") else int(rng.integers(1, 4))
+    pictures = 0 if use in ("bathroom", "storage") else int(rng.integers(1, 4))
     pictures *= pictured
     seed = int(rng.integers(2**31))
 
@@ -211,23 +211,9 @@ def _floor(room: Rect, use: str, wood: np.ndarray, along: int, rugs: np.ndarray,
 def finishes(
     rooms: Sequence[Rect], uses: Sequence[str], rng: np.random.Generator, pictures: bool = True, rugs: np.ndarray = RUGS
 ) -> list[Finish]:
-    """Choose how each room is finished."""
+    """Choose how each room is finished, which has one of the `uses`."""
     wood, along = WOODS[rng.integers(len(WOODS))], int(rng.integers(2))
-    if uses:
-        return [
-            Finish(_floor(room, use, wood, along, rugs, rng), _wall(room, use, rng, pictures), use != "bathroom")
-            for room, use in zip(rooms, uses, strict=True)
-        ]
-    tiled = rng.random(len(rooms)) < 0.25
-    paint_of = rng.integers(len(PAINTS), size=len(rooms))
-
-    def bare(k: int) -> Finish:
-        def floor(p: np.ndarray) -> np.ndarray:
-            return tiles(p[:, 0], p[:, 1], TILES[0], 0.3) if tiled[k] else boards(p, wood, along)
-
-        def wall(p: np.ndarray) -> np.ndarray:
-            return np.where((p[:, 2] < SKIRTING_M)[:, None], [0.95, 0.95, 0.94], PAINTS[paint_of[k]])
-
-        return Finish(floor, wall)
-
-    return [bare(k) for k in range(len(rooms))]
+    return [
+        Finish(_floor(room, use, wood, along, rugs, rng), _wall(room, use, rng, pictures), use != "bathroom")
+        for room, use in zip(rooms, uses, strict=True)
+    ]

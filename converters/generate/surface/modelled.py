@@ -1,4 +1,4 @@
-"""Build the exact structure of a home from its plan: a finely painted mesh of its rooms and fixtures, lit by lamps.
+"""Build the exact structure of a home from its plan: a finely painted mesh of rooms and what is built in, lit by lamps.
 
 Frame: scan x, y, height above the floor; metres.
 """
@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 from scipy import ndimage
 
-from converters.generate.design.plan import Plan, Rect
+from converters.generate.homes.building import Plan, PlanBox, Rect
 from converters.generate.models.cad import Instance
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface import sides as at_walls
@@ -20,7 +20,7 @@ from converters.generate.surface.decor import decor
 from converters.generate.surface.finishes import FRAMES, RUGS, Finish, finishes, framed
 from converters.generate.surface.scan import NYU40, Scan, building_solids, fuse, solid_from_box
 from converters.generate.surface.sides import CLOTHS, ENTRANCES, FLOOR_M, PICTURE, Side
-from converters.generate.surface.texture import SHEETS, Atlas, Chart, assemble, piece_charts, plain, polygon
+from converters.generate.surface.texture import Atlas, Chart, assemble, piece_charts, plain, polygon
 from converters.records.raw import CEILING, FLOOR, WALL, VisualMesh
 from converters.write.light import VOXEL_M, Daylight, Space
 from converters.write.texture import share_plain
@@ -29,13 +29,14 @@ Sides = list[list[Side]]
 """Of each room its walls."""
 
 
-def space_of(plan: Plan, items: Sequence[Instance] = ()) -> Space:
-    """Return the distances to the structure, windows open, and to furniture where it stands."""
+def space_of(plan: Plan, items: Sequence[Instance] = (), boxes: Sequence[PlanBox] = ()) -> Space:
+    """Return the distances to the structure, windows open, to furniture where it stands, and to boxes on walls."""
     o, pad = plan.outer, 4 * VOXEL_M
     low = np.array([o.x0, o.y0, 0.0]) - pad
     top = plan.wall_height_m
     lid = solid_from_box((o.x0, o.y0, top), (o.x1, o.y1, top + 0.4), 0, "paint")
-    near = fuse([*building_solids(plan, list(items)), lid], low, np.array([o.x1, o.y1, top]) + pad, VOXEL_M).sdf
+    hung = [solid_from_box(box.low, box.high, 0, "paint") for box in boxes]
+    near = fuse([*building_solids(plan, list(items)), *hung, lid], low, np.array([o.x1, o.y1, top]) + pad, VOXEL_M).sdf
     for w in plan.windows:
         i0 = np.maximum(np.floor((np.array(w.low) - 0.3 - low) / VOXEL_M).astype(int), 0)
         i1 = np.ceil((np.array(w.high) + 0.3 - low) / VOXEL_M).astype(int) + 1
@@ -167,7 +168,7 @@ def _fittings(
             charts += hung
             left -= len(hung) // 4
         for side in sides[k]:
-            for d in side.doorways if use else ():
+            for d in side.doorways:
                 low, high = side.along(d.rect)
                 beside = high + 0.19 if high + 0.3 < side.end else low - 0.19
                 if side.start + 0.05 < beside < side.end - 0.05:
@@ -201,17 +202,16 @@ def model_building(
     items: Sequence[Instance],
     uses: Sequence[str],
     rng: np.random.Generator,
-    sheets: Sequence[int] = SHEETS,
     palette: Sequence[str] = (),
 ) -> tuple[Scan, Atlas]:
     """Model and paint the structure; no vertex of the mesh is in faces of two labels.
 
-    Rooms without a use, "", are finished as those of a scanned building are. Rugs and pale curtains are of a `palette`.
+    Rugs and pale curtains are of a `palette`.
     """
     shades = np.array([MATERIALS[name] for name in palette])
     # As many as without a palette: pictures, which collide, are drawn from the same stream.
     rugs, cloths = (shades[: len(RUGS)], 0.5 + 0.5 * shades[: len(CLOTHS)]) if palette else (RUGS, CLOTHS)
-    finish = finishes(plan.rooms, uses if any(uses) else (), rng, False, rugs)
+    finish = finishes(plan.rooms, uses, rng, False, rugs)
     sides = [at_walls.sides_of(room, plan.doorways, plan.windows) for room in plan.rooms]
     everything = [*plan.built_in, *items]
     lamps = np.array([[*np.round(r.centre, 3), plan.wall_height_m] for r in plan.rooms])
@@ -223,12 +223,10 @@ def model_building(
     charts += _fittings(plan, uses, sides, tall, rng)
     for room, lamp in zip(plan.rooms, lamps, strict=True):
         charts += _lamp(lamp, min(0.22, 0.11 * min(room.size)))
-    cabinet = np.array(MATERIALS["white"] if rng.random() < 0.6 else MATERIALS["oak"])
-    charts += [c for box in plan.fixtures for c in at_walls.cupboard(box, cabinet)]
     charts += _built_in(plan.built_in)
     spans = [(side, *side.along(w.rect)) for walls in sides for side in walls for w in side.windows]
     places = [side.at(low + (high - low) * share, 0.0, 1.5) for side, low, high in spans for share in (0.25, 0.75)]
     inwards = np.repeat([side.inward for side, *_ in spans], 2, axis=0)
-    space = space_of(dataclasses.replace(plan, fixtures=(*plan.fixtures, *boxes)), items)
+    space = space_of(plan, items, boxes)
     light = Daylight(space, lamps - [0, 0, 0.3], np.reshape(places, (-1, 3)), inwards.reshape(-1, 3))
-    return assemble(charts, light, sheets)
+    return assemble(charts, light)

@@ -12,9 +12,9 @@ import fast_simplification
 import numpy as np
 from scipy import ndimage
 
-from converters.generate.design.config import BuildingConfig
-from converters.generate.design.plan import Plan
-from converters.generate.design.space import GRID_M, cell_centres, free_grid, room_mask
+from converters.generate.homes.building import Plan
+from converters.generate.homes.config import HomeConfig
+from converters.generate.homes.space import GRID_M, cell_centres, free_grid, room_mask
 from converters.generate.models.cad import Instance
 from converters.geometry.faces import compacted, loose_parts, vertex_normals
 from converters.records.raw import FLOOR, WALL
@@ -182,7 +182,6 @@ def building_solids(plan: Plan, items: list[Instance]) -> list[Solid]:
     o = plan.outer
     solids = [solid_from_box((o.x0, o.y0, -0.3), (o.x1, o.y1, 0.0), NYU40["floor"], "floor")]
     solids += [solid_from_box(w.low, w.high, NYU40["wall"], "paint") for w in plan.walls]
-    solids += [solid_from_box(f.low, f.high, NYU40["cabinet"], "cabinet") for f in plan.fixtures]
     for owner, item in [(-1, i) for i in plan.built_in] + list(enumerate(items)):
         label = NYU40[item.model.category]
         for part in item.model.parts:
@@ -277,7 +276,7 @@ def nearest_solids(points: np.ndarray, solids: list[Solid], reach_m: float = 0.1
     return index, np.where(table.min(axis=1) < 0.05, labels[table.argmin(axis=1)], 0)
 
 
-def scan_building(plan: Plan, items: list[Instance], cfg: BuildingConfig, rng: np.random.Generator) -> Scan:
+def scan_building(plan: Plan, items: list[Instance], cfg: HomeConfig, rng: np.random.Generator) -> Scan:
     """Reconstruct the building: a mesh with a label for each vertex."""
     solids = building_solids(plan, items)
     o = plan.outer

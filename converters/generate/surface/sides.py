@@ -9,10 +9,9 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 import shapely
 
-from converters.generate.design.plan import Doorway, PlanBox, Rect
+from converters.generate.homes.building import Doorway, PlanBox, Rect
 from converters.generate.homes.plans import ENTRANCE_M
 from converters.generate.surface.finishes import SKIRTING_M, Colouring
-from converters.generate.surface.scan import NYU40
 from converters.generate.surface.texture import Chart, plain, polygon
 from converters.records.raw import FLOOR, WALL, WINDOW
 
@@ -293,18 +292,3 @@ def switch(side: Side, along: float, z: float) -> list[Chart]:
     plate = side.slab(run, (0.0, 0.008), heights, WALL, plain([0.97, 0.97, 0.96]))
     inner = (along - 0.022, along + 0.022), (0.008, 0.011), (z - 0.026, z + 0.026)
     return plate + side.slab(*inner, WALL, plain([0.88, 0.88, 0.87]))
-
-
-def cupboard(box: PlanBox, colour: np.ndarray) -> list[Chart]:
-    """Return a fixture: a box with fronts and a dark worktop where it is low."""
-    low, high = np.array(box.low), np.array(box.high)
-
-    def paint(p: np.ndarray) -> np.ndarray:
-        seam = (np.mod(p[:, :2] - low[:2] + 0.003, 0.45) < 0.006).any(axis=1) & (p[:, 2] < high[2] - 0.001)
-        value = colour * np.where(seam, 0.7, 1.0)[:, None]
-        return np.where((p[:, 2] > high[2] - 0.04)[:, None] & (high[2] < 1.2), [0.35, 0.34, 0.33], value)
-
-    side = Side(0, 1, low[0], low[1], high[1], (), ())
-    return side.slab(
-        (low[1], high[1]), (0.0, high[0] - low[0]), (low[2], high[2]), NYU40["cabinet"], paint, 80.0, "u", False
-    )

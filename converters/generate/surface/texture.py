@@ -15,7 +15,7 @@ from scipy import sparse
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import cKDTree
 
-from converters.generate.design.plan import Rect
+from converters.generate.homes.building import Rect
 from converters.generate.models.cad import CadModel
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.finishes import Colouring, finishes
@@ -326,7 +326,7 @@ def _texels(laid: _Laid, n: np.ndarray, density: np.ndarray, grid: np.ndarray | 
     return colour * RegularGridInterpolator(lattice, grid)(tuple(places))
 
 
-def _packed(laid: list[_Laid], sheets: Sequence[int]) -> tuple[int, float, list[np.ndarray], np.ndarray]:
+def _packed(laid: list[_Laid]) -> tuple[int, float, list[np.ndarray], np.ndarray]:
     """Return side of the sheet, factor on the resolution, texels (columns, rows) and corner of each patch."""
     finer, paints = 1.0, [q.chart.paint for q in laid]
     images = [np.array(paint.shape[1::-1]) if isinstance(paint, np.ndarray) else None for paint in paints]
@@ -334,7 +334,7 @@ def _packed(laid: list[_Laid], sheets: Sequence[int]) -> tuple[int, float, list[
         sizes = [np.ceil(np.round(q.size_m * q.chart.texels_per_m * finer, 6)).astype(int) for q in laid]
         sizes = [np.maximum(n, 1) if image is None else image for n, image in zip(sizes, images, strict=True)]
         wide = np.array(sizes) + 2 * MARGIN
-        for side in sheets:
+        for side in SHEETS:
             if wide.max() > side:
                 continue
             corner, used = pack_rows(wide, side)
@@ -343,13 +343,13 @@ def _packed(laid: list[_Laid], sheets: Sequence[int]) -> tuple[int, float, list[
         finer *= 0.95
 
 
-def assemble(charts: list[Chart], light: Light, sheets: Sequence[int] = SHEETS) -> tuple[Scan, Atlas]:
-    """Join patches into one mesh, no vertex in two of them, and paint its sheet, whose side is one of `sheets`."""
+def assemble(charts: list[Chart], light: Light) -> tuple[Scan, Atlas]:
+    """Join patches into one mesh, no vertex in two of them, and paint its sheet, whose side is one of `SHEETS`."""
     laid = [_Laid(c, *c.frame()) for c in charts]
     first: dict[int, int] = {}
     sheet_of = [first.setdefault(id(c.paint) if c.uv is not None else -1 - k, k) for k, c in enumerate(charts)]
     drawn = sorted(set(sheet_of))
-    side, finer, sizes, corners = _packed([laid[k] for k in drawn], sheets)
+    side, finer, sizes, corners = _packed([laid[k] for k in drawn])
     shaded = [k for k in drawn if not charts[k].glows and charts[k].uv is None]
     grids = dict(zip(shaded, _lit([laid[k] for k in shaded], light), strict=True))
     sheet = np.full((side, side, 3), 0.8)

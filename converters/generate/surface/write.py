@@ -14,7 +14,7 @@ from PIL import Image
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from converters.generate.design.config import BuildingConfig
+from converters.generate.homes.config import HomeConfig
 from converters.generate.models.cad import CadModel, Instance
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.scan import Scan
@@ -66,8 +66,8 @@ def write_scan(folder: Path, scan: Scan, atlas: Atlas, floor_height_m: float) ->
     write_npz(folder / "mesh_z_up.labels.npz", label=scan.labels, **bare)
 
 
-def write_cad(library: Path, model: CadModel, pieces: bool = False) -> None:
-    """Write `<library>/<catid>/<id>/models/model_normalized.obj` and its MTL, with `pieces` its convex parts too."""
+def write_cad(library: Path, model: CadModel) -> None:
+    """Write `<library>/<catid>/<id>/models/model_normalized.obj` and its MTL, and its convex parts."""
     folder = library / model.catid / model.id_cad / "models"
     folder.mkdir(parents=True, exist_ok=True)
     path, surface = folder / "model_normalized.obj", model.surface
@@ -85,8 +85,7 @@ def write_cad(library: Path, model: CadModel, pieces: bool = False) -> None:
             if any(p.material == name for p in model.parts)
         ]
         path.with_suffix(".mtl").write_text("".join(colours), "ascii")
-    if pieces:
-        (folder / "collision.obj").write_text(_part_lines(model, drawn=False), "ascii")
+    (folder / "collision.obj").write_text(_part_lines(model, drawn=False), "ascii")
 
 
 def _part_lines(model: CadModel, drawn: bool) -> str:
@@ -148,7 +147,7 @@ def pick_keypoints(item: Instance, scanned: np.ndarray, n: int, rng: np.random.G
 
 
 def annotate_items(
-    items: list[Instance], scan: Scan, floor_height_m: float, cfg: BuildingConfig, seed: int, rng: np.random.Generator
+    items: list[Instance], scan: Scan, floor_height_m: float, cfg: HomeConfig, seed: int, rng: np.random.Generator
 ) -> list[dict[str, Any]]:
     """Return the content of `alignments.json`, a list of one scan: noisy poses and keypoint pairs, as people give.
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import networkx as nx
 import shapely
 
-from converters.generate.design.plan import Plan
+from converters.generate.homes.building import Plan
 from converters.generate.homes.furnish import IN_ROWS
 from converters.generate.homes.plans import LARGE_M2, USES
 from converters.generate.models.cad import LIBRARY, Instance

@@ -5,7 +5,7 @@ from collections import Counter
 import numpy as np
 
 from converters.generate import GenerationError, design_building
-from converters.generate.design.config import TIERS, home_config
+from converters.generate.homes.config import TIERS, home_config
 from converters.generate.homes.plans import home_plan
 from converters.generate.models.cad import HOME_TRAIN_MODELS, LIBRARY, tints
 from docs.studies import command_line
@@ -23,7 +23,7 @@ def main() -> None:
     cfg, counts, names = home_config(args.tier, {}), Counter[str](), list[Counter[str]]()
     categories = Counter[str]()
     for seed in range(args.seed, args.seed + args.plans):
-        counts += plan_counts(*home_plan(cfg.shell, np.random.default_rng(seed)))
+        counts += plan_counts(*home_plan(cfg, np.random.default_rng(seed)))
     for seed in range(args.seed, args.seed + args.homes):
         try:
             home = design_building(seed, cfg)

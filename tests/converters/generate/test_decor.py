@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import shapely
 
-from converters.generate.design.plan import Plan, PlanBox, Rect
+from converters.generate.homes.building import Plan, PlanBox, Rect
 from converters.generate.models.cad import LIBRARY, LOOKS, Instance, cad_model, drawn_parts, place
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.decor import CUPBOARD_DEEP_M, CUPBOARD_M, HOOD_M, MIRROR_M, RAIL_M, decor

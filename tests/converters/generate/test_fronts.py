@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from converters.generate.design.config import GenerationError
-from converters.generate.design.plan import Plan, PlanBox, Rect
+from converters.generate.homes.config import GenerationError
+from converters.generate.homes.building import Plan, PlanBox, Rect
 from converters.generate.homes.opening import KITCHEN, open_fronts
 from converters.generate.models.cad import LIBRARY, cad_model, place
 from converters.generate.models.fronts import carcass, opened, openings

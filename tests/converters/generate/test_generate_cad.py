@@ -8,7 +8,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from converters.generate.design.config import BuildingConfig
+from converters.generate.homes.config import BuildingConfig
 from converters.generate.design.sparse import make_plan
 from converters.generate.models.cad import (
     HOME_TEST_MODELS,

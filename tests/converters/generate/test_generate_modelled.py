@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from converters.generate import GENERATOR_VERSION, Building, GenerationError, design_building, render_building
-from converters.generate.design.config import HomeConfig, home_config
-from converters.generate.design.plan import Plan, Rect
+from converters.generate.homes.config import HomeConfig, home_config
+from converters.generate.homes.building import Plan, Rect
 from converters.generate.models.cad import Instance
 from converters.generate.surface.modelled import model_building, space_of
 from converters.generate.surface.scan import NYU40, Scan

@@ -13,8 +13,8 @@ import shapely
 from scipy import ndimage
 
 from converters.generate import Building, BuildingConfig, GenerationError, design_building
-from converters.generate.design.furnish import DOOR_GAP_M
-from converters.generate.design.space import GRID_M, floor_maps, free_grid, image_size, passes, room_mask, static_grid
+from converters.generate.homes.doors import DOOR_GAP_M
+from converters.generate.homes.space import GRID_M, floor_maps, free_grid, image_size, passes, room_mask, static_grid
 from converters.generate.models.cad import TEST_MODELS, Instance, cad_model, place
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.grids import clearance

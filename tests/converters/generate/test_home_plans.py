@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from converters.generate import GenerationError
-from converters.generate.design.config import home_config
-from converters.generate.design.plan import Plan, Rect
+from converters.generate.homes.config import home_config
+from converters.generate.homes.building import Plan, Rect
 from converters.generate.homes.arrange import TABLES
 from converters.generate.homes.plans import FORBIDDEN, LARGE_M2, USES, Relations, assign_uses, home_plan, programme
 from tests.converters.generate.test_generate_plan import polygon

@@ -14,9 +14,9 @@ import shapely
 from scipy import ndimage
 
 from converters.generate import Building, BuildingConfig, GenerationError, HomeConfig, design_building
-from converters.generate.design.config import MOST_SHARE, TIERS, home_config, home_fields
-from converters.generate.design.furnish import Effort, furnish_plan
-from converters.generate.design.plan import Rect
+from converters.generate.homes.config import MOST_SHARE, TIERS, home_config, home_fields
+from converters.generate.homes.doors import Effort, furnish_plan
+from converters.generate.homes.building import Rect
 from converters.generate.design.sparse import make_plan
 from converters.generate.homes import design, furnish
 from converters.generate.homes.arrange import SEAT_M, TABLES, _seats, apart, arrange, draw_set, least_of, stand
@@ -52,7 +52,7 @@ def first_home(cfg: HomeConfig, seed: int) -> Home:
     rng = np.random.default_rng(seed)
     for _ in range(design.MOST_PLANS):
         with contextlib.suppress(GenerationError):
-            return furnish_home(*home_plan(cfg.shell, rng), cfg, rng)
+            return furnish_home(*home_plan(cfg, rng), cfg, rng)
     raise AssertionError(f"no home of seed {seed}")
 
 

@@ -15,8 +15,8 @@ import pytest
 from converters.check.gates import collide_with
 from converters.check.opening import blocked_fronts, held_bodies
 from converters.generate import Building, design_building
-from converters.generate.design.config import home_config
-from converters.generate.design.plan import Plan, PlanBox, Rect
+from converters.generate.homes.config import home_config
+from converters.generate.homes.building import Plan, PlanBox, Rect
 from converters.generate.homes.arrange import TABLES
 from converters.generate.homes.opening import KITCHEN, OPENS, TOUCH_M, open_fronts
 from converters.generate.models.cad import LIBRARY, Instance, cad_model, place

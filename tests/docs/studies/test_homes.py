@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 
-from converters.generate.design.config import home_config
-from converters.generate.design.plan import Doorway
+from converters.generate.homes.config import home_config
+from converters.generate.homes.building import Doorway
 from converters.generate.homes.plans import home_plan
 from converters.generate.models.cad import Instance, cad_model, place
 from docs.studies.homes import WRONG, home_counts, plan_counts, seats_at

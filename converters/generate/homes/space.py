@@ -8,9 +8,9 @@ import dataclasses
 import numpy as np
 import shapely
 
-from converters.generate.design.plan import CM, Plan, Rect
+from converters.generate.homes.building import CM, Plan, Rect
 from converters.generate.models.cad import Instance
-from interactive_nav_common.grids import clearance, label, largest_component
+from interactive_nav_common.grids import clearance, largest_component
 
 BAND_M = (0.02, 1.2)
 """Heights above the floor between which a robot meets obstacles."""
@@ -37,7 +37,7 @@ def floor_maps(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
 
     for rect in (*plan.rooms, *(d.rect for d in plan.doorways)):
         traversable[pixels(rect)] = 255
-    for box in (*plan.walls, *plan.fixtures):
+    for box in plan.walls:
         if box.low[2] < BAND_M[1] and box.high[2] > BAND_M[0]:
             obstacles[pixels(box.rect)] = traversable[pixels(box.rect)] = 0
     middles = (np.arange(size) - half + 0.5) * CM
@@ -74,17 +74,13 @@ def cell_centres(grid: np.ndarray) -> np.ndarray:
     return (np.arange(n) - n / 2 + 0.5) * GRID_M
 
 
-def without(grid: np.ndarray, items: list[Instance]) -> np.ndarray:
-    """Return a copy of the grid with the footprints of the furniture blocked."""
-    middles, grid = cell_centres(grid), grid.copy()
+def free_grid(plan: Plan, items: list[Instance]) -> np.ndarray:
+    """Draw static map and furniture on a coarse grid: (n, n) bool, True where free."""
+    grid = static_grid(plan)
+    middles = cell_centres(grid)
     for item in items:
         block(grid, item.footprint.buffer(GRID_M * 0.35), middles)
     return grid
-
-
-def free_grid(plan: Plan, items: list[Instance]) -> np.ndarray:
-    """Draw static map and furniture on a coarse grid: (n, n) bool, True where free."""
-    return without(static_grid(plan), items)
 
 
 def room_mask(grid: np.ndarray, room: Rect) -> np.ndarray:
@@ -97,9 +93,3 @@ def rooms_joined(grid: np.ndarray, plan: Plan, radius_m: float, least_m2: float 
     """Return whether a disc of `radius_m` reaches `least_m2` or more of every room from every other."""
     main = largest_component(clearance(grid, GRID_M) >= radius_m)
     return bool(main.any()) and all((main & room_mask(grid, r)).sum() * GRID_M**2 >= least_m2 for r in plan.rooms)
-
-
-def passes(room_m: np.ndarray, masks: list[np.ndarray], width_m: float) -> bool:
-    """Return whether a disc `width_m` wide gets from one of two masks to the other, given the clearance `room_m`."""
-    region = label(room_m >= width_m / 2)[0]
-    return bool(set(np.unique(region[masks[0]])) & set(np.unique(region[masks[1]])) - {0})

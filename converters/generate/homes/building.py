@@ -1,4 +1,4 @@
-"""Draw a floor plan from a configuration and a random stream: rooms, walls, doorways, windows, cupboards.
+"""Describe a home: rectangles, walls, doorways, its plan and what stands in it.
 
 Frame: x, y of the scan (z up), metres; heights are above the floor. All horizontal coordinates are whole
 centimetres, so that a map of 1 cm a pixel shows the walls exactly.
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from converters.generate.design.config import BuildingConfig
+from converters.generate.homes.config import HomeConfig
 from converters.generate.models.cad import Instance
 
 CM = 0.01
@@ -128,13 +128,11 @@ class Plan:
     doorways: tuple[Doorway, ...]
     windows: tuple[PlanBox, ...]
     """Glass: as deep as the outer wall."""
-    fixtures: tuple[PlanBox, ...]
-    """Built-in cupboards and counters: unmovable."""
     corridor: int | None
     """Index of the corridor in `rooms`."""
     wall_height_m: float
     built_in: tuple[Instance, ...] = dataclasses.field(default=(), compare=False)
-    """Furniture that stays: part of the static structure as the fixtures are."""
+    """Furniture that stays: part of the static structure."""
     entrance: Doorway | None = None
     """The front door, which stays closed, in an outer wall; both of its rooms are the one behind it."""
 
@@ -169,13 +167,13 @@ class Building:
 
     plan: Plan
     items: tuple[Instance, ...]
-    """What can be moved; of a home the door leaves first."""
+    """What can be moved, the door leaves first."""
     floor_height_m: float
     """The floor in the scan's frame."""
     uses: tuple[str, ...] = ()
-    """Use of each room of a home, keys of `converters.generate.homes.design.USES`; empty if rooms have no use."""
+    """Use of each room, keys of `converters.generate.homes.plans.USES`."""
     measured: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """How much of a home's floor furniture covers (`furniture_share`), and how much of it is behind furniture: robot ->
+    """How much of the floor furniture covers (`furniture_share`), and how much of it is behind furniture: robot ->
     share of the pairs of places between which it has no path round the movables (`must_push_share`)."""
 
 
@@ -206,7 +204,7 @@ def cut(rect: Rect, axis: int, at: float, thick: float) -> tuple[Rect, Wall, Rec
 
 
 def split(
-    rect: Rect, weights: Sequence[float], spread: float, cfg: BuildingConfig, rng: np.random.Generator
+    rect: Rect, weights: Sequence[float], spread: float, cfg: HomeConfig, rng: np.random.Generator
 ) -> tuple[list[Rect], list[Wall]]:
     """Cut a rectangle into rooms, mostly across its longer side.
 
@@ -240,7 +238,7 @@ def shared_wall(a: Rect, b: Rect, walls: Iterable[Wall]) -> Wall | None:
 
 
 def place_doorway(
-    stretch: tuple[float, float], width_m: float, cfg: BuildingConfig, rng: np.random.Generator
+    stretch: tuple[float, float], width_m: float, cfg: HomeConfig, rng: np.random.Generator
 ) -> tuple[float, float]:
     """Draw where on a stretch of wall a doorway of this width starts; return that and the width that fits."""
     start, end = stretch
@@ -272,5 +270,5 @@ def wall_boxes(wall: Wall, doorways: list[Doorway], height: float) -> list[PlanB
 
 
 def doorway_zone(doorway: Doorway, reach_m: float, side_m: float = 0.05) -> Rect:
-    """Return the doorway and the floor before it on both sides, which stay free of fixtures and furniture."""
+    """Return the doorway and the floor before it on both sides, which stay free of furniture."""
     return doorway.rect.grown(*((reach_m, side_m) if doorway.axis == 0 else (side_m, reach_m)))

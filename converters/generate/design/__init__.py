@@ -1,1 +1,0 @@
-"""Design floor plans and furnish them sparsely."""
