@@ -326,6 +326,10 @@ def make_packaged(
             log(f"{scene}: in the cache is not the scene that the set {name} lists; made again")
         if not todo:
             continue
+        if not (folder / RECIPES).is_file():
+            log(f"{', '.join(todo)}: an earlier version of the generator wrote these scenes; the repository has them")
+            failed += todo
+            continue
         rest = wanted_set(out=out, recipes=folder / RECIPES, only=todo, overwrite=bool(others))
         failed += generate_scenes(rest, report, log)
         for scene in (n for n in todo if n not in failed and not is_listed(out / n, wanted[n])):

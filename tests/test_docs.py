@@ -193,10 +193,7 @@ FOREIGN = {"benchmarks/kitchen"}
 """In the repository of `mujoco_warp`."""
 PROSE = [
     *PAGES,
-    *(
-        ROOT / name
-        for name in ("CONTRIBUTING.md", "benchmarks/README.md", "scenes_mjcf/README.md", "scenes_mjcf/recipes.yaml")
-    ),
+    *(ROOT / name for name in ("CONTRIBUTING.md", "benchmarks/README.md", "scenes_mjcf/README.md")),
     *sorted(p for room in ROOMS if room != "tests" for p in ROOT.glob(f"{room}/**/*.py")),
 ]
 

@@ -10,15 +10,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from converters.generate import BuildingConfig, design_building, write_look
-from converters.generate.homes.space import floor_maps
 from interactive_nav.pictures.scene_model import picture_spec
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.grids import cell_centres, clearance
 from scenes_mjcf.agreement import is_lit
 from scenes_mjcf.look import LOOK, cast, spec_for_people
 from scenes_mjcf.schema import SceneError
-from tests.test_scenes import RECIPES, SCENES
+from tests.test_scenes import GENERATED, SCENES
 
 
 def structure(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
@@ -30,7 +28,7 @@ def structure(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     return model.mesh_vert[first : first + count], model.tex_data[start : start + size]
 
 
-@pytest.mark.parametrize("name", sorted(RECIPES))
+@pytest.mark.parametrize("name", GENERATED)
 def test_people_see_rooms_that_are_closed_above_and_at_the_sides(name):
     scene = load_scene(SCENES / name)
     model = spec_for_people(scene.path).compile()
@@ -39,7 +37,7 @@ def test_people_see_rooms_that_are_closed_above_and_at_the_sides(name):
     maps, only = scene.maps, model.geom("structure_visual").id
     free = clearance(maps.traversable, maps.resolution_m) > 0.15
     places = cell_centres(free, maps.resolution_m, maps.origin_w)[::211]
-    low, high = RECIPES[name].building.wall_height_m
+    low, high = 2.4, 2.6  # the generator's walls
     group, geom = np.array([0, 0, 1, 0, 0, 0], np.uint8), np.zeros(1, np.int32)
     for body in range(1, model.nbody):  # furniture out of the way
         if model.body_jntnum[body]:
@@ -88,25 +86,6 @@ def test_the_drawn_flat_is_lit_for_people_on_the_surfaces_that_observations_have
     stored, lit = np.array(distances)
     assert np.mean(lit > 0) > 0.9 and np.array_equal(lit > 0, stored > 0)
     assert np.mean(np.abs(lit - stored) < 0.005) > 0.99  # others pass by an edge
-
-
-@pytest.mark.parametrize("name", ["apartment_0", "rowan"])
-def test_the_look_is_that_of_the_plan_that_was_scanned(name, tmp_path):
-    recipe, maps = RECIPES[name], load_scene(SCENES / name).maps
-    assert isinstance(recipe.building, BuildingConfig)
-    _, planned = floor_maps(design_building(recipe.seed, recipe.building).plan)  # 1 cm, its middle at the origin
-    places = cell_centres(np.ones_like(maps.traversable), maps.resolution_m, maps.origin_w)
-    column, row = np.floor(100 * places + len(planned) // 2).astype(int).T
-    inside = (np.stack([row, column]) >= 0).all(axis=0) & (np.stack([row, column]) < len(planned)).all(axis=0)
-    free = np.zeros(len(places), bool)
-    free[inside] = planned[row[inside], column[inside]] > 0
-    kept = maps.traversable.ravel()
-    assert (kept & ~free).sum() < 1e-3 * kept.sum() and (free & ~kept).sum() < 0.06 * kept.sum()  # borders are cut
-    (tmp_path / "assets").mkdir()
-    write_look(tmp_path, recipe.seed, recipe.building)
-    with np.load(tmp_path / "assets" / LOOK) as made, np.load(SCENES / name / "assets" / LOOK) as stored:
-        assert np.array_equal(made["corners"], stored["corners"])
-        assert np.array_equal(made["vertices_mm"], stored["vertices_mm"])
 
 
 @pytest.mark.parametrize("content", [b"", b"no archive", None])

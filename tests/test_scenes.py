@@ -12,19 +12,21 @@ import pytest
 from PIL import Image
 
 from converters.check.gates import LIMITS, eroded, free_space_values, judge
-from converters.generate.models.cad import TEST_MODELS, TRAIN_MODELS, cad_model
-from converters.recipes import load_recipes
+from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.grids import label
 from scenes_mjcf.schema import SceneManifest, load_manifest, load_maps
+from scenes_mjcf.sets import packaged_set
+from topological_nav.scenes.space import recorded_rooms
 
 ROOT = Path(__file__).parents[1]
 SCENES = ROOT / "scenes_mjcf"
 SMALL = "apartment_0"
 """The building of tests and benchmarks; not one of the ten."""
 DESIGNED = "aws_house"
-"""A home that people designed; not made from a recipe."""
-RECIPES = {r.name: r for r in load_recipes(SCENES / "recipes.yaml").scenes}
-TEN = sorted(set(RECIPES) - {SMALL})
+"""A home that people designed."""
+LISTED = packaged_set("sparse").scenes
+TEN = sorted(LISTED)
+GENERATED = (SMALL, *TEN)
 FURNITURE = ("chair", "desk", "door", "sofa", "table")
 
 
@@ -33,20 +35,20 @@ def manifest(name: str) -> SceneManifest:
     return load_manifest(SCENES / name)
 
 
-def test_every_recipe_is_a_scene_and_every_scene_has_a_recipe():
+def test_every_listed_scene_is_there():
     folders = {p.parent.name for p in SCENES.glob("*/scene.json")}
-    assert folders == {*RECIPES, DESIGNED} and len(TEN) == 10
-    assert {name: manifest(name).split for name in RECIPES} == {name: r.split for name, r in RECIPES.items()}
+    assert folders == {*GENERATED, DESIGNED} and len(TEN) == 10
+    assert {name: manifest(name).split for name in TEN} == {name: member.split for name, member in LISTED.items()}
     assert Counter(manifest(name).split for name in TEN) == {"train": 8, "test": 2}
-    assert len({r.seed for r in RECIPES.values()}) == len(RECIPES)
+    assert len({member.seed for member in LISTED.values()}) == len(TEN)
 
 
 def test_sizes_and_rooms_span_those_of_the_original():
     areas = sorted(manifest(name).floor_area_m2 for name in TEN)
     assert 60 <= areas[0] < 70 and 140 < areas[-1] <= 165
     assert min(b - a for a, b in zip(areas, areas[1:], strict=False)) > 1.0
-    rooms = [RECIPES[name].building.n_rooms[0] for name in TEN]
-    assert min(rooms) == 4 and max(rooms) == 11 and len(set(rooms)) >= 6
+    rooms = [len(rooms) for name in TEN if (rooms := recorded_rooms(load_scene(SCENES / name).digest)) is not None]
+    assert len(rooms) == 10 and min(rooms) == 4 and max(rooms) == 11 and len(set(rooms)) >= 6
 
 
 @pytest.mark.parametrize("name", TEN)
@@ -58,13 +60,10 @@ def test_objects(name):
 
 def test_no_cad_model_is_in_both_splits_and_each_class_has_several():
     used = {
-        split: {(o.category, o.cad_id) for n in RECIPES if manifest(n).split == split for o in manifest(n).objects}
+        split: {(o.category, o.cad_id) for n in GENERATED if manifest(n).split == split for o in manifest(n).objects}
         for split in ("train", "test")
     }
     assert used["train"].isdisjoint(used["test"])
-    library = {cad_model(name).id_cad: name for name in (*TRAIN_MODELS, *TEST_MODELS)}
-    assert {library[cad] for _, cad in used["train"]} <= set(TRAIN_MODELS)
-    assert {library[cad] for _, cad in used["test"]} <= set(TEST_MODELS)
     for split, least in (("train", 3), ("test", 2)):
         variety = Counter(category for category, _ in used[split])
         assert all(variety[c] >= least for c in FURNITURE), (split, variety)
@@ -80,7 +79,7 @@ def test_the_designed_home_is_whole_and_says_whose_it_is():
     assert sum(path.endswith("model.sdf") for path in found.source["sha256"]) == 63
 
 
-@pytest.mark.parametrize("name", sorted((*RECIPES, DESIGNED)))
+@pytest.mark.parametrize("name", sorted((*GENERATED, DESIGNED)))
 def test_gates_pass_and_mujoco_loads_it(name):
     gates = manifest(name).gates
     # The conversion of these scenes did not measure the first two, and they have no fronts that open.

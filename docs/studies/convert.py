@@ -1,10 +1,9 @@
 """Cost of a conversion: a generated building in, two JSON rows (cold cache, warm cache) out.
 
-    python -m docs.studies.convert --faces 150000 --objects 25
+    python -m docs.studies.convert --faces 50000
 
-Generates a building of about that many scan faces and exactly so many objects, and converts it twice with one new
-cache folder, each time in a process of its own. A row holds wall seconds in all and of each stage, the peak resident
-memory, and the machine. Memory is the larger of the converter's own peak and its largest child's
+Generates a sparsely furnished home of about that many scan faces and converts it twice with one new cache folder, each
+time in a process of its own. A row holds wall seconds in all and of each stage, the peak resident memory, and the machine. Memory is the larger of the converter's own peak and its largest child's
 (`resource.getrusage`), and beside it the sum of the converter and `--jobs` such children, which bounds what all hold
 together. Rows are appended to `benchmarks/results/convert.jsonl`; on a machine that others use, times are upper
 bounds: the load is recorded beside them, and `cpu_s`, the processor seconds of the converter and its children, which
@@ -23,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.steps_per_second import append_row, origin
-from converters.generate import BuildingConfig, generate_building
+from converters.generate import generate_building
+from converters.generate.homes.config import HomeConfig, home_config
 from docs.studies import command_line
 
 PACKAGES = ("mujoco", "coacd", "trimesh", "numpy", "scipy", "xatlas")
@@ -51,30 +51,11 @@ print(json.dumps({
 """
 
 
-def building_config(faces: int, objects: int) -> BuildingConfig:
-    """A building whose scan has about so many faces and that holds exactly so many objects.
-
-    Shares of the categories are an ordinary apartment's: of 25 objects 14 chairs, 3 tables, 3 desks, 2 sofas, 3 doors.
-    """
-    tables = desks = doors = max(1, round(0.12 * objects))
-    sofas = max(1, round(0.08 * objects))
-    chairs = objects - tables - desks - doors - sofas
-    if chairs < 2:
-        raise SystemExit(f"--objects is {objects}, expected at least 6")
-    config = BuildingConfig()
-    area = faces / config.faces_per_m2
-    return BuildingConfig(
-        floor_area_m2=(area, 1.07 * area),
-        n_rooms=(max(3, round(area / 16)), max(4, round(area / 13))),
-        n_chairs=(chairs, chairs),
-        n_tables=(tables, tables),
-        n_desks=(desks, desks),
-        n_sofas=(sofas, sofas),
-        n_doors=(doors, doors),
-        n_static=(3, 5),
-        n_windows=(4, 8),
-        n_bottlenecks=2,
-    )
+def building_config(faces: int) -> HomeConfig:
+    """A home of the sparse tier whose scan has about so many faces."""
+    area = faces / home_config("sparse", {}).faces_per_m2
+    rooms = max(4, round(area / 16))
+    return home_config("sparse", {"floor_area_m2": (area, 1.07 * area), "n_rooms": (rooms, rooms + 1)})
 
 
 def measure(raw: Path, out: Path, cache: Path, jobs: int) -> dict[str, Any]:
@@ -92,8 +73,7 @@ def count_faces(raw: Path) -> int:
 def main() -> None:
     """Measures and appends two rows."""
     parser = command_line(__doc__, "convert")
-    parser.add_argument("--faces", type=int, default=150_000, help="of the raw scan, about")
-    parser.add_argument("--objects", type=int, default=25, help="movable objects, doors included")
+    parser.add_argument("--faces", type=int, default=50_000, help="of the raw scan, about")
     parser.add_argument("--seed", type=int, default=0, help="of the building")
     parser.add_argument(
         "--raw", type=Path, default=None, help="convert this raw Gibson folder instead of generating one"
@@ -104,15 +84,13 @@ def main() -> None:
         base = Path(folder)
         clock = time.perf_counter()
         if args.raw is None:
-            generate_building(base / "raw", args.seed, config=building_config(args.faces, args.objects))
+            generate_building(base / "raw", args.seed, config=building_config(args.faces))
         raw = args.raw or base / "raw"
         generate_s = round(time.perf_counter() - clock, 1)
         for kind in ("cold", "warm"):
             load = os.getloadavg()[0]
             row: dict[str, Any] = {"cache": kind, "faces": count_faces(raw), "seed": args.seed}
-            row["building"] = (
-                "given folder" if args.raw else f"generated: --faces {args.faces} --objects {args.objects}"
-            )
+            row["building"] = "given folder" if args.raw else f"generated: --faces {args.faces}"
             row |= measure(raw, base / kind, base / "cache", args.jobs)
             row |= {
                 "memory_bound_mib": row["peak_mib"] + args.jobs * row["peak_child_mib"],

@@ -54,7 +54,7 @@ class Copier(LocalLauncher):
 def test_a_tiers_recipes_name_seeds_and_splits(tmp_path: Path) -> None:
     many.begin_set(tmp_path / "homes", "furnished", 10, 500)
     recipes = load_recipes(tmp_path / "homes" / "recipes.yaml")
-    assert [(r.name, r.seed, r.split, r.tier) for r in recipes.scenes][7:9] == [
+    assert [(r.name, r.seed, r.split, r.building.tier) for r in recipes.scenes][7:9] == [
         ("furnished_007", 507, "train", "furnished"),
         ("furnished_008", 508, "test", "furnished"),
     ]

@@ -2,7 +2,7 @@
 
 Obstacles are the walls and everything movable where it stands at rest, up to the robot's height, doors included. Rooms
 are clusters of free positions by their coordinates alone. Where a scene's plan is recorded (plans.json: the generated
-scenes, drawn by `converters.generate.design_building`), they are compared with it by the adjusted Rand index.
+scenes of the package), they are compared with it by the adjusted Rand index.
 """
 
 import dataclasses

@@ -1,10 +1,9 @@
 """Build CAD furniture by name, as ShapeNet-like normalised models of convex parts, and place it on a floor.
 
-Frame of a CAD model: y up, front along +z (or -z where `front` says so), normalised so that the diagonal of
-the bounding box is 1. Each model is a union of overlapping convex parts, so most are not watertight as a
-whole; parts marked `open` lack their underside, as in many models that people draw. Homes take the packaged library's
-models, with a textured surface, and drawn ones; each also in other tints: `Scopia/puff~moss` is that pouf in the
-colour of the material moss.
+Frame of a CAD model: y up, front along +z, normalised so that the diagonal of the bounding box is 1. Each model is a
+union of overlapping convex parts, so most are not watertight as a whole. Homes take the packaged library's models, with
+a textured surface, and drawn ones; each also in other tints: `Scopia/puff~moss` is that pouf in the colour of the
+material moss.
 """
 
 import dataclasses
@@ -41,8 +40,6 @@ class Drawing:
     """Functions of `parts`, each with its arguments in order and, last, those by name; none of a library model."""
     sym: str = "__SYM_NONE"
     """Scan2CAD's symmetry class."""
-    front: int = 1
-    """+1: the model faces +z; -1: it faces -z, as some ShapeNet models do."""
     held_out: bool = False
     """Only homes to test in have it."""
     role: str = ""
@@ -110,7 +107,6 @@ class CadModel:
     catid: str
     id_cad: str
     sym: str
-    front: int
     parts: tuple[Part, ...]
     """In the normalised CAD frame."""
     unit_m: float
@@ -190,9 +186,6 @@ def _empty(name: str) -> CadModel:
     """Return a model that holds nothing, without a tint."""
     drawing = LIBRARY[name]
     parts = _library_parts(name) if name in _PACKAGED else on_floor(drawing.draw())
-    if drawing.front < 0:
-        flip = np.diag([-1.0, 1.0, -1.0])
-        parts = [dataclasses.replace(p, vertices=p.vertices @ flip) for p in parts]
     points = np.concatenate([p.vertices for p in parts])
     low, high = points.min(axis=0), points.max(axis=0)
     unit_m = float(np.linalg.norm(high - low))
@@ -201,9 +194,7 @@ def _empty(name: str) -> CadModel:
     move = -(low + high) / 2 / unit_m + np.round(shift, 4)
     scaled = tuple(dataclasses.replace(p, vertices=np.round(p.vertices / unit_m + move, 6)) for p in parts)
     look, category = functools.partial(_surface, name, unit_m, move) if name in _PACKAGED else None, drawing.category
-    return CadModel(
-        name, category, CATEGORIES[category].synset, digest[:32], drawing.sym, drawing.front, scaled, unit_m, look
-    )
+    return CadModel(name, category, CATEGORIES[category].synset, digest[:32], drawing.sym, scaled, unit_m, look)
 
 
 def as_drawn(surface: VisualMesh) -> VisualMesh:
@@ -360,5 +351,4 @@ def stand_at(
 
 def place(model: CadModel, scale: np.ndarray, xy: np.ndarray, facing_rad: float, lift_m: float = 0.0) -> Instance:
     """Stand a model on the floor: centre of the footprint at `xy`, front towards `facing_rad` (from +x)."""
-    yaw = facing_rad + math.pi / 2 + (math.pi if model.front < 0 else 0.0)
-    return stand_at(model, scale, yaw, model.center, xy, lift_m)
+    return stand_at(model, scale, facing_rad + math.pi / 2, model.center, xy, lift_m)

@@ -56,7 +56,7 @@ class Opening:
 
 def _pieces(model: CadModel) -> tuple[np.ndarray, list[Bounds]]:
     """Return the piece of each face of the surface, or of each part, and each piece's bounds, m, front along +z."""
-    scale = model.unit_m * np.array([model.front, 1, model.front])
+    scale = model.unit_m
     if model.surface is None:
         groups, of = [part.vertices for part in model.parts], np.arange(len(model.parts))
     else:
@@ -174,7 +174,7 @@ def _front(
         tray = [_block(side, "birch") for side in _sides(ends)]
     name = f"{model.name}#{k}"
     category = "drawer" if tray else "cabinet_door"
-    scale = np.array([model.front, 1.0, model.front]) / model.unit_m
+    scale = 1 / model.unit_m
     surface, drawn = None, [model.parts[j] for j in pieces] if model.surface is None else []
     if model.surface is not None:
         surface = _with_tray(_cut(model.surface, np.isin(of, pieces)), _normalised(tray, model))
@@ -193,7 +193,7 @@ def _front(
 
 def _normalised(parts: list[Part], model: CadModel) -> tuple[Part, ...]:
     """Return parts in the model's CAD frame."""
-    scale = np.array([model.front, 1.0, model.front]) / model.unit_m
+    scale = 1 / model.unit_m
     return tuple(dataclasses.replace(p, vertices=np.round(p.vertices * scale, 6)) for p in parts)
 
 

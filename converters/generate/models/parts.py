@@ -28,8 +28,6 @@ class Part:
     """(m, 3) int64, counter-clockwise from outside."""
     material: str
     """Key of `MATERIALS`."""
-    open: bool = False
-    """Written without its underside."""
 
 
 def _leaned(part: Part, center, tilt_rad: float) -> Part:
@@ -38,16 +36,16 @@ def _leaned(part: Part, center, tilt_rad: float) -> Part:
     return dataclasses.replace(part, vertices=part.vertices @ turn.T + np.asarray(center, float))
 
 
-def box(center, size, material, tilt_rad=0.0, open=False) -> Part:
+def box(center, size, material, tilt_rad=0.0) -> Part:
     """Build a box that leans back by `tilt_rad`."""
     mesh = trimesh.creation.box(extents=size)
-    return _leaned(Part(np.asarray(mesh.vertices), np.asarray(mesh.faces), material, open), center, tilt_rad)
+    return _leaned(Part(np.asarray(mesh.vertices), np.asarray(mesh.faces), material), center, tilt_rad)
 
 
-def block(base, size, material, open=False) -> Part:
+def block(base, size, material) -> Part:
     """Build a box whose underside has its middle at `base`."""
     x, y, z = base
-    return box((x, y + size[1] / 2, z), size, material, open=open)
+    return box((x, y + size[1] / 2, z), size, material)
 
 
 SPINES = ("navy", "rust", "cream", "moss", "leather", "slate", "red", "mustard", "denim", "linen", "teal")
@@ -199,9 +197,7 @@ def on_floor(parts) -> list[Part]:
     """Return the same parts, with what leaning bars reach below the floor cut off."""
     low = [part.vertices[:, 1].min() for part in parts]
     return [
-        dataclasses.replace(hull(np.maximum(part.vertices, [-np.inf, 0.0, -np.inf]), part.material), open=part.open)
-        if y < 0
-        else part
+        hull(np.maximum(part.vertices, [-np.inf, 0.0, -np.inf]), part.material) if y < 0 else part
         for part, y in zip(parts, low, strict=True)
     ]
 

@@ -33,7 +33,7 @@ def _backed(side: Side, items: Iterable[Instance]) -> Iterator[tuple[Instance, S
     """Yield what stands with its back at a wall, low enough to hang something above, and where along the wall."""
     strip = side.strip(side.start, side.end, 0.12)
     for item in items:
-        front = item.model.front * item.matrix[:3, 2] / item.scale[2]
+        front = item.matrix[:3, 2] / item.scale[2]
         top_m = item.position[2] + item.scale[1] * item.model.bounds[1, 1]
         if front @ side.inward > 0.99 and top_m < MIRROR_M[0] and item.footprint.intersects(strip):
             low, high = np.reshape(item.footprint.bounds, (2, 2))[:, 1 - side.axis]

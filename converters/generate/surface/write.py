@@ -19,7 +19,6 @@ from converters.generate.models.cad import CadModel, Instance
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.scan import Scan
 from converters.generate.surface.texture import Atlas
-from converters.geometry.faces import face_vectors
 
 LICENCE = """CC0 1.0 Universal
 
@@ -89,15 +88,11 @@ def write_cad(library: Path, model: CadModel) -> None:
 
 
 def _part_lines(model: CadModel, drawn: bool) -> str:
-    """Return the OBJ lines of a model's parts: as they are drawn, in their materials, or closed."""
+    """Return the OBJ lines of a model's parts as they are drawn, in their materials, or of what collides."""
     lines, base = "", 1
     for k, part in enumerate(model.parts if drawn else model.solids or model.parts):
-        faces = part.faces
-        if drawn and part.open:
-            normal = face_vectors(part.vertices, faces)
-            faces = faces[normal[:, 1] > -0.99 * np.linalg.norm(normal, axis=1)]
         lines += f"o part_{k}\n" + (f"usemtl {part.material}\n" if drawn else "")
-        lines += _rows("v %.6f %.6f %.6f\n", part.vertices) + _rows("f %d %d %d\n", faces + base)
+        lines += _rows("v %.6f %.6f %.6f\n", part.vertices) + _rows("f %d %d %d\n", part.faces + base)
         base += len(part.vertices)
     return lines
 

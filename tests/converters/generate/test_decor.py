@@ -106,8 +106,8 @@ def test_books_are_drawn_inside_of_a_shelf_in_their_colours_and_nothing_else_of_
 def test_the_floor_beneath_a_table_is_darker_and_the_far_corner_is_not():
     sides = [(-0.2, -0.2, 0.0, 3.2), (4.0, -0.2, 4.2, 3.2), (-0.2, -0.2, 4.2, 0.0), (-0.2, 3.0, 4.2, 3.2)]
     walls = tuple(PlanBox((a, b, 0.0), (c, d, HEIGHT_M)) for a, b, c, d in sides)
-    plan = Plan((ROOM,), Rect(-0.2, -0.2, 4.2, 3.2), walls, (), (), (), None, HEIGHT_M)
-    cad = cad_model("table_apron")
+    plan = Plan((ROOM,), Rect(-0.2, -0.2, 4.2, 3.2), walls, (), (), None, HEIGHT_M)
+    cad = cad_model("Scopia/white_kitchen_table")
     table = place(cad, np.full(3, cad.unit_m), np.array([2.0, 1.5]), 0.0)
     floor, up = np.array([[2.0, 1.5, 0.004], [0.4, 0.4, 0.004]]), np.array([[0.0, 0.0, 1.0]] * 2)
     none = np.zeros((0, 3))

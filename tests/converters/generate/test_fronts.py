@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from converters.generate.homes.config import GenerationError
 from converters.generate.homes.building import Plan, PlanBox, Rect
+from converters.generate.homes.config import GenerationError
 from converters.generate.homes.opening import KITCHEN, open_fronts
 from converters.generate.models.cad import LIBRARY, cad_model, place
 from converters.generate.models.fronts import carcass, opened, openings
@@ -82,7 +82,7 @@ def test_a_kitchen_front_before_a_wall_refuses_the_plan():
     rooms, outer = (Rect(-3, -3, 3, 3),), Rect(-3.1, -3.1, 3.1, 3.1)
     for gap_m, reach_m in ((1.0, 0.338), (0.30, None), (0.15, 0.0)):
         wall = PlanBox.over(Rect(x + gap_m, -3, x + gap_m + 0.1, 3), 0.0, 2.5)
-        plan = Plan(rooms, outer, (wall,), (), (), (), None, 2.5)
+        plan = Plan(rooms, outer, (wall,), (), (), None, 2.5)
         if reach_m == 0:
             with pytest.raises(GenerationError, match="a front of the counter .*drawersCabinet opens by 0.14 m only"):
                 open_fronts(plan, (item,), (), "kitchen")

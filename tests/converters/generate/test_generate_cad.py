@@ -8,15 +8,13 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from converters.generate.homes.config import BuildingConfig
-from converters.generate.design.sparse import make_plan
+from converters.generate.homes.config import HomeConfig
+from converters.generate.homes.plans import home_plan
 from converters.generate.models.cad import (
     HOME_TEST_MODELS,
     HOME_TRAIN_MODELS,
     LIBRARY,
     LOOKS,
-    TEST_MODELS,
-    TRAIN_MODELS,
     Models,
     _painted,
     cad_model,
@@ -60,39 +58,14 @@ def test_model_is_normalised_and_made_of_closed_convex_parts(name):
         assert solid.distance(part.vertices).max() < 1e-4
 
 
-@pytest.mark.parametrize(
-    ("category", "height_m", "width_m"),
-    [
-        ("chair", (0.7, 1.1), (0.38, 0.70)),
-        ("table", (0.38, 0.80), (0.75, 1.4)),
-        ("desk", (0.7, 1.1), (1.0, 1.4)),
-        ("sofa", (0.7, 0.95), (1.2, 2.1)),
-        ("door", (1.9, 2.1), (0.8, 0.95)),
-    ],
-)
-def test_sizes_are_those_of_real_furniture(category, height_m, width_m):
-    models = [cad_model(n) for n in (*TRAIN_MODELS, *TEST_MODELS) if LIBRARY[n].category == category]
-    assert len(models) >= 4
-    for model in models:
-        size_m = 2 * model.half_extents * model.unit_m
-        assert height_m[0] <= size_m[1] <= height_m[1], model.name
-        assert width_m[0] <= size_m[0] <= width_m[1], model.name
-
-
-def test_held_out_models_are_apart_and_cover_all_categories_of_sparse_homes():
-    assert set(TRAIN_MODELS).isdisjoint(TEST_MODELS)
-    for names in (TRAIN_MODELS, TEST_MODELS):
-        assert {LIBRARY[n].category for n in names} == {"chair", "sofa", "table", "desk", "door"}
-    assert len({cad_model(n).id_cad for n in LIBRARY}) == len(LIBRARY)
-
-
-def test_homes_take_what_sparse_homes_have_only_of_kinds_that_the_library_lacks():
+def test_held_out_models_are_apart_and_drawn_doors_are_in_both_splits():
     assert set(HOME_TRAIN_MODELS).isdisjoint(HOME_TEST_MODELS)
-    for names, own in ((HOME_TRAIN_MODELS, "plant_snake"), (HOME_TEST_MODELS, "plant_monstera")):
+    for names, mine in ((HOME_TRAIN_MODELS, "plant_snake"), (HOME_TEST_MODELS, "plant_monstera")):
         packaged = {LIBRARY[n].category for n in names if "/" in n}
-        sparse = {LIBRARY[n].category for n in names if n in (*TRAIN_MODELS, *TEST_MODELS)}
-        assert packaged.isdisjoint(sparse) and "door" in sparse and {"chair", "sofa", "bed", "table"} <= packaged
-        assert own in names
+        assert mine in names and "door" not in packaged and {"chair", "sofa", "bed", "table"} <= packaged
+    doors = [[n for n in names if LIBRARY[n].category == "door"] for names in (HOME_TRAIN_MODELS, HOME_TEST_MODELS)]
+    assert doors == [["door_panel", "door_flush", "door_three"], ["door_dark", "door_battens"]]
+    assert len({cad_model(n).id_cad for n in LIBRARY}) == len(LIBRARY)
 
 
 @pytest.mark.parametrize("name", ["Scopia/puff", "Scopia/armchair2", "bag_tote", "plant_snake"])
@@ -147,7 +120,7 @@ def test_homes_have_six_models_of_each_of_the_commonest_categories():
 
 
 def test_models_of_a_home_are_apart_by_role_and_what_is_spent_is_not_drawn():
-    rng, models = np.random.default_rng(0), Models(HOME_TRAIN_MODELS, 0.0, home=True)
+    rng, models = np.random.default_rng(0), Models(HOME_TRAIN_MODELS, 0.0)
     drawn = [models.draw("chair", rng, role="office")[0].name for _ in range(24)]
     assert {name.partition("~")[0] for name in drawn} == {"Scopia/office_chair", "Scopia/tubular_chair"}
     assert len(set(drawn)) >= 10
@@ -156,7 +129,7 @@ def test_models_of_a_home_are_apart_by_role_and_what_is_spent_is_not_drawn():
     models.spent = {"bag_tote", *tints("bag_backpack")}
     bags = {models.draw("bag", rng)[0].name for _ in range(40)}
     assert "bag_tote" not in bags and {n.partition("~")[0] for n in bags} == {"bag_tote", "BlendSwap-CC-0/handbag"}
-    assert models.has("table", "bar") and not Models(HOME_TRAIN_MODELS, 0.0).has("table", "bar")
+    assert models.has("table", "bar") and not models.has("table", "child bar")
     tint = models.draw("counter", rng)[0].name.partition("~")[2]
     assert {models.draw("counter", rng)[0].name.partition("~")[2] for _ in range(8)} == {tint}
     assert models.draw("sink", rng)[0].name.partition("~")[2] == tint
@@ -164,7 +137,7 @@ def test_models_of_a_home_are_apart_by_role_and_what_is_spent_is_not_drawn():
 
 def test_a_library_model_is_written_with_its_texture_and_its_hulls(tmp_path):
     model = cad_model("Scopia/chair")
-    write_cad(tmp_path / "cad", model, pieces=True)
+    write_cad(tmp_path / "cad", model)
     read = read_cad(SourceFolder(tmp_path), model.catid, model.id_cad)
     assert model.surface is not None and read.surface is not None and read.pieces is not None
     np.testing.assert_array_equal(read.surface.texture, model.surface.image)
@@ -175,24 +148,15 @@ def test_a_library_model_is_written_with_its_texture_and_its_hulls(tmp_path):
         )
 
 
-def test_front_minus_z_turns_the_back_rest_to_plus_z():
-    # chair_panel is drawn with its back at -z and listed with front -1, so its back ends up at +z.
-    model = cad_model("chair_panel")
-    top = max(model.parts, key=lambda p: p.vertices[:, 1].max())
-    assert model.front == -1 and top.vertices[:, 2].mean() > model.center[2] + 0.1
-
-
-def test_written_obj_loads_with_the_same_bounds_and_open_parts_lack_a_face(tmp_path):
-    model = cad_model("chair_tub")
+def test_written_obj_loads_with_the_same_bounds(tmp_path):
+    model = cad_model("dresser_tall")
     write_cad(tmp_path, model)
-    path = tmp_path / "03001627" / model.id_cad / "models" / "model_normalized.obj"
+    (path,) = tmp_path.rglob("model_normalized.obj")
+    assert path.parts[-3] == model.id_cad
     mesh = trimesh.load(path, force="mesh", process=False)
     assert isinstance(mesh, trimesh.Trimesh)
     np.testing.assert_allclose(mesh.bounds, model.bounds, atol=1e-5)
-    opened = sum(p.open for p in model.parts)
-    assert opened == 1
-    # A box's underside is two triangles.
-    assert len(mesh.faces) == sum(len(p.faces) for p in model.parts) - 2 * opened
+    assert len(mesh.faces) == sum(len(p.faces) for p in model.parts)
 
 
 def test_bar_has_the_volume_of_a_prism():
@@ -252,7 +216,7 @@ def test_a_scan_shows_a_library_model_in_the_colours_of_its_texture():
     model = cad_model(name)
     surface = model.surface
     assert surface is not None
-    plan = make_plan(BuildingConfig(), np.random.default_rng(0))
+    plan, uses = home_plan(HomeConfig(), np.random.default_rng(0))
     item = place(model, model.unit_m * np.array([1.05, 0.95, 1.0]), np.array(plan.rooms[0].centre), 0.7)
     solids = building_solids(plan, [item])
     own = next(k for k, s in enumerate(solids) if s.item is item)
@@ -260,7 +224,7 @@ def test_a_scan_shows_a_library_model_in_the_colours_of_its_texture():
     faces = np.arange(3 * len(points)).reshape(-1, 3)
     scan = Scan(item.to_floor(surface.vertices[surface.faces].reshape(-1, 3)), faces, np.zeros(faces.size, np.uint8),
                 np.full(faces.size, own), tuple(solids))  # fmt: skip
-    got = paint(scan, plan.rooms, (), points, np.arange(len(points)), np.random.default_rng(0))
+    got = paint(scan, plan.rooms, uses, points, np.arange(len(points)), np.random.default_rng(0))
     uv = surface.uv[surface.uv_faces].mean(axis=1)
     height, width = surface.image.shape[:2]
     at = np.clip([(1 - uv[:, 1]) * height, uv[:, 0] * width], 0, [[height - 1], [width - 1]]).astype(int)
@@ -273,8 +237,8 @@ def test_a_scan_shows_a_library_model_in_the_colours_of_its_texture():
 def test_glass_is_drawn_in_its_one_colour_however_dark_it_is():
     pane = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]]), np.array([[0, 1, 2], [0, 2, 3]])
     charts = [*piece_charts(*pane, 38, "glass"), *piece_charts(*pane, 38, "white")]
-    _, atlas = assemble(charts, lambda points, normals: np.full((len(points), 3), 0.5), (128,))
-    middle = (np.array([1, -1]) * atlas.uv.reshape(2, 4, 2).mean(axis=1) + [0, 1]) * 128
+    _, atlas = assemble(charts, lambda points, normals: np.full((len(points), 3), 0.5))
+    middle = (np.array([1, -1]) * atlas.uv.reshape(2, 4, 2).mean(axis=1) + [0, 1]) * len(atlas.image)
     glass, white = (atlas.image[int(row), int(column)] for column, row in middle)
     assert tuple(glass) == GLASS == tuple(round(255 * v) for v in MATERIALS["glass"])
     assert np.abs(white - 127.5 * np.array(MATERIALS["white"])).max() < 3

@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from converters.generate import GENERATOR_VERSION, Building, GenerationError, design_building, render_building
-from converters.generate.homes.config import HomeConfig, home_config
 from converters.generate.homes.building import Plan, Rect
+from converters.generate.homes.config import HomeConfig, home_config
 from converters.generate.models.cad import Instance
 from converters.generate.surface.modelled import model_building, space_of
 from converters.generate.surface.scan import NYU40, Scan
@@ -172,7 +172,7 @@ def test_every_patch_has_texels_of_its_own_and_the_sheet_stays_small():
 def test_corners_are_darker_than_the_middle_and_walls_cast_shadows():
     room = Rect(0.0, 0.0, 4.0, 3.0)
     plan = dataclasses.replace(home().plan, rooms=(room,), outer=Rect(-0.2, -0.2, 4.2, 3.2), walls=(), doorways=(),
-                               windows=(), fixtures=(), built_in=(), corridor=None, entrance=None)  # fmt: skip
+                               windows=(), built_in=(), corridor=None, entrance=None)  # fmt: skip
     scan, atlas = model_building(_boxed(plan), [], ["bathroom"], np.random.default_rng(0))
     ceiling = np.flatnonzero(scan.labels == CEILING)
     uv = atlas.uv[ceiling]
@@ -273,7 +273,7 @@ def test_the_folder_says_that_it_shows_no_furniture_and_is_drawn_as_it_is(tmp_pa
 
 def test_annotations_of_a_home_whose_furniture_is_not_in_the_scan():
     items = list(home().items)
-    found = annotate_items(items, made()[0], home().floor_height_m, CONFIG.shell, SEED, np.random.default_rng(0))
+    found = annotate_items(items, made()[0], home().floor_height_m, CONFIG, SEED, np.random.default_rng(0))
     models = found[0]["aligned_models"]
     assert len(models) == len(items)
     assert all(m["keypoints_cad"]["n_keypoints"] >= 6 for m in models)

@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from converters.generate import GenerationError
-from converters.generate.homes.config import home_config
-from converters.generate.homes.building import Plan, Rect
 from converters.generate.homes.arrange import TABLES
+from converters.generate.homes.building import Plan, Rect
+from converters.generate.homes.config import home_config
 from converters.generate.homes.plans import FORBIDDEN, LARGE_M2, USES, Relations, assign_uses, home_plan, programme
 from tests.converters.generate.test_generate_plan import polygon
 
@@ -23,7 +23,7 @@ PRIVATE = {"bathroom", "bedroom"}
 
 @functools.cache
 def plans() -> tuple[tuple[Plan, list[str]], ...]:
-    shell = home_config("furnished", {}).shell
+    shell = home_config("furnished", {})
     return tuple(home_plan(shell, np.random.default_rng(650_000 + seed)) for seed in range(150))
 
 
@@ -125,6 +125,6 @@ def test_facades_enclose_the_walls():
 
 
 def test_what_no_plan_can_satisfy_is_one_line():
-    shell = home_config("furnished", {"floor_area_m2": (20.0, 20.0), "n_rooms": (9, 9)}).shell
+    shell = home_config("furnished", {"floor_area_m2": (20.0, 20.0), "n_rooms": (9, 9)})
     with pytest.raises(GenerationError, match="no plan in .* tries for .9, 9. rooms on .20.0, 20.0. m2: fewer rooms"):
         home_plan(shell, np.random.default_rng(0))

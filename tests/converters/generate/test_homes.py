@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import functools
 import itertools
 import math
@@ -13,13 +12,11 @@ import pytest
 import shapely
 from scipy import ndimage
 
-from converters.generate import Building, BuildingConfig, GenerationError, HomeConfig, design_building
-from converters.generate.homes.config import MOST_SHARE, TIERS, home_config, home_fields
-from converters.generate.homes.doors import Effort, furnish_plan
-from converters.generate.homes.building import Rect
-from converters.generate.design.sparse import make_plan
+from converters.generate import Building, GenerationError, HomeConfig, design_building
 from converters.generate.homes import design, furnish
 from converters.generate.homes.arrange import SEAT_M, TABLES, _seats, apart, arrange, draw_set, least_of, stand
+from converters.generate.homes.building import Rect
+from converters.generate.homes.config import MOST_SHARE, home_config, home_fields
 from converters.generate.homes.floor import Floor
 from converters.generate.homes.furnish import Home, furnish_home
 from converters.generate.homes.plans import USES, home_plan
@@ -79,7 +76,7 @@ def labelled(mask: np.ndarray) -> np.ndarray:
 
 def facing(item: Instance) -> np.ndarray:
     """(2,) direction of its front."""
-    angle = item.yaw_rad - math.pi / 2 + (math.pi if item.model.front < 0 else 0.0)
+    angle = item.yaw_rad - math.pi / 2
     return np.array([math.cos(angle), math.sin(angle)])
 
 
@@ -207,7 +204,7 @@ def test_behind_the_front_door_nothing_stands():
 
 
 @complete
-@pytest.mark.parametrize("tier", TIERS)
+@pytest.mark.parametrize("tier", ["furnished", "cluttered"])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_share_is_met(seed, tier):
     inside, fixed, below = drawn(building(seed, tier), 0.01)
@@ -217,7 +214,7 @@ def test_the_share_is_met(seed, tier):
 
 
 @complete
-@pytest.mark.parametrize("tier", TIERS)
+@pytest.mark.parametrize("tier", ["furnished", "cluttered"])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_as_much_must_be_pushed_as_asked_for(seed, tier):
     b, cell_m = building(seed, tier), 0.0125
@@ -254,7 +251,7 @@ def test_every_room_is_reached_with_the_movables_away(seed):
 
 
 @complete
-@pytest.mark.parametrize("tier", TIERS)
+@pytest.mark.parametrize("tier", ["furnished", "cluttered"])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_no_home_has_more_of_a_kind_than_people_keep(seed, tier):
     b = building(seed, tier)
@@ -386,7 +383,7 @@ def test_bed_heads_wardrobes_and_bookcases_have_a_wall_behind(seed):
     ],
 )
 def test_seats_are_spread_evenly_opposite_sides_first(count, at_wall, places):
-    table = draw_set(Models(("table_apron",), 0.0), np.random.default_rng(0))("table")
+    table = draw_set(Models(("Scopia/white_kitchen_table",), 0.0), np.random.default_rng(0))("table")
     width, _, depth = table.size_m
     assert 2 <= width / SEAT_M < 3 and 1 <= depth / SEAT_M < 2
     want = [(side, pytest.approx(slide * (width if side % 2 == 0 else depth))) for side, slide in places]
@@ -397,7 +394,7 @@ def test_seats_are_spread_evenly_opposite_sides_first(count, at_wall, places):
 @pytest.mark.parametrize("name", ["dining table", "small table", "desk"])
 def test_chairs_face_their_table_and_go_under_it_where_parts_allow(name, seed):
     rng = np.random.default_rng(seed)
-    draws = (arrange(name, Models(HOME_TRAIN_MODELS, 0.08, home=True), rng) for _ in range(10))
+    draws = (arrange(name, Models(HOME_TRAIN_MODELS, 0.08), rng) for _ in range(10))
     group = next(group for group in draws if group)  # too few chairs fit under some tables
     host, *seats = [stand(p, np.zeros(2), 0.3) for p in group.pieces if p.model.category in ("table", "desk", "chair")]
     assert len(seats) == 1 if name == "desk" else 2 <= len(seats) <= 6
@@ -446,7 +443,7 @@ def pieces_overlap(a: Instance, b: Instance) -> bool:
     return False
 
 
-@pytest.mark.parametrize("tier", TIERS)
+@pytest.mark.parametrize("tier", ["furnished", "cluttered"])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_nothing_stands_in_anything(seed, tier):
     if "bed" not in HAVE:
@@ -463,7 +460,7 @@ def test_nothing_stands_in_anything(seed, tier):
 
 
 @complete
-@pytest.mark.parametrize("tier", TIERS)
+@pytest.mark.parametrize("tier", ["furnished", "cluttered"])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_doors_turn_freely(seed, tier):
     b = building(seed, tier)
@@ -475,7 +472,7 @@ def test_doors_turn_freely(seed, tier):
 
 
 def test_a_seat_under_a_table_top_is_apart_from_it_and_one_in_its_leg_is_not():
-    draw = draw_set(Models(("table_apron", "chair_slat"), 0.0), np.random.default_rng(0))
+    draw = draw_set(Models(("Scopia/white_kitchen_table", "Scopia/chair"), 0.0), np.random.default_rng(0))
     table, chair = stand(draw("table"), np.zeros(2), 0.0), draw("chair")
     depth = (table.footprint.bounds[2] - table.footprint.bounds[0]) / 2 + chair.size_m[2] / 2
     assert apart(table, stand(chair, np.array([depth - 0.12, 0.0]), math.pi))
@@ -495,7 +492,7 @@ def test_a_seed_gives_the_same_home_and_another_another():
 @pytest.mark.parametrize(
     ("tier", "settings", "message"),
     [
-        ("full", {}, "tier is 'full': expected one of furnished, cluttered"),
+        ("full", {}, "tier is 'full': expected one of sparse, furnished, cluttered"),
         ("furnished", {"furniture_share": 0.7}, "furniture_share is 0.7, expected between 0 and 0.38"),
         (
             "furnished",
@@ -530,7 +527,7 @@ def test_tables_name_what_there_is():
 
 
 def test_a_floor_counts_what_is_put_down_and_taken_away():
-    plan = make_plan(BuildingConfig(), np.random.default_rng(0))
+    plan = home_plan(HomeConfig(), np.random.default_rng(0))[0]
     floor = Floor(plan, [])
     draw = draw_set(Models(HOME_TRAIN_MODELS, 0.0), np.random.default_rng(0))
     item = stand(draw("sofa"), np.array(plan.rooms[0].centre), 0.4)
@@ -540,22 +537,3 @@ def test_a_floor_counts_what_is_put_down_and_taken_away():
     assert floor.share == pytest.approx(shapely.union_all(item.outlines()).area / area_m2, rel=0.03)
     floor.remove(sofa)
     assert floor.share == 0.0 and not floor.standing
-
-
-CROWDED = BuildingConfig(
-    floor_area_m2=(90, 90), n_rooms=(7, 7), n_chairs=(22, 22), n_tables=(5, 5), n_desks=(4, 4), n_sofas=(4, 4),
-    n_doors=(5, 5), n_bottlenecks=4, n_blockers=3, n_static=(6, 6),
-)  # fmt: skip
-
-
-def test_too_much_furniture_of_the_plain_kind_is_refused_within_bounded_work():
-    cfg, effort = dataclasses.replace(CROWDED, n_doors=(0, 0)), Effort(2000)
-    assert furnish_plan(make_plan(cfg, np.random.default_rng(0)), cfg, np.random.default_rng(0), effort) is None
-    assert -2000 < effort.places <= 0
-    assert Effort().places <= 30_000
-
-
-@pytest.mark.heavy
-def test_the_whole_of_that_ends_with_one_line():
-    with pytest.raises(GenerationError, match="no way to furnish .7, 7. rooms"):
-        design_building(0, CROWDED)

@@ -15,9 +15,9 @@ import pytest
 from converters.check.gates import collide_with
 from converters.check.opening import blocked_fronts, held_bodies
 from converters.generate import Building, design_building
-from converters.generate.homes.config import home_config
-from converters.generate.homes.building import Plan, PlanBox, Rect
 from converters.generate.homes.arrange import TABLES
+from converters.generate.homes.building import Plan, PlanBox, Rect
+from converters.generate.homes.config import home_config
 from converters.generate.homes.opening import KITCHEN, OPENS, TOUCH_M, open_fronts
 from converters.generate.models.cad import LIBRARY, Instance, cad_model, place
 from converters.generate.models.fronts import openings
@@ -133,7 +133,7 @@ def test_fronts_of_one_model_do_not_jam() -> None:
     for name in (n for n, drawing in LIBRARY.items() if drawing.category in OPENS and openings(n)):
         model = cad_model(name)
         item = place(model, np.full(3, model.unit_m), np.zeros(2), 0.0)
-        plan = Plan((Rect(-3, -3, 3, 3),), Rect(-3.1, -3.1, 3.1, 3.1), (), (), (), (), None, 2.5)
+        plan = Plan((Rect(-3, -3, 3, 3),), Rect(-3.1, -3.1, 3.1, 3.1), (), (), (), None, 2.5)
         bodies, fronts = open_fronts(plan, (item,), (), "all")
         alone = room(Building(dataclasses.replace(plan, built_in=bodies), fronts, 0.0), item)
         assert (stuck(alone, 0.9), alone.njnt) == ([], len(openings(name))), name
@@ -145,7 +145,7 @@ def test_a_wall_before_a_kitchen_is_noticed() -> None:
     """It stands 0.2 m before each piece, as wide as that."""
     b = kitchen(720_003, "furnished")
     for item in (i for i in b.plan.built_in if i.model.category in KITCHEN):
-        ahead = item.model.front * item.matrix[:2, 2] / item.scale[2]
+        ahead = item.matrix[:2, 2] / item.scale[2]
         x0, y0, x1, y1 = item.footprint.bounds
         away = ahead * (np.array([x1 - x0, y1 - y0]) + 0.2)
         moved = Rect(x0 + away[0], y0 + away[1], x1 + away[0], y1 + away[1])

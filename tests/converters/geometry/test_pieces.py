@@ -40,10 +40,10 @@ def test_joining_goes_on_while_it_adds_little():
     assert len(merge_pieces(four, 9)) == 4
 
 
-@pytest.mark.parametrize("name", ["chair_slat", "table_apron", "plant_monstera", "BlendSwap-CC-0/chair"])
+@pytest.mark.parametrize("name", ["cart_tea", "plant_monstera", "BlendSwap-CC-0/chair"])
 def test_a_model_with_a_collision_mesh_comes_with_its_pieces(tmp_path, name):
     model = cad_model(name)
-    write_cad(tmp_path / "cad", model, pieces=True)
+    write_cad(tmp_path / "cad", model)
     source = SourceFolder(tmp_path)
     read = read_cad(source, model.catid, model.id_cad)
     assert read.pieces is not None and 1 < len(read.pieces) <= MOST_PIECES
@@ -58,7 +58,7 @@ def test_a_model_with_a_collision_mesh_comes_with_its_pieces(tmp_path, name):
 
 
 def test_a_piece_that_is_not_convex_is_told_and_the_model_decomposed(tmp_path):
-    model = cad_model("chair_slat")
+    model = cad_model("cart_tea")
     write_cad(tmp_path / "cad", model)
     folder = tmp_path / "cad" / model.catid / model.id_cad / "models"
     (folder / "collision.obj").write_text(trimesh.creation.annulus(0.5, 1.0, 0.2).export(file_type="obj"))

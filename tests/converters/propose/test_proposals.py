@@ -168,7 +168,7 @@ def test_models_of_classes_that_are_not_looked_for_are_passed_over(tmp_path):
     write_cad(tmp_path / "cad", cad_model("dresser_tall"))
     with pytest.raises(SceneRejected, match="no model of a known class"):
         read_library(tmp_path)
-    write_cad(tmp_path / "cad", cad_model("chair_slat"))
+    write_cad(tmp_path / "cad", cad_model("Scopia/chair"))
     assert [cad.category for cad in read_library(tmp_path).values()] == ["chair"]
 
 

@@ -127,9 +127,9 @@ def test_a_few_steps_learn_one_sample_by_heart_and_weights_keep_it(tmp_path):
     assert score_crops(kept, variables["params"], [stair()], TINY) == {"wall": 1.0, "floor": 1.0}
 
 
-def test_crops_of_a_sparse_building_are_seen_in_part():
+def test_crops_of_a_scanned_home_are_seen_in_part():
     surface, classes = building_surface(3, "sparse", "train")
-    assert {NAMES[k] for k in np.unique(classes)} >= {"wall", "floor", "chair", "door"}
+    assert {NAMES[k] for k in np.unique(classes)} >= {"wall", "floor", "bed", "door"}
     crops = [make_crop(surface, classes, np.random.default_rng(k), 64) for k in range(4)]
     assert all(c.index.max() < 80 and (c.index[:, :2] < 64).all() for c in crops)
     assert len({len(c.index) for c in crops}) == 4
@@ -313,7 +313,7 @@ def made_of(folder):
 
 @pytest.mark.slow
 def test_training_goes_on_where_it_stopped(tmp_path):
-    # The building of seed 30 is a sparse one, soon made; what is held out is there already, and is kept.
+    # The home of seed 30 is a sparse one; what is held out is there already, and is kept.
     kept, held_out = tmp_path / f"run/held_out/{HELD_OUT_SEED}.npz", stair()
     kept.parent.mkdir(parents=True)
     np.savez(kept, lengths=[len(held_out.index)], **vars(held_out))

@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 
-from converters.generate.homes.config import home_config
 from converters.generate.homes.building import Doorway
+from converters.generate.homes.config import home_config
 from converters.generate.homes.plans import home_plan
 from converters.generate.models.cad import Instance, cad_model, place
 from docs.studies.homes import WRONG, home_counts, plan_counts, seats_at
@@ -23,7 +23,7 @@ def test_nothing_is_wrong_in_two_homes_and_twenty_plans():
         counts = home_counts(home.plan, home.uses, [s.item for s in home.floor.standing])
         assert {name: counts[name] for name in WRONG if counts[name]} == {}
         assert counts["homes"] == 1 and counts["cartons"] <= 4
-    shell = home_config("furnished", {}).shell
+    shell = home_config("furnished", {})
     for seed in range(720_200, 720_220):
         counts = plan_counts(*home_plan(shell, np.random.default_rng(seed)))
         assert {name: counts[name] for name in WRONG if counts[name]} == {} and counts["plans"] == 1
