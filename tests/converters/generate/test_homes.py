@@ -534,6 +534,6 @@ def test_a_floor_counts_what_is_put_down_and_taken_away():
     assert floor.share == 0.0
     sofa = floor.add(item, 0, "sofa")
     area_m2 = sum(r.area_m2 for r in plan.rooms) + sum(d.rect.area_m2 for d in plan.doorways)
-    assert floor.share == pytest.approx(shapely.union_all(item.outlines()).area / area_m2, rel=0.03)
+    assert floor.share == pytest.approx(shapely.union_all(item.outlines()).area / area_m2, rel=0.05)
     floor.remove(sofa)
     assert floor.share == 0.0 and not floor.standing
