@@ -3,11 +3,11 @@
     python -m docs.studies.convert --faces 50000
 
 Generates a sparsely furnished home of about that many scan faces and converts it twice with one new cache folder, each
-time in a process of its own. A row holds wall seconds in all and of each stage, the peak resident memory, and the machine. Memory is the larger of the converter's own peak and its largest child's
-(`resource.getrusage`), and beside it the sum of the converter and `--jobs` such children, which bounds what all hold
-together. Rows are appended to `benchmarks/results/convert.jsonl`; on a machine that others use, times are upper
-bounds: the load is recorded beside them, and `cpu_s`, the processor seconds of the converter and its children, which
-depends on it little.
+time in a process of its own. A row holds wall seconds in all and of each stage, the peak resident memory, and the
+machine. Memory is the larger of the converter's own peak and its largest child's (`resource.getrusage`), and beside it
+the sum of the converter and `--jobs` such children, which bounds what all hold together. Rows are appended to
+`benchmarks/results/convert.jsonl`; on a machine that others use, times are upper bounds: the load is recorded beside
+them, and `cpu_s`, the processor seconds of the converter and its children, which depends on it little.
 """
 
 from __future__ import annotations
