@@ -151,7 +151,7 @@ class Adapt(_Networks):
 
 @dataclasses.dataclass(kw_only=True)
 class Export(_Listed):
-    """Write finished runs as a small folder of weights in half precision."""
+    """Write finished runs as a small folder of weights in half precision, or as ONNX files."""
 
     LISTED = {"": configs.ExportConfig()}
     localiser: Annotated[Path, option(metavar="RUN")] = RUNS / "rooms"
@@ -160,6 +160,8 @@ class Export(_Listed):
     """Network that judges passages."""
     policy: Annotated[Path | None, option(metavar="RUN")] = None
     """Local policy."""
+    onnx: Flag = False
+    """Write rooms.onnx, passages.onnx and policy.onnx instead."""
     maps: Annotated[Path | None, option(metavar="DIR")] = None
     """Folder of SCENE.npz, all of which are exported."""
     images: Annotated[Path, option(metavar="PATH")] = DATASET

@@ -11,7 +11,7 @@ from typing import Any
 from interactive_nav import load_scene
 from interactive_nav_common.config import field_docs, overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.files import write_text
+from interactive_nav_common.files import whole_folder, write_text
 from interactive_nav_common.jobs.progress import Host, Progress, SafeConsole, Stopped, progress_bar, say
 from interactive_nav_common.records import read_metrics
 from interactive_nav_common.rows import where
@@ -24,17 +24,18 @@ from topological_nav.data.dataset import load_passages, load_rooms, make_dataset
 from topological_nav.data.domains import AdaptConfig, as_seen, preset
 from topological_nav.data.folders import folder_bytes
 from topological_nav.drives.dataset import draw_drives, simulate_drives, summary
-from topological_nav.drives.driving import embed_drives
+from topological_nav.drives.driving import embed_drives, load_policy
 from topological_nav.drives.imitation import grid_table, train_grid, train_policy
 from topological_nav.evaluate import scores
 from topological_nav.evaluate.contest import Contest, contest_scenes, play_contest, tracks_of
 from topological_nav.figures import learning as figures
 from topological_nav.figures.maps import dataset_figure, drive_episode, film, journeys_figure, map_figure, save
 from topological_nav.learn.networks import in_words
-from topological_nav.learn.training import train
+from topological_nav.learn.training import load_networks, train
 from topological_nav.maps.build import Built, build_map, forget
 from topological_nav.maps.graph import save_map
-from topological_nav.weights.export import choose, export, fitting_map, size_lines
+from topological_nav.weights.export import choose, export, fitting_map, level_images, size_lines
+from topological_nav.weights.onnx_files import onnx_models
 
 
 @contextmanager
@@ -208,8 +209,17 @@ def keep_map(built: Built, out: Path, ends: Sequence[int] | None = None) -> None
 
 
 def run_export(arguments: Any) -> None:
-    """Write finished runs as a small folder."""
+    """Write finished runs as a small folder, or as ONNX files."""
     config = overridden(configs.ExportConfig(), arguments.settings)
+    if arguments.onnx:
+        refuse_unused(arguments, "--maps --picture limit_mib tolerance commit", "with --onnx")
+        networks = load_networks(arguments.localiser, arguments.detector)
+        driver = arguments.policy and load_policy(arguments.policy, arguments.localiser, arguments.detector)
+        with bar() as report, whole_folder(arguments.out) as part:
+            images = level_images(arguments.images, networks, config.places, report)
+            for name, content in onnx_models(networks, driver, images).items():
+                (part / f"{name}.onnx").write_bytes(content)
+        return print(f"{arguments.out}: as JAX over {len(images) * images.shape[1]:,} images")
     with bar() as report:
         runs = (arguments.localiser, arguments.detector, arguments.policy, arguments.maps)
         sizes, compared = export(*runs, arguments.images, arguments.out, config, report)

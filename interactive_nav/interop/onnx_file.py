@@ -1,16 +1,21 @@
-"""Read ONNX files of `interactive-nav export`: a policy with a description of what it takes and gives."""
+"""Write and read ONNX files: a policy or a network with a description of what it takes and gives."""
 
 import json
-from collections.abc import Mapping
+import logging
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.sensing.description import KEY
 from interactive_nav_common.errors import UserError, missing, optional, regular
 
 NEEDED = missing("an ONNX policy", "onnxruntime", "onnx")
+TOLERANCE = 1e-5
+"""Largest difference of each output from JAX: of its largest number, or of 1 where all are smaller."""
 
 
 class OnnxError(UserError):
@@ -39,3 +44,39 @@ class OnnxFile:
     def run(self, output: str, inputs: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return an output [B, n] for inputs [B, ...]."""
         return self._session.run([output], dict(inputs))[0]
+
+
+def convert(
+    graph: Callable[..., Any],
+    inputs: Mapping[str, np.ndarray],
+    expected: Mapping[str, np.ndarray],
+    about: Mapping[str, Any],
+) -> bytes:
+    """Return a function of arrays [N, ...], by name, as an ONNX model with its description.
+
+    Raise `OnnxError` where one of its outputs, in order, differs from what is `expected` of it by name.
+    """
+    jax2onnx = optional("jax2onnx", missing("export", "jax2onnx", "onnx"))
+    runtime = optional("onnxruntime", NEEDED)
+    logging.getLogger("onnx_ir").setLevel(logging.ERROR)  # it warns of values that it leaves out
+    passes = optional("jax2onnx.converter.ir_optimizations", NEEDED)
+    # jax2onnx 0.17 takes transpositions out of sums of residual blocks whose other terms then do not fit.
+    passes._OPTIMIZER_PASSES = tuple(one for one in passes._OPTIMIZER_PASSES if "transpose_" not in one.name)
+    names, outputs = list(inputs), list(expected)
+    shapes = [jax.ShapeDtypeStruct(("batch", *x.shape[1:]), x.dtype) for x in inputs.values()]
+    cumsum = jnp.cumsum
+    with jax.numpy_rank_promotion("allow"):  # jax2onnx's layers promote
+        model = jax2onnx.to_onnx(graph, shapes, model_name=KEY, input_names=names, output_names=outputs)
+    jnp.cumsum = cumsum  # jax2onnx 0.17 leaves a function of its own there, which takes no axis by position
+    model.metadata_props.add(key=KEY, value=json.dumps(about))
+    content = model.SerializeToString()
+    session = runtime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    for name, a in zip(outputs, session.run(outputs, dict(inputs)), strict=True):
+        b = expected[name]
+        difference = np.max(np.abs(a - b)) / max(1.0, np.max(np.abs(b)))
+        if not difference <= TOLERANCE:
+            raise OnnxError(
+                f"output {name} differs by {difference:.1e} between ONNX and JAX over {len(a)} observations, "
+                f"expected at most {TOLERANCE:.0e}; nothing was written"
+            )
+    return content

@@ -67,7 +67,7 @@ def describe(env: Any) -> dict[str, Any]:
     placed = {"base_height_m": robot.spawn_height_m, "success_distance_m": distance_m}
     about: dict[str, Any] = {
         "robot": {"name": robot.name, "control_mode": robot.control_mode, "rate_hz": rate_hz, **placed},
-        "inputs": {name: _input(name, x, config) | {"rate_hz": rate_hz} for name, x in inputs.items()},
+        "inputs": {name: describe_input(name, x, config) | {"rate_hz": rate_hz} for name, x in inputs.items()},
         "outputs": {name: {"shape": [len(of["names"])], "dtype": "float32"} | of for name, of in outputs.items()},
         "cameras": [_camera(camera, robot.camera.body) for camera in env.sensors.cameras],
     }
@@ -79,7 +79,8 @@ def describe(env: Any) -> dict[str, Any]:
     return json.loads(json.dumps(about))
 
 
-def _input(name: str, value: Any, config: Any) -> dict[str, Any]:
+def describe_input(name: str, value: Any, config: Any) -> dict[str, Any]:
+    """Describe one input of a policy."""
     kind, steps = name.rpartition("/")[2], 255 if value.dtype == np.uint8 else 1
     unit, frame, content = PARTS.get(kind, ("", "", "a term of the environment's"))
     ranges = {"depth": config.depth_range_m, "lidar": config.lidar_range_m}

@@ -247,10 +247,15 @@ class TrainedPolicy:
         state, (linear, angular) = jax.device_get(self._step(self._weights, state, jnp.asarray(images)))
         return state, np.asarray(self.about["linear_m_s"])[linear], np.asarray(self.about["angular_rad_s"])[angular]
 
-    def _stepped(self, weights, state, images):
-        x = standardised(embedded(self._networks, weights["embedders"], images), weights["policy"]["scale"])
-        state, logits = self._policy.apply({"params": weights["policy"]["params"]}, state, x)  # type: ignore[misc]
+    def step(self, state: Any, embedding: jax.Array, weights: Any = None) -> tuple[Any, tuple[jax.Array, ...]]:
+        """Return the new state, and the likeliest classes [B] of linear and of angular velocity, by embeddings."""
+        weights = weights or self._weights["policy"]
+        x = standardised(embedding, weights["scale"])
+        state, logits = self._policy.apply({"params": weights["params"]}, state, x)  # type: ignore[misc]
         return state, tuple(one.argmax(-1) for one in logits)
+
+    def _stepped(self, weights, state, images):
+        return self.step(state, embedded(self._networks, weights["embedders"], images), weights["policy"])
 
 
 def load_policy(

@@ -25,7 +25,7 @@ class ResNet18(nn.Module):
         """Return maps after the third (conv3_x) and the fifth stage (conv5_x): [N, h, w, 2 width], [.., 8 width]."""
         x = _conv(self.width, 7, 2)(x)
         x = nn.relu(_norm(train)(x))
-        x = nn.max_pool(x, (3, 3), (2, 2), padding="SAME")
+        x = nn.max_pool(x, window_shape=(3, 3), strides=(2, 2), padding="SAME")
         stages = []
         for stage in range(4):
             for block in range(2):
@@ -61,7 +61,7 @@ class AlexNet(nn.Module):
             x = nn.relu(nn.Conv(factor * self.width, (kernel, kernel), (stride, stride), padding="SAME")(x))
             maps.append(x)
             if i in (0, 1, 4):
-                x = nn.max_pool(x, (3, 3), (2, 2), padding="SAME")
+                x = nn.max_pool(x, window_shape=(3, 3), strides=(2, 2), padding="SAME")
         return maps[2], x
 
 
@@ -122,7 +122,7 @@ class Contrast(nn.Module):
 
 def falling(x: jax.Array) -> jax.Array:
     """Map [N, L] to logits that fall from each to the next, by softplus of it: what is free to 2 m is free to 1 m."""
-    return x[:, :1] - jnp.cumsum(jnp.pad(nn.softplus(x[:, 1:]), ((0, 0), (1, 0))), 1)
+    return x[:, :1] - jnp.cumsum(jnp.pad(nn.softplus(x[:, 1:]), ((0, 0), (1, 0))), axis=1)
 
 
 def joined(maps: tuple[jax.Array, jax.Array]) -> jax.Array:
