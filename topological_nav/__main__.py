@@ -27,7 +27,7 @@ class _Listed(Command):
     LISTED: ClassVar[dict[str, Any]]
     """Name of a group of settings -> their defaults."""
     settings: Words = ()
-    """Change settings, listed below."""
+    """Change settings, listed below; preset=report takes those of the report (topological_nav/presets.yaml) first."""
 
     @classmethod
     def epilog(cls) -> str:
@@ -80,11 +80,11 @@ class Train(_Networks):
 
     LISTED = {"": configs.TASKS["rooms"], " of policy": configs.PolicyConfig()}
     task: Annotated[Literal["rooms", "passages", "policy"], *word("TASK")]
-    """What to train: rooms, passages (whose defaults differ: batch=32 epochs=20) or policy."""
+    """What to train: rooms, passages (whose defaults differ: batch=32 epochs=20 hidden=0) or policy."""
     data: Annotated[Path | None, option(metavar="DIR")] = None
     """The dataset."""
     grid: Flag = False
-    """policy: train with every alpha and lambda of the report."""
+    """policy: train with several pairs of alpha and lambda."""
     out: Annotated[Path | None, option("-o", metavar="DIR")] = None
     """Run folder."""
 

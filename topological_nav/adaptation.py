@@ -234,7 +234,9 @@ def passage_configurations(
         network, tx = trained.network, optax.adam(config.fine_tune_learning_rate)
         shape = (trained.about["data"]["height"], trained.about["data"]["width"])
         fresh = learning.make_learner(network, shape, tx, config.seed)
-        epoch = learning.labelled_epoch(network, tx, config.fine_tune_batch, 0.0, True, learned.scored)
+        epoch = learning.labelled_epoch(
+            network, tx, config.fine_tune_batch, 0.0, config.fine_tune_augment, learned.scored
+        )
         one = learning.over(epoch, learned.images, learned.free.astype(np.int32))
         keys = learning.phase_key(config.seed, 3)
         results: dict[str, Any] = {"fine_tuned_on": len(learned.images), "tested_on": len(tested.images)}
@@ -285,7 +287,7 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
 
 
 def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> tuple[PassageImages, PassageImages]:
-    """Return target images to learn from and to test, as many free as blocked, no source in both."""
+    """Return target images to learn from and to test, no source in both: so many free, or as many as blocked."""
     passages = load_passages(target)
     if list(passages.lengths_m) != list(lengths_m):
         lengths = ",".join(f"{length:g}" for length in lengths_m)
@@ -296,9 +298,14 @@ def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> 
     scored = passages.free[:, passages.scored]
     images = as_seen(passages.images, preset(config.domain), PASSAGES_STREAM)
     rng, parts = np.random.default_rng([config.seed, 4]), []
-    for held, most in ((False, config.fine_tune), (True, config.test)):
-        rows = balanced(np.flatnonzero(passages.test == held), scored, rng)
-        yes, no = (rng.permutation(rows[scored[rows] == label])[: most // 2] for label in (True, False))
+    for held, most, free in (
+        (False, config.fine_tune, config.fine_tune_free),
+        (True, config.test, config.test_free),
+    ):
+        rows = np.flatnonzero(passages.test == held)
+        rows = rows if free else balanced(rows, scored, rng)
+        free = free or most // 2
+        yes, no = rng.permutation(rows[scored[rows]])[:free], rng.permutation(rows[~scored[rows]])[: most - free]
         rows = np.sort(np.concatenate([yes, no]))
         if not len(rows):
             what = "for testing" if held else "to learn from"

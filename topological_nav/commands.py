@@ -34,6 +34,7 @@ from topological_nav.learn.networks import in_words
 from topological_nav.learn.training import load_networks, train
 from topological_nav.maps.build import Built, build_map, forget
 from topological_nav.maps.graph import save_map
+from topological_nav.presets import configured, preset_of
 from topological_nav.weights.export import choose, export, fitting_map, level_images, size_lines
 from topological_nav.weights.onnx_files import onnx_models
 
@@ -79,7 +80,8 @@ def _contest(arguments: Any, scenes: Sequence[str], contenders: Sequence[str], o
         scenes=tuple(Path(scene) for scene in scene_folders(scenes)),
         contenders=tuple(contenders),
         out=out,
-        config=overridden(configs.EvaluationConfig(), arguments.settings),
+        config=configured(configs.EvaluationConfig(), arguments.settings, "evaluate"),
+        preset=preset_of(arguments.settings),
         truth=arguments.truth,
         policy=arguments.policy or PASSAGE_POLICY,
         ppo=getattr(arguments, "ppo", None),
@@ -173,7 +175,7 @@ def run_evaluate(arguments: Any) -> None:
 
 def run_map(arguments: Any) -> None:
     """Build a map and draw it."""
-    config = overridden(MapConfig(), arguments.settings)
+    config = configured(MapConfig(), arguments.settings, "map")
     chosen = choose(arguments.localiser, arguments.detector, PASSAGE_POLICY)
     chosen.report(policy=False)
     out = arguments.out or chosen.maps[0] / f"{Path(arguments.scene).resolve().name}.npz"
@@ -234,7 +236,7 @@ def run_data(arguments: Any) -> None:
     """Render a dataset, or drives of the expert."""
     if arguments.drives:
         return _drives(arguments)
-    config = overridden(configs.DataConfig(), arguments.settings)
+    config = configured(configs.DataConfig(), arguments.settings, "data")
     out = arguments.out or DATASET
     with bar() as report:
         header = make_dataset([Path(s) for s in scene_folders(arguments.scenes)], out, config, report)
@@ -254,7 +256,7 @@ def _size_line(out: Path, images: int, config: configs.CameraConfig) -> str:
 
 
 def _drives(arguments: Any) -> None:
-    config = overridden(configs.DriveConfig(), arguments.settings)
+    config = configured(configs.DriveConfig(), arguments.settings, "drives")
     out, scenes = arguments.out or DRIVES, [Path(s) for s in scene_folders(arguments.scenes)]
     with stop_signals() as stops:
         with bar(stops) as report:
@@ -276,9 +278,11 @@ def run_train(arguments: Any) -> None:
     if arguments.task == "policy":
         return _policy(arguments)
     refuse_unused(arguments, "--localiser --detector --grid", f"in 'train {arguments.task}'")
-    if arguments.task == "passages":
-        refuse_unused(arguments, "hidden pitch label_smoothing", "in 'train passages'")
-    config = overridden(configs.TASKS[arguments.task], arguments.settings)
+    unused = "test_scenes" if arguments.task == "rooms" else "pitch label_smoothing test_headings"
+    refuse_unused(arguments, unused, f"in 'train {arguments.task}'")
+    config = configured(configs.TASKS[arguments.task], arguments.settings, arguments.task)
+    if config.network == "alexnet":
+        refuse_unused(arguments, "first_stage" + " hidden" * (arguments.task == "passages"), "with network=alexnet")
     if config.init != "selfsup":
         refuse_unused(arguments, "selfsup_epochs selfsup_batch selfsup_learning_rate", f"with init={config.init}")
     out = arguments.out or RUNS / arguments.task
@@ -295,9 +299,11 @@ def run_train(arguments: Any) -> None:
 
 
 def _policy(arguments: Any) -> None:
-    config = overridden(configs.PolicyConfig(), arguments.settings)
+    config = configured(configs.PolicyConfig(), arguments.settings, "policy")
     if arguments.grid:
-        refuse_unused(arguments, "alpha lam", "with --grid, which takes every pair of the report's")
+        refuse_unused(arguments, "alpha lam", "with --grid, which takes several")
+    else:
+        refuse_unused(arguments, "pairs", "without --grid")
     out = arguments.out or RUNS / ("policy-grid" if arguments.grid else "policy")
     with terminal() as host:
         runs = arguments.localiser or RUNS / "rooms", arguments.detector or RUNS / "passages"
@@ -326,7 +332,7 @@ def _policy(arguments: Any) -> None:
 
 def run_adapt(arguments: Any) -> None:
     """Take networks, and a map, to another domain."""
-    config = overridden(AdaptConfig(), arguments.settings)
+    config = configured(AdaptConfig(), arguments.settings, "adapt")
     if (arguments.what == "map") != bool(arguments.scene):
         raise ConfigError("adapt map takes a scene folder, adapt features and adapt passages none")
     _refuse_unused_to_adapt(arguments)

@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Literal
 
-from interactive_nav_common.config import Bounds, Count, Seed, Settings, Share
+from interactive_nav_common.config import Bounds, Count, Natural, Seed, Settings, Share
 from interactive_nav_common.errors import ConfigError
 
 PITCHES = ("up", "level", "down")
@@ -41,7 +41,7 @@ class CameraConfig(Settings):
 
 @dataclasses.dataclass(frozen=True)
 class DataConfig(CameraConfig):
-    """Set what is drawn of each scene. Defaults: the report's, at a stored size of 128 x 96."""
+    """Set what is drawn of each scene; `preset=report` has the report's values."""
 
     room_method: Literal["kmeans", "gmm", "spectral"] = "gmm"
     """How free positions are clustered into rooms."""
@@ -53,6 +53,8 @@ class DataConfig(CameraConfig):
     """Their least distance from obstacles."""
     max_per_room: Count = 10
     """Of them kept in a room."""
+    least_per_room: Natural = 0
+    """Rooms with fewer positions than this have no images."""
     test_share: Annotated[float, Bounds(0, 1, open=True)] = 0.2
     """Share of a room's positions (and of its passages' sources) that are for testing only."""
     headings: int = 18
@@ -103,7 +105,7 @@ class DataConfig(CameraConfig):
 
 @dataclasses.dataclass(frozen=True)
 class NetworkTrainConfig(Settings):
-    """Set a network and how it learns. Defaults: the report's room classifier, from scratch."""
+    """Set a network and how it learns."""
 
     seed: Seed = 0
     """The one seed of weights, order and augmentation."""
@@ -111,12 +113,19 @@ class NetworkTrainConfig(Settings):
     """Backbone."""
     width: Count = 64
     """Channels of the backbone's first stage; 64 is the original."""
-    hidden: Count = 512
-    """Units of each of the room classifier's two layers."""
+    hidden: Natural = 512
+    """Units of each of the two layers behind the backbone; 0: no layers."""
+    first_stage: Annotated[int, Bounds(1, 3)] = 2
+    """Stage of ResNet-18 that gives the embedding's first feature map; the fourth gives the second. With 1 and width
+    64, the report's, an embedding has 64 + 512 numbers."""
     init: str = "scratch"
     """Where the backbone starts: scratch, selfsup (first learns without labels), or a run folder to take it from."""
     pitch: Literal["all", "up", "level", "down"] = "all"
     """Room images to learn from."""
+    test_headings: Literal["thirds", "random"] = "thirds"
+    """Images of a room's test positions to test: every third heading, or as many at random."""
+    test_scenes: tuple[str, ...] = ()
+    """passages: scenes to test by, and to learn nothing from; none: the sources that the dataset holds out."""
     epochs: Count = 15
     """Passes over the training images."""
     batch: Count = 20
@@ -135,20 +144,24 @@ class NetworkTrainConfig(Settings):
     """Adam's, of them."""
 
 
-TASKS = {"rooms": NetworkTrainConfig(), "passages": NetworkTrainConfig(batch=32, epochs=20)}
-"""The report's room classifier, and its passage detector, but without hidden layers."""
+TASKS = {"rooms": NetworkTrainConfig(), "passages": NetworkTrainConfig(batch=32, epochs=20, hidden=0)}
+"""Defaults of the room classifier and of the passage detector."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MapConfig(Settings):
     """Set where nodes stand, and which edges join them."""
 
+    seed: Seed = 0
+    """Of random nodes."""
     clearance_m: Annotated[float, Bounds(0.0, 10.0)] = 0.4
     """Least distance of nodes from obstacles: robots turn about there; TTbot's corners reach 0.33 m."""
     min_per_room: Annotated[int, Bounds(1, 1000)] = 3
     """Nodes a room, at least."""
     spacing_m: Annotated[float, Bounds(0.1, 100.0)] = 0.9
     """No free place of a room is farther than this from one of its nodes."""
+    nodes: Literal["covering", "random"] = "covering"
+    """How nodes are chosen: greedily, those that cover most of what is left, or at random."""
     edge_m: Annotated[float, Bounds(0.1, 100.0)] = 2.5
     """Nodes nearer than this are joined, both ways."""
     edge_image: Literal["exact", "nearest"] = "exact"
@@ -166,10 +179,13 @@ class MapConfig(Settings):
 
 @dataclasses.dataclass(frozen=True)
 class NavigatorConfig(Settings):
-    """Set how the navigator localises, turns and drives. Defaults: the report's where it gives a value."""
+    """Set how the navigator localises, turns and drives; `preset=report` has the report's values."""
 
     images: Annotated[int, Bounds(1, 1000)] = 18
     """Images that one localisation looks at, evenly about; a divisor of the map's images a node."""
+    goal_images: Annotated[int | None, Bounds(1, 1000)] = None
+    """Images of the goal, evenly about from a heading that each episode draws; auto: as `images`, from the world's x
+    axis on."""
     match: Literal["aligned", "nearest"] = "aligned"
     """An image is compared with the nodes' images of the same heading, and all are summed (aligned); or with all of
     them, and the nearest of all decides (nearest)."""
@@ -325,7 +341,7 @@ class DriveConfig(ExpertConfig, CameraConfig):
 
 @dataclasses.dataclass(frozen=True)
 class PolicyConfig(Settings):
-    """Set the local policy and how it learns. Defaults: the report's, but 50 of its 1,000 epochs."""
+    """Set the local policy and how it learns; `preset=report` has the report's values."""
 
     seed: Seed = 0
     """The one seed of weights, order and thinning."""
@@ -353,6 +369,12 @@ class PolicyConfig(Settings):
     """Weight of the commands' cross-entropies."""
     lam: Annotated[float, Bounds(0.0, 1e6)] = 0.5
     """Weight of forward consistency: lambda."""
+    lam_alone: bool = False
+    """Count forward consistency also while only the forward model learns, as the report's equation 1 does."""
+    predicts: Literal["change", "next"] = "change"
+    """What the forward model predicts: an embedding's change, in units of its spread, or the next embedding."""
+    pairs: Literal["nine", "report"] = "nine"
+    """With --grid: all pairs of three alphas and three lambdas, or the report's three."""
     epochs: Count = 50
     """Passes over the sequences."""
     alone: Share = 0.1

@@ -127,6 +127,7 @@ def plan_scene(scene: Scene, space: FreeSpace, config: DataConfig) -> ScenePlan:
     kept, test = [], []
     for k in range(rooms.count):
         mine = np.flatnonzero(label == k)
+        mine = mine if len(mine) >= config.least_per_room else mine[:0]
         mine = mine[np.sort(spread(drawn[mine], config.max_per_room, rng))]
         kept.append(mine)
         test.append(held_out(len(mine), config.test_share, rng))

@@ -64,7 +64,7 @@ def preset(name: str) -> DomainConfig:
 
 @dataclasses.dataclass(frozen=True)
 class AdaptConfig(Settings):
-    """Set how networks are taken to another domain. Batches: the report's."""
+    """Set how networks are taken to another domain; `preset=report` has the report's values."""
 
     seed: Seed = 0
     """Of weights, order and splits."""
@@ -82,12 +82,18 @@ class AdaptConfig(Settings):
     """features: units of each of the critic's two layers."""
     fine_tune: Annotated[int, Bounds(2, 10**6)] = 252
     """passages: target images to learn from, at most."""
+    fine_tune_free: Annotated[int | None, Bounds(1, 10**6)] = None
+    """passages: of them free; auto: half."""
     test: Annotated[int, Bounds(2, 10**6)] = 108
     """passages: target images to test, at most."""
+    test_free: Annotated[int | None, Bounds(1, 10**6)] = None
+    """passages: of them free; auto: half."""
     fine_tune_epochs: Count = 20
     """passages: passes over them."""
     fine_tune_batch: Count = 32
     """passages: images an update."""
+    fine_tune_augment: bool = True
+    """passages: vary brightness, contrast and colour, and shift and mirror images."""
     fine_tune_learning_rate: Annotated[float, Bounds(1e-9, 10.0)] = 1e-4
     """passages: Adam's."""
     edge_m: Annotated[float, Bounds(0.1, 100.0)] = 2.5

@@ -71,9 +71,10 @@ class Policy(nn.Module):
 
 
 class Forward(nn.Module):
-    """Predict the next embedding after an action: two layers that say how it changes."""
+    """Predict the next embedding after an action by two layers, which give its `change` or, if not, itself."""
 
     hidden: int = 512
+    change: bool = True
 
     @nn.compact
     def __call__(self, u: jax.Array, x: jax.Array, action: jax.Array, deviation: jax.Array) -> jax.Array:
@@ -84,7 +85,8 @@ class Forward(nn.Module):
         y = jnp.concatenate([x, action], -1)
         for _ in range(2):
             y = nn.relu(nn.Dense(self.hidden)(y))
-        return u + jnp.broadcast_to(deviation, u.shape) * nn.Dense(u.shape[-1])(y)
+        y = nn.Dense(u.shape[-1])(y)
+        return u + jnp.broadcast_to(deviation, u.shape) * y if self.change else y
 
 
 def standardised(u: jax.Array, scale: dict[str, jax.Array]) -> jax.Array:
@@ -116,19 +118,20 @@ def policy_loss(
     alpha: jax.Array | float,
     lam: jax.Array | float,
     jointly: jax.Array | float = 1.0,
+    consistent: jax.Array | float = 0.0,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Return alpha (CE_angular + CE_linear) + |u - f(u, a)|^2 + lambda |u - f(u, a_hat)|^2 and its parts, means.
 
     The policy's logits are [B, T, L] and [B, T, A], `truth` fields of `imitation.Sequences`, `guesses` [B, T, D]
     f(u, a) by the expert's action a and f(u, a_hat) by the policy's, `following` [B, T, D] u, the embedding of the next
-    step; `jointly` 0 leaves the forward model's error alone.
+    step; `jointly` 0 leaves the forward model's error alone, with the share `consistent` of the last term.
     """
     cross = [
         mean_over(optax.softmax_cross_entropy_with_integer_labels(one, truth[name]), truth["valid"])
         for one, name in zip(logits, ("linear", "angular"), strict=True)
     ]
     forward, consistency = (mean_over(jnp.square(following - u).sum(-1), truth["followed"]) for u in guesses)
-    loss = forward + jointly * (alpha * (cross[1] + cross[0]) + lam * consistency)
+    loss = forward + jointly * alpha * (cross[1] + cross[0]) + jnp.maximum(jointly, consistent) * lam * consistency
     return loss, {"ce_linear": cross[0], "ce_angular": cross[1], "forward": forward, "consistency": consistency}
 
 

@@ -33,8 +33,11 @@ from topological_nav.learn.learning import RESULTS, Epoch, Learner, descent_epoc
 from topological_nav.learn.training import class_scores
 from topological_nav.scenes.rendering import batched
 
-GRID = [(alpha, lam) for alpha in (0.1, 10.0, 50.0) for lam in (0.1, 0.5, 1.0)]
-"""All pairs of the alphas and lambdas in the report's table II, which has three of them."""
+GRIDS = {
+    "nine": [(alpha, lam) for alpha in (0.1, 10.0, 50.0) for lam in (0.1, 0.5, 1.0)],
+    "report": [(0.1, 0.5), (10.0, 0.1), (50.0, 1.0)],
+}
+"""Pairs of alpha and lambda: those of the report's table II, and all that its alphas and lambdas give."""
 LEAST_SPREAD = 0.3
 """Features are scaled by their standard deviation, at least this share of the mean one."""
 
@@ -125,7 +128,7 @@ def train_policy(frames: Frames, out: Path, config: PolicyConfig, host: Host = A
     digests = [network.about["digest"] for network in frames.networks]
     with claimed(out, {"task": "policy", "dataset": frames.header, "networks": digests, **to_dict(config)}):
         policy = Policy(config.hidden, config.projection, config.linear_classes, config.angular_classes)
-        forward = Forward(config.forward_hidden)
+        forward = Forward(config.forward_hidden, config.predicts == "change")
         params = fresh_params(policy, forward, frames.features.shape[1], config.seed)
         # Features that hardly vary here must not become large where they do.
         used = frames.features[np.unique(learned.rows)].astype(np.float32)
@@ -138,7 +141,8 @@ def train_policy(frames: Frames, out: Path, config: PolicyConfig, host: Host = A
         epoch = policy_epoch(policy, forward, config.learning_rate, config.batch, len(learned))  # type: ignore[arg-type]
 
         def one(learner: Learner, number: int, key: jax.Array):
-            return epoch(learner, shown, {**truth, **weights, "jointly": jnp.float32(number >= alone)}, key)
+            phase = {"jointly": jnp.float32(number >= alone), "consistent": jnp.float32(config.lam_alone)}
+            return epoch(learner, shown, {**truth, **weights, **phase}, key)
 
         key = jax.random.PRNGKey(config.seed)
         learner = run_epochs(out, "policy", learner, one, config.epochs, key, host)
@@ -201,18 +205,20 @@ def _one_hot(policy: Policy, linear: jax.Array, angular: jax.Array) -> list[jax.
 def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: int, count: int) -> Epoch:
     """Build an epoch over `count` sequences; the last, incomplete batch is left out. See `learning.compiled_epoch`.
 
-    Labels: the fields of `Sequences`, and numbers `alpha`, `lam` and `jointly` as `policy_loss` has them: one program
-    serves a whole grid.
+    Labels: the fields of `Sequences`, and the numbers `alpha`, `lam`, `jointly` and `consistent` of `policy_loss`: one
+    program serves a whole grid. The policy is frozen while `jointly` is 0.
     """
 
     def loss_of(params, scale, features, labels, step):
         (which,) = step
         batch = {name: labels[name][which] for name in ("rows", "valid", "followed", "linear", "angular")}
-        weights = {name: labels[name] for name in ("alpha", "lam", "jointly")}
+        weights = {name: labels[name] for name in ("alpha", "lam", "jointly", "consistent")}
         u = features[batch["rows"]].astype(jnp.float32)
         truth = (batch["linear"], batch["angular"])
         logits, next_after = _applied(policy, forward, params, scale, u)
-        guesses = next_after(_one_hot(policy, *truth)), next_after([nn.softmax(value) for value in logits])
+        chosen = [nn.softmax(value) for value in logits]
+        chosen = [jnp.where(weights["jointly"] > 0, p, jax.lax.stop_gradient(p)) for p in chosen]
+        guesses = next_after(_one_hot(policy, *truth)), next_after(chosen)
         loss, parts = policy_loss(logits, batch, guesses, u[:, 1:], **weights)
         right = {
             f"{name}_accuracy": ((one.argmax(-1) == t) & batch["valid"]).sum() / batch["valid"].sum()
@@ -264,14 +270,15 @@ def _scores(
 
 
 def train_grid(frames: Frames, out: Path, config: PolicyConfig, host: Host = ALONE) -> list[dict[str, Any]]:
-    """Train a policy for every alpha and lambda of the report, each in a separate folder under `out`.
+    """Train a policy for every pair of alpha and lambda, each in a separate folder under `out`.
 
     Return the results, also written to grid.json and, as a table, to grid.md.
     """
     rows = []
-    for alpha, lam in GRID:
+    grid = GRIDS[config.pairs]
+    for alpha, lam in grid:
         one = dataclasses.replace(config, alpha=alpha, lam=lam)
-        host.show(f"alpha {alpha:g}, lambda {lam:g}: {len(rows) + 1} of {len(GRID)}")
+        host.show(f"alpha {alpha:g}, lambda {lam:g}: {len(rows) + 1} of {len(grid)}")
         rows.append(train_policy(frames, out / f"alpha-{alpha:g}-lambda-{lam:g}", one, host))
     write_json(out / "grid.json", rows)
     write_text(out / "grid.md", grid_table(rows))

@@ -63,6 +63,8 @@ EXPERT_WEIGHT = 1.0
 """Of path against effort: objects are pushed only where no way is free."""
 UNDECIDING = ("batch", "episodes", "supersample")
 """Settings that decide no row, or that enter the digest in another way."""
+LATER = ("goal_images",)
+"""Settings that older rows do not have; those count where the setting is at its default."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,6 +90,8 @@ class Contest:
     robot: str = "ttbot"
     domain: str = "clean"
     """The camera that the navigator sees by, goals included: a name of `domains.PRESETS`."""
+    preset: str = ""
+    """The name that rows have for their settings."""
 
     def __post_init__(self) -> None:
         for name in self.contenders:
@@ -202,7 +206,9 @@ class ContestScene:
 
     def request(self, contender: str) -> dict[str, Any]:
         """Return everything that decides the rows of a contender."""
-        config = {k: v for k, v in to_dict(self.contest.config).items() if k not in UNDECIDING}
+        default, config = to_dict(EvaluationConfig()), to_dict(self.contest.config)
+        left_out = {*UNDECIDING, *(name for name in LATER if config[name] == default[name])}
+        config = {k: v for k, v in config.items() if k not in left_out}
         request = {"scene": self.scene.digest, "robot": self.contest.robot, "contender": contender, "settings": config}
         if contender == "ppo":
             assert self.contest.ppo is not None
@@ -328,6 +334,7 @@ def _write(
         "sight": ("truth" if scene.networks is None else "networks") if navigates else "none",
         "domain": scene.contest.domain if navigates else "none",
         "policy": scene.contest.policy if navigates else name,
+        "preset": scene.contest.preset,
         "scene": scene.scene.name,
         "split": scene.scene.split,
         "robot": env.robot.name,

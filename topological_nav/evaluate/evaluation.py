@@ -3,7 +3,7 @@
 Contenders: the navigator on a map, dense or thinned, with trained networks or with the truth in their place; an expert
 that has the map and the poses of all objects; a learned policy that observes the goal's position. All play the
 same episodes under the same rule: an episode is won when a run of 5 s ends within 1.5 m of the goal, or when the
-navigator localises at the goal's node; it is lost after 30 minutes of simulated time.
+navigator localises at the goal's node; it is lost after `limit_s` of simulated time.
 """
 
 import dataclasses
@@ -232,11 +232,14 @@ class NavigatorPlayer(Contender):
         self.state: State | None = None
 
     def begin(self, episodes: DrivenEpisodes) -> None:
-        """Take the goals' images, of the scene at rest, along as many headings as a localisation's."""
-        count = self._navigator.config.images
-        around = 2 * np.pi * np.arange(count) / count
-        n = len(episodes)
-        images = self._camera(np.repeat(episodes.goal_xy_w, count, 0), np.tile(around, n), None)
+        """Take the goals' images, of the scene at rest; see `NavigatorConfig.goal_images`."""
+        config, n = self._navigator.config, len(episodes)
+        count = config.goal_images or config.images
+        around = np.tile(2 * np.pi * np.arange(count) / count, (n, 1))
+        if config.goal_images:
+            drawn = (np.random.default_rng([self.config.seed, 9, number]) for number in episodes.number)
+            around += np.array([rng.uniform(0, 2 * np.pi) for rng in drawn])[:, None]
+        images = self._camera(np.repeat(episodes.goal_xy_w, count, 0), around.ravel(), None)
         images = images.reshape(n, count, *images.shape[1:])
         self.state = self._navigator.start(self._navigator.goal_nodes(images, around))
         self._images = images[:, 0].copy()

@@ -2,6 +2,7 @@
 
 RC is the share of successes with a contact, AADC the seconds in contact of a success, where a run with a contact
 counts as a whole (5 s); both, and the duration, are over successes, as a failure's contacts grow with the time limit.
+AD is the mean duration of all episodes, in simulated seconds.
 A scene's intervals are over its episodes (Wilson's for shares, bootstrap for means); those over scenes are Student's.
 """
 
@@ -23,18 +24,21 @@ SCORES = {
     "rc": "RC",
     "aadc_s": "AADC (s)",
     "duration_s": "duration (s)",
+    "ad_s": "AD (s)",
     "within": "within 1.5 m",
 }
 """Name -> heading; `within` is the share of episodes that ended near the goal, whatever the navigator believed."""
 HEADER = ("contender", "scene", "episodes", *SCORES.values())
 EPISODE = ["scene", "episode"]
-OF_SUCCESSES = {"rc": "contact", "aadc_s": "aadc_s", "duration_s": "duration_s"}
+COLUMN = {"rc": "contact", "ad_s": "duration_s"}
+"""Name of a score -> the column it is of, where that has another name."""
+OF_SUCCESSES = ("rc", "aadc_s", "duration_s")
 NOTHING = Estimate(np.nan, np.nan, np.nan, 0)
 
 
 def score(rows: pa.Table, name: str) -> Estimate:
     """Return one of `SCORES` over the rows' episodes."""
-    values = rows[OF_SUCCESSES.get(name, name)].to_numpy().astype(float)
+    values = rows[COLUMN.get(name, name)].to_numpy().astype(float)
     if name in OF_SUCCESSES:
         values = values[rows["success"].to_numpy() > 0]
     return over_episodes("success" if name in ("rc", "within") else name, values) if len(values) else NOTHING

@@ -19,10 +19,11 @@ class ResNet18(nn.Module):
     """Define the ResNet-18 of He et al. 2016, table 1: stem, then four stages of two residual blocks."""
 
     width: int = 64
+    first_stage: int = 2
 
     @nn.compact
     def __call__(self, x: jax.Array, train: bool) -> tuple[jax.Array, jax.Array]:
-        """Return maps after the third (conv3_x) and the fifth stage (conv5_x): [N, h, w, 2 width], [.., 8 width]."""
+        """Return maps after one of the first stages (2: conv3_x) and the last: [N, h, w, 2 width], [.., 8 width]."""
         x = _conv(self.width, 7, 2)(x)
         x = nn.relu(_norm(train)(x))
         x = nn.max_pool(x, window_shape=(3, 3), strides=(2, 2), padding="SAME")
@@ -31,7 +32,7 @@ class ResNet18(nn.Module):
             for block in range(2):
                 x = _Block(self.width * 2**stage, 2 if stage and not block else 1)(x, train)
             stages.append(x)
-        return stages[1], stages[3]
+        return stages[self.first_stage - 1], stages[3]
 
 
 class _Block(nn.Module):
@@ -69,23 +70,22 @@ class Network(nn.Module):
     """Join a backbone and the head of a task."""
 
     task: str
-    """rooms: two layers with leaky ReLU; passages: an output a length, never more for a longer
-    one; after AlexNet two more layers with dropout."""
+    """passages: an output a length, never more for a longer one; after AlexNet two layers with dropout."""
     backbone: str = "resnet18"
     width: int = 64
     hidden: int = 512
+    """Units of each of two layers with leaky ReLU; 0: none."""
     outputs: int = 1
+    first_stage: int = 2
 
     def setup(self) -> None:
         """Make the parts; flax calls it."""
-        self.body = {"resnet18": ResNet18, "alexnet": AlexNet}[self.backbone](self.width)
-        if self.task == "rooms":
-            self.layers = [nn.Dense(self.hidden), nn.Dense(self.hidden)]
-        elif self.backbone == "alexnet":
-            self.layers = [nn.Dense(64 * self.width), nn.Dense(64 * self.width)]
-            self.drop = nn.Dropout(0.5)
-        else:
-            self.layers = []
+        of_resnet = {"first_stage": self.first_stage} if self.backbone == "resnet18" else {}
+        self.body = {"resnet18": ResNet18, "alexnet": AlexNet}[self.backbone](self.width, **of_resnet)
+        self.drops = self.task == "passages" and self.backbone == "alexnet"
+        units = 64 * self.width if self.drops else self.hidden
+        self.layers = [nn.Dense(units), nn.Dense(units)] if units else []
+        self.drop = nn.Dropout(0.5)
         self.last = nn.Dense(self.outputs)
 
     def __call__(self, images: jax.Array, train: bool = False) -> jax.Array:
@@ -93,10 +93,7 @@ class Network(nn.Module):
         _, x = self.body(normalised(images), train)
         x = x.reshape(len(x), -1) if self.backbone == "alexnet" else x.mean((1, 2))
         for layer in self.layers:
-            if self.task == "passages":
-                x = nn.relu(layer(self.drop(x, deterministic=not train)))
-            else:
-                x = nn.leaky_relu(layer(x))
+            x = nn.relu(layer(self.drop(x, deterministic=not train))) if self.drops else nn.leaky_relu(layer(x))
         x = self.last(x)
         return falling(x) if self.task == "passages" else x
 

@@ -108,7 +108,7 @@ def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host:
     work = _work(task, dataset, config)
     with claimed(out, {"task": task, "dataset": header, **to_dict(config)}):
         outputs, tx = len(work.lengths_m or work.rooms.names), optax.adam(config.learning_rate)
-        network = Network(task, config.network, config.width, config.hidden, outputs)
+        network = Network(task, config.network, config.width, config.hidden, outputs, config.first_stage)
         learner = learning.make_learner(network, (data.height, data.width), tx, config.seed)
         if config.init == "selfsup":
             saved = read_state(out / CHECKPOINT)
@@ -134,6 +134,7 @@ def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host:
             "backbone": config.network,
             "width": config.width,
             "hidden": config.hidden,
+            "first_stage": config.first_stage,
             "outputs": outputs,
             "names": list(work.rooms.names) if task == "rooms" else ["blocked", "free"],
             **({"lengths_m": list(work.lengths_m)} if task == "passages" else {}),
@@ -162,7 +163,8 @@ def load_trained(run: Path) -> Trained:
             "its dataset again and train it again"
         )
     with readable(run / learning.DESCRIPTION, FileError, "train again"):
-        network = Network(about["task"], about["backbone"], about["width"], about["hidden"], about["outputs"])
+        shape = (about["width"], about["hidden"], about["outputs"], about.get("first_stage", 2))
+        network = Network(about["task"], about["backbone"], *shape)
         template = learning.variable_shapes(network, (about["data"]["height"], about["data"]["width"]))
     return Trained(network, learning.read_weights(run, template, about), about, run)
 
@@ -172,12 +174,26 @@ def _work(task: str, dataset: Path, config: NetworkTrainConfig) -> _Work:
     size = rooms.images.shape[3:]
     if task == "passages":
         passages = load_passages(dataset)
-        test, free, groups = passages.test, passages.free.astype(np.int32), {"all": np.arange(int(passages.test.sum()))}
+        test, free = passages.test, passages.free.astype(np.int32)
+        if config.test_scenes:
+            scenes = [scene["name"] for scene in read_header(dataset)[0]["scenes"]]
+            if missing := set(config.test_scenes) - set(scenes):
+                raise FileError(
+                    f"{dataset}: has no scene {', '.join(sorted(missing))}, expected among {', '.join(scenes)}"
+                )
+            test = np.isin(passages.scene, [scenes.index(name) for name in config.test_scenes])
+        groups = {"all": np.arange(int(test.sum()))}
         sides = passages.images[~test], free[~test], passages.images[test], free[test]
         return _Work(rooms, *sides, groups, passages.lengths_m, passages.scored)
     names = PITCHES if config.pitch == "all" else (config.pitch,)
     learned = rooms.images[~rooms.test][:, [PITCHES.index(name) for name in names]]
-    held_out = rooms.images[rooms.test][:, :, ::3]
+    held_out = rooms.images[rooms.test]
+    count, around = len(held_out), held_out.shape[2]
+    turns = np.broadcast_to(np.arange(0, around, 3), (count, around // 3))
+    if config.test_headings == "random":
+        rng = np.random.default_rng([config.seed, 8])
+        turns = np.sort(rng.permuted(np.tile(np.arange(around), (count, 1)), axis=1)[:, : around // 3], 1)
+    held_out = np.take_along_axis(held_out, turns[:, None, :, None, None, None], 2)
     label, truth = (
         np.broadcast_to(rooms.label[test][:, None, None], images.shape[:3]).ravel().astype(np.int32)
         for test, images in ((~rooms.test, learned), (rooms.test, held_out))

@@ -60,9 +60,13 @@ class Sight(Protocol):
 
 
 def place_distances(sight: Sight, images: np.ndarray, heading_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far each node is from places, by each image [P, K, N] and by all [P, N]; images [P, K, ...]."""
+    """Return how far each node is from places, by each image [P, K, N] and by all [P, N]; images [P, K, ...].
+
+    Headings are [K], the same at all places, or [P, K].
+    """
     count, around = images.shape[:2]
-    each = sight.distances(images.reshape(count * around, *images.shape[2:]), np.tile(heading_rad, count))
+    headings_rad = np.broadcast_to(heading_rad, (count, around)).ravel()
+    each = sight.distances(images.reshape(count * around, *images.shape[2:]), headings_rad)
     each = each.reshape(count, around, -1)
     return each, each.sum(1) if sight.summed else each.min(1)
 

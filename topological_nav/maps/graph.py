@@ -227,7 +227,8 @@ def place_nodes(
     """Return where a map's nodes stand, [N, 2] m, and what could not be had, in words.
 
     In every room one place after the other becomes a node, each time the one that has most places within `spacing_m`
-    that no node has yet. A room that needs fewer than `min_per_room` is covered again with less spacing.
+    that no node has yet. A room that needs fewer than `min_per_room` is covered again with less spacing. With random
+    `nodes` a room has one for every square of the spacing, anywhere.
     Then, where `connect` is set, nodes are added along the free way between parts of the map that no free edge joins
     which is shortest where room to the sides counts as well.
     """
@@ -239,6 +240,10 @@ def place_nodes(
         if len(mine) < config.min_per_room:
             lacking.append(f"room {room} has place for {len(mine)} nodes only, expected {config.min_per_room}")
             nodes.append(mine)
+            continue
+        if config.nodes == "random":
+            count = max(config.min_per_room, round(len(mine) * space.resolution_m**2 / config.spacing_m**2))
+            nodes.append(mine[np.random.default_rng([config.seed, room]).permutation(len(mine))[:count]])
             continue
         radius = config.spacing_m
         chosen = _covering(mine, radius, space.resolution_m)

@@ -164,7 +164,7 @@ class Navigator:
         self._ask_m = np.append(np.minimum(ahead_m, config.ahead_m), config.clear_m)
 
     def goal_nodes(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
-        """Return the nodes [B] nearest to goals, by images [B, K, ...] taken there along headings [K]."""
+        """Return the nodes [B] nearest to goals, by images [B, K, ...] taken there along headings [K] or [B, K]."""
         return place_distances(self.sight, images, heading_rad)[1].argmin(-1).astype(np.int32)
 
     def start(self, goal: np.ndarray) -> State:

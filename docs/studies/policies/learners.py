@@ -45,8 +45,8 @@ class Timed(TorchVectorEnv):
         obs, reward, terminated, truncated, info = super().step(actions)
         if info:
             ended = int((terminated | truncated).sum())
-            means = (float(info["episode"][name]) for name in ("success", "ins_0.5"))
-            self.scores.append((len(self.times_s), ended, *means))
+            success, ins = (float(info["episode"][name]) for name in ("success", "ins_0.5"))
+            self.scores.append((len(self.times_s), ended, success, ins))
         self.times_s.append(time.perf_counter())
         return obs, reward, terminated, truncated, info
 

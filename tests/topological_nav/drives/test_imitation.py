@@ -67,7 +67,8 @@ def test_the_forward_model_learns_alone_first_and_then_everything(run):
     assert np.sum(results["test"]["angular"]["confusion"]) == results["test"]["steps"]
 
 
-def test_alone_the_forward_model_leaves_the_policy_as_it_is(frames):
+@pytest.mark.parametrize("consistent", [0.0, 1.0])
+def test_alone_the_forward_model_leaves_the_policy_as_it_is(frames, consistent):
     policy, forward, tx = Policy(6, 4), Forward(5), optax.adam(1e-2)
     params = imitation.fresh_params(policy, forward, 3, 0)
     learner = Learner(params, {"mean": jnp.zeros(3), "deviation": jnp.ones(3)}, tx.init(params))
@@ -81,6 +82,7 @@ def test_alone_the_forward_model_leaves_the_policy_as_it_is(frames):
         "linear": jnp.zeros((4, 20), jnp.int32),
         "angular": jnp.zeros((4, 20), jnp.int32),
         **{"alpha": jnp.float32(10.0), "lam": jnp.float32(0.5), "jointly": jnp.float32(0.0)},
+        "consistent": jnp.float32(consistent),
     }
     after, _ = epoch(learner, jnp.asarray(rng.normal(size=(9, 3)), jnp.float32), labels, jax.random.PRNGKey(0))
     same = jax.tree.map(lambda a, b: bool((np.asarray(a) == b).all()), after.params, before)
@@ -146,7 +148,7 @@ def test_the_command_draws_and_its_grid_is_a_table(made, driven, tmp_path, capsy
     words = ["train", "policy", *runs, "--grid", "-o", str(out), *WORDS, "epochs=2", "mirror=false"]
     assert main(words) == 0
     rows = json.loads((out / "grid.json").read_text())
-    assert [(r["alpha"], r["lambda"]) for r in rows] == imitation.GRID and len(rows) == 9
+    assert [(r["alpha"], r["lambda"]) for r in rows] == imitation.GRIDS["nine"] and len(rows) == 9
     table = (out / "grid.md").read_text()
     assert table.count("\n") == 11 and table in capsys.readouterr().out
     assert len(list(out.glob("alpha-*-lambda-*/curves.png"))) == 9

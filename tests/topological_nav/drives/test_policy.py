@@ -114,6 +114,8 @@ def test_the_loss_by_hand():
     assert float(loss) == pytest.approx(10 * (ce_linear + ce_angular) + 0.25 + 0.5 * 4.0, abs=1e-5)
     alone, _ = policy_loss(*arguments, alpha=10.0, lam=0.5, jointly=0.0)
     assert float(alone) == pytest.approx(0.25)
+    first, _ = policy_loss(*arguments, alpha=10.0, lam=0.5, jointly=0.0, consistent=1.0)  # the report's equation 1
+    assert float(first) == pytest.approx(0.25 + 0.5 * 4.0)
 
 
 def test_a_mean_over_nothing_is_zero():

@@ -63,6 +63,7 @@ def test_scores_by_hand():
             "rc": 2 / 3,  # of the three successes two had a contact
             "aadc_s": 5.0,  # (2 + 0 + 1) runs of 5 s over three successes
             "duration_s": 30.0,
+            "ad_s": 472.5,  # (30 + 20 + 40 + 1800) / 4
             "within": 0.5,  # the third believed to be at the goal's node, 2 m away
         }
     )
