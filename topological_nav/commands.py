@@ -300,10 +300,8 @@ def run_train(arguments: Any) -> None:
 
 def _policy(arguments: Any) -> None:
     config = configured(configs.PolicyConfig(), arguments.settings, "policy")
-    if arguments.grid:
-        refuse_unused(arguments, "alpha lam", "with --grid, which takes several")
-    else:
-        refuse_unused(arguments, "pairs", "without --grid")
+    unused = ("alpha lam", "with --grid, which takes several") if arguments.grid else ("pairs", "without --grid")
+    refuse_unused(arguments, *unused)
     out = arguments.out or RUNS / ("policy-grid" if arguments.grid else "policy")
     with terminal() as host:
         runs = arguments.localiser or RUNS / "rooms", arguments.detector or RUNS / "passages"
@@ -382,10 +380,8 @@ def _adapt_passages(arguments: Any, config: AdaptConfig, host: Host) -> None:
     results = adaptation.passage_configurations(arguments.detector, arguments.target, out, config, host)
     images = load_passages(arguments.target).images
     captured = as_seen(images, preset(config.domain))
-    save(
-        figures.passages_figure(images, captured, read_metrics(out / "metrics.jsonl"), results),
-        out / "configurations.png",
-    )
+    figure = figures.passages_figure(images, captured, read_metrics(out / "metrics.jsonl"), results)
+    save(figure, out / "configurations.png")
     for name, (from_source, tunes) in adaptation.CONFIGURATIONS.items():
         row, start = results[name], "the source's weights" if from_source else "fresh weights"
         how = f"{start}{', fine-tuned' if tunes else ''}"

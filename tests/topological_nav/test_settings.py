@@ -7,8 +7,9 @@ import pytest
 
 from interactive_nav_common.config import Bounds, Settings, overlay, overridden, settings_help, to_dict
 from interactive_nav_common.errors import ConfigError
-from topological_nav.config import TASKS, DataConfig, HeadingConfig, NetworkTrainConfig, PolicyConfig
+from topological_nav.config import TASKS, DataConfig, NetworkTrainConfig, PolicyConfig
 from topological_nav.data.domains import AdaptConfig
+from topological_nav.ros import HeadingConfig
 
 
 def test_words_are_read_by_the_types_of_the_settings():

@@ -17,7 +17,8 @@ from interactive_nav_common.config import overridden, refuse_unused, settings_he
 from interactive_nav_common.errors import UserError, reports_errors
 from interactive_nav_common.jobs.progress import say
 from interactive_nav_common.signals import stop_signals
-from topological_nav.config import HeadingConfig, NavigatorConfig
+from topological_nav.config import NavigatorConfig
+from topological_nav.ros import HeadingConfig
 
 DRIVERS = {"heading": HeadingConfig, "topological": NavigatorConfig}
 """Driver -> its settings."""

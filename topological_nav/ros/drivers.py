@@ -13,13 +13,14 @@ from interactive_nav import get_robot
 from interactive_nav.ros.messages import seen_through
 from interactive_nav_common.errors import ConfigError, UserError
 from scenes_mjcf.look import Lens
-from topological_nav.config import HeadingConfig, NavigatorConfig
+from topological_nav.config import NavigatorConfig
 from topological_nav.data.folders import lens_of
 from topological_nav.drives.driving import local_policy
 from topological_nav.learn.training import load_networks
 from topological_nav.maps.build import NetworkSight
 from topological_nav.maps.graph import load_map
 from topological_nav.navigate.navigator import Navigator, State
+from topological_nav.ros import HeadingConfig
 from topological_nav.weights.export import Choice
 
 

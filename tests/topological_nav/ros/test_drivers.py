@@ -8,7 +8,7 @@ import pytest
 
 from interactive_nav_common.errors import UserError
 from scenes_mjcf.look import Lens
-from topological_nav.config import HeadingConfig
+from topological_nav.ros import HeadingConfig
 from topological_nav.ros.drivers import HeadingDriver, PilotDriver, VelocityCommand
 
 PICTURE = np.zeros((2, 2, 3), np.uint8)

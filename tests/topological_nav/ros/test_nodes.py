@@ -14,7 +14,7 @@ from interactive_nav.ros import messages, nodes
 from interactive_nav.ros.nodes import RosError, SimulatorNode, ros_node
 from interactive_nav.ros.simulator import Pace, Sensed
 from scenes_mjcf.look import Lens
-from topological_nav.config import HeadingConfig
+from topological_nav.ros import HeadingConfig
 from topological_nav.ros import nodes as navigator_nodes
 from topological_nav.ros.drivers import HeadingDriver, VelocityCommand
 from topological_nav.ros.nodes import Headings, NavigatorNode
