@@ -111,11 +111,11 @@ def _refuse_unused(arguments: Any, contest: Contest) -> None:
     names = set(contest.contenders)
     who = f"without a contender that needs it (contenders: {', '.join(contest.contenders)})"
     if not names & {"dense", "sparse"}:
-        navigators = {f.name for f in dataclasses.fields(configs.NavigatorConfig)} - {"limit_s", "run_s"}
+        navigators = {f.name for of in (configs.NavigatorConfig, configs.GapConfig) for f in dataclasses.fields(of)}
         refuse_unused(arguments, "--truth --maps --localiser --detector --policy supersample", who)
         if arguments.domain != "clean":
             refuse_unused(arguments, "--domain", who)
-        refuse_unused(arguments, " ".join(sorted(navigators)), who)
+        refuse_unused(arguments, " ".join(sorted(navigators - {"limit_s", "run_s"})), who)
     if "sparse" not in names:
         refuse_unused(arguments, "thinned", who)
     if arguments.truth:

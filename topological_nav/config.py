@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from interactive_nav_common.config import Bounds, Count, Natural, Seed, Settings, Share
 from interactive_nav_common.errors import ConfigError
+from topological_nav.gap import GapConfig
 
 PITCHES = ("up", "level", "down")
 """Order of a position's images by pitch."""
@@ -233,8 +234,8 @@ class NavigatorConfig(Settings):
 
 
 @dataclasses.dataclass(frozen=True)
-class EvaluationConfig(NavigatorConfig):
-    """Set the navigator, its episodes, and how they are scored."""
+class EvaluationConfig(GapConfig, NavigatorConfig):
+    """Set the navigator, its robot, its episodes, and how they are scored."""
 
     seed: Seed = 0
     """Of the episodes."""

@@ -13,7 +13,6 @@ from topological_nav.__main__ import main
 from topological_nav.learn.networks import squares_between
 from topological_nav.maps import build
 from topological_nav.maps.graph import load_map
-from topological_nav.ros.__main__ import main as nodes
 from topological_nav.scenes import space as rooms
 from topological_nav.scenes.rendering import SceneRenderer
 
@@ -135,20 +134,6 @@ def test_what_would_change_nothing_is_refused(words, unused, capsys):
     assert main(words) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"topological_nav: {unused} has no effect ") and error.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("words", "unused"),
-    [
-        (["--map", "M"], "--map"),
-        (["--goal", "G"], "--goal"),
-        (["--policy", "passage"], "--policy"),
-    ],
-)
-def test_what_a_node_would_not_look_at_is_refused(words, unused, capsys):
-    assert nodes(words) == 2
-    error = capsys.readouterr().err
-    assert error.startswith(f"topological_nav.ros: {unused} has no effect ") and error.count("\n") == 1
 
 
 def test_a_stop_before_the_work_begins_is_one_line(monkeypatch, capsys):

@@ -9,7 +9,6 @@ from interactive_nav_common.config import Bounds, Settings, overlay, overridden,
 from interactive_nav_common.errors import ConfigError
 from topological_nav.config import TASKS, DataConfig, NetworkTrainConfig, PolicyConfig
 from topological_nav.data.domains import AdaptConfig
-from topological_nav.ros import HeadingConfig
 
 
 def test_words_are_read_by_the_types_of_the_settings():
@@ -68,8 +67,6 @@ def test_help_names_every_setting_with_its_meaning():
     [
         (PolicyConfig, "learning_rate", 0.0),
         (AdaptConfig, "critic_learning_rate", 11.0),
-        (HeadingConfig, "heading_rad", 6.3),
-        (HeadingConfig, "gain", 0.0),
     ],
 )
 def test_ranges_with_small_ends_are_checked(kind, name, wrong):

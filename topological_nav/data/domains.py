@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import convolve1d, map_coordinates
 
 from interactive_nav_common.config import Bounds, Count, Seed, Settings, Share
 from interactive_nav_common.errors import ConfigError
@@ -179,11 +179,7 @@ def smeared(light: np.ndarray, way_px: float) -> np.ndarray:
     whole = math.floor(half)
     weights = np.ones(2 * whole + 3)
     weights[[0, -1]] = half - whole
-    weights /= weights.sum()
-    reach = whole + 1
-    padded = np.pad(light, ((0, 0), (reach, reach), (0, 0)), mode="edge")
-    width = light.shape[1]
-    return sum(w * padded[:, k : k + width] for k, w in enumerate(weights))  # type: ignore[return-value]
+    return convolve1d(light, weights / weights.sum(), axis=1, mode="nearest")
 
 
 def _through_lens(light: np.ndarray, zoom: float, barrel: float) -> np.ndarray:

@@ -116,12 +116,8 @@ def window(velocity: jax.Array, config: ExpertConfig) -> tuple[jax.Array, jax.Ar
 def arcs(linear: jax.Array, angular: jax.Array, times_s: jax.Array) -> jax.Array:
     """Return poses [C, K, 3] in the frame where constant velocities [C] start, after times [K]."""
     turn = angular[:, None] * times_s[None]
-    length = linear[:, None] * times_s[None]
-    small = jnp.abs(turn) < 1e-4
-    safe = jnp.where(small, 1.0, turn)
-    along = jnp.where(small, 1.0, jnp.sin(safe) / safe)
-    aside = jnp.where(small, turn / 2, (1.0 - jnp.cos(safe)) / safe)
-    return jnp.stack([length * along, length * aside, turn], -1)
+    chord = linear[:, None] * times_s[None] * jnp.sinc(turn / (2 * jnp.pi))
+    return jnp.stack([chord * jnp.cos(turn / 2), chord * jnp.sin(turn / 2), turn], -1)
 
 
 def scan_gap(poses_b: jax.Array, points_b: jax.Array, half_m: jax.Array) -> jax.Array:

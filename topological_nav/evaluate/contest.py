@@ -47,6 +47,7 @@ from topological_nav.evaluate.evaluation import (
     draw_episodes,
     learned,
 )
+from topological_nav.gap import GapConfig
 from topological_nav.learn.training import Networks, load_networks
 from topological_nav.maps.build import NetworkSight, Sight, TrueSight, drawn_for, renderer_of, true_map
 from topological_nav.maps.graph import TopologicalMap, load_map
@@ -63,7 +64,7 @@ EXPERT_WEIGHT = 1.0
 """Of path against effort: objects are pushed only where no way is free."""
 UNDECIDING = ("batch", "episodes", "supersample")
 """Settings that decide no row, or that enter the digest in another way."""
-LATER = ("goal_images",)
+LATER = ("goal_images", *(f.name for f in dataclasses.fields(GapConfig)))
 """Settings that older rows do not have; those count where the setting is at its default."""
 
 

@@ -22,6 +22,7 @@ from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.grids import label
 from interactive_nav_common.rows import Rows, column, fresh
 from topological_nav.config import EvaluationConfig
+from topological_nav.gap import Gap
 from topological_nav.navigate.navigator import Events, Navigator, State
 from topological_nav.scenes.rendering import Camera, Snapshot, episode_starts
 from topological_nav.scenes.space import FreeSpace, Rooms
@@ -243,23 +244,31 @@ class NavigatorPlayer(Contender):
         images = images.reshape(n, count, *images.shape[1:])
         self.state = self._navigator.start(self._navigator.goal_nodes(images, around))
         self._images = images[:, 0].copy()
+        half_m = self.player.env.robot.body_width_m / 2
+        self._gap = Gap(self.config, self.config.seed, episodes.number, half_m)
 
     def keep(self, rows: np.ndarray) -> None:
         """See `Contender`."""
         assert self.state is not None
         self.state, self._images = self.state.take(rows), self._images[rows]
+        self._shot = tuple(part[rows] for part in self._shot)
+        self._gap.keep(rows)
 
     def step(self, state: Any, now: Snapshot, running: np.ndarray, step: int) -> tuple[Any, Events]:
         """See `Contender`."""
         assert self.state is not None
         time_s, robot = step * self.player.env.dt, self.player.env.robot
+        heading = self._gap.heading(now.yaw_rad, time_s)
+        if step % self.config.image_steps == 0:
+            self._shot = now.xy_w, now.yaw_rad, now.qpos
         mind = self._navigator.stop(self.state, ~running)
-        looks = np.flatnonzero(self._navigator.looks(mind, now.yaw_rad, time_s))
+        looks = np.flatnonzero(self._navigator.looks(mind, heading, time_s))
         if len(looks):  # the others keep an old image, which nobody looks at
-            self._images[looks] = self._camera(now.xy_w[looks], now.yaw_rad[looks], now.qpos[looks])
-        self.state = self._navigator.step(mind, self._images, now.yaw_rad, time_s)
+            self._images[looks] = self._camera(*(part[looks] for part in self._shot))
+        self.state = self._navigator.step(mind, self._images, heading, time_s)
         self._watch(time_s, now, self.state)
-        return np.asarray(robot.drive(self.state.linear, self.state.angular, np), np.float32), self.state
+        executed = self._gap.executed(self.state.linear, self.state.angular, step)
+        return np.asarray(robot.drive(*executed, np), np.float32), self.state
 
 
 Act = Callable[[Any, np.ndarray, np.ndarray, int], Any]

@@ -7,21 +7,17 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import UseAppendAction
 
 from interactive_nav.ros.commands import need_ros
 from interactive_nav_common.commands import Command, Words, option, parse
-from interactive_nav_common.config import overridden, refuse_unused, settings_help
-from interactive_nav_common.errors import UserError, reports_errors
+from interactive_nav_common.config import overridden, settings_help
+from interactive_nav_common.errors import reports_errors
 from interactive_nav_common.jobs.progress import say
 from interactive_nav_common.signals import stop_signals
 from topological_nav.config import NavigatorConfig
-from topological_nav.ros import HeadingConfig
-
-DRIVERS = {"heading": HeadingConfig, "topological": NavigatorConfig}
-"""Driver -> its settings."""
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -29,15 +25,13 @@ class Navigator(Command):
     """Run the navigator as a node of ROS 2, for a robot or a simulator."""
 
     settings: Words = ()
-    """Change settings of the driver, listed below."""
-    driver: Literal["heading", "topological"] = "heading"
-    """What decides on velocities."""
+    """Change settings of the navigator, listed below."""
+    map: Annotated[Path, option(metavar="PATH")]
+    """Of `python -m topological_nav map`."""
     heading_from: Literal["imu", "odom"] = "imu"
     """Topic of the heading."""
     heading_offset: Annotated[float, option(metavar="RAD")] = 0.0
     """Of that frame in the map's."""
-    map: Annotated[Path | None, option(metavar="PATH")] = None
-    """Of `python -m topological_nav map`."""
     localiser: Annotated[Path | None, option(metavar="RUN")] = None
     """Network that embeds images (default: a trained one, else the packaged)."""
     detector: Annotated[Path | None, option(metavar="RUN")] = None
@@ -46,30 +40,13 @@ class Navigator(Command):
     """Drives along edges; or passage (default: as the networks, if none is named)."""
     goal: Annotated[UseAppendAction[tuple[Path, ...]], option(metavar="PICTURE")] = ()
     """Taken at the goal."""
-    goal_heading: Annotated[float | None, option(metavar="RAD")] = None
-    """Along which the first was (default: 0)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.driver == "heading":
-            options = "--map --localiser --detector --policy --goal --goal-heading"
-            refuse_unused(self, options, "with --driver heading, only with --driver topological")
+    goal_heading: Annotated[float, option(metavar="RAD")] = 0.0
+    """Along which the first was."""
 
     @classmethod
     def epilog(cls) -> str:
-        """Return the settings of both drivers."""
-        drivers = DRIVERS.items()
-        return "\n".join(f"settings of driver {name} (key=default):\n{settings_help(of())}" for name, of in drivers)
-
-    def choose(self) -> Any:
-        """Return the networks that are named, or used where none are."""
-        from topological_nav.weights.export import choose
-
-        if self.map is None:
-            raise UserError("--driver topological needs a map: --map PATH")
-        chosen = choose(self.localiser, self.detector, self.policy)
-        chosen.report()
-        return chosen
+        """Return the settings."""
+        return f"settings (key=default):\n{settings_help(NavigatorConfig())}"
 
 
 @reports_errors("topological_nav.ros")
@@ -77,18 +54,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the navigator's node."""
     with stop_signals() as stops:
         arguments = parse(Navigator, "python -m topological_nav.ros", argv)
-        config = overridden(DRIVERS[arguments.driver](), arguments.settings)
-        chosen = arguments.choose() if arguments.driver == "topological" else None
+        config = overridden(NavigatorConfig(), arguments.settings)
         need_ros("topological_nav.ros")
         from interactive_nav.ros.nodes import ros_node
-        from topological_nav.ros import drivers
+        from topological_nav.ros.drivers import topological_driver
         from topological_nav.ros.nodes import NavigatorNode
+        from topological_nav.weights.export import choose
 
-        if chosen is None:
-            driver: drivers.Driver = drivers.HeadingDriver(config)
-        else:
-            goal = arguments.goal, arguments.goal_heading or 0.0
-            driver = drivers.topological_driver(arguments.map, chosen, *goal, config)
+        chosen = choose(arguments.localiser, arguments.detector, arguments.policy)
+        chosen.report()
+        driver = topological_driver(arguments.map, chosen, arguments.goal, arguments.goal_heading, config)
         with ros_node("navigator") as node:
             navigator = NavigatorNode(node, driver, arguments.heading_from, arguments.heading_offset, say)
             done = navigator.run(lambda: bool(stops))

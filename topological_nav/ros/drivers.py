@@ -20,7 +20,6 @@ from topological_nav.learn.training import load_networks
 from topological_nav.maps.build import NetworkSight
 from topological_nav.maps.graph import load_map
 from topological_nav.navigate.navigator import Navigator, State
-from topological_nav.ros import HeadingConfig
 from topological_nav.weights.export import Choice
 
 
@@ -50,30 +49,6 @@ class Driver(Protocol):
     def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> VelocityCommand:
         """Return the next command, by a level image [H, W, 3] u8 straight ahead and the yaw in the map's frame."""
         ...
-
-
-class HeadingDriver:
-    """Turn to a heading and drive along it without looking at pictures: for tests and for trying out a robot."""
-
-    lens: Lens | None = None
-
-    def __init__(self, config: HeadingConfig):
-        self._config = config
-        self._since: float | None = None
-
-    def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> VelocityCommand:
-        """See `Driver.step`."""
-        del image
-        config = self._config
-        error = math.remainder(config.heading_rad - heading_rad, math.tau)
-        turn = min(max(config.gain * error, -config.max_angular_radps), config.max_angular_radps)
-        if self._since is None:
-            if abs(error) > config.tolerance_rad:
-                return VelocityCommand(0.0, turn)
-            self._since = time_s
-        if time_s - self._since >= config.drive_s - 1e-6:
-            return VelocityCommand(0.0, 0.0, done=True)
-        return VelocityCommand(config.linear_mps, turn)
 
 
 class PilotDriver:

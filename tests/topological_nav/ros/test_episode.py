@@ -35,7 +35,7 @@ def words_of(base, node):
 def episode(tmp_path_factory):
     base = tmp_path_factory.mktemp("episode")
     # Relative paths are relative to the folder in which the command was given.
-    words = words_of(base, "-m topological_nav.ros drive_s=2 heading_rad=0 linear_mps=0.5")
+    words = words_of(base, Path(__file__).with_name("turning.py"))
     ran = subprocess.run([*words, "--lockstep", "--bag", "bag"], cwd=base, capture_output=True, text=True)
     assert ran.returncode == 0, ran.stdout + ran.stderr
     store, read = get_typestore(Stores.ROS2_KILTED), {}
@@ -104,10 +104,10 @@ def test_pictures_scans_and_clock_hold_what_was_sensed(episode):
 
 @pytest.mark.slow
 def test_a_failed_node_is_in_the_exit_code(tmp_path):
-    words = words_of(tmp_path, "-m topological_nav.ros linear_mps=5")
+    words = words_of(tmp_path, "-m topological_nav.ros --map x.npz passable=5")
     ran = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
     first, last = ran.stderr.splitlines()[:: len(ran.stderr.splitlines()) - 1]
-    assert ran.returncode == 2 and first.startswith("topological_nav.ros: setting: linear_mps is 5.0"), ran.stderr
+    assert ran.returncode == 2 and first.startswith("topological_nav.ros: setting: passable is 5.0"), ran.stderr
     assert last == f"interactive_nav.ros: {sys.executable} ended with exit code 2; its message is above"
 
 
@@ -129,11 +129,11 @@ def test_a_stop_is_in_the_exit_code_and_ends_both_nodes(number, tmp_path):
     ("words", "told"),
     [
         (["hight=3"], "unknown key 'hight'"),
-        (["linear_mps=5"], "linear_mps is 5.0, expected between -2 and 2"),
+        (["passable=5"], "passable is 5.0, expected between 0 and 1"),
     ],
 )
 def test_mistakes_are_one_line(words, told, capsys):
-    assert main(words) == 2
+    assert main(["--map", "x.npz", *words]) == 2
     error = capsys.readouterr().err
     assert error.startswith("topological_nav.ros: ") and told in error and error.count("\n") == 1
 
@@ -148,6 +148,6 @@ def test_a_node_that_is_no_program_is_one_line(tmp_path, capsys):
 
 def test_without_rclpy_the_command_that_installs_it_is_named(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "rclpy", None)
-    assert main([]) == 2
+    assert main(["--map", "x.npz"]) == 2
     error = capsys.readouterr().err
     assert "needs rclpy" in error and "pip install 'interactive-nav[ros2]'" in error and error.count("\n") == 1

@@ -14,9 +14,9 @@ from interactive_nav.ros import messages, nodes
 from interactive_nav.ros.nodes import RosError, SimulatorNode, ros_node
 from interactive_nav.ros.simulator import Pace, Sensed
 from scenes_mjcf.look import Lens
-from topological_nav.ros import HeadingConfig
+from tests.topological_nav.ros.turning import Turning
 from topological_nav.ros import nodes as navigator_nodes
-from topological_nav.ros.drivers import HeadingDriver, VelocityCommand
+from topological_nav.ros.drivers import VelocityCommand
 from topological_nav.ros.nodes import Headings, NavigatorNode
 
 
@@ -80,8 +80,7 @@ def together(simulator, navigator):
 
 def test_an_episode_in_lockstep_has_one_command_for_each_picture(bus):
     simulator = SimulatorNode(bus.simulator, Robot(), Pace(lockstep=True, recorded=True))  # type: ignore[arg-type]
-    config = HeadingConfig(heading_rad=math.pi / 2, linear_mps=0.5, drive_s=2.0)
-    tally, done = together(simulator, NavigatorNode(bus.navigator, HeadingDriver(config)))
+    tally, done = together(simulator, NavigatorNode(bus.navigator, Turning(math.pi / 2)))
     # 20 steps of 0.05 m along the world's y; half of them and more beyond 0.5 m, where the robot touches something.
     assert done and tally.done
     assert (tally.seconds, tally.path_m, tally.structure_s) == pytest.approx((2.0, 1.0, 0.0))

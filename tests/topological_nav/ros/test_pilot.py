@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from interactive_nav_common.commands import parse
 from interactive_nav_common.errors import ConfigError
 from topological_nav.config import NavigatorConfig
 from topological_nav.data.dataset import load_rooms
 from topological_nav.learn.training import load_trained
 from topological_nav.maps.graph import load_map
-from topological_nav.ros.__main__ import Navigator, main
+from topological_nav.ros.__main__ import main
 from topological_nav.ros.drivers import topological_driver
 from topological_nav.weights.export import choose
 
@@ -49,17 +48,11 @@ def test_out_of_time_it_is_done(made, goal):
     assert driver.step(goal[1], 0.5, 11.0).done
 
 
-def test_networks_are_read_from_words(made):
-    words = ["--map", str(made.map), "--localiser", str(made.rooms), "--detector", str(made.passages)]
-    chosen = parse(Navigator, "", ["--driver", "topological", *words, "--policy", "passage"]).choose()
-    assert (chosen.localiser, chosen.detector, chosen.policy) == (made.rooms, made.passages, "passage")
-
-
 def test_what_is_missing_is_told(made, tmp_path, capsys):
     with pytest.raises(ConfigError, match="no goal; name a picture"):
         topological_driver(made.map, seeing(made), (), 0.0, NavigatorConfig())
     (tmp_path / "goal.png").write_text("no")
     with pytest.raises(ConfigError, match="is no picture that can be read"):
         topological_driver(made.map, seeing(made), (tmp_path / "goal.png",), 0.0, NavigatorConfig())
-    assert main(["--driver", "topological"]) == 2
-    assert "needs a map: --map PATH" in capsys.readouterr().err
+    assert main([]) == 2
+    assert "missing --map" in capsys.readouterr().err

@@ -12,7 +12,6 @@ from PIL import Image
 
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
-from interactive_nav_common.commands import parse
 from interactive_nav_common.config import overlay
 from interactive_nav_common.errors import FileError
 from topological_nav.__main__ import main
@@ -22,7 +21,6 @@ from topological_nav.drives.driving import load_policy
 from topological_nav.learn.training import load_networks
 from topological_nav.maps.build import drawn_for, renderer_of
 from topological_nav.maps.graph import load_map, save_map
-from topological_nav.ros.__main__ import Navigator
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.space import find_rooms, free_space, recorded_rooms
 from topological_nav.weights import export as packaged
@@ -177,14 +175,6 @@ def test_rows_of_exported_networks_are_not_those_of_the_runs(made, exported):
         asked.append(contest_scenes(contest)[0].request("dense"))
     assert asked[0]["map"] == asked[1]["map"] and "localiser" not in asked[0]
     assert asked[1]["detector"] == f"{asked[0]['detector']}-fp16" and asked[1]["localiser"].endswith("-fp16")
-
-
-@pytest.mark.heavy
-def test_the_robots_navigator_uses_the_package_too(made, exported, here, capsys):
-    shutil.copytree(exported, here)
-    chosen = parse(Navigator, "", ["--driver", "topological", "--map", str(made.map)]).choose()
-    assert (chosen.localiser, chosen.detector) == (here / "rooms", here / "passages")
-    assert chosen.policy == str(here / "policy") and "of the package" in capsys.readouterr().err
 
 
 needs_weights = pytest.mark.skipif(
