@@ -106,8 +106,7 @@ class Generate(Command):
             _, seed = with_seeds(self.seed, lambda seed: generate_building(self.out, seed, report, config))
         console.print(
             f"{self.out}: building of {seed}; convert it with "
-            f"'python -m converters convert {shlex.quote(str(self.out))} SCENE_DIR'",
-            soft_wrap=True,
+            f"'python -m converters convert {shlex.quote(str(self.out))} SCENE_DIR'"
         )
 
 
@@ -142,9 +141,8 @@ class GenerateScenes(OnCluster):
             self.count, self.seed = self.count or 10, SEEDS if self.seed is None else self.seed
         else:
             refuse_unused(self, "--count --seed", "without --tier")
-        log = functools.partial(console.print, soft_wrap=True, highlight=False)
         with stage_progress(console) as report:
-            failed = generate_scenes(self, report, log)
+            failed = generate_scenes(self, report, console.print)
         return 1 if failed else 0
 
 
@@ -162,8 +160,7 @@ class MakeScenes(Command):
         from converters.many import make_packaged
 
         with stage_progress(console) as report:
-            log = functools.partial(console.print, soft_wrap=True, highlight=False)
-            failed = make_packaged(self.names, functools.partial(GenerateScenes, jobs=self.jobs), report, log)
+            failed = make_packaged(self.names, functools.partial(GenerateScenes, jobs=self.jobs), report, console.print)
         return 1 if failed else 0
 
 
@@ -199,7 +196,7 @@ class Models(Command):
         from converters.check.pictures import model_sheet
 
         count = model_sheet(self.output, self.names)
-        console.print(f"{self.output}: picture of {count} models", soft_wrap=True)
+        console.print(f"{self.output}: picture of {count} models")
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -221,7 +218,7 @@ class Get(Command):
 
         target = self.out or library_folder()
         files = fetch(self.given, target, self.overwrite)
-        console.print(f"{target}: {len(files)} furniture libraries, checked by digest", soft_wrap=True)
+        console.print(f"{target}: {len(files)} furniture libraries, checked by digest")
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -246,7 +243,7 @@ class Build(Command):
             checked(given, path.stem, path.read_bytes() if path.is_file() else None)
         with stage_progress(console) as report:
             count = build(files, self.out, self.jobs, report)
-        console.print(f"{self.out}: {count} models with their hulls, and ATTRIBUTION.md", soft_wrap=True)
+        console.print(f"{self.out}: {count} models with their hulls, and ATTRIBUTION.md")
 
 
 @dataclasses.dataclass(kw_only=True)

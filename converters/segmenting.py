@@ -101,7 +101,7 @@ def label_unlabelled(arguments: Any, console: Console) -> None:
     target = _beside(arguments.source, "labels.npz")
     if not target.exists():
         return _label(arguments, target, None, console)
-    console.print(f"{target}: is there, kept", soft_wrap=True)
+    console.print(f"{target}: is there, kept")
 
 
 def propose_unproposed(arguments: Any, console: Console) -> Path | None:
@@ -116,7 +116,7 @@ def propose_unproposed(arguments: Any, console: Console) -> Path | None:
     if (source / ALIGNMENTS).exists():
         return None
     if target.exists():
-        console.print(f"{target}: is there, kept", soft_wrap=True)
+        console.print(f"{target}: is there, kept")
         return target
     library = arguments.library or (source if (source / "cad").is_dir() else None)
     with stage_progress(console) as report:
@@ -126,13 +126,13 @@ def propose_unproposed(arguments: Any, console: Console) -> Path | None:
     placed, models = [p for p, model in pairs if model], [model for _, model in pairs if model]
     text = json.dumps(as_scan2cad(source.stem, tuple(placed), dict(enumerate(models))), indent=1, allow_nan=False)
     write_text(target, text + "\n")
-    console.print(f"{target}: {len(models)} models", soft_wrap=True)
+    console.print(f"{target}: {len(models)} models")
     counts = np.bincount(np.concatenate([classes_of(floor.scan.labels) for floor in floors]), minlength=len(NAMES))
     unfit = [name for name in UNFIT if counts[NAMES.index(name)] >= MIN_VOXELS]
     lines = given_up([p for p, model in pairs if model is None], ())
     lines += (f"labelled, and never given a model: {', '.join(unfit)}",) if unfit else ()
     for line in (*lines, *((f"{_annotate(source)} places models by hand",) if lines else ())):
-        console.print(f"{source}: {line}", soft_wrap=True, highlight=False)
+        console.print(f"{source}: {line}")
     return target
 
 
@@ -158,7 +158,7 @@ def _label(arguments: Any, target: Path, weights: Path | None, console: Console)
     with stage_progress(console) as report:
         labels = label_scan(_read(arguments), scores, report)
     write_arrays(target, label=labels.astype("uint8"))
-    console.print(f"{target}: labels of {len(labels)} vertices", soft_wrap=True)
+    console.print(f"{target}: labels of {len(labels)} vertices")
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -177,7 +177,7 @@ class SegmentTrain(Command):
 
         config = overridden(SegmentConfig(), self.settings)
         with stage_progress(console) as report:
-            scores = train(self.out, config, report, lambda line: console.print(line, soft_wrap=True))
+            scores = train(self.out, config, report, lambda line: console.print(line))
         _table(console, "held-out crops", scores)
 
 
@@ -205,8 +205,7 @@ class SegmentScore(Command):
                 _table(console, str(source), score["iou"])
                 console.print(
                     f"{source}: {score['matched']} of {score['objects']} annotated objects are recognised, "
-                    f"{score['matched_true']} with the scan's labels",
-                    soft_wrap=True,
+                    f"{score['matched_true']} with the scan's labels"
                 )
             if self.homes:
                 # Whole buildings of other seeds than those whose crops the training was watched by.
@@ -217,7 +216,7 @@ class SegmentScore(Command):
 def _table(console: Console, what: str, iou: dict[str, float]) -> None:
     mean = iou.get("mean", sum(iou.values()) / max(len(iou), 1))
     row = ", ".join(f"{name} {value:.3f}" for name, value in iou.items() if name != "mean")
-    console.print(f"{what}: mIoU {mean:.3f}; {row}", soft_wrap=True, highlight=False)
+    console.print(f"{what}: mIoU {mean:.3f}; {row}")
 
 
 def proposal_tables(proposed: Any) -> Iterator[Table]:
@@ -270,7 +269,7 @@ class Propose(WithLibrary):
             proposed = propose(raw, self.output, library, report)
         for table in proposal_tables(proposed):
             console.print(table)
-        console.print(f"{self.output}: proposals.json and proposals.png", soft_wrap=True)
+        console.print(f"{self.output}: proposals.json and proposals.png")
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -304,7 +303,7 @@ class Annotate(MeshFile, WithLibrary):
             session = store.save(store.open(raw, lambda: start(raw, proposals)))
             server, address = guarded_server(self.host, self.port, raw.name, "annotate")
             page = Page(server, store, session, raw, proposals)
-            console.print(f"{address} (Ctrl-C ends it; every action is saved)", soft_wrap=True, highlight=False)
+            console.print(f"{address} (Ctrl-C ends it; every action is saved)")
             try:
                 threading.Event().wait()
             except KeyboardInterrupt as stop:
@@ -312,5 +311,5 @@ class Annotate(MeshFile, WithLibrary):
             server.stop()
         states = [item.state for item in page.session.items]
         counts = ", ".join(f"{states.count(word)} {word}" for word in ("accepted", "skipped", "open"))
-        console.print(f"{self.output}: {counts}", soft_wrap=True)
+        console.print(f"{self.output}: {counts}")
         return 0 if number == signal.SIGINT else 128 + number

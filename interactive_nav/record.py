@@ -260,15 +260,6 @@ def _write_frames(frames: Iterator[np.ndarray], path: Path, rate: float, hold_s:
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=shown_ms, loop=0, **words)
 
 
-def replay_of(run: Path, episode: int, policy: str, out: Path) -> Path:
-    """Return where a run keeps the replay of an episode."""
-    path = replay_path(run, policy, episode)
-    if not path.is_file():
-        words = f"{run} --episode {episode} --policy {policy} -o {out}"
-        raise ReplayError(f"{path}: no such replay; play the episode and draw it: python -m train.record {words}")
-    return path
-
-
 @dataclasses.dataclass(kw_only=True)
 class Picture(Command):
     """Make a video of an episode."""
@@ -296,19 +287,29 @@ class Picture(Command):
             need_rerun()
             refuse_unused(self, "--views", "with --rerun, which makes no video")
 
-    def record(self, source: Path, console: Console) -> None:
-        """Draw a replay."""
-        replay = load_replay(source)
-        compositor = Compositor(replay, load_scene(replay.scene), self.height, self.views)
-        with progress_bar(console, "frames", -(-replay.num_steps // self.every) + 1, transient=True) as update:
-            how: Any = self.every, lambda n: update(completed=n)
-            if self.rerun:
-                frames = write_recording(replay, compositor._view, self.rerun, self.height // 3, *how)
-            else:
-                frames = write_video(compositor, self.out, *how)
-        console.print(
-            f"{self.rerun or self.out}: {frames} frames of {replay.policy}, episode {replay.episode}; replay: {source}"
-        )
+    def source(self, console: Console) -> Path:
+        """Return the replay to draw."""
+        raise NotImplementedError
+
+    def film(self, program: str) -> int:
+        """Draw the replay; return the program's exit code: 0, or 130 when interrupted."""
+        console = SafeConsole()
+        try:
+            source = self.source(console)
+            replay = load_replay(source)
+            compositor = Compositor(replay, load_scene(replay.scene), self.height, self.views)
+            with progress_bar(console, "frames", -(-replay.num_steps // self.every) + 1, transient=True) as update:
+                how: Any = self.every, lambda n: update(completed=n)
+                if self.rerun:
+                    frames = write_recording(replay, compositor._view, self.rerun, self.height // 3, *how)
+                else:
+                    frames = write_video(compositor, self.out, *how)
+        except KeyboardInterrupt:
+            print(f"{program}: stopped; no video was written", file=sys.stderr)
+            return 130
+        about = f"{frames} frames of {replay.policy}, episode {replay.episode}; replay: {source}"
+        console.print(f"{self.rerun or self.out}: {about}")
+        return 0
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -318,20 +319,21 @@ class Record(Picture):
     replay: Annotated[Path, *word("REPLAY")]
     """A replay (.npz), or a run folder that holds the episode's."""
 
+    def source(self, console: Console) -> Path:
+        """Return the replay, or where a run keeps it."""
+        if self.replay.suffix == ".npz":
+            return self.replay
+        path = replay_path(self.replay, self.policy, self.episode)
+        if not path.is_file():
+            words = f"{self.replay} --episode {self.episode} --policy {self.policy} -o {self.out}"
+            raise ReplayError(f"{path}: no such replay; play the episode and draw it: python -m train.record {words}")
+        return path
+
 
 @reports_errors("interactive_nav.record")
 def main(argv: Sequence[str] | None = None) -> int:
     """Record a video; return 0 when done, 2 on a user's error, 130 when interrupted."""
-    arguments = parse(Record, "python -m interactive_nav.record", argv)
-    source = arguments.replay
-    try:
-        if source.suffix != ".npz":
-            source = replay_of(source, arguments.episode, arguments.policy, arguments.out)
-        arguments.record(source, SafeConsole())
-    except KeyboardInterrupt:
-        print("interactive_nav.record: stopped; no video was written", file=sys.stderr)
-        return 130
-    return 0
+    return parse(Record, "python -m interactive_nav.record", argv).film("interactive_nav.record")
 
 
 if __name__ == "__main__":

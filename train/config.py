@@ -77,11 +77,7 @@ class PPOConfig(Settings):
     num_updates_per_batch: AtLeastOne = 4
     """Passes over the collected data."""
     learning_rate: Positive = 3e-4
-    """Adam's step size; with adaptive_kl the first one."""
-    learning_rate_schedule: Literal["constant", "adaptive_kl"] = "constant"
-    """adaptive_kl moves the step size so that an update changes the policy by about desired_kl."""
-    desired_kl: Positive = 0.01
-    """Target of adaptive_kl."""
+    """Adam's step size."""
     discounting: Share = 0.99
     """Discount of one control step."""
     gae_lambda: Share = 0.95
@@ -104,8 +100,6 @@ class PPOConfig(Settings):
     """Widths of the policy network, behind its encoder if there are images."""
     value_hidden_layer_sizes: tuple[AtLeastOne, ...] = (256, 256)
     """Widths of the value network, behind its encoder if there are images."""
-
-    IDLE = (("desired_kl", "learning_rate_schedule adaptive_kl", lambda c: c.learning_rate_schedule == "adaptive_kl"),)
 
 
 @dataclasses.dataclass(frozen=True)

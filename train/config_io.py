@@ -32,8 +32,12 @@ def from_dict(plain: Any, base: TrainConfig | None = None, where: str = "config"
     return overlay(base or TrainConfig(), plain, where, elsewhere=list(flatten(TrainConfig())))
 
 
-GONE = {"env": {"windows"}, "sac": {"replay_dtype"}, "ddpg": {"replay_dtype"}}
-"""Section -> settings that older runs wrote: they sized what was simulated or stored, not what happens."""
+GONE = {
+    **{"env": {"windows"}, "sac": {"replay_dtype"}, "ddpg": {"replay_dtype"}},
+    "ppo": {"learning_rate_schedule", "desired_kl"},
+}
+"""Section -> settings that older runs wrote: they sized what was simulated or stored, or how step sizes changed while a
+run was trained; none changes what a policy does."""
 
 
 def from_yaml(text: str, where: str = "config") -> TrainConfig:

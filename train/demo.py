@@ -1,17 +1,16 @@
 """Run `interactive-nav demo`: watch a packaged policy push its way through a packaged flat, without training."""
 
 import dataclasses
-import inspect
 import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from interactive_nav_common.commands import Command, option, parse
 from interactive_nav_common.errors import reports_errors
 from scenes_mjcf.sets import installed
-from train import record
+from train.record import Record
 
 POLICY = Path(__file__).parent / "policies" / "turtlebot"
 SCENE, OBJECTS, EPISODE = "scenes_mjcf/drawn/flat", 10, 23
@@ -35,9 +34,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     run, film = arguments.out / "turtlebot", arguments.out / "demo.mp4"
     # A copy, because replays are written into the run's folder.
     shutil.copytree(POLICY, run, dirs_exist_ok=True)
-    words = [str(run), f"env.scenes=[{installed(SCENE)}]", f"env.num_objects={OBJECTS}", "env.backend=native"]
-    words += ["--checkpoint", "last", "--episode", str(arguments.episode), "--views", "follow", "-o", str(film)]
-    status = inspect.unwrap(record.main)(words)
+    settings = f"env.scenes=[{installed(SCENE)}]", f"env.num_objects={OBJECTS}", "env.backend=native"
+    played: Any = {"run": run, "settings": settings, "checkpoint": "last", "episode": arguments.episode}
+    status = Record(**played, views=("follow",), out=film).film("interactive-nav demo")
     if not status:
         print(f"The film is {film.resolve()}. Train a policy of your own with `interactive-nav train --config demo`.")
     return status

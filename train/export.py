@@ -119,7 +119,7 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
     with writing(arguments.out, "choose another --out"), whole_file(arguments.out) as partial:
         partial.write_bytes(content)
     text = f"{arguments.out}: {config.algorithm}, {meta.env_steps:,} steps; as JAX over {OBSERVATIONS:,} observations"
-    console.print(text, highlight=False, soft_wrap=True)
+    console.print(text)
     return 0
 
 

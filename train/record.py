@@ -4,52 +4,33 @@ This is `python -m train.replay`, then `python -m interactive_nav.record` of the
 """
 
 import dataclasses
-import inspect
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+
+from rich.console import Console
 
 from interactive_nav.pictures.replay import replay_path
 from interactive_nav.record import Picture
-from interactive_nav_common.commands import Words, option, parse, word
+from interactive_nav_common.commands import parse
 from interactive_nav_common.errors import reports_errors
-from interactive_nav_common.jobs.progress import SafeConsole
-from train import replay
-from train.config import EnvConfig
-from train.runs.run import build_env
+from train.replay import OfRun
 
 
 @dataclasses.dataclass(kw_only=True)
-class Record(Picture):
+class Record(Picture, OfRun):
     """Make a video of an episode of a run."""
 
-    run: Annotated[Path, *word("RUN_DIR")]
-    """Folder that `python -m train` wrote."""
-    settings: Words = ()
-    """Environment settings to change: env.NAME=VALUE."""
-    checkpoint: Annotated[str, option(metavar="best|last|STEPS")] = "best"
-    """Which checkpoint plays."""
-    episode_file: Annotated[str | None, option(metavar="FILE")] = None
-    """Play those of this one (python -m interactive_nav.episodes make)."""
+    def source(self, console: Console) -> Path:
+        """Play the episode; return its replay."""
+        self.play([self.episode], self.policy, console)
+        return replay_path(self.run, self.policy, self.episode)
 
 
 @reports_errors("train.record")
-def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = build_env) -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """Play and draw; return 0 when done, 2 on a user's error, 130 when interrupted."""
-    arguments = parse(Record, "python -m train.record", argv)
-    played = ["--episodes", str(arguments.episode), "--policies", arguments.policy]
-    played += ["--episode-file", arguments.episode_file] if arguments.episode_file else []
-    try:
-        words = [str(arguments.run), *played, "--checkpoint", arguments.checkpoint, *arguments.settings]
-        refused = inspect.unwrap(replay.main)(words, build_env)  # errors are this program's
-        if refused:
-            return refused
-        arguments.record(replay_path(arguments.run, arguments.policy, arguments.episode), SafeConsole())
-    except KeyboardInterrupt:
-        print("train.record: stopped; no video was written", file=sys.stderr)
-        return 130
-    return 0
+    return parse(Record, "python -m train.record", argv).film("train.record")
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import jax
+from rich.console import Console
 
 from interactive_nav.episodes import load_episode_file, starts_of
 from interactive_nav.pictures import replay
@@ -31,13 +32,62 @@ from train.scoring.evaluation import make_policies
 
 
 @dataclasses.dataclass(kw_only=True)
-class Replay(Command):
-    """Record episodes step by step."""
+class OfRun(Command):
+    """Base of the commands that record episodes of a run."""
 
     run: Annotated[Path, *word("RUN_DIR")]
     """Folder that `python -m train` wrote."""
     settings: Words = ()
     """Environment settings to change: env.NAME=VALUE."""
+    checkpoint: Annotated[str, option(metavar="best|last|STEPS")] = "best"
+    """Which checkpoint plays."""
+    episode_file: Annotated[str | None, option(metavar="FILE")] = None
+    """Play those of this one (python -m interactive_nav.episodes make)."""
+
+    def play(
+        self,
+        episodes: Sequence[int],
+        policies: str,
+        console: Console,
+        build_env: Callable[[EnvConfig], Any] = build_env,
+        scenes: Sequence[str] = (),
+        seed: int = SEED,
+        deterministic: bool = False,
+    ) -> None:
+        """Write a replay of each of the episodes by each of the policies, `NAME,...`, into the run's folder."""
+        folder = RunFolder(self.run)
+        config = config_to_play(folder, self.settings, scenes, console)
+        claim(folder.path / "replays")
+        env, starts = build_env(config.env), None
+        if self.episode_file:
+            file = load_episode_file(installed(self.episode_file))
+            if max(episodes) >= len(file.episodes):
+                raise ConfigError(f"--episodes has {max(episodes)}, expected less than the file's {len(file.episodes)}")
+            seed, starts = file.seed, starts_of(file, env, "--episode-file")
+        keys = episode_keys(seed, max(episodes) + 1)
+        names = [named(name) if name.endswith(".onnx") else name for name in policies.split(",")]
+        players = make_policies(names, folder, config, env, self.checkpoint, deterministic)
+        for name, (policy, meta) in players.items():
+            label = f"{config.run.name}, {meta.env_steps:,} steps" if meta else ""
+            player = replay.EpisodePlayer(env, policy, name, label)
+            for episode in episodes:
+                with console.status(f"{name}, episode {episode}: compiling") as status:
+                    played = player.play(
+                        keys[episode],
+                        episode,
+                        lambda step, n=name, k=episode: status.update(f"{n}, episode {k}: step {step}"),
+                        None if starts is None else jax.tree.map(lambda x, k=episode: x[k : k + 1], starts),
+                    )
+                path = replay.replay_path(folder.path, name, episode)
+                replay.save_replay(played, path)
+                score = played.metrics["ins_0.5"]
+                console.print(f"{path}: {played.num_steps} steps, INS_0.5 {score:.2f}")
+
+
+@dataclasses.dataclass(kw_only=True)
+class Replay(OfRun):
+    """Record episodes step by step."""
+
     episodes: Annotated[str, option(metavar="K,K,...")] = "0"
     """Which of the fixed episodes."""
     policies: Annotated[str, option(metavar="NAME,...")] = "learned"
@@ -46,10 +96,6 @@ class Replay(Command):
     """Where to play (default: the scenes that the policy was trained on)."""
     seed: Annotated[int | None, option()] = None
     """Of the fixed episodes."""
-    episode_file: Annotated[str | None, option(metavar="FILE")] = None
-    """Play those of this one (python -m interactive_nav.episodes make)."""
-    checkpoint: Annotated[str, option(metavar="best|last|STEPS")] = "best"
-    """Which checkpoint plays."""
     stochastic: bool = True
     """Sample the learned policy's actions, as the original did, or take their mode."""
 
@@ -58,39 +104,13 @@ class Replay(Command):
 def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = build_env) -> int:
     """Record; return 0 when done, 2 on a user's error."""
     arguments = parse(Replay, "python -m train.replay", argv)
-    console = SafeConsole()
     if not all(number.isdecimal() for number in arguments.episodes.split(",")):
         raise ConfigError(f"--episodes is {arguments.episodes!r}, expected numbers from 0 on, such as 0,1,5")
-    episodes = [int(number) for number in arguments.episodes.split(",")]
-    folder = RunFolder(arguments.run)
-    config = config_to_play(folder, arguments.settings, arguments.scenes, console)
-    claim(folder.path / "replays")
-    env = build_env(config.env)
-    seed, starts = SEED if arguments.seed is None else arguments.seed, None
     if arguments.episode_file:
         refuse_unused(arguments, "--seed", "with --episode-file, whose episodes are fixed")
-        file = load_episode_file(installed(arguments.episode_file))
-        if max(episodes) >= len(file.episodes):
-            raise ConfigError(f"--episodes has {max(episodes)}, expected less than the file's {len(file.episodes)}")
-        seed, starts = file.seed, starts_of(file, env, "--episode-file")
-    keys = episode_keys(seed, max(episodes) + 1)
-    names = [named(name) if name.endswith(".onnx") else name for name in arguments.policies.split(",")]
-    policies = make_policies(names, folder, config, env, arguments.checkpoint, not arguments.stochastic)
-    for name, (policy, meta) in policies.items():
-        label = f"{config.run.name}, {meta.env_steps:,} steps" if meta else ""
-        player = replay.EpisodePlayer(env, policy, name, label)
-        for episode in episodes:
-            with console.status(f"{name}, episode {episode}: compiling") as status:
-                played = player.play(
-                    keys[episode],
-                    episode,
-                    lambda step, n=name, k=episode: status.update(f"{n}, episode {k}: step {step}"),
-                    None if starts is None else jax.tree.map(lambda x, k=episode: x[k : k + 1], starts),
-                )
-            path = replay.replay_path(folder.path, name, episode)
-            replay.save_replay(played, path)
-            score = played.metrics["ins_0.5"]
-            console.print(f"{path}: {played.num_steps} steps, INS_0.5 {score:.2f}", highlight=False, soft_wrap=True)
+    episodes = [int(number) for number in arguments.episodes.split(",")]
+    seed, deterministic = SEED if arguments.seed is None else arguments.seed, not arguments.stochastic
+    arguments.play(episodes, arguments.policies, SafeConsole(), build_env, arguments.scenes, seed, deterministic)
     return 0
 
 

@@ -17,7 +17,15 @@ from interactive_nav_common.signals import raise_stop
 
 
 class SafeConsole(Console):
-    """Print names as they are written: they may hold neither markup nor control characters that have an effect."""
+    """Print names as they are written: they may hold neither markup nor control characters that have an effect.
+
+    Lines are neither wrapped nor highlighted; tables are as wide as the console.
+    """
+
+    def print(self, *objects: Any, **how: Any) -> None:
+        """Print lines, or tables."""
+        lines = all(isinstance(each, str | Text) for each in objects)
+        super().print(*objects, **{"soft_wrap": lines, "highlight": not lines, **how})
 
     def render_str(self, text: str, **how: Any) -> Text:
         """Render text that is printed, or that stands in a table."""
@@ -61,7 +69,7 @@ def warn_once(console: Console) -> Callable[[str], None]:
     def warn(warning: str) -> None:
         if warning not in printed:
             printed.add(warning)
-            console.print(f"warning: {warning}", soft_wrap=True, highlight=False)
+            console.print(f"warning: {warning}")
 
     return warn
 

@@ -27,7 +27,7 @@ from train.learners.learner import Snapshot
 from train.runs import checkpoint
 from train.runs.checkpoint import CheckpointMeta
 from train.runs.run_folder import RunFolder
-from train.scoring.onnx_policy import OnnxPolicy
+from train.scoring.brought import OnnxPolicy
 
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")

@@ -228,7 +228,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     split = None if arguments.split == "all" else arguments.split
     text = page(arguments.results, split, arguments.films, console)
     write_text(arguments.out, text)
-    console.print(f"{arguments.out}: {len(text) / 1e6:.1f} MB", highlight=False, soft_wrap=True)
+    console.print(f"{arguments.out}: {len(text) / 1e6:.1f} MB")
     return 0
 
 

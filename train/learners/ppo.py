@@ -31,7 +31,6 @@ from brax.training import acting, gradients, types
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo import losses as ppo_losses
 from brax.training.agents.ppo import networks as ppo_networks
-from brax.training.agents.ppo import optimizer as ppo_optimizer
 
 from train.config import PPOConfig, TrainConfig
 from train.learners import networks as nets
@@ -110,10 +109,7 @@ def make_agent(env: Any, config: TrainConfig) -> PPOParts:
     network, size, c = config.network, env.observation_size, config.ppo
     layers = c.policy_hidden_layer_sizes, c.value_hidden_layer_sizes
     built = nets.make_ppo_networks(network, size, env.action_size, *layers, c.normalize_observations)
-    adam = optax.adam(c.learning_rate)
-    if c.learning_rate_schedule == "adaptive_kl":
-        adam = optax.inject_hyperparams(optax.adam)(learning_rate=c.learning_rate)
-    optimizer = optax.chain(optax.clip_by_global_norm(c.max_grad_norm), adam)
+    optimizer = optax.chain(optax.clip_by_global_norm(c.max_grad_norm), optax.adam(c.learning_rate))
     shared = network.share_encoder and isinstance(size, Mapping)
     return PPOParts(c, built, optimizer, size, shared, config.run.devices)
 
@@ -222,15 +218,9 @@ def learn(
         optimizer_state, params, key = carry
         key, key_loss = jax.random.split(key)
         (_, losses), grads = loss_and_grad(params, normalizer_params, batch, key_loss)
-        if config.learning_rate_schedule == "adaptive_kl":
-            optimizer_state, rate = ppo_optimizer.adaptive_kl_learning_rate(
-                optimizer_state, losses["kl_mean"], config.desired_kl
-            )
-        else:
-            rate = jnp.asarray(config.learning_rate)
         updates, optimizer_state = parts.optimizer.update(grads, optimizer_state)
         params = optax.apply_updates(params, updates)
-        return (optimizer_state, params, key), {**losses, "learning_rate": rate, "grad_norm": optax.tree.norm(grads)}
+        return (optimizer_state, params, key), {**losses, "grad_norm": optax.tree.norm(grads)}
 
     def one_pass(carry: Any, _: None) -> tuple[Any, dict[str, jax.Array]]:
         optimizer_state, params, key = carry
@@ -257,12 +247,10 @@ def update(parts: PPOParts, env: Env, state: PPOState, env_state: Any) -> tuple[
     """Collect a batch and learn from it: Brax's training step."""
     key_sgd, key_unroll, key_next = jax.random.split(state.key, 3)
     env_state, data, sums = collect(parts, env, state, env_state, key_unroll)
-    # As in Brax: with adaptive_kl the old policy's outputs must stay comparable, so normalise afterwards.
-    late = parts.config.learning_rate_schedule == "adaptive_kl"
     statistics = nets.update_normalizer(state.normalizer_params, data.observation)
-    normalizer_params = state.normalizer_params if late else statistics
-    optimizer_state, params, losses = learn(parts, state, data, normalizer_params, key_sgd)
-    losses = {**jax.tree.map(jnp.mean, losses), "reward_per_step": jnp.mean(data.reward)}
+    optimizer_state, params, losses = learn(parts, state, data, statistics, key_sgd)
+    means = {"learning_rate": jnp.asarray(parts.config.learning_rate), "reward_per_step": jnp.mean(data.reward)}
+    losses = jax.tree.map(jnp.mean, losses) | means
     new_state = PPOState(optimizer_state=optimizer_state, params=params, normalizer_params=statistics, key=key_next)
     finite = all_finite((losses, params, statistics.mean, statistics.std))
     return new_state, env_state, Update(losses, sums, finite, data)

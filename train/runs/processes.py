@@ -97,6 +97,9 @@ class Together:
     def __init__(self, folder: Callbacks | None, stops: list[int], env_state_limit_mb: float):
         """Take the folder's callbacks (None: of another process) and the list that signals are collected in."""
         self.folder, self.stops, self.limit_mb = folder, stops, env_state_limit_mb
+        self.on_start = folder.on_start if folder else _ignore
+        self.on_update = folder.on_update if folder else _ignore
+        self.on_log = folder.on_log if folder else _ignore
 
     def restore(self, template: Snapshot) -> Snapshot | None:
         """Return what process 0 restores, as all processes do."""
@@ -129,21 +132,6 @@ class Together:
             self.stops.append(int(came.max()))
         return bool(self.stops) and bool(came.any())
 
-    def on_start(self, snapshot: Snapshot, total_steps: int) -> None:
-        """Prepare the folder."""
-        if self.folder:
-            self.folder.on_start(snapshot, total_steps)
-
-    def on_update(self, env_steps: int) -> None:
-        """Show progress."""
-        if self.folder:
-            self.folder.on_update(env_steps)
-
-    def on_log(self, env_steps: int, metrics: dict[str, float]) -> None:
-        """Log."""
-        if self.folder:
-            self.folder.on_log(env_steps, metrics)
-
     def on_checkpoint(self, snapshot: Snapshot) -> None:
         """Gather the environments of all processes, and save."""
         kept = megabytes(snapshot.env_state) <= self.limit_mb
@@ -155,6 +143,10 @@ class Together:
         """Gather the batch, and save."""
         update = Update(update.losses, update.episode_sums, update.finite, gathered(update.batch))
         return self.folder.on_diverged(before, update) if self.folder else "the folder of process 0"
+
+
+def _ignore(*_: Any) -> None:
+    """Do nothing: another process keeps the folder."""
 
 
 def mine_of(snapshot: Snapshot) -> Any:

@@ -70,7 +70,7 @@ def config_to_play(
         except ConfigError:
             there = resolve_backend("auto")
             note = f"{folder.path}: trained with backend {env.backend}, which is not here; played with {there}"
-            console.print(note, highlight=False, soft_wrap=True)
+            console.print(note)
             sizes = dict.fromkeys(SIZES) if there == "native" else {}
             env = replace(env, backend=there, **sizes)
     return dataclasses.replace(config, env=env)
@@ -107,7 +107,7 @@ class FolderCallbacks:
         with warnings.catch_warnings(record=True) as passed_over:
             path, meta = checkpoint.find(self.folder.checkpoints, self.resume_from)
         for warning in passed_over:
-            self.console.print(str(warning.message), style="yellow", markup=False, soft_wrap=True)
+            self.console.print(str(warning.message), style="yellow", markup=False)
         if not checkpoint.is_whole(path):
             raise CheckpointError(
                 f"{path}: holds the policy alone, as `train.sweep --export` writes it, expected all of the learner to "
@@ -121,7 +121,7 @@ class FolderCallbacks:
                     "set run.name to begin another run"
                 )
         for later in checkpoint.set_aside(self.folder.checkpoints, meta.env_steps):
-            self.console.print(f"{later}: renamed to aside-{later.name}", markup=False, soft_wrap=True)
+            self.console.print(f"{later}: renamed to aside-{later.name}", markup=False)
         self._wall_before_s = meta.wall_s
         learner = checkpoint.load_learner(path, template.learner)
         env_state = checkpoint.load_env_state(path, template.env_state)
@@ -148,7 +148,7 @@ class FolderCallbacks:
         if self.config.run.tensorboard:
             self._logs.append(tracking.Events(self.folder.tensorboard, snapshot.env_steps))
         if note := getattr(snapshot.env_state, "note", ""):
-            self.console.print(note, highlight=False, soft_wrap=True)
+            self.console.print(note)
         if self.config.run.wandb:
             self._logs.append(tracking.Tracker(self.folder.path, self.config, versions()))
         self._total_steps = total_steps
@@ -169,7 +169,7 @@ class FolderCallbacks:
             left_s = (total - env_steps) / max(metrics["env_steps_per_s"], 1e-9)
             share = 100.0 * env_steps / max(total, 1)
             reached = f"training {share:3.0f} %  {env_steps:,} of {total:,} steps  {left_s:.0f} s left"
-            self.console.print(f"{reached}  {status}", highlight=False, soft_wrap=True)
+            self.console.print(f"{reached}  {status}")
 
     def on_checkpoint(self, snapshot: Snapshot) -> None:
         """Write a checkpoint; its score is the mean over the episodes of at least the time that one can take.
@@ -305,14 +305,12 @@ def _train_in(
     console.print(
         f"{folder.path}: {'continuing' if exists else 'training'} {config.algorithm} on {config.env.robot}, "
         f"{len(config.env.scenes)} scene(s), backend {env.backend}, {num_envs(config)} environments"
-        + (f" on {len(devices)} devices" if len(devices) > 1 else ""),
-        highlight=False,
-        soft_wrap=True,
+        + (f" on {len(devices)} devices" if len(devices) > 1 else "")
     )
     each, limit = config.run.num_timesteps // num_envs(config), config.env.episode_steps
     if each < limit:
         note = f"{each:,} steps for each environment, and an episode has up to {limit:,}: none that fails comes to its"
-        console.print(f"{note} end; lower env.episode_steps or train longer", style="yellow", soft_wrap=True)
+        console.print(f"{note} end; lower env.episode_steps or train longer", style="yellow")
     with stop_signals() as stops, progress_bar(console, "training") as bar:
         bar(status="compiling")
         with contextlib.closing(FolderCallbacks(folder, config, env, console, bar, stops, resume_from)) as callbacks:
@@ -327,13 +325,11 @@ def _train_in(
         f"{folder.path}: {'done' if result.completed else 'stopped'} at {result.snapshot.env_steps:,} steps; "
         + (describe(metrics) if metrics else "nothing logged")
         + (f"; best checkpoint at {best.env_steps:,} steps" if best else "")
-        + ("" if result.completed else "; the same command continues"),
-        highlight=False,
-        soft_wrap=True,
+        + ("" if result.completed else "; the same command continues")
     )
     if lost := failures(folder):
         note = ", ".join(f"{name} {count:,.0f}" for name, count in lost.items())
-        console.print(f"what physics lost, summed over ended episodes: {note}", style="yellow", soft_wrap=True)
+        console.print(f"what physics lost, summed over ended episodes: {note}", style="yellow")
     return result, folder, stops[0] if stops else None
 
 

@@ -10,10 +10,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from interactive_nav.interop.onnx_file import OnnxError, OnnxFile
+from interactive_nav.sensing.description import describe, difference, inputs_of
 from interactive_nav.task.rollout import HostPolicy
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.imports import first_line, import_function
-from train.scoring.onnx_policy import OnnxPolicy
 
 TAKEN = ("learned", "random", "follower", "avoider", "namo", "keyboard", "ros")
 EXPECTED = "expected [name=]module:factory, [name=]path/to/file.py:factory or [name=]policy.onnx"
@@ -77,6 +78,23 @@ def named(word: str) -> str:
             f"--policy: name is {name!r}, expected letters, digits and any of _ . : + -, and none of {', '.join(TAKEN)}"
         )
     return f"{name}={place}"
+
+
+class OnnxPolicy:
+    """A policy of an ONNX file that `interactive-nav export` wrote, for the environments that it fits."""
+
+    def __init__(self, path: str | Path, env: Any):
+        self._file, self._env = OnnxFile(path), env
+        try:
+            differs = difference(self._file.about, describe(env))
+        except (KeyError, TypeError, AttributeError):
+            raise OnnxError(f"{path}: has no description, expected a file of interactive-nav export") from None
+        if differs:
+            raise OnnxError(f"{path}: {differs}; choose a policy of this robot and these observations, or set env.*")
+
+    def __call__(self, observations: Mapping[str, np.ndarray], first: Any) -> np.ndarray:
+        """Return actions [B, A]."""
+        return self._file.run("action", inputs_of(self._env, observations))
 
 
 class BroughtPolicy(HostPolicy):

@@ -205,7 +205,7 @@ def evaluate(
             table = table.append_column("push_needed", pa.array(needed, pa.bool_()))
         tables.append(table)
         note = f" ({policy.note})" if isinstance(policy, HostPolicy) and policy.note else ""
-        console.print(f"{name}: {request.episodes} episodes in {wall_s:.0f} s{note}", highlight=False)
+        console.print(f"{name}: {request.episodes} episodes in {wall_s:.0f} s{note}")
         yield pa.concat_tables(tables), played
 
 

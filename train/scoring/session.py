@@ -136,7 +136,7 @@ def run(arguments: Evaluate, build_env: Callable[[EnvConfig], Any] | None, kept:
         out = _place(arguments, folder, config, request)
         claim(out.parent)
         summary = f"{request.episodes} episodes by each of {', '.join(policies)} in {', '.join(request.scenes)}"
-        console.print(f"{config.run.name}: {summary}; loading and compiling first", highlight=False, soft_wrap=True)
+        console.print(f"{config.run.name}: {summary}; loading and compiling first")
         if player is None or kinds[i] != built:
             player = None  # the old one's memory goes before the new one's comes
             env = build_env(config.env)
@@ -157,13 +157,13 @@ def run(arguments: Evaluate, build_env: Callable[[EnvConfig], Any] | None, kept:
                 write_demonstrations(steps, player.env, arguments.demonstrations)
             kept[out] = f"rows of {', '.join(played)} in {place}"
             if place == unfinished:
-                console.print(f"until all have played: {place}; {out} stays as it is", highlight=False, soft_wrap=True)
+                console.print(f"until all have played: {place}; {out} stays as it is")
         for path in (unfinished, paths_beside(unfinished)):
             path.unlink(missing_ok=True)
         _report(console, rows, config, player.env, out)
         if steps:
             text = f"demonstrations: {arguments.demonstrations}, {sum(map(len, steps)):,} control steps"
-            console.print(text, highlight=False, soft_wrap=True)
+            console.print(text)
     return 0
 
 
@@ -175,4 +175,4 @@ def _report(console: Console, rows: pa.Table, config: TrainConfig, env: Any, out
         bad = int((rows[name].to_numpy() > 0).sum())
         if bad:
             console.print(f"{bad} of {len(rows)} episodes with {name} > 0: their scores are in doubt", style="yellow")
-    console.print(f"rows: {out}", highlight=False, soft_wrap=True)
+    console.print(f"rows: {out}")

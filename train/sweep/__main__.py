@@ -85,15 +85,15 @@ def main(argv: Sequence[str] | None = None, programs: Programs = PROGRAMS) -> in
     if arguments.status:
         states = [folder.state(run) for run in sweep.runs]
         console.print(status_table(states))
-        console.print(totals(states), highlight=False, soft_wrap=True)
+        console.print(totals(states))
         return 0
     if arguments.export:
         from train.sweep.export import export
 
         size, best = export(folder, arguments.export, arguments.policy_step)
         for name in best.values():
-            console.print(f"checkpoint of {name}", highlight=False)
-        console.print(f"{arguments.export}: {size / 2**20:.1f} MiB", highlight=False, soft_wrap=True)
+            console.print(f"checkpoint of {name}")
+        console.print(f"{arguments.export}: {size / 2**20:.1f} MiB")
         return 0
     if arguments.resume and not (folder.root / "configs").is_dir():
         raise ConfigError(f"--resume: {folder.root} holds no sweep; leave --resume out to begin it")
@@ -113,11 +113,11 @@ def main(argv: Sequence[str] | None = None, programs: Programs = PROGRAMS) -> in
         scheduler = Scheduler(folder, launcher, display, stages, arguments.redo, arguments.unfinished, programs)
         outcome = scheduler.run(stops, arguments.time_limit)
     console.print(status_table(outcome.states))
-    console.print(totals(outcome.states), highlight=False, soft_wrap=True)
+    console.print(totals(outcome.states))
     if outcome.elsewhere:
-        console.print(f"{outcome.elsewhere} runs were left to another sweep that works on them", highlight=False)
+        console.print(f"{outcome.elsewhere} runs were left to another sweep that works on them")
     if outcome.stopped_by or outcome.timed_out:
-        console.print("the same command continues", highlight=False)
+        console.print("the same command continues")
     return outcome.exit_code(
         "unfinished" if arguments.unfinished else "trained" if arguments.only == "train" else "done"
     )

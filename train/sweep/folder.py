@@ -257,7 +257,7 @@ class SweepDisplay(contextlib.ExitStack):
 
     def event(self, text: str, style: str = "") -> None:
         """Print a line."""
-        self._console.print(Text(f"{time.strftime('%H:%M:%S')} {text}", style), soft_wrap=True)
+        self._console.print(Text(f"{time.strftime('%H:%M:%S')} {text}", style))
 
     def update(self, states: Sequence[RunState], where: dict[str, str]) -> None:
         """Show how far the runs are, every few seconds."""
@@ -269,7 +269,7 @@ class SweepDisplay(contextlib.ExitStack):
             ordered = sorted(states, key=lambda state: ORDER.index(state.state))
             self._live.update(Group(status_table(ordered, where), Text(totals(states))), refresh=True)
         else:
-            self._console.print(Text(f"{time.strftime('%H:%M:%S')} {totals(states)}"), soft_wrap=True)
+            self._console.print(Text(f"{time.strftime('%H:%M:%S')} {totals(states)}"))
 
 
 def _hours(seconds: float) -> str:
