@@ -1,6 +1,7 @@
 """The settings of `preset=report`: each does what the report states, by values."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -162,6 +163,7 @@ def test_the_goal_is_one_image_along_a_heading_of_the_episode(two_rooms):
 
     player = object.__new__(NavigatorPlayer)
     player.config, player._navigator = config, Sees()
+    player.player = SimpleNamespace(env=SimpleNamespace(robot=SimpleNamespace(body_width_m=0.45)))  # type: ignore[assignment]
     player._camera = lambda xy, yaw, _: np.concatenate([xy, yaw[:, None]], -1)
     player.begin(episodes)
     assert looked["images"].shape == (4, 1, 3) and looked["heading_rad"].shape == (4, 1)
