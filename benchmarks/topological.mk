@@ -2,6 +2,7 @@
 #
 #   make -f benchmarks/topological.mk -j 8 RUNS=runs/topological-full            on a GPU machine (SIZE=full)
 #   make -f benchmarks/topological.mk -j 2 SIZE=cpu RUNS=runs/topological-cpu    on two CPU cores
+#   make -f benchmarks/topological.mk -j 8 SIZE=report RUNS=runs/report          the report's settings, ends in RUNS/tables.md
 #   make -f benchmarks/topological.mk -n ...                                     only shows the commands
 #
 # What each command printed is in RUNS/log, how long it took in RUNS/times.txt. Interrupted, the same line goes on.
@@ -55,9 +56,31 @@ else ifeq ($(SIZE),cpu)
   FEATURES = epochs=4
   PPO ?=
   PPO_STEPS = 500_000
+else ifeq ($(SIZE),report)
+  # preset=report has the values. Eight homes for its ten and twenty, with as many drives; three homes test passages and
+  # teach the detector nothing. Words of a command can be laid over it: MAP="preset=report check=5".
+  DATA = preset=report
+  PASSAGE_DATA = $(DATA) max_per_room=1 least_per_room=0
+  TEST_SCENES = maple,rowan,willow
+  ROOMS = preset=report
+  PASSAGES = preset=report test_scenes=$(TEST_SCENES)
+  ALEXNET = $(PASSAGES)
+  DRIVES = preset=report backend=native drives=311 batch=2488
+  GRID = preset=report
+  MAP = preset=report check=60
+  EVALUATION = preset=report backend=native
+  ADAPT = preset=report
+  PPO ?=
+  DRIVEN_BY = $(RUNS)/policy-grid/alpha-10-lambda-0.1
+  PASSAGES_FROM = data-passages
+  LEARNED = dense,sparse
+  BASELINE = --contenders dense$(if $(PPO),$(comma)ppo)
 else
-  $(error SIZE is '$(SIZE)', expected full or cpu)
+  $(error SIZE is '$(SIZE)', expected full, cpu or report)
 endif
+DRIVEN_BY ?= $(RUNS)/policy
+PASSAGES_FROM ?= data
+LEARNED ?= dense
 
 NAV = $(PY) -m topological_nav
 WITH = --localiser $(RUNS)/rooms --detector $(RUNS)/passages
@@ -74,11 +97,25 @@ run = @mkdir -p $(@D) $(RUNS)/log; echo "$(notdir $@): $(1)"; began=$$(date +%s)
 D = $(RUNS)/done
 MAPS = $(ALL:%=$(D)/map-%)
 .DEFAULT_GOAL := all
-.PHONY: all networks maps evaluation transfer transfer-policy renderer renderer-policy scan batch
+.PHONY: all networks maps evaluation transfer transfer-policy renderer renderer-policy scan batch tables
+ifeq ($(SIZE),report)
+all: tables
+networks: $(D)/rooms $(D)/rooms-up $(D)/rooms-down $(D)/passages $(D)/alexnet
+evaluation: $(D)/evaluation $(D)/evaluation-policy
+$(D)/policy-grid: $(D)/rooms $(D)/passages $(D)/drives
+$(D)/policy: $(D)/policy-grid
+	@touch $@
+else
 all: networks maps $(D)/policy evaluation transfer $(D)/export
 networks: $(D)/rooms $(D)/rooms-selfsup $(D)/rooms-more $(D)/passages $(D)/alexnet
-maps: $(MAPS)
 evaluation: $(D)/evaluation $(D)/evaluation-policy $(D)/evaluation-ahead1
+$(D)/policy-grid: $(D)/policy
+$(D)/policy: $(D)/rooms $(D)/passages $(D)/drives
+	$(call run,$(NAV) train policy --data $(RUNS)/drives $(WITH) -o $(RUNS)/policy $(POLICY))
+endif
+maps: $(MAPS)
+tables: networks evaluation $(D)/policy-grid $(D)/adapted-passages
+	$(NAV) tables $(RUNS)
 transfer: $(D)/features $(D)/adapted-passages $(D)/evaluation-unadapted $(D)/evaluation-adapted
 transfer-policy: $(D)/evaluation-unadapted-policy $(D)/evaluation-adapted-policy
 batch: $(D)/evaluation-batch.cedar $(D)/evaluation-batch.rowan
@@ -90,6 +127,8 @@ $(D)/data:
 	$(call run,$(NAV) data $(call folders,$(SEEN)) -o $(RUNS)/data $(DATA))
 $(D)/data-more:
 	$(call run,$(NAV) data $(call folders,$(SEEN)) -o $(RUNS)/data-more $(MORE_POSITIONS))
+$(D)/data-passages:
+	$(call run,$(NAV) data $(call folders,$(ALL)) -o $(RUNS)/data-passages $(PASSAGE_DATA))
 $(D)/drives:
 	$(call run,$(NAV) data --drives $(call folders,$(SEEN)) -o $(RUNS)/drives $(DRIVES))
 
@@ -99,16 +138,16 @@ $(D)/rooms-selfsup: $(D)/data
 	$(call run,$(NAV) train rooms --data $(RUNS)/data -o $(RUNS)/rooms-selfsup init=selfsup $(ROOMS))
 $(D)/rooms-more: $(D)/data-more
 	$(call run,$(NAV) train rooms --data $(RUNS)/data-more -o $(RUNS)/rooms-more $(ROOMS_MORE))
-$(D)/passages: $(D)/data
-	$(call run,$(NAV) train passages --data $(RUNS)/data -o $(RUNS)/passages $(PASSAGES))
-$(D)/alexnet: $(D)/data
-	$(call run,$(NAV) train passages --data $(RUNS)/data -o $(RUNS)/alexnet network=alexnet $(ALEXNET))
+$(D)/rooms-up $(D)/rooms-down: $(D)/rooms-%: $(D)/data
+	$(call run,$(NAV) train rooms --data $(RUNS)/data -o $(RUNS)/rooms-$* $(ROOMS) pitch=$*)
+$(D)/passages: $(D)/$(PASSAGES_FROM)
+	$(call run,$(NAV) train passages --data $(RUNS)/$(PASSAGES_FROM) -o $(RUNS)/passages $(PASSAGES))
+$(D)/alexnet: $(D)/$(PASSAGES_FROM)
+	$(call run,$(NAV) train passages --data $(RUNS)/$(PASSAGES_FROM) -o $(RUNS)/alexnet network=alexnet $(ALEXNET))
 
 $(D)/map-%: $(D)/rooms $(D)/passages
 	$(call run,$(NAV) map scenes_mjcf/$* $(WITH) -o $(RUNS)/maps/$*.npz $(MAP))
-$(D)/policy: $(D)/rooms $(D)/passages $(D)/drives
-	$(call run,$(NAV) train policy --data $(RUNS)/drives $(WITH) -o $(RUNS)/policy $(POLICY))
-$(D)/policy-grid: $(D)/policy
+$(D)/policy-grid:
 	$(call run,$(NAV) train policy --grid --data $(RUNS)/drives $(WITH) -o $(RUNS)/policy-grid $(GRID))
 
 $(D)/ppo:
@@ -117,8 +156,8 @@ $(D)/ppo:
 
 # Scenes are played side by side (evaluation.alder, ...); the command for all of them then finds their rows, and adds up.
 played = $(NAV) evaluate $(1) --maps $(RUNS)/maps $(WITH) $(EVALUATION) -o $(RUNS)/$(basename $(notdir $@))
-baseline = $(call played,$(1)) --policy passage $(if $(PPO),--ppo $(PPO))
-learned = $(call played,$(1)) --contenders dense --policy $(RUNS)/policy
+baseline = $(call played,$(1)) --policy passage $(BASELINE) $(if $(PPO),--ppo $(PPO))
+learned = $(call played,$(1)) --contenders $(LEARNED) --policy $(DRIVEN_BY)
 ahead1 = $(call played,$(1)) --contenders dense --policy passage ahead_m=1
 each = $(patsubst %,$(D)/$(1).%,$(ALL))
 $(call each,evaluation): $(D)/evaluation.%: $(D)/map-% $(if $(filter $(RUNS)/ppo,$(PPO)),$(D)/ppo)
@@ -136,7 +175,7 @@ $(D)/evaluation-ahead1: $(call each,evaluation-ahead1)
 
 # All episodes of a scene at once.
 $(ALL:%=$(D)/evaluation-batch.%): $(D)/evaluation-batch.%: $(D)/map-% $(D)/policy
-	$(call run,$(NAV) evaluate scenes_mjcf/$* --maps $(RUNS)/maps $(WITH) --policy $(RUNS)/policy --contenders dense $(BATCH) \
+	$(call run,$(NAV) evaluate scenes_mjcf/$* --maps $(RUNS)/maps $(WITH) --policy $(DRIVEN_BY) --contenders dense $(BATCH) \
 	  -o $(RUNS)/evaluation-batch)
 
 # Another camera: what the networks of the source see by it, and what adapting them brings. rowan and willow are new.
@@ -145,13 +184,14 @@ $(D)/features: $(D)/data $(D)/rooms
 $(D)/data-unseen:
 	$(call run,$(NAV) data $(call folders,$(UNSEEN)) -o $(RUNS)/data-unseen $(DATA))
 $(D)/adapted-passages: $(D)/passages $(D)/data-unseen
-	$(call run,$(NAV) adapt passages --target $(RUNS)/data-unseen --detector $(RUNS)/passages -o $(RUNS)/adapted-passages)
+	$(call run,$(NAV) adapt passages --target $(RUNS)/data-unseen --detector $(RUNS)/passages -o $(RUNS)/adapted-passages \
+	  $(ADAPT))
 ADAPTED = --localiser $(RUNS)/features --detector $(RUNS)/adapted-passages
 $(D)/unadapted-map-%: $(D)/rooms $(D)/passages $(D)/data-unseen
 	$(call run,$(NAV) adapt map scenes_mjcf/$* --target $(RUNS)/data-unseen $(WITH) -o $(RUNS)/maps-unadapted/$*.npz)
 $(D)/adapted-map-%: $(D)/features $(D)/adapted-passages
 	$(call run,$(NAV) adapt map scenes_mjcf/$* --target $(RUNS)/data-unseen $(ADAPTED) -o $(RUNS)/maps-adapted/$*.npz)
-DRIVER = --policy $(RUNS)/policy
+DRIVER = --policy $(DRIVEN_BY)
 driven = $(NAV) evaluate $(call folders,$(UNSEEN)) --contenders dense$(1) -o $(RUNS)/$(notdir $@) $(SECONDARY)
 $(D)/evaluation-unadapted: $(UNSEEN:%=$(D)/unadapted-map-%)
 	$(call run,$(call driven, --domain camera) --maps $(RUNS)/maps-unadapted $(WITH))

@@ -1,4 +1,4 @@
-"""Run `python -m topological_nav data|train|map|navigate|evaluate|adapt|export`: words in, files and pictures out.
+"""Run `python -m topological_nav COMMAND`: words in, files and pictures out.
 
 Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when stopped: the same command goes on.
 """
@@ -172,7 +172,15 @@ class Export(_Listed):
     """The picture (default: DIR.png)."""
 
 
-COMMANDS = {kind.__name__.lower(): kind for kind in (Data, Train, Map, Navigate, Evaluate, Adapt, Export)}
+@dataclasses.dataclass(kw_only=True)
+class Tables(Command):
+    """Write the report's tables with ours beside them."""
+
+    runs: Annotated[Path, *word("RUNS")]
+    """Folder of `make -f benchmarks/topological.mk SIZE=report`, which gets tables.md."""
+
+
+COMMANDS = {kind.__name__.lower(): kind for kind in (Data, Train, Map, Navigate, Evaluate, Adapt, Export, Tables)}
 
 
 @reports_errors("topological_nav")

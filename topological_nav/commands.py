@@ -35,6 +35,7 @@ from topological_nav.learn.training import load_networks, train
 from topological_nav.maps.build import Built, build_map, forget
 from topological_nav.maps.graph import save_map
 from topological_nav.presets import configured, preset_of
+from topological_nav.tables import tables
 from topological_nav.weights.export import choose, export, fitting_map, level_images, size_lines
 from topological_nav.weights.onnx_files import onnx_models
 
@@ -133,12 +134,7 @@ def run_navigate(arguments: Any) -> None:
     name = Path(arguments.scene).resolve().name
     out = arguments.out or RUNS / "navigate" / f"{name}-{arguments.episode}.png"
     with bar() as report:
-        limit_s = int(contest.config.limit_s)
-
-        def on_time(time_s: float) -> None:
-            report(f"{name}, simulated s", int(time_s), limit_s)
-
-        driven = drive_episode(contest, arguments.episode, bool(arguments.video), on_time)
+        driven = drive_episode(contest, arguments.episode, bool(arguments.video), report)
     for line in driven.log:
         print(line)
     save(driven.figure(), out)
@@ -168,8 +164,8 @@ def run_evaluate(arguments: Any) -> None:
     lines, compared = scores.summary(rows), scores.differences(rows)
     write_text(contest.out / "summary.md", scores.markdown(lines, compared))
     SafeConsole(width=None if sys.stdout.isatty() else 160).print(scores.console_table(lines))
-    for difference in compared:
-        print(difference)
+    for what, name, result in compared:
+        print(f"{what}, {name}: {scores.text(result)}")
     print(f"{contest.out}: {len(rows)} episodes; tables in summary.md, a picture a scene")
 
 
@@ -226,10 +222,16 @@ def run_export(arguments: Any) -> None:
         runs = (arguments.localiser, arguments.detector, arguments.policy, arguments.maps)
         sizes, compared = export(*runs, arguments.images, arguments.out, config, report)
     picture = arguments.picture or arguments.out.with_name(f"{arguments.out.name}.png")
-    save(figures.export_figure(sizes, compared, config.limit_mib), picture)
+    save(figures.export_figure(compared), picture)
     for name, value in compared.scores.items():
         print(f"{name.replace('_', ' ')}: {value:.3g}")
     print(f"{arguments.out}: {size_lines(sizes, config.limit_mib)}; drawn in {picture}")
+
+
+def run_tables(arguments: Any) -> None:
+    """Write the report's tables with ours."""
+    write_text(arguments.runs / "tables.md", tables(arguments.runs))
+    print(arguments.runs / "tables.md")
 
 
 def run_data(arguments: Any) -> None:
@@ -308,23 +310,14 @@ def _policy(arguments: Any) -> None:
         frames = embed_drives(arguments.data or DRIVES, *runs, config.mirror, host)
         learn = train_grid if arguments.grid else train_policy
         results = learn(frames, out, config, host)
-    if isinstance(results, list):
-        for row in results:
-            folder = out / f"alpha-{row['alpha']:g}-lambda-{row['lambda']:g}"
-            save(figures.policy_figure(read_metrics(folder / "metrics.jsonl"), row), folder / "curves.png")
-        print(grid_table(results), end="")
-        return
-    save(figures.policy_figure(read_metrics(out / "metrics.jsonl"), results), out / "curves.png")
-    if test := results.get("test"):
-        for name in ("linear", "angular"):
-            print(
-                f"{name:<8} {test['steps']:,} held-out steps  accuracy {test[name]['accuracy']:.3f} "
-                f"(the commonest class {test[name]['commonest']:.3f})  macro F1 {test[name]['macro_f1']:.3f}"
-            )
-        print(f"forward model: error {test['forward']:.4f}, of no change {test['no_change']:.4f}")
+    rows = results if isinstance(results, list) else [results]
+    for row in rows:
+        folder = out / f"alpha-{row['alpha']:g}-lambda-{row['lambda']:g}" if arguments.grid else out
+        save(figures.policy_figure(read_metrics(folder / "metrics.jsonl"), row), folder / "curves.png")
+    print(grid_table(rows), end="")
     print(
-        f"{out}: {results['sequences']:,} sequences ({results['nearly_straight']:.2f} of all are nearly straight), "
-        f"{results['parameters']:,} parameters"
+        f"{out}: {rows[0]['sequences']:,} sequences ({rows[0]['nearly_straight']:.2f} of all are nearly straight), "
+        f"{rows[0]['parameters']:,} parameters"
     )
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from interactive_nav_common.commands import parse
-from interactive_nav_common.config import overridden
 from topological_nav.__main__ import COMMANDS
 from topological_nav.config import (
     TASKS,
@@ -23,6 +22,8 @@ from topological_nav.config import (
     PolicyConfig,
 )
 from topological_nav.data.domains import AdaptConfig
+from topological_nav.drives.imitation import GRIDS
+from topological_nav.presets import configured
 from train.config_io import load_config
 
 ROOT = Path(__file__).parents[2]
@@ -43,6 +44,12 @@ def settings_of(arguments):
     return {"map": MapConfig, "evaluate": EvaluationConfig, "adapt": AdaptConfig, "export": ExportConfig}[command]()
 
 
+def part_of(arguments) -> str:
+    """The part of a preset that a command reads."""
+    command = type(arguments).__name__.lower()
+    return "drives" if getattr(arguments, "drives", False) else getattr(arguments, "task", command)
+
+
 def commands_of(shown: str) -> list[list[str]]:
     """Words of each command of `topological_nav`; those over two lines as one."""
     joined = shown.replace("\\\n", " ")
@@ -56,7 +63,7 @@ def understood(words: list[str], made: Collection[str]):
         needed = getattr(arguments, name, None)
         if needed is not None and str(needed).startswith("/nowhere"):
             assert any(done == str(needed) or done.startswith(f"{needed}/") for done in made), (words, name)
-    return arguments, overridden(settings_of(arguments), arguments.settings)
+    return arguments, configured(settings_of(arguments), arguments.settings, part_of(arguments))
 
 
 @pytest.mark.parametrize("size", ["full", "cpu"])
@@ -68,6 +75,33 @@ def test_all_commands_are_understood_and_made_in_order(size):
     made: set[str] = set()
     for words in commands:
         made.add(str(understood(words, made)[0].out))
+
+
+def test_the_report_is_one_graph_that_ends_in_its_tables():
+    shown = listed("SIZE=report", "PPO=")
+    assert shown.rstrip().endswith("python -m topological_nav tables /nowhere")
+    made, done = set(), {}
+    for words in commands_of(shown):
+        arguments, settings = understood(words, made)
+        assert "preset=report" in words
+        made.add(str(arguments.out))
+        done[str(arguments.out).removeprefix("/nowhere/")] = arguments, settings
+        if type(arguments).__name__ == "Evaluate":
+            assert settings.limit_s == 175.0 and settings.images == settings.goal_images == 1
+    networks = {"rooms", "rooms-up", "rooms-down", "passages", "alexnet", "policy-grid", "adapted-passages"}
+    scenes = {f"maps/{Path(one).name}.npz" for one in done["data-passages"][0].scenes}
+    data = {"data", "data-passages", "data-unseen", "drives"}
+    assert set(done) == networks | scenes | data | {"evaluation", "evaluation-policy"} and len(scenes) == 10
+    assert [done[name][1].pitch for name in ("rooms-up", "rooms", "rooms-down")] == ["up", "level", "down"]
+    passages, policy = done["passages"][1], done["evaluation-policy"][0].policy
+    seven = {Path(one).name for one in done["data-passages"][0].scenes} - set(passages.test_scenes)
+    assert (len(seven), passages.test_scenes) == (7, ("maple", "rowan", "willow"))
+    alpha, lam = policy.removeprefix("/nowhere/policy-grid/alpha-").split("-lambda-")
+    assert done["policy-grid"][0].grid and (float(alpha), float(lam)) in GRIDS[done["policy-grid"][1].pairs]
+    assert done["evaluation-policy"][0].contenders == "dense,sparse"
+    # As many drives as the report has, but for a few.
+    drives = done["drives"]
+    assert len(drives[0].scenes) * drives[1].drives == 2488
 
 
 def with_given_networks(*words: str):
@@ -182,4 +216,4 @@ def test_commands_are_spread_over_gpus():
 def test_another_size_is_refused():
     with pytest.raises(subprocess.CalledProcessError) as refused:
         listed("SIZE=tiny")
-    assert "SIZE is 'tiny', expected full or cpu" in refused.value.stderr
+    assert "SIZE is 'tiny', expected full, cpu or report" in refused.value.stderr

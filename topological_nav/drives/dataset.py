@@ -279,8 +279,8 @@ def _image_files(out: Path, name: str, index: int, drives: Drives, config: Drive
     return numbered(out / name, "images", np.flatnonzero(drives.kept & (drives.scene == index)), config.shard)
 
 
-def drive_images(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the kept drives of a folder, some at a time: indices [k] and images [F, H, W, 3] u8 of their steps."""
+def drive_images(folder: Path, most: int | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield indices [k] of kept drives and images [F, H, W, 3] u8 of their steps, file by file, at most so many."""
     header, config = read_drives_header(folder)
     drives = load_drives(folder)
     files = [
@@ -288,6 +288,7 @@ def drive_images(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for index, about in enumerate(header["scenes"])
         for part in _image_files(Path(folder), about["name"], index, drives, config)
     ]
+    files = files[:: max(1, len(files) // most)][:most] if most else files
     for (path, rows), images in zip(files, read_shards([path for path, _ in files], AGAIN), strict=True):
         shape = (int(drives.steps[rows].sum()), config.height, config.width, 3)
         if images.shape != shape:

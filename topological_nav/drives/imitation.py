@@ -286,16 +286,14 @@ def train_grid(frames: Frames, out: Path, config: PolicyConfig, host: Host = ALO
 
 
 def grid_table(rows: list[dict[str, Any]]) -> str:
-    """Return a Markdown table with a row for every alpha and lambda."""
-    lines = []
-    for row in rows:
-        cells = [f"{row['alpha']:g}", f"{row['lambda']:g}"]
-        if "test" in row:
-            test = row["test"]
-            cells += [f"{test[name][key]:.3f}" for name in ("linear", "angular") for key in ("accuracy", "macro_f1")]
-            cells += [f"{test['forward']:.4f}", f"{test['no_change']:.4f}"]
-        else:
-            cells += ["none held out"] + [""] * 5
-        lines.append(cells)
+    """Return a Markdown table with a row for every alpha and lambda, of scores on held-out drives, if there are any."""
+    names = [(kind, key) for kind in ("linear", "angular") for key in ("accuracy", "macro_f1")]
+    lines = [
+        [f"{row[name]:g}" for name in ("alpha", "lambda")]
+        + [f"{test[kind][key]:.3f}" for kind, key in names]
+        + [f"{test[name]:.4f}" for name in ("forward", "no_change")]
+        for row in rows
+        if (test := row.get("test"))
+    ]
     scores = ("linear accuracy", "macro F1", "angular accuracy", "macro F1", "forward error", "of no change")
     return markdown(("alpha", "lambda", *scores), lines)

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from rich.table import Table
 
 from interactive_nav_common import rows as tables
@@ -29,7 +28,6 @@ SCORES = {
 }
 """Name -> heading; `within` is the share of episodes that ended near the goal, whatever the navigator believed."""
 HEADER = ("contender", "scene", "episodes", *SCORES.values())
-EPISODE = ["scene", "episode"]
 COLUMN = {"rc": "contact", "ad_s": "duration_s"}
 """Name of a score -> the column it is of, where that has another name."""
 OF_SUCCESSES = ("rc", "aadc_s", "duration_s")
@@ -44,10 +42,10 @@ def score(rows: pa.Table, name: str) -> Estimate:
     return over_episodes("success" if name in ("rc", "within") else name, values) if len(values) else NOTHING
 
 
-def by_scene(rows: pa.Table, name: str) -> list[float]:
+def by_scene(rows: pa.Table, name: str) -> dict[str, float]:
     """Return each scene's score; scenes without any (RC where nothing succeeded) are left out."""
-    means = (score(where(rows, scene=scene), name).mean for scene in rows["scene"].unique().to_pylist())
-    return [mean for mean in means if not np.isnan(mean)]
+    means = {scene: score(where(rows, scene=scene), name).mean for scene in rows["scene"].unique().to_pylist()}
+    return {scene: mean for scene, mean in means.items() if not np.isnan(mean)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,39 +70,26 @@ def summary(rows: pa.Table) -> list[Line]:
             lines.append(Line(contender, scene, len(part), {name: score(part, name) for name in SCORES}))
         for group, split in (("seen", "train"), ("unseen", "test"), ("all", None)) if len(scenes) > 1 else ():
             if len(part := where(played, split=split)):
-                means = {name: estimate(by_scene(part, name)) for name in SCORES}
+                means = {name: estimate(by_scene(part, name).values()) for name in SCORES}
                 lines.append(Line(contender, group, len(part), means))
     return lines
 
 
-@dataclasses.dataclass(frozen=True)
-class Difference:
-    """Compare two means."""
-
-    compared: str
-    score: str
-    result: Estimate | Contrast
-
-    def __str__(self) -> str:
-        return f"{self.compared}, {self.score}: {text(self.result)}"
-
-
-def differences(rows: pa.Table) -> list[Difference]:
-    """Compare dense and sparse map on the same episodes, scene by scene; unseen and seen scenes by Welch's test."""
+def differences(rows: pa.Table) -> list[tuple[str, str, Estimate | Contrast]]:
+    """Compare the same episodes on dense and sparse map, scene by scene; unseen and seen scenes by Welch's test."""
     results = []
     contenders = rows["contender"].unique().to_pylist()
     for name in ("success", "spl"):
         if {"dense", "sparse"} <= set(contenders):
-            dense, sparse = (where(rows, contender=c).select([*EPISODE, name]) for c in ("dense", "sparse"))
-            both = dense.join(sparse, EPISODE, join_type="inner", right_suffix="_sparse")
-            both = both.append_column("gap", pc.subtract(both[name], both[f"{name}_sparse"]))
-            gaps = both.group_by("scene").aggregate([("gap", "mean")])["gap_mean"]
-            results.append(Difference("dense minus sparse map", name, estimate(gaps.to_pylist())))
+            dense, sparse = (by_scene(where(rows, contender=c), name) for c in ("dense", "sparse"))
+            gaps = [dense[scene] - sparse[scene] for scene in dense if scene in sparse]
+            results.append(("dense minus sparse map", name, estimate(gaps)))
         for contender in contenders:
-            unseen, seen = (by_scene(where(rows, contender=contender, split=x), name) for x in ("test", "train"))
+            unseen, seen = (
+                [*by_scene(where(rows, contender=contender, split=x), name).values()] for x in ("test", "train")
+            )
             if unseen and seen:
-                test = welch(np.array(unseen), np.array(seen))
-                results.append(Difference(f"{contender}: unseen minus seen", name, test))
+                results.append((f"{contender}: unseen minus seen", name, welch(np.array(unseen), np.array(seen))))
     return results
 
 
@@ -114,11 +99,11 @@ def console_table(lines: Sequence[Line]) -> Table:
     return tables.console_table(HEADER, map(_cells, lines), left=3, caption=caption)
 
 
-def markdown(lines: Sequence[Line], compared: Sequence[Difference]) -> str:
+def markdown(lines: Sequence[Line], compared: Sequence[tuple[str, str, Estimate | Contrast]]) -> str:
     """Return the summary and the comparisons for a file."""
     summed = tables.markdown(HEADER, map(_cells, lines))
     header = ("Compared", "Score", "Difference [95 % interval]")
-    lines_compared = [(d.compared, SCORES[d.score], text(d.result)) for d in compared]
+    lines_compared = [(what, SCORES[name], text(result)) for what, name, result in compared]
     return summed + ("\n" + tables.markdown(header, lines_compared) if compared else "")
 
 

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from sklearn.metrics import ConfusionMatrixDisplay
 
 from interactive_nav import get_robot, load_scene
 from interactive_nav_common.figures import BLUE, ORANGE, RC, VERMILION, curves, panels, parts, plt, scene_axes
@@ -73,19 +74,11 @@ def drives_figure(scene_folders: Sequence[Path], folder: Path) -> Figure:
 
 
 def _some(folder: Path, count: int) -> list[tuple[int, np.ndarray]]:
-    """Return a few drives with their images, from files all over the folder: it is read once and a few are held."""
-    held, every = [], 1
-    for i, item in enumerate(drive_images(folder)):
-        if i % every == 0:
-            held.append(item)
-        if len(held) == 2 * count:
-            held, every = held[::2], 2 * every
+    """Return a few drives with their images, each of another file."""
     drives, out = load_drives(folder), []
-    for rows, images in held[:count]:
-        k = int(rows[len(rows) // 2])
-        ends = np.cumsum(drives.steps[rows])
-        at = int(np.flatnonzero(rows == k)[0])
-        out.append((k, images[ends[at] - drives.steps[k] : ends[at]]))
+    for rows, images in drive_images(folder, count):
+        k, end = int(rows[len(rows) // 2]), int(drives.steps[rows[: len(rows) // 2 + 1]].sum())
+        out.append((k, images[end - drives.steps[k] : end]))
     return out
 
 
@@ -107,26 +100,20 @@ def policy_figure(lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
     curves(axes[0], lines, {"forward": "forward", "consistency": "consistency"})
     axes[0].set_yscale("log")
     axes[0].set_title("errors in feature space", fontsize=9)
-    if "test" in results:
-        for name, colour in (("linear", "tab:blue"), ("angular", "tab:orange")):
-            axes[1].axhline(results["test"][name]["accuracy"], color=colour, ls="--", label=f"{name}, held out")
-    curves(axes[1], lines, {f"{name}_accuracy": f"{name}, learned from" for name in ("linear", "angular")})
-    axes[1].set_title("accuracy", fontsize=9)
-    axes[1].set_ylim(0, 1)
-    for axis, name, unit in ((axes[2], "linear", "m/s"), (axes[3], "angular", "rad/s")):
+    for axis, name, unit, colour in ((axes[2], "linear", "m/s", "C0"), (axes[3], "angular", "rad/s", "C1")):
         if "test" not in results:
             axis.set_axis_off()
             continue
+        axes[1].axhline(results["test"][name]["accuracy"], color=colour, ls="--", label=f"{name}, held out")
         counts = np.asarray(results["test"][name]["confusion"], float)
         share = counts / np.maximum(counts.sum(1, keepdims=True), 1)
-        axis.imshow(share, cmap="Blues", vmin=0, vmax=1)
-        for i, j in np.ndindex(*share.shape):
-            axis.text(j, i, f"{share[i, j]:.2f}", ha="center", va="center", fontsize=7)
-        values = [f"{v:+.2f}" for v in results["classes"][name]]
-        axis.set_xticks(range(len(values)), values, fontsize=7)
-        axis.set_yticks(range(len(values)), values, fontsize=7)
+        shown = ConfusionMatrixDisplay(share, display_labels=[f"{v:+.2f}" for v in results["classes"][name]])
+        shown.plot(ax=axis, cmap="Blues", values_format=".2f", colorbar=False, im_kw={"vmin": 0, "vmax": 1})
         axis.set(xlabel=f"policy, {unit}", ylabel="expert")
         axis.set_title(f"{name}, held-out steps", fontsize=9)
+    curves(axes[1], lines, {f"{name}_accuracy": f"{name}, learned from" for name in ("linear", "angular")})
+    axes[1].set_title("accuracy", fontsize=9)
+    axes[1].set_ylim(0, 1)
     return figure
 
 
@@ -207,9 +194,9 @@ def _bars(axis: Axes, at: np.ndarray, values: Sequence[float], width: float, col
     axis.bar_label(bars, fmt="%.2f", fontsize=8)
 
 
-def export_figure(sizes: Mapping[str, int], compared: Compared, limit_mib: float) -> Figure:
-    """Draw three panels: distances of embeddings, probabilities of passages, sizes."""
-    figure, ((left, middle, right),) = panels((13, 3.8), 1, 3)
+def export_figure(compared: Compared) -> Figure:
+    """Draw two panels: distances of embeddings, probabilities of passages."""
+    figure, ((left, right),) = panels((9, 3.8), 1, 2)
     rows = [("by precision, localiser", compared.embedding[0]), ("by precision, detector", compared.embedding[1])]
     if (compared.apart > 0).any():
         rows.append(("to the nearest image of another place", compared.apart))
@@ -222,12 +209,7 @@ def export_figure(sizes: Mapping[str, int], compared: Compared, limit_mib: float
     left.set(xscale="log", xlabel="distance of embeddings", ylabel="images")
     left.set_ylim(0, 1.35 * left.get_ylim()[1])
     left.legend(fontsize=8, loc="upper center")
-    middle.plot([0, 1], [0, 1], color="0.7", lw=1)
-    middle.scatter(*compared.probability.reshape(2, -1), s=8, alpha=0.6)
-    middle.set(xlabel="probability of a passage, the run", ylabel=f"the same, {PRECISION}", aspect="equal")
-    parts = sorted(sizes.items(), key=lambda item: item[1])
-    total = sum(sizes.values()) / 2**20
-    right.barh([name for name, _ in parts] + ["all"], [size / 2**20 for _, size in parts] + [total])
-    right.axvline(limit_mib, color=VERMILION, lw=1)
-    right.set(xlabel=f"MiB (at most {limit_mib:g}, the line)")
+    right.plot([0, 1], [0, 1], color="0.7", lw=1)
+    right.scatter(*compared.probability.reshape(2, -1), s=8, alpha=0.6)
+    right.set(xlabel="probability of a passage, the run", ylabel=f"the same, {PRECISION}", aspect="equal")
     return figure

@@ -19,6 +19,7 @@ from interactive_nav_common import figures
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.figures import BLUE, GREEN, ORANGE, PINK, SKY, VERMILION, parts, plt, scene_axes
 from interactive_nav_common.files import whole_file
+from interactive_nav_common.jobs.progress import Progress
 from topological_nav.data.dataset import load_plan, load_rooms, read_header
 from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
 from topological_nav.evaluate.evaluation import DrivenEpisodes, NavigatorPlayer, Played
@@ -92,13 +93,11 @@ def plan_picture(space: FreeSpace, graph: TopologicalMap, passable: float, heigh
     map_lines(axis, graph, passable)
     canvas: Any = figure.canvas
     canvas.draw()
-    picture = np.asarray(Image.fromarray(np.array(canvas.buffer_rgba())).convert("RGB").resize((width, height)))
-    (x0, x1), (y0, y1) = axis.get_xlim(), axis.get_ylim()
+    picture, placed = np.array(canvas.buffer_rgba())[..., :3], axis.transData.frozen()
     plt.close(figure)
-    scale = np.array([width / (x1 - x0), -height / (y1 - y0)])
 
     def pixels(xy_w: np.ndarray) -> np.ndarray:
-        return (np.asarray(xy_w) - [x0, y1]) * scale
+        return [0, height] + placed.transform(xy_w) * [1, -1]
 
     return picture, pixels
 
@@ -280,7 +279,7 @@ class Driven:
         return np.concatenate([np.asarray(image), np.asarray(beside)], 1)
 
 
-def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callable[[float], None]) -> Driven:
+def drive_episode(contest: Contest, number: int, filmed: bool, progress: Progress) -> Driven:
     """Drive one of the episodes of a contest's only scene, as the contest's only contender."""
     (venue,) = contest_scenes(contest)
     if not 0 <= number < len(venue.episodes):
@@ -302,7 +301,8 @@ def drive_episode(contest: Contest, number: int, filmed: bool, progress: Callabl
         log.extend(f"{time_s:7.1f} s  {line}" for line in _log_lines(graph, state))
 
     player = NavigatorPlayer(venue.player, contest.config, navigator, venue.camera, watch)
-    played = player.play(journey, lambda _, time_s: progress(time_s))
+    what, limit_s = f"{venue.scene.name}, simulated s", int(contest.config.limit_s)
+    played = player.play(journey, lambda _, time_s: progress(what, int(time_s), limit_s))
     assert player.state is not None
     time_s, xy, yaw, phase = zip(*steps, strict=True)
     columns = (np.array(column) for column in (time_s, xy, yaw, phase))

@@ -117,7 +117,7 @@ def test_the_summary_has_scenes_and_means_over_them():
 
 
 def test_differences_pair_what_both_played():
-    found = {(d.compared, d.score): d.result for d in scores.differences(all_rows())}
+    found = {(what, name): result for what, name, result in scores.differences(all_rows())}
     gap = found["dense minus sparse map", "success"]
     assert gap.mean == pytest.approx(0.5) and gap.runs == 2  # 0.75 - 0.25 and 1 - 0.5; willow has one side only
     assert found["dense minus sparse map", "spl"].mean == pytest.approx(0.25)
