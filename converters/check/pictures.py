@@ -266,7 +266,7 @@ def model_picture(name: str, pixels: int = PIXELS) -> np.ndarray:
     else:
         parts = ((TexturedMesh(p.vertices, p.faces, None, None), np.array(MATERIALS[p.material])) for p in model.parts)
         mesh = join_meshes(*(in_colour(*part) for part in parts))
-    return mesh_picture(mesh, camera_axes() * [model.front, 1, model.front], pixels, one_sided=True)
+    return mesh_picture(mesh, camera_axes(), pixels, one_sided=True)
 
 
 def mesh_picture(mesh: TexturedMesh, axes: np.ndarray, pixels: int, one_sided: bool = False) -> np.ndarray:

@@ -119,7 +119,7 @@ def test_mistakes_are_one_line(words, told, capsys):
         (["train", "rooms", "--grid"], "--grid"),
         (["train", "rooms", "selfsup_epochs=3"], "selfsup_epochs"),
         (["train", "passages", "--detector", "R"], "--detector"),
-        (["train", "passages", "hidden=3"], "hidden"),
+        (["train", "passages", "pitch=up"], "pitch"),
         (["train", "policy", "--grid", "alpha=3"], "alpha"),
         (["adapt", "map", "S", "epochs=5"], "epochs"),
         (["adapt", "map", "S", "seed=5"], "seed"),
