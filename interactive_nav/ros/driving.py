@@ -121,7 +121,8 @@ class DrivingNode:
             raise RosError(f"{others} other node(s) publish {ros.COMMAND}, expected none; end them")
 
     def _send(self, command: tuple[float, float], reason: str = "") -> None:
-        if self._command and not (reason and reason == self._said):
+        # A robot that was never commanded needs no stop, and a simulator in lockstep would take it for an answer.
+        if self._command and not (reason and (reason == self._said or self._acted_s == -math.inf)):
             self._command.publish(ros.twist_message(*command))
         if reason and reason != self._said:
             self._say(f"{self._name}: {reason}; the robot stops")

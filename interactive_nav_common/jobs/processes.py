@@ -129,6 +129,14 @@ class Launcher:
         """Start the process of a job in its share."""
         return Child(job, job.env_on(*share))
 
+    def start(self, job: Job) -> str | None:
+        """Start a job; return where in a few words, or None where there is no room now."""
+        share = self.take(job)
+        if share is None:
+            return None
+        self.running.append((job, self.begin(job, share), share))
+        return self.where(share)
+
     def where(self, share: Share) -> str:
         """Return where a job with a share runs, in a few words."""
         return "cpu" if share[0] is None else f"gpu {share[0]}"
@@ -192,9 +200,8 @@ def run_jobs(
     try:
         while (todo := ready()) is not None or launcher.running:
             for job in todo or ():
-                if (share := launcher.take(job)) is None:
+                if not launcher.start(job):
                     break
-                launcher.running.append((job, launcher.begin(job, share), share))
             time.sleep(poll_s)
             yield from launcher.ended()
     finally:

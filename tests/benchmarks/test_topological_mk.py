@@ -31,7 +31,16 @@ pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is no
 
 
 def listed(*words: str) -> str:
-    command = ("make", "-n", "-f", "benchmarks/topological.mk", "RUNS=/nowhere", "PPO=runs/x", *words)
+    command = (
+        "make",
+        "--no-print-directory",
+        "-n",
+        "-f",
+        "benchmarks/topological.mk",
+        "RUNS=/nowhere",
+        "PPO=runs/x",
+        *words,
+    )
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
 
 
