@@ -92,7 +92,7 @@ class Contest:
     domain: str = "clean"
     """The camera that the navigator sees by, goals included: a name of `domains.PRESETS`."""
     preset: str = ""
-    """The name that rows have for their settings."""
+    """Preset that the settings were laid over; rows name it."""
 
     def __post_init__(self) -> None:
         for name in self.contenders:
