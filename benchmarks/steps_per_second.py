@@ -13,6 +13,7 @@ logs, compiling and checkpoints apart. Rows carry device, versions and commit, a
 import dataclasses
 import datetime
 import functools
+import gzip
 import json
 import os
 import statistics
@@ -59,9 +60,9 @@ def origin(commit_told: str | None = None, packages: Sequence[str] = PACKAGES) -
 
 
 def append_row(path: Path, row: dict[str, Any], hidden: Sequence[str] | None = ()) -> None:
-    """Adds a row to a file of JSON lines, and prints it without the hidden columns (None: all)."""
+    """Add a row to a file of JSON lines, or a packed one (.gz), and print it without the hidden columns (None: all)."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "a", encoding="utf-8") as out:
+    with gzip.open(path, "at") if path.suffix == ".gz" else open(path, "a", encoding="utf-8") as out:
         out.write(json.dumps(row, separators=(",", ":")) + "\n")
     if hidden is not None:
         print(json.dumps({name: value for name, value in row.items() if name not in hidden}), flush=True)

@@ -317,21 +317,10 @@ def convert_building(
 ) -> tuple[Converted, ...]:
     """Convert one raw folder, floor by floor; the scene folders appear whole and together, or not at all.
 
-    Args:
-        source: folder in one of the layouts of `READERS`.
-        target: scene folder to make; its name becomes the scene's. A building of several floors makes `<target>_0`,
-            `<target>_1` and so on instead, from the lowest floor up.
-        config: choices.
-        report: progress callback.
-        cache: folder of hulls and stage results by content; default `cache_folder()`.
-        warn: called with what is wrong with the source as soon as it is read; all warnings stand in the result too.
-        floors: that it must have; None: any number.
-        annotations: Scan2CAD's file, in place of the source's; its models are those of `config.library`.
-
-    Raises:
-        SceneRejected: a source that cannot be used, or that has another number of floors.
-        FileError: a target that exists already or cannot be written.
-        StageFailed: a stage gave no usable result.
+    A building of several floors makes `<target>_0`, `<target>_1` and so on, from the lowest floor up; `floors` is the
+    number that it must have. `cache` keeps hulls and stage results by content (default: `cache_folder()`). `warn` gets
+    what is wrong with the source as soon as it is read. `annotations` is Scan2CAD's file, in place of the source's; its
+    models are those of `config.library`. Raises `SceneRejected`, `FileError` (of the target) or `StageFailed`.
     """
     clock = Clock(report or (lambda stage, share: None))
     if config.library is None and (source / "cad").is_dir():

@@ -76,18 +76,10 @@ def distance_field(
 
 
 def navigation_grid(traversable: np.ndarray, resolution_m: float, radius_m: float, cell_m: float) -> np.ndarray:
-    """Return the free cells of a grid of `cell_m` squares sharing the map's origin: the body fits at their centre.
+    """Return the largest connected component of the `cell_m` squares at whose centre a body of `radius_m` fits.
 
-    The erosion is measured at the map's resolution, so a coarse grid does not widen walls.
-
-    Args:
-        traversable: [rows, columns] bool.
-        resolution_m: the map's cell side.
-        radius_m: body radius.
-        cell_m: side of the navigation cell.
-
-    Returns:
-        [ceil(rows * resolution / cell), ...] bool, the largest connected component only.
+    `traversable` is [rows, columns] bool, the result [ceil(rows * resolution / cell), ...] with the same origin. The
+    erosion is measured at the map's resolution, so a coarse grid does not widen walls.
     """
     return largest_component(sampled_clearance(traversable, resolution_m, cell_m) >= max(radius_m, 1e-6))
 
@@ -223,19 +215,10 @@ def _nodes(room: np.ndarray, ratio: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def corner_graph(free: np.ndarray, fine_m: float, cell_m: float, origin_w: tuple[float, float]) -> CornerGraph:
-    """Prepare shortest paths from anywhere to anywhere on a map of free cells.
+    """Prepare shortest paths between all places on the largest component of a map of free cells [R, C].
 
-    Args:
-        free: [R, C] bool: cells that the body's centre may be in.
-        fine_m: their side.
-        cell_m: side of a node's cell, a whole multiple of `fine_m`.
-        origin_w: world corner of cell [0, 0].
-
-    Returns:
-        The graph, over the largest component of `free`.
-
-    Raises:
-        ValueError: cell_m is not a multiple of fine_m, or nothing is free.
+    A cell's side is `fine_m`; a node's `cell_m` must be a whole multiple of it. Raises `ValueError` otherwise, and if
+    nothing is free.
     """
     ratio = round(cell_m / fine_m)
     if ratio < 1 or abs(cell_m / fine_m - ratio) > 1e-6:

@@ -58,17 +58,10 @@ class Compositor:
     """Frames of one replay."""
 
     def __init__(self, replay: Replay, scene: Scene, height: int = 360, views: Sequence[str] = ()):
-        """Compile the scene.
+        """Compile the scene that the replay was recorded in; raise `ReplayError` if it has changed since.
 
-        Args:
-            replay: the episode.
-            scene: the folder that it was played in.
-            height: rows of the view from behind; a multiple of 12, so that every part has whole, even pixels.
-            views: of `VIEWS`, side by side in place of the view from behind and the robot's camera.
-
-        Raises:
-            ConfigError: another height.
-            ReplayError: the scene has changed since the replay was recorded.
+        `height` is that of the view from behind, a multiple of 12, so that every part has whole, even pixels. `views`
+        of `VIEWS` stand side by side in place of the view from behind and the robot's camera.
         """
         check_height(height)
         check_replay_scene(replay, scene)
@@ -194,16 +187,9 @@ def write_video(
     every: int = 1,
     on_progress: Callable[[int], None] = lambda frames: None,
 ) -> int:
-    """Write a video in real time, whole or not at all.
+    """Write a video (.mp4, .gif or .webp) in real time, whole or not at all; return the number of different frames.
 
-    Args:
-        compositor: the frames.
-        path: ends in .mp4 (H.264), .gif or .webp; another ending raises `ReplayError`.
-        every: control steps from one frame to the next.
-        on_progress: called with the number of frames written.
-
-    Returns:
-        The number of different frames.
+    A frame is `every` control steps apart from the next; `on_progress` gets the number of frames written.
     """
     check_format(path)
     steps = [*range(0, compositor.replay.num_steps, every), compositor.replay.num_steps]
@@ -221,13 +207,9 @@ def write_video(
 
 
 def write_mp4(frames: Iterable[np.ndarray], path: Path, rate: float, hold_s: float = 0.0) -> int:
-    """Write H.264; return the number of different frames.
+    """Write H.264 of one or more [rows, columns, 3] u8 frames of even sides; return the number of different frames.
 
-    Args:
-        frames: [rows, columns, 3] u8, of even numbers, one at least.
-        path: of the file.
-        rate: frames a second.
-        hold_s: the last frame stays so long.
+    `rate` is in frames a second; the last frame stays for `hold_s`.
     """
     count, writer, frame = 0, None, np.zeros((2, 2, 3), np.uint8)
     settings: dict[str, Any] = {"fps": rate, "quality": 7, "codec": "libx264", "macro_block_size": 2}

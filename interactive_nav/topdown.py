@@ -52,12 +52,7 @@ def shadow(boxes: np.ndarray, pos_w: np.ndarray, quat_w: np.ndarray) -> Any:
 
 
 def draw_topdown(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "time") -> None:
-    """Draw one replay, its path coloured by "time" (first step dark, last bright) or "contact".
-
-    Raises:
-        ConfigError: another `colour_by`.
-        ReplayError: the scene has changed since the replay was recorded.
-    """
+    """Draw one replay, its path coloured by "time" (first step dark, last bright) or "contact"."""
     if colour_by not in COLOUR_BY:
         raise ConfigError(f"colour_by is {colour_by!r}, expected one of {', '.join(COLOUR_BY)}")
     check_replay_scene(replay, scene)
@@ -94,14 +89,7 @@ def draw_topdown(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "tim
 
 
 def panels(replays: Sequence[Replay], scenes: dict[str, Scene], colour_by: str = "time", columns: int = 3) -> Figure:
-    """Return a figure with one panel a replay.
-
-    Args:
-        replays: at least one.
-        scenes: by the path that the replays name.
-        colour_by: see `draw_topdown`.
-        columns: panels in a row, at most.
-    """
+    """Return a figure of at most `columns` panels in a row, one a replay; replays name their paths of `scenes`."""
     columns = min(columns, len(replays))
     rows = -(-len(replays) // columns)
     shapes = [scenes[r.scene].maps.traversable.shape for r in replays]

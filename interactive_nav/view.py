@@ -119,16 +119,10 @@ def build_model(folder: Path, robot: RobotSpec | None, small: Sequence[SmallObje
         add_shapes(spec.body(name), obj, name)
     model = spec.compile()
     if robot is not None:
-        _show_robot(model, robot)
+        geoms = np.flatnonzero(model.body_rootid[model.geom_bodyid] == model.body(robot.base_body).id)
+        if len(geoms) and (model.geom_group[geoms] > VISUAL_GROUP).all():  # viewers hide groups 3 and up
+            model.geom_group[geoms] = VISUAL_GROUP
     return model
-
-
-def _show_robot(model: mujoco.MjModel, robot: RobotSpec) -> None:
-    """Show a robot of collision shapes only by these: viewers hide groups 3 and up."""
-    base = model.body(robot.base_body).id
-    geoms = np.flatnonzero(model.body_rootid[model.geom_bodyid] == base)
-    if len(geoms) and (model.geom_group[geoms] > VISUAL_GROUP).all():
-        model.geom_group[geoms] = VISUAL_GROUP
 
 
 def aim_at_robot(model: mujoco.MjModel, data: mujoco.MjData, robot: RobotSpec) -> None:

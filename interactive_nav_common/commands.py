@@ -77,9 +77,7 @@ def version() -> str:
 def parse(command: Any, prog: str, argv: Sequence[str] | None = None) -> Any:
     """Return the command line as an instance of `command`, or of the one that it names where `command` maps names.
 
-    Raises:
-        ConfigError: a word cannot be used; the message is one line.
-        SystemExit: the help or the version has been printed.
+    A word that cannot be used raises `ConfigError` with one line; help and version raise `SystemExit`.
     """
     words, prog = list(sys.argv[1:] if argv is None else argv), TYPED.get(prog, prog)
     if words[:1] == ["--version"]:

@@ -287,14 +287,10 @@ def field_docs(config_type: type) -> dict[str, str]:
 
 
 def overlay(base: Config, plain: Any, where: str, prefix: str = "", elsewhere: Sequence[str] = ()) -> Config:
-    """Return a dataclass of settings with nested plain values laid over it; other programs use it, too.
+    """Return a dataclass of settings with nested plain values, as of a YAML file, laid over it.
 
-    Args:
-        base: what `plain` does not name.
-        plain: nested mapping as read from YAML; None, as of an empty file or section: nothing.
-        where: file or word the values come from, for messages.
-        prefix: dotted name of `base` inside the whole, with its dot.
-        elsewhere: dotted names outside of `base` that a wrong key may have meant.
+    `where` names the file or word that they come from, and `prefix` the place of `base` inside the whole, with its dot;
+    `elsewhere` are dotted names outside of `base` that a wrong key may have meant.
     """
     plain = {} if plain is None else plain
     if not isinstance(plain, Mapping):
@@ -324,13 +320,7 @@ def overridden(config: Config, words: Sequence[str]) -> Config:
 
 
 def refuse_unused(arguments: Any, names: str, why: str) -> None:
-    """Refuse options and settings that were given but would change nothing.
-
-    Args:
-        arguments: a `Command`; what is None, False or empty was not given.
-        names: `--options` and settings.
-        why: with what they change nothing.
-    """
+    """Refuse options and settings, `names` of a `Command`, that were given but change nothing, and say `why`."""
     words = {word.partition("=")[0] for word in getattr(arguments, "settings", ())}
     for name in names.split():
         option = name.startswith("--")

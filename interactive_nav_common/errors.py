@@ -56,15 +56,10 @@ def regular(path: str | Path) -> Path:
 
 @contextlib.contextmanager
 def readable(path: str | Path, kind: type[UserError], remedy: str, what: str = "") -> Iterator[None]:
-    """Report whatever goes wrong in the block that reads a file as one line.
+    """Report whatever goes wrong in the block that reads a file as one line of a `kind` of error, with a remedy.
 
-    Zip, npy, Parquet, msgpack, picture and mesh readers raise many kinds for a damaged file.
-
-    Args:
-        path: of the file.
-        kind: of the error.
-        remedy: what to do about it.
-        what: it should be, such as ` as Parquet`.
+    Zip, npy, Parquet, msgpack, picture and mesh readers raise many kinds for a damaged file. `what` it should be is
+    such as ` as Parquet`.
     """
     try:
         if os.path.exists(path):  # who reads tells whether it may be missing

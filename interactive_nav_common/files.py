@@ -63,17 +63,12 @@ NO_LOCKS = "choose a folder on one that does", "its file system has no locks"
 
 
 def take_lock(path: Path) -> int | None:
-    """Hold a lock as long as the file descriptor that it returns is open, here or in a child.
+    """Hold a lock as long as the returned file descriptor is open, here or in a child; None if another holds it.
 
-    The system frees it however its holder ends. A lock and not a process id in a file: ids are used again, and mean
-    nothing in another container. And a descriptor and not a `filelock.FileLock`, which opens no folders, and whose
-    release frees what a child has inherited.
-
-    Args:
-        path: of a folder that is there, or of a file, which is created and names its holder.
-
-    Returns:
-        The descriptor, or None where another holds the lock.
+    The path is of a folder that is there, or of a file, which is created and names its holder. The system frees the
+    lock however its holder ends. A lock and not a process id in a file: ids are used again, and mean nothing in another
+    container. And a descriptor and not a `filelock.FileLock`, which opens no folders, and whose release frees what a
+    child has inherited.
     """
     is_folder = path.is_dir()
     with contextlib.ExitStack() as unless_held:
@@ -131,12 +126,7 @@ def holder(path: Path) -> str:
 
 @contextlib.contextmanager
 def locked(path: Path, busy: str) -> Iterator[None]:
-    """Hold a lock file for the block.
-
-    Args:
-        path: of the lock file.
-        busy: what to say where it is held, with `{holder}` in it.
-    """
+    """Hold a lock file for the block; where another holds it, say that it is `busy`, with `{holder}` in it."""
     descriptor = take_lock(path)
     if descriptor is None:
         raise FileError(busy.replace("{holder}", holder(path)))  # a path in it may have braces

@@ -97,11 +97,8 @@ def grid_graph(
 ) -> scipy.sparse.csr_matrix:
     """Return the undirected graph of moves between free cells: [cells, cells] of costs, cells numbered row by row.
 
-    Args:
-        free: [rows, columns] bool.
-        cost: [rows, columns] per metre; a move's is the mean of the cells that it crosses.
-        moves: (row, column) of at most 3 cells, one way each.
-        corners: whether a diagonal's mean includes the two cells beside it.
+    `cost` [rows, columns] is per metre; a move's is the mean of the cells that it crosses, with `corners` the two
+    beside a diagonal among them. `moves` are (row, column) of at most 3 cells, one way each.
     """
     rows, columns = free.shape
     index, pad = np.arange(rows * columns).reshape(rows, columns), 3

@@ -30,14 +30,11 @@ def raise_stop() -> None:
 
 @contextlib.contextmanager
 def interrupts_heard(*also: int, at_once: bool = True) -> Iterator[None]:
-    """Raise KeyboardInterrupt at SIGINT as always, and SystemExit at other stops, which would end the process at once.
+    """Raise KeyboardInterrupt at SIGINT and `also`, and SystemExit at other stops, which would end the process at once.
 
-    So nothing unfinished stays behind. Signals that others handle, or that are ignored, are left alone.
-
-    Args:
-        *also: signals that raise KeyboardInterrupt, too, unless they are ignored. `number_of` tells which.
-        at_once: False leaves the first one to `raise_stop`, and raises the next: JAX turns what leaves a callback into
-            another error, and a compilation that is left runs on and crashes the interpreter at its end.
+    So nothing unfinished stays behind. Signals that others handle, or that are ignored, are left alone. Without
+    `at_once`, the first is left to `raise_stop`: JAX turns what leaves a callback into another error, and a compilation
+    that is left runs on and crashes the interpreter at its end.
     """
 
     def handler(number: int, _: FrameType | None) -> None:
@@ -71,9 +68,7 @@ def _handled(handlers: dict[int, Any]) -> Iterator[None]:
 def stop_signals(second_ends: bool = True) -> Iterator[list[int]]:
     """Collect `STOPS` into the list that it yields; what they did before is put back at the end.
 
-    Args:
-        second_ends: a second one acts as it always would; False: it is collected too (a sweep waits for its runs,
-            which save).
+    A second one acts as it always would, or without `second_ends` is collected too.
     """
     collected: list[int] = []
     usual: dict[int, Any] = {n: signal.getsignal(n) for n in STOPS}

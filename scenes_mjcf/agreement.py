@@ -35,12 +35,7 @@ def sliding_friction(model: mujoco.MjModel, body: int) -> list[float]:
 
 
 def differences(model: mujoco.MjModel, objects: Sequence[SceneObject]) -> tuple[str, ...]:
-    """Return a line for each mass or friction in which the two files differ; objects that the model lacks are skipped.
-
-    Args:
-        model: of `scene.xml`.
-        objects: as `scene.json` lists them.
-    """
+    """Return a line for each mass or friction in which `scene.xml` and `scene.json` differ, for objects in both."""
     lines = []
     for item in objects:
         body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, item.name)

@@ -124,15 +124,7 @@ have no class of their own."""
 
 
 def class_id(category: str, classes: MaskClasses = 4) -> int:
-    """Segmentation id of an object category.
-
-    Args:
-        category: such as chair.
-        classes: the setting `segmentation_classes`.
-
-    Raises:
-        ConfigError: a category without an id.
-    """
+    """Return the segmentation id of an object category with so many `segmentation_classes`."""
     ids = SEGMENTATIONS[classes].ids
     if category not in ids:
         near = nearest(category, list(ids))

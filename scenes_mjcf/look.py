@@ -190,10 +190,8 @@ def straight_down(low_w: np.ndarray, high_w: np.ndarray, aspect: float, fov_deg:
 def over(axes_w: np.ndarray, low: np.ndarray, high: np.ndarray, pixel_m: float) -> tuple[CameraPose, Lens]:
     """Return a camera so far off a rectangle that its rays are parallel.
 
-    Args:
-        axes_w: (3, 3) rows: what points to the right, up, and at the viewer.
-        low: (2 or 3,) m along these axes, lower left corner of the picture.
-        pixel_m: width of a pixel; the picture is some whole pixels large, from the lower left corner on.
+    The rows of `axes_w` (3, 3) point to the right, up, and at the viewer; `low` and `high` are corners (m) along them.
+    The picture is some whole pixels of `pixel_m` large, from the lower left corner on.
     """
     columns, rows = np.ceil((high - low)[:2] / pixel_m - 1e-6).astype(int).tolist()
     away, half = 1e4 * pixel_m * max(columns, rows), np.array([columns, rows]) * pixel_m / 2
@@ -288,14 +286,10 @@ class GlPainter:
         sky: tuple[int, ...] | None = SKY,
         shadows: bool = False,
     ):
-        """Create a context.
+        """Create a context for pictures of so many pixels; `sky` is the colour of the background (None: the model's).
 
-        Args:
-            width: of the pictures, pixels.
-            height: pixels.
-            sky: colour where nothing is hit; None: the model's.
-            shadows: what stands in a building casts some, by the lights that are neither lamps nor have ambient light,
-                which MuJoCo takes from shadows too; these lights become as even as the sun's, in the model.
+        With `shadows`, what stands in a building casts some, by the lights that are neither lamps nor have ambient
+        light, which MuJoCo takes from shadows too; these lights become as even as the sun's, in the model.
         """
         buffer = model.vis.global_
         if width > buffer.offwidth or height > buffer.offheight:
@@ -330,15 +324,7 @@ class GlPainter:
     def draw(
         self, data: mujoco.MjData, pose: CameraPose, fov_deg: float, groups: Sequence[int], depth: bool = False
     ) -> np.ndarray:
-        """Draw pictures of cameras.
-
-        Args:
-            pose: of N cameras without roll, leaves [N, ...].
-            depth: distances along the axis (m) rather than colours.
-
-        Returns:
-            [N, H, W, 3] u8, or [N, H, W] f32.
-        """
+        """Draw pictures [N, H, W, 3] u8 of N cameras without roll; or `depth` [N, H, W] f32, m along the axis."""
         self._context.make_current()
         self._model.vis.global_.fovy = fov_deg
         option = mujoco.MjvOption()

@@ -101,12 +101,7 @@ class SceneMaps:
 
 
 def manifest_from_dict(data: Any, where: str = "scene.json") -> SceneManifest:
-    """Builds a manifest from decoded JSON; `where` is the file named in errors.
-
-    Raises:
-        SceneError: no JSON object, unknown or missing key, a value of another type, unknown category or split,
-            non-positive mass or friction.
-    """
+    """Build a manifest from decoded JSON; a `SceneError` that names `where` says what breaks the schema."""
     manifest = SCENES.record(data, SceneManifest, where)
     check_name(manifest.name, f"{where}: name", SceneError)
     if manifest.schema_version != SCHEMA_VERSION:
@@ -125,11 +120,7 @@ def manifest_from_dict(data: Any, where: str = "scene.json") -> SceneManifest:
 
 
 def load_manifest(folder: str | Path) -> SceneManifest:
-    """Reads and checks `folder/scene.json`.
-
-    Raises:
-        SceneError: the folder or file is missing, is not JSON, or breaks the schema.
-    """
+    """Read and check `folder/scene.json`; raise `SceneError` where it is missing or breaks the schema."""
     path = Path(folder) / "scene.json"
     if not path.is_file():
         raise SceneError(
@@ -148,11 +139,7 @@ def save_manifest(manifest: SceneManifest, folder: str | Path) -> None:
 
 
 def load_maps(folder: str | Path) -> SceneMaps:
-    """Reads and checks `folder/maps.npz`.
-
-    Raises:
-        SceneError: missing or unreadable file, wrong shapes, resolution coarser than 0.05 m, or no traversable cell.
-    """
+    """Read and check `folder/maps.npz`; raise `SceneError` if it is missing or unusable, or coarser than 0.05 m."""
     path = Path(folder) / "maps.npz"
     if not path.is_file():
         raise SceneError(f"{path}: no such file; convert the scene again")

@@ -248,18 +248,13 @@ def _robust_fit(p: np.ndarray, q: np.ndarray, round_model: bool) -> Alignment:
     return dataclasses.replace(least_squares(p[keep], q[keep], round_model), outliers=~keep)
 
 
-def _equivalents(p: np.ndarray, q: np.ndarray, fit: Alignment, folds: int) -> np.ndarray:
-    """Return (k, 3) of each CAD point's `folds` images under the symmetry the one that the fit brings closest."""
-    images = np.stack([p @ yaw_matrix(2 * math.pi * i / folds).T for i in range(folds)])
-    distance = np.stack([_squared(fit, image, q) for image in images])
-    return images[np.argmin(distance, axis=0), np.arange(len(p))]
-
-
 def _fit_equivalents(p: np.ndarray, q: np.ndarray, first: Alignment, folds: int) -> Alignment:
     """Alternate between choosing equivalent CAD points and fitting, while the residual falls."""
     best, images = first, p
     for _ in range(10):
-        images = _equivalents(p, q, best, folds)
+        turned = np.stack([p @ yaw_matrix(2 * math.pi * i / folds).T for i in range(folds)])
+        closest = np.argmin([_squared(best, image, q) for image in turned], axis=0)
+        images = turned[closest, np.arange(len(p))]
         try:
             fit = _robust_fit(images, q, False)
         except AlignmentError:

@@ -173,11 +173,7 @@ def read_single_mesh(
 ) -> RawScene:
     """Read a scan that is one mesh file; without labels beside it, structure is recognised by its shape.
 
-    `path`: of the file; what it names must lie in its folder.
-    `strict`: refuse what would be repaired with a warning.
-    `up`: word of `AXES`, or `auto` to detect it.
-    `unit`: word of `UNITS_M`, or `auto` to infer it from the height.
-    `mirror`: take -x for x.
+    What the file names must lie in its folder. `up` is a word of `AXES`, `unit` one of `UNITS_M`; `auto` detects them.
     """
     source = SourceFolder(path.parent, strict)
     mesh = read_surface(source, source.inside(path), "give a mesh file")

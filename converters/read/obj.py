@@ -281,10 +281,8 @@ def texels(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
 def join_textures(corner_uv: np.ndarray, number: np.ndarray, images: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Put several images above one another and move texture coordinates along.
 
-    `corner_uv`: (m, 3, 2), origin at the lower left of each face's own image; may leave [0, 1] (repeats).
-    `number`: (m,) image of each face.
-    `images`: (h, w, 3) uint8 each.
-    Returns corner_uv (m, 3, 2) in the joint image, the joint image.
+    `corner_uv` (m, 3, 2) has its origin at the lower left of each face's image, whose `number` is (m,), and may leave
+    [0, 1] (repeats). Return it as it is in the joint image, and that (h, w, 3) uint8.
     """
     if len(images) == 1 and images[0].size > 3:
         return corner_uv, images[0]

@@ -24,5 +24,5 @@ def command_line(description: str | None, rows: str = "", settings: bool = False
         parser.add_argument("--set", dest="settings", type=setting, nargs="*", default=[], metavar="key=value")
     if rows:
         parser.add_argument("--commit", help="recorded in the row; default: git's HEAD")
-        parser.add_argument("--out", type=Path, default=RESULTS / f"{rows}.jsonl", help="where rows are appended")
+        parser.add_argument("--out", type=Path, default=RESULTS / f"{rows}.jsonl.gz", help="where rows are appended")
     return parser

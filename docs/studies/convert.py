@@ -6,7 +6,7 @@ Generates a sparsely furnished home of about that many scan faces and converts i
 time in a process of its own. A row holds wall seconds in all and of each stage, the peak resident memory, and the
 machine. Memory is the larger of the converter's own peak and its largest child's (`resource.getrusage`), and beside it
 the sum of the converter and `--jobs` such children, which bounds what all hold together. Rows are appended to
-`benchmarks/results/convert.jsonl`; on a machine that others use, times are upper bounds: the load is recorded beside
+`benchmarks/results/convert.jsonl.gz`; on a machine that others use, times are upper bounds: the load is recorded beside
 them, and `cpu_s`, the processor seconds of the converter and its children, which depends on it little.
 """
 

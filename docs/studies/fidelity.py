@@ -7,13 +7,14 @@
 
 The reference is C MuJoCo at 1/240 s with 100 solver iterations to a tolerance of 1e-12, once with convex hulls and
 once with the boxes that batched scenes collide with. Every scenario is run from many offsets and turns of the object,
-since a single stick-slip push says little. Rows are appended to `benchmarks/results/fidelity.jsonl`; `--report` draws
-`docs/fidelity.webp` and prints the table of `docs/fidelity.md` from them.
+since a single stick-slip push says little. Rows are appended to `benchmarks/results/fidelity.jsonl.gz`; `--report`
+draws `docs/fidelity.webp` and prints the table of `docs/fidelity.md` from them.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import gzip
 import itertools
 import json
 import math
@@ -389,7 +390,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--report", action="store_true")
     args = parser.parse_args(argv)
     if args.report:
-        rows = [json.loads(line) for line in args.out.read_text(encoding="utf-8").splitlines()]
+        rows = [json.loads(line) for line in gzip.decompress(args.out.read_bytes()).splitlines()]
         print(report(rows, Path("docs/fidelity.webp")), end="")
         return
     numbers = range(len(SCENARIOS) if args.only == "sleep" else ALONE) if args.scenarios is None else args.scenarios

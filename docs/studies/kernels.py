@@ -6,7 +6,7 @@ Runs `AutoResetEnv.step`, or parts of it, under JAX's profiler, which sees Warp'
 time of each kernel. Two parts' difference is what lies between them: `--part simulation` less `observed` is drawing new
 episodes. `--preset NAME` profiles PPO instead: `--part collect` acts for an update, `--part update` learns from it too.
 `busy` is the share of the time between the first and the last kernel in which at least one ran: the rest is launching.
-The kernels' row is appended to `benchmarks/results/kernels.jsonl`.
+The kernels' row is appended to `benchmarks/results/kernels.jsonl.gz`.
 """
 
 from __future__ import annotations

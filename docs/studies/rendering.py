@@ -8,7 +8,7 @@ measured with the frames left on the device and copied to the host. `rgb` is Lam
 in their bodies' mean colours, or with `--image-geometry meshes` of the scenes' textured meshes; `rgb_textured` draws a
 scene's visual meshes with MJX-Warp's own renderer (renderer warp only); `observation` is depth and segmentation in one
 pass, without the environment around them. A row that fails (memory, for the most part) carries `error` instead of a
-rate. Rows are appended to `benchmarks/results/rendering.jsonl`.
+rate. Rows are appended to `benchmarks/results/rendering.jsonl.gz`.
 """
 
 from __future__ import annotations

@@ -46,12 +46,6 @@ def all_free(tables: SceneTables, scene: jax.Array, points: jax.Array) -> jax.Ar
     return tables.free[scene, r, c].all()
 
 
-def _in_sight(tables: SceneTables, scene: jax.Array, a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return [] bool: whether the line between two world points (2,) crosses free cells only."""
-    share = (jnp.arange(tables.sight_samples) + 0.5) / tables.sight_samples
-    return all_free(tables, scene, a[None] + share[:, None] * (b - a)[None])
-
-
 def goal_field(tables: SceneTables, scene: jax.Array, goal_xy_w: jax.Array) -> GoalField:
     """Return every corner's distance to a goal (2,) on free ground, and the next corner on the way: once an episode."""
     none = tables.corner_xy_w.shape[1] - 1
@@ -80,7 +74,9 @@ def _from_node(
     around = jnp.linalg.norm(tables.corner_xy_w[scene, corners] - xy[None], axis=-1) + goal.corner_m[corners]
     best = jnp.argmin(around)
     straight = jnp.linalg.norm(goal.xy_w - xy)
-    direct = _in_sight(tables, scene, tables.node_xy_w[scene, node], goal.xy_w) | jnp.isinf(around[best])
+    share, start = (jnp.arange(tables.sight_samples) + 0.5) / tables.sight_samples, tables.node_xy_w[scene, node]
+    in_sight = all_free(tables, scene, start[None] + share[:, None] * (goal.xy_w - start)[None])
+    direct = in_sight | jnp.isinf(around[best])
     direct &= straight <= around[best] * _LIFT
     return jnp.where(direct, straight, around[best]), jnp.where(direct, none, corners[best])
 

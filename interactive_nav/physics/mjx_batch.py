@@ -206,7 +206,10 @@ class JaxPhysics(MjxPhysics):
         self._rolls = rolling_geoms(self._host, world.robot, layout.robot_bodies)
 
     def _host_model(self):
-        return _without_sensors(self.window.spec)
+        spec = self.window.spec.copy()
+        for sensor in list(spec.sensors):
+            spec.delete(sensor)
+        return spec.compile()
 
     def _template(self, n):
         return mjx.make_data(self._host, impl="jax")
@@ -271,13 +274,6 @@ def _slot_of_geom(layout: Layout, model: mujoco.MjModel) -> np.ndarray:
 def _engine_step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     with jax.numpy_rank_promotion("allow"):  # MJX counts on it
         return mjx.step(model, data)
-
-
-def _without_sensors(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    spec = spec.copy()
-    for sensor in list(spec.sensors):
-        spec.delete(sensor)
-    return spec.compile()
 
 
 def measure_buffers(world: World, window: PhysicsWindow, dofs: int, head_room: float = 1.6) -> tuple[int, int]:

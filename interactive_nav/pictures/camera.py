@@ -92,11 +92,7 @@ class PictureCamera:
     """Takes pictures of one environment."""
 
     def __init__(self, env: Any, engine: str = "auto", fov_deg: float | None = None):
-        """Prepare nothing before it is needed.
-
-        Args:
-            fov_deg: vertical field of view of the robot's camera; None: that of its observations.
-        """
+        """Prepare nothing before it is needed; without a vertical `fov_deg` the camera is that of the observations."""
         self._env, self._painter, self._fov_deg = env, Painter(engine), fov_deg or env.sensors.lens.fov_deg
         world, classes = env.world, env.sensors.boxes.classes
         self._model = functools.cache(
@@ -116,16 +112,10 @@ class PictureCamera:
         streams: tuple[str, ...] = ("rgb",),
         view: str = "robot",
     ) -> dict[str, np.ndarray]:
-        """Draw pictures of where a state is now.
+        """Draw pictures, `width` by `height` pixels, of where a state is now.
 
-        Args:
-            width: pixels.
-            height: pixels.
-
-        Returns:
-            rgb [H, W, 3] u8; normals [H, W, 3] f32, unit vectors in the camera's frame (right, up, towards the
-            viewer), 0 where nothing is; depth [H, W] f32, m along the optical axis, 0 where nothing is;
-            segmentation [H, W] u8 class ids.
+        rgb [H, W, 3] u8; normals [H, W, 3] f32, unit vectors in the camera's frame (right, up, towards the viewer), 0
+        where nothing is; depth [H, W] f32, m along the optical axis, 0 where nothing is; segmentation [H, W] u8.
         """
         unknown = [s for s in streams if s not in STREAMS]
         if unknown or not streams:

@@ -116,13 +116,10 @@ def _read(state: Any, action: jax.Array) -> dict[str, Any]:
 
 
 class EpisodePlayer(Player):
-    """Plays episodes of one environment with one policy, compiled once.
+    """Plays episodes of one environment, not batched, with one policy, compiled once.
 
-    Args:
-        env: one environment, not batched, not resetting itself.
-        policy: pure (observation, key) -> action (A,) in [-1, 1], or one on the host.
-        name: of the policy, for captions.
-        label: where the policy comes from, for captions.
+    The policy is a pure (observation, key) -> action (A,) in [-1, 1], or one on the host; its `name` and `label`, where
+    it comes from, are for captions.
     """
 
     def __init__(self, env: InteractiveNav, policy: PolicyFn | HostPolicy, name: str = "policy", label: str = ""):

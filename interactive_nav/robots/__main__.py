@@ -32,18 +32,13 @@ class Robots(Command):
         return (*listed, *self.files)
 
 
-def _unit(label: str) -> str:
-    """Return the unit at the end of an action's name."""
-    return "N m" if label.endswith(" N m") else label.rsplit(" ", 1)[-1]
-
-
 def _print_table(names: tuple[str, ...], console: Console) -> None:
     table = Table("robot", "kg", "L x W x H m", "drive", "native action", "modes", "camera", "success m", "sources")
     for name in names:
         robot = get_robot(name)
         size = " x ".join(f"{v:.3g}" for v in robot.size_m) if robot.size_m else "-"
         ranges = sorted({(low, high) for low, high in zip(robot.action_low, robot.action_high, strict=True)})
-        units = sorted({_unit(label) for label in robot.action_names})
+        units = sorted({"N m" if name.endswith(" N m") else name.rsplit(" ", 1)[-1] for name in robot.action_names})
         action = f"{robot.action_size}: " + ", ".join(f"{low:g}..{high:g}" for low, high in ranges[:2])
         camera = robot.camera
         table.add_row(

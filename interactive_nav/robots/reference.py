@@ -70,7 +70,10 @@ def from_description(path: Path) -> Callable[[str], RobotSpec]:
 def _inferred(path: Path, given: dict[str, Any]) -> dict[str, Any]:
     """Complete the given settings by what the file shows."""
     spec = read_file(path, given.get("base_body", ""))
-    speeds = _speed_limits(spec, path)
+    # Largest speeds of joints, rad/s, as a URDF's limits or velocity servos declare them.
+    servos = {a.target: float(a.ctrlrange[1]) for a in spec.actuators if a.biasprm[2] < 0 and not a.biasprm[1]}
+    limits = {j.get("name", ""): j.find("limit") for j in ElementTree.parse(path).getroot().iter("joint")}
+    speeds = servos | {name: float(x.get("velocity", 0)) for name, x in limits.items() if x is not None}
     tops = spec.worldbody.bodies
     tops = [b for b in tops if any(j.type == mujoco.mjtJoint.mjJNT_FREE for j in b.joints)] or tops
     base = given.get("base_body") or tops[0].name if len(tops) == 1 else given.get("base_body", "")
@@ -109,13 +112,6 @@ def _inferred(path: Path, given: dict[str, Any]) -> dict[str, Any]:
         settings["torque_limits"] = {**dict.fromkeys(weak, slip), **limits}
     settings.setdefault("casters", tuple(w.body for w in stands if w.sphere and w not in driven))
     return settings
-
-
-def _speed_limits(spec: mujoco.MjSpec, path: Path) -> dict[str, float]:
-    """Return the largest speed of joints, rad/s, as a URDF's limits or velocity servos declare it."""
-    servos = {a.target: float(a.ctrlrange[1]) for a in spec.actuators if a.biasprm[2] < 0 and not a.biasprm[1]}
-    limits = {j.get("name", ""): j.find("limit") for j in ElementTree.parse(path).getroot().iter("joint")}
-    return servos | {name: float(x.get("velocity", 0)) for name, x in limits.items() if x is not None}
 
 
 def _on_floor(spec: mujoco.MjSpec, model: mujoco.MjModel, base: str) -> list[_Round]:

@@ -32,9 +32,7 @@ class Pilot:
     ):
         """Refuse a policy whose inputs no topic carries, or that gives no velocity.
 
-        Args:
-            limits: of forward m/s and turn rad/s; None: the policy's.
-            odom_in_map: pose of the odometry's frame, m and rad.
+        `limits` are of forward m/s and turn rad/s (None: the policy's); `odom_in_map` is a pose, m and rad.
         """
         about, self._policy, self._scene = policy.about, policy, scene
         self.inputs: dict[str, Any] = about["inputs"]

@@ -172,11 +172,9 @@ class RosSimulator(RosSensors):
         start: tuple[float, ...] = (),
         engine: str | None = None,
     ):
-        """Place the robot and compile.
+        """Place the robot at `start` (x, y in m and yaw in rad, world; empty: drawn) and compile.
 
-        Args:
-            start: x, y (m) and yaw (rad), world; empty: drawn.
-            engine: of `PictureCamera`, to draw the robot's camera's colours; None: as the environment observes.
+        `engine` of `PictureCamera` draws the colours of the robot's camera; None: as the environment observes.
         """
         super().__init__(env)
         self._camera = PictureCamera(env, engine) if engine else None

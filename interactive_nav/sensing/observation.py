@@ -31,18 +31,11 @@ def task_observation(
     goal_xy_w: jax.Array,
     waypoints_b: jax.Array,
 ) -> dict[str, jax.Array]:
-    """Return the task's parts of the observation of one environment, in the vector's order.
+    """Return the task's parts of the observation of one environment, name -> (n,) f32, in the vector's order.
 
-    Args:
-        pos_w: (3,) base position, m.
-        rotation: (3, 3) base axes as columns.
-        linear_velocity_w: (3,) m/s.
-        angular_velocity_b: (3,) rad/s, base frame (as MuJoCo's free joint has it).
-        goal_xy_w: (2,) m; the goal lies on the floor, z = 0.
-        waypoints_b: (W, 2) m.
-
-    Returns:
-        Name -> (n,) f32.
+    `pos_w` (3,) is in m, `rotation` (3, 3) has the base's axes as columns, `linear_velocity_w` (3,) is in m/s,
+    `angular_velocity_b` (3,) in rad/s in the base frame, `goal_xy_w` (2,) in m on the floor z = 0, `waypoints_b` (W, 2)
+    in m.
     """
     goal_w = jnp.concatenate([goal_xy_w, jnp.zeros(1)])
     return {
@@ -55,15 +48,10 @@ def task_observation(
 def advance_odometry(
     pose: jax.Array, moved_w: jax.Array, yaw_rad: jax.Array, turned_rad: jax.Array, noise: jax.Array
 ) -> jax.Array:
-    """Advance dead reckoning by one control step, in the frame of the episode's start.
+    """Advance the dead reckoning `pose` (3,) x, y (m), yaw (rad, not wrapped) by one control step.
 
-    Args:
-        pose: (3,) x, y (m), yaw (rad) reckoned so far.
-        moved_w: (2,) m, true displacement.
-        noise: (2,) relative error of the distance and of the angle of this step.
-
-    Returns:
-        (3,) the new pose; its yaw is not wrapped.
+    It is in the frame of the episode's start. `moved_w` (2,) m is the true displacement, `noise` (2,) the relative
+    error of the distance and of the angle of this step.
     """
     cos, sin = jnp.cos(yaw_rad), jnp.sin(yaw_rad)
     ahead, left = cos * moved_w[0] + sin * moved_w[1], -sin * moved_w[0] + cos * moved_w[1]

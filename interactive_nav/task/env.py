@@ -87,7 +87,9 @@ class InteractiveNav(Env):
         extra = {t.name: t.size for t in terms if t.kind == "observation"}
         self.sensors = Sensors(self.world, config, self.physics.name, extra)
         self.success_distance_m = config.success_distance_m or robot.body_width_m
-        self.score_mass_kg = self._score_mass_kg()
+        total, base = self.world.robot_mass_kg, self.world.models[0].body_mass[self.world.layout.robot_bodies[0]]
+        masses_kg = {"total": total, "links": total - robot.root_link_kg, "base": float(base)}
+        self.score_mass_kg = masses_kg[config.robot_mass]  # m_0 as the scores take it
         self._constants = config, self.tables, self.score_mass_kg
         self._small_radius_m = jnp.asarray([o.radius_m for o in self.world.small_objects], jnp.float32)
         self._num_small = len(self.world.small_objects)
@@ -301,12 +303,6 @@ class InteractiveNav(Env):
         """Return (M, 3) centres of mass in the world frame."""
         pos_w, axes_w = body_poses(self.sensors.boxes, scene, physics.qpos)
         return pos_w[:-1] + apply_axes(axes_w[:-1], self.tables.com_m[scene])
-
-    def _score_mass_kg(self) -> float:
-        """Return m_0 as the scores take it, kg."""
-        world = self.world
-        total, base = world.robot_mass_kg, float(world.models[0].body_mass[world.layout.robot_bodies[0]])
-        return {"total": total, "links": total - world.robot.root_link_kg, "base": base}[self.config.robot_mass]
 
     def _geodesic(
         self, scene: jax.Array, goal: GoalField, detour: tuple[GoalField, jax.Array] | None, pos_w: jax.Array

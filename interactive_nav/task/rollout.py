@@ -49,12 +49,8 @@ class HostPolicy:
     def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> Any:
         """Return the actions [N, A] of one control step; or a tuple of them and which episodes are over, [N] bool.
 
-        Such an episode was over before this step, and the environment's `done` ends nothing.
-
-        Args:
-            state: of the environments, leaves [N, ...]; on `warp` the step that follows overwrites it.
-            episode: [N] number of the episode in each environment.
-            running: [N] bool; the actions of the others have no effect.
+        Such an episode was over before this step, and the environment's `done` ends nothing. The leaves [N, ...] of the
+        `state` are overwritten by the step that follows on `warp`. Actions of what is not `running` [N] have no effect.
         """
         raise NotImplementedError
 
@@ -139,14 +135,11 @@ class Player:
     ) -> Rollout:
         """Play every episode to its end.
 
-        Args:
-            keys: [N, 2]; an episode is drawn, and its policy's randomness is, from its key alone.
-            starts: an `EpisodeStart` with leaves [N, ...]: these episodes instead of drawn ones.
-            scene_index: [N] i32, the scene of each drawn episode; None: drawn as well.
-            record: E of the recorders at each step; None: all.
-            batch: episodes played at a time; None: all. Where the device's memory lacks room, half as many are tried.
-            on_progress: called with the numbers of finished episodes and of steps.
-            fewest: on the CPU a batch is made no smaller than about this.
+        An episode is drawn, and its policy's randomness is, from its key of `keys` [N, 2] alone, or `starts` (an
+        `EpisodeStart` with leaves [N, ...]) are played; `scene_index` [N] i32 says in which scene one is drawn.
+        `record` episodes (None: all) pass the recorders at each step. `batch` are played at a time: half as many are
+        tried where memory lacks room, on the CPU no fewer than about `fewest`. `on_progress` gets the numbers of
+        finished episodes and of steps.
         """
         count = len(keys)
         size, record = min(batch or count, count), count if record is None else record
@@ -276,12 +269,7 @@ class Player:
 
 
 def rollout(env: Any, policy: Policy, starts: Any, recorders: Mapping[str, Recorder], **options: Any) -> Rollout:
-    """Play episodes once; see `Player.rollout`, which keeps what it compiles.
-
-    Args:
-        starts: keys [N, 2] of the episodes.
-        options: of `Player.rollout`.
-    """
+    """Play episodes with keys [N, 2] once; see `Player.rollout`, which takes `options` and keeps what it compiles."""
     return Player(env, recorders).rollout(policy, starts, **options)
 
 

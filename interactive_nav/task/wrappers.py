@@ -33,18 +33,14 @@ DRAW_SHARE = 16
 """New episodes are drawn for this fraction of the batch at a time."""
 
 
-def scene_of_slot(env: InteractiveNav, slot: jax.Array) -> jax.Array | None:
-    """Return the scenes [...] that environments of these numbers keep; None where each episode draws one."""
-    return slot % len(env.scenes) if env.config.scene_choice == "slot" else None
-
-
 def reset_all(env: InteractiveNav, keys: jax.Array, slot: jax.Array | None = None) -> State:
     """Return N new episodes of [N, 2] keys, consumed, each in the scene that its environment keeps, if it keeps one.
 
     `slot` is [N] i32, numbers of the environments where these are a part of a larger batch; None: 0 to N - 1.
     """
-    scene = scene_of_slot(env, jnp.arange(keys.shape[0]) if slot is None else slot)
-    return jax.vmap(env.reset)(keys) if scene is None else jax.vmap(env.reset)(keys, scene)
+    if env.config.scene_choice != "slot":
+        return jax.vmap(env.reset)(keys)
+    return jax.vmap(env.reset)(keys, (jnp.arange(keys.shape[0]) if slot is None else slot) % len(env.scenes))
 
 
 def draw_where(env: InteractiveNav, current: tuple, over: jax.Array) -> tuple:
@@ -129,7 +125,8 @@ def wrap_for_brax_training(
 def _refuse_passed_over(env: Any) -> None:
     """Refuse wrappers whose `step` or `reset` is never called: a batch calls their finer parts."""
     while isinstance(env, Wrapper):
-        changed = {name for name in ("reset", "step", "draw", "advance", "observe") if name in _overridden(type(env))}
+        bases = type(env).__mro__[: type(env).__mro__.index(Wrapper)]
+        changed = {name for base in bases for name in vars(base)} & {"reset", "step", "draw", "advance", "observe"}
         for name, part in (("step", "advance"), ("reset", "draw")):
             if name in changed and not changed & {part, "observe"}:
                 raise ConfigError(
@@ -137,10 +134,6 @@ def _refuse_passed_over(env: Any) -> None:
                     f"`{part}` (the {name} without its observation) or `observe`: override that too"
                 )
         env = env.env
-
-
-def _overridden(kind: type) -> set[str]:
-    return {name for base in kind.__mro__[: kind.__mro__.index(Wrapper)] for name in vars(base)}
 
 
 class AutoResetEnv(Wrapper):

@@ -42,11 +42,7 @@ class Actor:
 
 
 class RayLauncher(Launcher):
-    """Actors on a Ray cluster, each with the CPU cores and the part of a GPU that it asks for.
-
-    Args:
-        address: of the cluster, as `ray.init` takes it.
-    """
+    """Actors on a Ray cluster at an `address`, each with the CPU cores and the part of a GPU that it asks for."""
 
     def __init__(self, address: str):
         super().__init__()

@@ -186,15 +186,9 @@ def run_jobs(
 ) -> Generator[tuple[Any, int], None, None]:
     """Run jobs where there is room; yield each, with its exit code, as it ends: one that fails stops no other.
 
-    Closed early, by a signal or an error, it ends what runs.
-
-    Args:
-        launcher: where they run.
-        jobs: in turn, each drawn once the one before has room; or a function that returns those that may start now, the
-            most urgent first, or None if no more will come. It is called before each look for room, so what it returns
-            may depend on what has ended: stages, jobs to try again, limits.
-        grace_s: between asking what runs to save and end, and killing it.
-        poll_s: between two looks.
+    Closed early, by a signal or an error, it ends what runs: `grace_s` lie between asking it to save and end, and
+    killing it. Jobs run in turn, each drawn once the one before has room; or a function, called before each look for
+    room, returns those that may start now, the most urgent first, or None if no more will come.
     """
     ready = jobs if callable(jobs) else _in_turn(jobs)
     try:

@@ -68,13 +68,10 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def guarded_server(host: str, port: int, label: str, user: str) -> tuple[Any, str]:
-    """Start viser's server; return it and the address to open, which has a token where others can reach it.
+    """Start viser's server, its page titled `label`; return it and the address to open.
 
-    Args:
-        host: address to listen on.
-        port: 0 for any that is free.
-        label: title of the page.
-        user: the command, and the extra that installs viser for it: annotate or view.
+    The address has a token where others can reach it; port 0 is any that is free. `user` is the command, and the extra
+    that installs viser for it: annotate or view.
     """
     names = "viser", "websockets.asyncio.server"
     viser, serving = (optional(name, missing(user, "viser", user)) for name in names)

@@ -1,27 +1,31 @@
 """Rows say where they come from; random driving is uniform, and counted step by step."""
 
+import gzip
 import json
 
 import jax
 import jax.numpy as jnp
+import pytest
 
 from benchmarks.steps_per_second import append_row, origin, random_driving, timed
 from docs.studies import command_line
 
 
-def test_rows_say_where_they_come_from(tmp_path, capsys):
-    rows = tmp_path / "new" / "rows.jsonl"
+@pytest.mark.parametrize("name", ["rows.jsonl", "rows.jsonl.gz"])
+def test_rows_say_where_they_come_from(tmp_path, capsys, name):
+    rows = tmp_path / "new" / name
     row = {"rate": 2.0, **origin("abc", ("jax", "no-such-package"))}
     append_row(rows, row, hidden=("versions", "date", "device"))
     append_row(rows, row, hidden=None)
-    assert [json.loads(line) for line in rows.read_text().splitlines()] == [row, row]
+    content = gzip.decompress(rows.read_bytes()) if name.endswith("gz") else rows.read_bytes()
+    assert [json.loads(line) for line in content.splitlines()] == [row, row]
     assert set(row) == {"rate", "device", "versions", "commit", "date"} and list(row["versions"]) == ["jax"]
     assert json.loads(capsys.readouterr().out) == {"rate": 2.0, "commit": "abc"}
 
 
 def test_words_of_environments():
     args = command_line("", "x", settings=True).parse_args(["--set", "num_objects=0", 'observations=["goal"]'])
-    assert dict(args.settings) == {"num_objects": 0, "observations": ["goal"]} and args.out.name == "x.jsonl"
+    assert dict(args.settings) == {"num_objects": 0, "observations": ["goal"]} and args.out.name == "x.jsonl.gz"
     assert vars(command_line("").parse_args([])) == {}
 
 

@@ -56,11 +56,9 @@ class Results:
 
 
 def figures_of(results: Path | Results, split: str | None = "auto") -> Iterator[tuple[str, Callable[[], Figure]]]:
-    """Yield every picture that the files under a folder give: (name, how to draw it).
+    """Yield every picture that the files under a folder, or one file, give: (name, how to draw it).
 
-    Args:
-        results: a run folder, a sweep's folder, any folder of their files, or one file; without any, `FileError`.
-        split: train or test scenes, None for all, auto: test where there are rows of them.
+    `split`: train or test scenes, None for all, auto for test where there are rows of them.
     """
     files = results if isinstance(results, Results) else Results(results)
     facts = {run: fact for run in files.curves if (fact := files.facts(run))}

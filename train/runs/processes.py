@@ -120,7 +120,7 @@ class Together:
         parts = (
             jax.tree.map(lambda x: np.zeros(np.shape(x), jnp.asarray(x).dtype), parts)
             if mine is None
-            else mine_of(mine)
+            else jax.tree.map(lambda x: np.asarray(jnp.asarray(x)), (mine.learner, mine.env_state))
         )
         learner, env_state = jax.tree.map(jnp.asarray, multihost_utils.broadcast_one_to_all(parts))
         return Snapshot(int(steps), learner, env_state)
@@ -147,11 +147,6 @@ class Together:
 
 def _ignore(*_: Any) -> None:
     """Do nothing: another process keeps the folder."""
-
-
-def mine_of(snapshot: Snapshot) -> Any:
-    """Return learner and environments as NumPy arrays."""
-    return jax.tree.map(lambda x: np.asarray(jnp.asarray(x)), (snapshot.learner, snapshot.env_state))
 
 
 def gathered(tree: Any) -> Any:

@@ -237,21 +237,10 @@ def train_run(
 ) -> tuple[TrainResult, RunFolder, int | None]:
     """Train as configured, beginning or continuing the run folder.
 
-    Args:
-        config: as loaded; sizes may still be `auto`.
-        console: for progress.
-        build_env: config -> one environment.
-        resume_from: the checkpoint that an existing run continues from: `last`, `best` or env steps. Later ones are
-            renamed.
-
-    Returns:
-        The result, the folder, and the signal that ended it early, if one did.
-
-    Raises:
-        ConfigError: settings that exclude each other.
-        FileError: a folder of another run, or one that is being trained.
-        CheckpointError: a checkpoint that the run cannot continue from.
-        DivergedError: a number is no longer finite.
+    Return the result, the folder, and the signal that ended it early, if one did. An existing run continues from the
+    checkpoint `resume_from`: `last`, `best` or env steps; later ones are renamed. Raises `ConfigError` for settings
+    that exclude each other, `FileError` for the folder of another run or of one that is being trained,
+    `CheckpointError`, and `DivergedError` where a number is no longer finite.
     """
     if config.run.wandb:
         tracking.import_wandb()

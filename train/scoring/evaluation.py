@@ -88,19 +88,10 @@ def load_policy(
     deterministic: bool,
     cached: dict[Any, Any] | None = None,
 ) -> tuple[PolicyFn, CheckpointMeta]:
-    """Load the policy of a checkpoint.
+    """Load the policy of a checkpoint (`which`: best, last or env steps) to act in `env`; or raise `CheckpointError`.
 
-    Args:
-        folder: of the run.
-        config: of the run.
-        env: to act in.
-        which: best, last or env steps.
-        deterministic: take the mode of the actions.
-        cached: filled and used by calls for the same environment: policies of equal networks then share one function,
-            and what is compiled for it.
-
-    Raises:
-        CheckpointError: there is none, or it is damaged or of another robot or other observations.
+    A `deterministic` one takes the mode of its actions. `cached` is filled and used by calls for the same environment:
+    policies of equal networks then share one function, and what is compiled for it.
     """
     path, meta = checkpoint.find(folder.checkpoints, which)
     check_fits(meta, path, dataclasses.replace(config.env, robot=env.robot.name), env)
@@ -154,23 +145,10 @@ def evaluate(
     fixed: EpisodeFile | None = None,
     batch: int | None = None,
 ) -> Iterator[tuple[pa.Table, dict[str, PlayedEpisodes]]]:
-    """Play the same fixed episodes with each policy: drawn from a seed, or those of a file.
+    """Play the same episodes, drawn from a seed or `fixed` ones of a file, with each policy of the request.
 
-    Args:
-        folder: of the run; None for policies that never learned.
-        config: of the run, with the environment to evaluate in.
-        player: of that environment.
-        request: what to play.
-        record: episodes to return paths of.
-        console: for progress.
-        fixed: episodes to play instead of drawn ones.
-        batch: episodes played at a time; None: by backend.
-
-    Yields:
-        After each policy, rows of all that have played, one an episode; and their episodes by policy.
-
-    Raises:
-        UserError: a policy or an episode that cannot be played in this environment.
+    Yield after each policy the rows of all that have played, one an episode, and their episodes by policy, with paths
+    of `record` of them. The folder is None for policies that never learned. `batch` episodes are played at a time.
     """
     env = player.env
     # Everything that can be refused is refused before the first episode.

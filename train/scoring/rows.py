@@ -87,13 +87,9 @@ def check_rows(rows: pa.Table, path: Path) -> None:
 def episode_table(
     episodes: PlayedEpisodes, scenes: Any, categories: Sequence[Sequence[str]], constants: dict[str, Any]
 ) -> pa.Table:
-    """Return one row for each episode.
+    """Return one row for each episode; the columns of `constants` are the same in every row, and come first.
 
-    Args:
-        episodes: what was played.
-        scenes: the environment's, with name and split.
-        categories: [S][M] of what is in each scene's slots, '' for nothing.
-        constants: columns that are the same in every row; they come first.
+    `categories` [S][M] are those of what is in each scene's slots, '' for nothing.
     """
     count = len(episodes.scene_index)
     columns: dict[str, Any] = {name: pa.array([value] * count, TYPES.get(name)) for name, value in constants.items()}

@@ -177,7 +177,11 @@ def _parts(model: mujoco.MjModel, source: SourceFolder, path: Path) -> list[Home
     if not (np.abs(data.geom_xpos) < FARTHEST_M).all():  # NaN too
         raise SceneRejected(f"{path}: a geom stands at no usable place, expected all within {FARTHEST_M:g} m")
     categories = [category_of(model.body(body).name) for body in range(model.nbody)]
-    dropped, planes = _unread(model), _planes(model, data)
+    dropped = collections.Counter({f"{word}: dropped": int(getattr(model, count)) for word, count in UNREAD.items()})
+    for geom in np.flatnonzero((model.geom_matid >= 0) & (model.geom_type != int(_GEOM.mjGEOM_MESH))):
+        if model.mat_texid[model.geom_matid[geom]].max() >= 0:
+            dropped["texture of a geom that is no mesh: dropped"] += 1
+    planes = _planes(model, data)
     opens = _openings(model, data, categories, source, dropped)
     top = _tops(model, categories, opens)
     pieces = {int(top[model.body_parentid[body]]) for body in opens}
@@ -238,15 +242,6 @@ def _planes(model: mujoco.MjModel, data: mujoco.MjData) -> dict[int, HomePart]:
             assert mesh is not None
             planes[int(geom)] = HomePart("plane", at, mesh, None, True, held=True, endless=True)
     return planes
-
-
-def _unread(model: mujoco.MjModel) -> collections.Counter[str]:
-    """Count what is not read as it is, but for joints."""
-    dropped = collections.Counter({f"{word}: dropped": int(getattr(model, count)) for word, count in UNREAD.items()})
-    for geom in np.flatnonzero((model.geom_matid >= 0) & (model.geom_type != int(_GEOM.mjGEOM_MESH))):
-        if model.mat_texid[model.geom_matid[geom]].max() >= 0:
-            dropped["texture of a geom that is no mesh: dropped"] += 1
-    return dropped
 
 
 def _openings(
