@@ -182,11 +182,9 @@ LYING_DEG = 15.0
 
 
 def upright(pose: np.ndarray, pivot_cad: np.ndarray) -> tuple[alignment.Alignment, float]:
-    """Take the small roll and pitch out of an annotated pose, turning about the object's middle.
+    """Take the small roll and pitch out of an annotated pose (4, 4), turning about a point (3,) of the CAD frame.
 
-    `pose`: (4, 4) CAD frame -> scan frame, with scale.
-    `pivot_cad`: (3,) point of the CAD frame that keeps its place (the middle of the bounding box).
-    Returns the upright pose (`rms_m` is nan: nothing was fitted) and the tilt that was removed, rad.
+    Return the upright pose (`rms_m` is nan: nothing was fitted) and the tilt that was removed, rad.
     """
     scale = np.linalg.norm(pose[:3, :3], axis=0)
     turn = pose[:3, :3] / scale
@@ -200,10 +198,7 @@ def upright(pose: np.ndarray, pivot_cad: np.ndarray) -> tuple[alignment.Alignmen
 def compare(
     annotation: Annotation, placed: alignment.Alignment, tilt_rad: float, pivot_cad: np.ndarray, name: str
 ) -> dict[str, Any]:
-    """Return one row of the alignment report: residual of the annotated pose, and the re-solved pose beside it.
-
-    `pivot_cad`: (3,) where the two poses' translations are compared.
-    """
+    """Return a row of the alignment report: residual of the annotated pose, and the re-solved one, at a pivot (3,)."""
     row: dict[str, Any] = {
         "name": name,
         "cad_id": annotation.cad_id,
@@ -249,11 +244,7 @@ class PoseDifference:
 def pose_difference(
     one: alignment.Alignment, other: alignment.Alignment, pivot_cad: np.ndarray, symmetry: str
 ) -> PoseDifference:
-    """Compare two poses of the same model at the pivot; turns that the symmetry allows do not count.
-
-    `pivot_cad`: (3,) point of the CAD frame where translations are compared.
-    `symmetry`: Scan2CAD's word; unknown words count as none.
-    """
+    """Compare poses of a model at a pivot (3,), CAD frame, but for turns that the symmetry, Scan2CAD's word, allows."""
     period = alignment.SYMMETRY_PERIOD_RAD.get(symmetry, 2 * math.pi)
     at = [alignment.apply_alignment(a, pivot_cad[None])[0] for a in (one, other)]
     turn = wrap_angle(one.yaw - other.yaw)

@@ -97,10 +97,8 @@ def scan2cad_model(
 ) -> dict[str, Any]:
     """Return one model of Scan2CAD's list, whose world is y up; arguments are z up.
 
-    `pose`: scale (3,), yaw (rad) and translation (3,) m of the upright model.
-    `vertices`: (n, 3) of the model, CAD frame.
-    `symmetry`: Scan2CAD's word.
-    `pairs`: (k, 3) points of the model under its pose and of the scan, m, that were clicked.
+    `pose` is the upright model's scale (3,), yaw (rad) and translation (3,) m; `vertices` (n, 3) are in the CAD frame.
+    `pairs` are (k, 3) points of the model under its pose and of the scan, m, that were clicked.
     """
     (scale, yaw, translation), (low, high) = pose, bounds(vertices @ Y_UP_TO_Z_UP)
     return {

@@ -260,11 +260,8 @@ def assume_hinge(leaf: np.ndarray, pose: np.ndarray, structure: np.ndarray) -> S
 
     Of the leaf's two ends the hinge is the one with more structure around it; the leaf turns both ways from where it
     stands until structure lies in it, by 120 degrees at most. What lies in the leaf as it stands is taken for the
-    scanned leaf itself.
-
-    `leaf`: (n, 3) vertices, CAD frame, the leaf along x.
-    `pose`: (4, 4) CAD frame -> scan frame, upright and unscaled.
-    `structure`: (m, 3) points of the scan, m.
+    scanned leaf itself. `leaf` (n, 3) lies along x in the CAD frame, its `pose` (4, 4) is upright and unscaled;
+    `structure` (m, 3) are points of the scan.
     """
     low, high = leaf.min(axis=0), leaf.max(axis=0)
     local = (structure - pose[:3, 3]) @ pose[:3, :3]

@@ -186,11 +186,9 @@ def wrapped(
 ) -> tuple[np.ndarray, list[np.ndarray], bool]:
     """Return texture coordinates and images that show by repeating what other ways of wrapping show.
 
-    `uv`: (m, 3, 2) of faces, origin at the lower left.
-    `images`: (h, w, 3) of one size.
-    `modes`: along u and v: `repeat`, `mirror` or `clamp`.
-    Returns the coordinates, the images, and whether a face lies across an edge at which its texture is clamped: it
-    shows the texture up to there, stretched.
+    `uv` (m, 3, 2) has its origin at the lower left, `images` are of one size, `modes` (`repeat`, `mirror` or `clamp`)
+    are along u and v. Return also whether a face lies across an edge at which its texture is clamped: it shows the
+    texture up to there, stretched.
     """
     across = False
     for k, mode in enumerate(modes):

@@ -37,11 +37,7 @@ PLAIN, MARGIN = 8, 4
 def colour_cloud(
     scan: TexturedMesh, vertices_w: np.ndarray, face_index: np.ndarray, spacing_m: float = TEXTURE_SPACING_M
 ) -> ColourCloud:
-    """Sample coloured points of some faces of the scan: their vertices, or a sampling of the texture.
-
-    `vertices_w`: (n, 3) the scan's vertices in the world, m.
-    `face_index`: (k,) which faces to take.
-    """
+    """Sample coloured points of the scan's faces (k,): vertices (n, 3) m, world, or a sampling of the texture."""
     chosen = scan.faces[face_index]
     if scan.texture is None or scan.corner_uv is None:
         assert isinstance(scan, ScanMesh) and scan.vertex_colours is not None
@@ -190,12 +186,9 @@ def bake_structure(
 ) -> VisualMesh:
     """Bake a texture of the simplified scan from coloured points (three nearest, by inverse distance).
 
-    `vertices`: (n, 3) of the simplified scan with its patches, m.
-    `faces`: (m, 3).
-    `size`: of the texture, pixels.
-    `turned_m`: how much farther a point counts for each unit between its normal and the surface's: both sides of a
-    thin wall keep their colours.
-    `light`: that falls on it; the image is exact then, with few levels a channel, which make a smaller file.
+    `size` is in pixels. `turned_m` says how much farther a point counts for each unit between its normal and the
+    surface's: both sides of a thin wall keep their colours. With `light` that falls on it, the image is exact, with few
+    levels a channel, which make a smaller file.
     """
     uv, uv_faces = unwrap(vertices, faces, size)
     texel, point, face = texel_surface(vertices, faces, uv, uv_faces, size)
@@ -225,13 +218,8 @@ def bake_object(
 
     A texel takes the mean of the near scan points whose normal agrees. One that no scan point shows is
     in-painted from the eight nearest shown texels of the same CAD material, else of any; an object that the scan
-    does not show at all keeps its CAD colours.
-
-    `vertices`: (n, 3) CAD surface in the world, m.
-    `faces`: (m, 3).
-    `face_colours`: (m, 3) uint8 of the CAD materials.
-    `size`: of the texture, pixels.
-    Returns the mesh (world frame, as given) and the share of texels that the scan showed.
+    does not show at all keeps its CAD colours. Return the mesh, which stays in the world's frame, and the share of
+    texels that the scan showed.
     """
     low_vertices, low_faces = low
     uv, uv_faces = unwrap(low_vertices, low_faces, size)
@@ -281,10 +269,7 @@ class Drawn:
 
 
 def as_it_is(mesh: TexturedMesh, most_faces: int, size: int) -> VisualMesh | None:
-    """Return the surface with its vertices and image; None where it has too many faces or too large an image.
-
-    `size`: most pixels a side of the image, which must not repeat.
-    """
+    """Return a surface with its image; None if it repeats, has more pixels a side than `size`, or too many faces."""
     if mesh.texture is None or mesh.corner_uv is None or len(mesh.faces) > most_faces or max(mesh.texture.shape) > size:
         return None
     if mesh.corner_uv.min() < -1e-6 or mesh.corner_uv.max() > 1 + 1e-6:
@@ -305,8 +290,7 @@ def draw_objects(
 ) -> list[Drawn]:
     """Draw objects of one model and size: simplify the model once, by an error first, then to a number of faces.
 
-    One that the scan shows takes the scan's colours, any other one its model's.
-    `size`: of the texture, pixels.
+    One that the scan shows takes the scan's colours, any other one its model's. `size` is the texture's, in pixels.
     """
     first, unscanned = objects[0], None
     surface, mesh = first.surface_b, (first.vertices_b, first.faces)

@@ -1,10 +1,16 @@
 """One-off studies behind numbers of the documentation: programs to run in a checkout, not part of the package."""
 
 import argparse
+import gzip
 import json
 from pathlib import Path
 
 RESULTS = Path("benchmarks/results")
+
+
+def read_rows(path: Path) -> list[dict]:
+    """Return the rows of a packed file of JSON lines."""
+    return [json.loads(line) for line in gzip.decompress(path.read_bytes()).splitlines()]
 
 
 def command_line(description: str | None, rows: str = "", settings: bool = False) -> argparse.ArgumentParser:

@@ -14,9 +14,7 @@ draws `docs/fidelity.webp` and prints the table of `docs/fidelity.md` from them.
 from __future__ import annotations
 
 import dataclasses
-import gzip
 import itertools
-import json
 import math
 from pathlib import Path
 from typing import NamedTuple
@@ -27,7 +25,7 @@ import mujoco
 import numpy as np
 
 from benchmarks.steps_per_second import SCENE, append_row, origin
-from docs.studies import command_line
+from docs.studies import command_line, read_rows
 from interactive_nav.config import NavConfig, PhysicsConfig
 from interactive_nav.physics import PhysicsState, make_physics, resolve_backend
 from interactive_nav.robots import get_robot
@@ -390,8 +388,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--report", action="store_true")
     args = parser.parse_args(argv)
     if args.report:
-        rows = [json.loads(line) for line in gzip.decompress(args.out.read_bytes()).splitlines()]
-        print(report(rows, Path("docs/fidelity.webp")), end="")
+        print(report(read_rows(args.out), Path("docs/fidelity.webp")), end="")
         return
     numbers = range(len(SCENARIOS) if args.only == "sleep" else ALONE) if args.scenarios is None else args.scenarios
     measure(args.backend, [SCENARIOS[i] for i in numbers], args.only, args.scene, args.out, args.commit)

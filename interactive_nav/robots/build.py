@@ -152,14 +152,6 @@ def _limits(child: mujoco.MjSpec, joint: Joint) -> tuple[tuple[float, float] | N
     return (low, high) if low < high else None, effort
 
 
-def _set_mode(actuator: Any, kind: str, joint: Joint, effort: float, low_high: tuple[float, float] | None) -> None:
-    """Turn an actuator into a position servo, velocity servo or motor; the file has its native one."""
-    stiff, damp = float(actuator.gainprm[0]), -float(actuator.biasprm[2])
-    speed = damp if joint.side else effort / (_SPEED_ERROR * joint.max_speed)
-    stiff = _WHEEL_STIFFNESS * damp if joint.side else stiff
-    set_servo(actuator, {"position": (stiff, damp), "velocity": (0.0, speed), "torque": None}[kind], low_high)
-
-
 def _law(base: WheeledBase, mode: str, child: mujoco.MjSpec, actions: list[_Action]) -> ControlLaw | None:
     """Return the law controls = matrix @ command + offset, plus the joint's position where the command is an advance.
 
@@ -270,7 +262,11 @@ def wheeled_robot(
             if np.count_nonzero(action.gain) == 1 and action.gain.max() == 1.0:
                 bounds[int(action.gain.argmax())] = action.low, action.high
         for joint, kind, (_, effort), low_high in zip(joints, servos, limits, bounds, strict=True):
-            _set_mode(robot.actuator(joint.name), kind, joint, effort, low_high)
+            actuator = robot.actuator(joint.name)  # with the gains of its native mode
+            stiff, damp = float(actuator.gainprm[0]), -float(actuator.biasprm[2])
+            speed = damp if joint.side else effort / (_SPEED_ERROR * joint.max_speed)
+            gains = {"position": (_WHEEL_STIFFNESS * damp if joint.side else stiff, damp), "velocity": (0.0, speed)}
+            set_servo(actuator, gains.get(kind), low_high)
         attach(world, robot, prefix)
 
     wheels = rolling or tuple(child.joint(j.name).parent.name for j in joints if j.side)

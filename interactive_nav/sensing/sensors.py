@@ -129,7 +129,11 @@ class Sensors:
         """
         self._layout, self._config = world.layout, config
         model = world.models[0]
-        self._joints = _robot_joints(model, world)
+        # The robot's joints but its free one: addresses in qpos and qvel, and whether they turn without limit.
+        driven = np.isin(model.jnt_type, [mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE])
+        joints = np.flatnonzero(driven & np.isin(model.jnt_bodyid, world.layout.robot_bodies))
+        turns = (model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE) & ~model.jnt_limited[joints].astype(bool)
+        self._joints = model.jnt_qposadr[joints], model.jnt_dofadr[joints], turns
         self._images = tuple(name for name in IMAGES if name in config.observations)
         meshes = config.image_geometry == "meshes"
         self._drawn = (*self._images, *(["normals"] if config.depth_grazing_deg else []))
@@ -279,14 +283,6 @@ def _noisy(reading: jax.Array, noise: float, dropout: float, lost: float, key: j
     if dropout:
         reading = jnp.where(jax.random.bernoulli(key_dropout, dropout, reading.shape), lost, reading)
     return reading
-
-
-def _robot_joints(model: mujoco.MjModel, world: World) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the robot's joints but its free one: addresses in qpos and qvel, and whether they turn without limit."""
-    driven = np.isin(model.jnt_type, [mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE])
-    joints = np.flatnonzero(driven & np.isin(model.jnt_bodyid, world.layout.robot_bodies))
-    turns = (model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE) & ~model.jnt_limited[joints].astype(bool)
-    return model.jnt_qposadr[joints], model.jnt_dofadr[joints], turns
 
 
 def disturbed(noise: CameraNoise, lens: Lens, images: dict[str, jax.Array], key_of: KeyOf) -> dict[str, jax.Array]:

@@ -1,6 +1,5 @@
 """Rows say where they come from; random driving is uniform, and counted step by step."""
 
-import gzip
 import json
 
 import jax
@@ -8,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 from benchmarks.steps_per_second import append_row, origin, random_driving, timed
-from docs.studies import command_line
+from docs.studies import command_line, read_rows
 
 
 @pytest.mark.parametrize("name", ["rows.jsonl", "rows.jsonl.gz"])
@@ -17,8 +16,7 @@ def test_rows_say_where_they_come_from(tmp_path, capsys, name):
     row = {"rate": 2.0, **origin("abc", ("jax", "no-such-package"))}
     append_row(rows, row, hidden=("versions", "date", "device"))
     append_row(rows, row, hidden=None)
-    content = gzip.decompress(rows.read_bytes()) if name.endswith("gz") else rows.read_bytes()
-    assert [json.loads(line) for line in content.splitlines()] == [row, row]
+    assert (read_rows(rows) if name.endswith(".gz") else [json.loads(x) for x in rows.open()]) == [row, row]
     assert set(row) == {"rate", "device", "versions", "commit", "date"} and list(row["versions"]) == ["jax"]
     assert json.loads(capsys.readouterr().out) == {"rate": 2.0, "commit": "abc"}
 
