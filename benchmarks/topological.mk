@@ -9,7 +9,8 @@
 # PPO=RUN lets a run of `python -m train` (env.robot=ttbot) play the same episodes; SIZE=full trains one, RUNS/ppo.
 # GPUS="0 1 2 3" spreads the commands over these.
 # Not part of `all`: `renderer` (MuJoCo's renderer as the target; needs EGL or OSMesa), `scan` (SCAN=FOLDER, a converted room),
-# `transfer-policy` and `renderer-policy` (the learned policy on the targets' maps), `batch` (thousands of episodes at once).
+# `transfer-policy` and `renderer-policy` (the learned policy on the targets' maps), `batch` (thousands of episodes at once),
+# `figures` (those of the report, for alder).
 
 PY ?= python
 SIZE ?= full
@@ -97,7 +98,7 @@ run = @mkdir -p $(@D) $(RUNS)/log; echo "$(notdir $@): $(1)"; began=$$(date +%s)
 D = $(RUNS)/done
 MAPS = $(ALL:%=$(D)/map-%)
 .DEFAULT_GOAL := all
-.PHONY: all networks maps evaluation transfer transfer-policy renderer renderer-policy scan batch tables
+.PHONY: all networks maps evaluation transfer transfer-policy renderer renderer-policy scan batch tables figures
 ifeq ($(SIZE),report)
 all: tables
 networks: $(D)/rooms $(D)/rooms-up $(D)/rooms-down $(D)/passages $(D)/alexnet
@@ -116,6 +117,8 @@ endif
 maps: $(MAPS)
 tables: networks evaluation $(D)/policy-grid $(D)/adapted-passages
 	$(NAV) tables $(RUNS)
+figures: $(D)/drives $(D)/map-alder $(D)/policy $(D)/adapted-passages
+	$(NAV) figures $(RUNS) $(WITH) --policy $(DRIVEN_BY) --maps $(RUNS)/maps $(EVALUATION)
 transfer: $(D)/features $(D)/adapted-passages $(D)/evaluation-unadapted $(D)/evaluation-adapted
 transfer-policy: $(D)/evaluation-unadapted-policy $(D)/evaluation-adapted-policy
 batch: $(D)/evaluation-batch.cedar $(D)/evaluation-batch.rowan

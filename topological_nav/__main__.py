@@ -180,7 +180,20 @@ class Tables(Command):
     """Folder of `make -f benchmarks/topological.mk SIZE=report`, which gets tables.md."""
 
 
-COMMANDS = {kind.__name__.lower(): kind for kind in (Data, Train, Map, Navigate, Evaluate, Adapt, Export, Tables)}
+@dataclasses.dataclass(kw_only=True)
+class Figures(_Driving):
+    """Draw the report's figures 8 to 11, 13 to 18 and 22 to 24 of one scene; a line says what is missing for others."""
+
+    runs: Annotated[Path, *word("RUNS")]
+    """Folder of `make -f benchmarks/topological.mk`: drives, data-unseen and adapted-passages."""
+    scene: Annotated[str, option(metavar="SCENE")] = "scenes_mjcf/alder"
+    """Scene folder."""
+    out: Annotated[Path | None, option("-o", metavar="DIR")] = None
+    """The pictures (default: RUNS/figures)."""
+
+
+KINDS = (Data, Train, Map, Navigate, Evaluate, Adapt, Export, Tables, Figures)
+COMMANDS = {kind.__name__.lower(): kind for kind in KINDS}
 
 
 @reports_errors("topological_nav")

@@ -227,7 +227,7 @@ def passage_configurations(
     """
     trained = load_trained(run)
     need_task(trained.about, "passages", f"{run}:")
-    learned, tested = _labelled(target, trained.about["lengths_m"], config)
+    learned, tested = labelled(target, trained.about["lengths_m"], config)
     header, _ = read_header(target)
     about = {"run": trained.about["digest"][:12], "target": digest_of(header, 12)}
     with claimed(out, {"task": "transfer", **to_dict(config), **about}):
@@ -286,7 +286,7 @@ def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detecto
     return built
 
 
-def _labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> tuple[PassageImages, PassageImages]:
+def labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> tuple[PassageImages, PassageImages]:
     """Return target images to learn from and to test, no source in both: so many free, or as many as blocked."""
     passages = load_passages(target)
     if list(passages.lengths_m) != list(lengths_m):

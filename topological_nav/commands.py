@@ -30,6 +30,7 @@ from topological_nav.evaluate import scores
 from topological_nav.evaluate.contest import Contest, contest_scenes, play_contest, tracks_of
 from topological_nav.figures import learning as figures
 from topological_nav.figures.maps import dataset_figure, drive_episode, film, journeys_figure, map_figure, save
+from topological_nav.figures.report import draw_report
 from topological_nav.learn.networks import in_words
 from topological_nav.learn.training import load_networks, train
 from topological_nav.maps.build import Built, build_map, forget
@@ -197,7 +198,7 @@ def keep_map(built: Built, out: Path, ends: Sequence[int] | None = None) -> None
         route = built.map.plan(*ends)
         print(f"{ends[0]} to {ends[1]}: {' '.join(map(str, route.nodes))}, cost {route.cost:.2f}")
     picture = out.with_suffix(".png")
-    save(map_figure(built, route), picture)
+    save(map_figure(built.space, [built.map], route), picture)
     for name, value in built.scores.items():
         print(f"{name}: {value}")
     print(
@@ -232,6 +233,14 @@ def run_tables(arguments: Any) -> None:
     """Write the report's tables with ours."""
     write_text(arguments.runs / "tables.md", tables(arguments.runs))
     print(arguments.runs / "tables.md")
+
+
+def run_figures(arguments: Any) -> None:
+    """Draw the report's figures."""
+    refuse_unused(arguments, "--truth batch", "in 'figures', which draws what networks see in one episode at a time")
+    contest = _contest(arguments, [arguments.scene], ["dense", "sparse"], arguments.out or arguments.runs / "figures")
+    with bar() as report:
+        draw_report(contest, arguments.runs, report)
 
 
 def run_data(arguments: Any) -> None:
@@ -308,8 +317,7 @@ def _policy(arguments: Any) -> None:
     with terminal() as host:
         runs = arguments.localiser or RUNS / "rooms", arguments.detector or RUNS / "passages"
         frames = embed_drives(arguments.data or DRIVES, *runs, config.mirror, host)
-        learn = train_grid if arguments.grid else train_policy
-        results = learn(frames, out, config, host)
+        results = (train_grid if arguments.grid else train_policy)(frames, out, config, host)
     rows = results if isinstance(results, list) else [results]
     for row in rows:
         folder = out / f"alpha-{row['alpha']:g}-lambda-{row['lambda']:g}" if arguments.grid else out
@@ -384,8 +392,7 @@ def _adapt_passages(arguments: Any, config: AdaptConfig, host: Host) -> None:
 
 def _adapt_map(arguments: Any, config: AdaptConfig, host: Host) -> None:
     del host
-    scene = Path(arguments.scene)
-    out = arguments.out or ADAPTED / f"{scene.resolve().name}.npz"
+    out, scene = arguments.out or ADAPTED / f"{arguments.scene.resolve().name}.npz", arguments.scene
     keep_map(adaptation.collected_map(scene, arguments.target, arguments.localiser, arguments.detector, config), out)
 
 

@@ -178,6 +178,6 @@ def test_the_goal_is_one_image_along_a_heading_of_the_episode(two_rooms):
 def test_a_target_may_have_more_free_images_than_blocked_ones(made):
     passages = dataset.load_passages(made.data)
     config = AdaptConfig(domain="clean", fine_tune=10, fine_tune_free=7, test=6, test_free=2)
-    learned, tested = adaptation._labelled(made.data, passages.lengths_m, config)
+    learned, tested = adaptation.labelled(made.data, passages.lengths_m, config)
     assert learned.free[:, 1].sum() == 7 and len(learned.images) == 10
     assert tested.free[:, 1].sum() == 2 and len(tested.images) == 6

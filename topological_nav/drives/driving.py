@@ -250,6 +250,14 @@ class TrainedPolicy:
         state, (linear, angular) = jax.device_get(self._step(self._weights, state, jnp.asarray(images)))
         return state, np.asarray(self.about["linear_m_s"])[linear], np.asarray(self.about["angular_rad_s"])[angular]
 
+    def probabilities(self, images: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return those of linear [T, L] and angular [T, A] classes in a run that sees images [T, H, W, 3] u8."""
+        embeddings = np.concatenate([network.embed(images) for network in self._networks], -1)
+        weights = self._weights["policy"]
+        x = standardised(jnp.asarray(embeddings), weights["scale"])
+        logits = unrolled(self._policy, weights["params"], x[None])
+        return tuple(np.asarray(nn.softmax(one[0])) for one in logits)
+
     def step(self, state: Any, embedding: jax.Array, weights: Any = None) -> tuple[Any, tuple[jax.Array, ...]]:
         """Return the new state, and the likeliest classes [B] of linear and of angular velocity, by embeddings."""
         weights = weights or self._weights["policy"]

@@ -241,7 +241,7 @@ class NavigatorPlayer(Contender):
             drawn = (np.random.default_rng([self.config.seed, 9, number]) for number in episodes.number)
             around += np.array([rng.uniform(0, 2 * np.pi) for rng in drawn])[:, None]
         images = self._camera(np.repeat(episodes.goal_xy_w, count, 0), around.ravel(), None)
-        images = images.reshape(n, count, *images.shape[1:])
+        self.goal_images = images = images.reshape(n, count, *images.shape[1:])
         self.state = self._navigator.start(self._navigator.goal_nodes(images, around))
         self._images = images[:, 0].copy()
         half_m = self.player.env.robot.body_width_m / 2

@@ -3,12 +3,13 @@
 import dataclasses
 import functools
 import textwrap
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, ListedColormap
 from matplotlib.figure import Figure
@@ -23,7 +24,6 @@ from interactive_nav_common.jobs.progress import Progress
 from topological_nav.data.dataset import load_plan, load_rooms, read_header
 from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
 from topological_nav.evaluate.evaluation import DrivenEpisodes, NavigatorPlayer, Played
-from topological_nav.maps.build import Built
 from topological_nav.maps.graph import Route, TopologicalMap
 from topological_nav.navigate.navigator import FACE, PHASES, State
 from topological_nav.scenes.rendering import Snapshot
@@ -167,29 +167,31 @@ def dataset_figure(folder: Path) -> Figure:
     return figure
 
 
-def map_figure(built: Built, route: Route | None = None) -> Figure:
-    """Draw a map over the floor plan, a route on top: edges from blocked to free, each direction on half of it."""
-    graph = built.map
-    extent = np.ptp(built.space.centres(0.0), axis=0)
-    figure, axis = plt.subplots(figsize=(7.2, 1.2 + 7.0 * extent[1] / extent[0]), layout="constrained")
-    floor_plan(axis, built.space)
-    start, end = graph.xy_w[graph.edges[:, 0]], graph.xy_w[graph.edges[:, 1]]
-    order = np.argsort(graph.p)
-    halves = LineCollection(list(np.stack([start, (start + end) / 2], 1)[order]), cmap=FREE, linewidths=1.1, zorder=2)
-    halves.set_array(graph.p[order])
-    halves.set_clim(0.0, 1.0)
-    axis.add_collection(halves)
-    room_points(axis, graph.xy_w, graph.room, s=130, linewidths=0, zorder=4)
-    axis.scatter(graph.xy_w[:, 0], graph.xy_w[:, 1], s=70, c="w", linewidths=0, zorder=4)
-    for node, xy in enumerate(graph.xy_w):
-        if np.linalg.norm(graph.xy_w[:node] - xy, axis=-1).min(initial=1.0) > 0.25:  # else one over the other
-            axis.text(xy[0], xy[1], str(node), ha="center", va="center", fontsize=6, zorder=5)
-    if route is not None:
-        axis.plot(*graph.xy_w[list(route.nodes)].T, color="k", linewidth=2.6, zorder=3)
-    figure.colorbar(
-        halves, ax=axis, label="probability that the way is free", orientation="horizontal", shrink=0.6, pad=0.01
-    )
-    axis.set_title(f"{graph.scene}: {len(graph.xy_w)} nodes, {len(graph.edges)} directed edges", fontsize=9)
+def map_figure(space: FreeSpace, graphs: Sequence[TopologicalMap], route: Route | None = None) -> Figure:
+    """Draw maps of a scene side by side, a route on top: edges from blocked to free, each direction on half of it."""
+    extent = np.ptp(space.centres(0.0), axis=0)
+    width = 7.2 if len(graphs) == 1 else 5.5
+    size = (width * len(graphs), 1.2 + 0.97 * width * extent[1] / extent[0])
+    figure, (axes,) = figures.panels(size, 1, len(graphs))
+    for axis, graph in zip(axes, graphs, strict=True):
+        floor_plan(axis, space)
+        start, end = graph.xy_w[graph.edges[:, 0]], graph.xy_w[graph.edges[:, 1]]
+        order = np.argsort(graph.p)
+        ways = list(np.stack([start, (start + end) / 2], 1)[order])
+        halves = LineCollection(ways, cmap=FREE, linewidths=1.1, zorder=2)
+        halves.set_array(graph.p[order])
+        halves.set_clim(0.0, 1.0)
+        axis.add_collection(halves)
+        room_points(axis, graph.xy_w, graph.room, s=130, linewidths=0, zorder=4)
+        axis.scatter(graph.xy_w[:, 0], graph.xy_w[:, 1], s=70, c="w", linewidths=0, zorder=4)
+        for node, xy in enumerate(graph.xy_w):
+            if np.linalg.norm(graph.xy_w[:node] - xy, axis=-1).min(initial=1.0) > 0.25:  # else one over the other
+                axis.text(xy[0], xy[1], str(node), ha="center", va="center", fontsize=6, zorder=5)
+        if route is not None:
+            axis.plot(*graph.xy_w[list(route.nodes)].T, color="k", linewidth=2.6, zorder=3)
+        axis.set_title(f"{graph.scene}: {len(graph.xy_w)} nodes, {len(graph.edges)} directed edges", fontsize=9)
+    look: Any = {"label": "probability that the way is free", "orientation": "horizontal", "aspect": 20 * len(graphs)}
+    figure.colorbar(ScalarMappable(cmap=FREE), ax=axes, shrink=0.6, pad=0.01, **look)
     return figure
 
 
@@ -220,6 +222,8 @@ class Driven:
     """[t] i8."""
     views: dict[int, np.ndarray]
     """Control step -> image, where it was filmed."""
+    goal_images: np.ndarray
+    """[K, ...]."""
     log: list[str]
     """Events, a line each."""
 
@@ -236,25 +240,27 @@ class Driven:
 
     def figure(self) -> Figure:
         """Draw the path over plan and map."""
-        space, passable = self.venue.space, self.venue.contest.config.passable
-        extent = np.ptp(space.centres(0.0), axis=0) + 0.8
+        extent = np.ptp(self.venue.space.centres(0.0), axis=0) + 0.8
         figure, axis = plt.subplots(figsize=(8.0, 0.7 + 6.6 * extent[1] / extent[0]), layout="constrained")
-        floor_plan(axis, space)
-        map_lines(axis, self.map, passable)
-        axis.plot(*self.xy_w.T, color="tab:blue", linewidth=1.2, zorder=3)
-        for name, colour in (("localise", "tab:orange"), ("swing", "tab:purple"), ("lean", "tab:red")):
+        self.draw(axis)
+        axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+        return figure
+
+    def draw(self, axis: Axes, width: int = 90) -> None:
+        """Draw the path over plan and map, with labels for a legend, below a title of lines so many letters wide."""
+        title = f"{self.venue.scene.name}, episode {self.journey.number[0]}: {self.outcome}"
+        axis.set_title(textwrap.fill(title, width), fontsize=9)
+        floor_plan(axis, self.venue.space)
+        map_lines(axis, self.map, self.venue.contest.config.passable)
+        axis.plot(*self.xy_w.T, color=BLUE, linewidth=1.2, zorder=3)
+        for name, colour in (("localise", ORANGE), ("swing", PINK), ("lean", VERMILION)):
             here = self.xy_w[self.phase == PHASES.index(name)]
             if len(here):
                 axis.scatter(*here.T, s=22, color=colour, zorder=4, label=name, linewidths=0)
         axis.plot(*self.journey.start_xy_w[0], "o", color="k", markersize=7, zorder=5, label="start")
-        axis.plot(*self.journey.goal_xy_w[0], "*", color="tab:green", markersize=14, zorder=5, label="goal")
-        style: Any = {"mfc": "none", "mec": "tab:green", "markersize": 11, "zorder": 5}
+        axis.plot(*self.journey.goal_xy_w[0], "*", color=GREEN, markersize=14, zorder=5, label="goal")
+        style: Any = {"mfc": "none", "mec": GREEN, "markersize": 11, "zorder": 5}
         axis.plot(*self.map.xy_w[self.goal_node], "s", label="goal's node", **style)
-        axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
-        axis.set_title(
-            textwrap.fill(f"{self.venue.scene.name}, episode {self.journey.number[0]}: {self.outcome}", 90), fontsize=9
-        )
-        return figure
 
     def frame(self, step: int, plan: np.ndarray, pixels: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Return [H, W, 3] u8: the plan with the path so far, beside it the camera's image, if any."""
@@ -282,12 +288,18 @@ class Driven:
 def drive_episode(contest: Contest, number: int, filmed: bool, progress: Progress) -> Driven:
     """Drive one of the episodes of a contest's only scene, as the contest's only contender."""
     (venue,) = contest_scenes(contest)
+    return drive_in(venue, contest.contenders[0], number, filmed, progress)
+
+
+def drive_in(venue: ContestScene, contender: str, number: int, filmed: bool, progress: Progress) -> Driven:
+    """Drive one of a scene's episodes."""
+    contest = venue.contest
     if not 0 <= number < len(venue.episodes):
         raise ConfigError(
             f"episode is {number}, expected 0 to {len(venue.episodes) - 1}; episodes=N makes more of the scene"
         )
     journey = venue.episodes.take(np.array([number]))
-    navigator = venue.navigator(contest.contenders[0])
+    navigator = venue.navigator(contender)
     graph = navigator.map
     steps: list[tuple[float, np.ndarray, float, int]] = []
     views: dict[int, np.ndarray] = {}
@@ -306,7 +318,8 @@ def drive_episode(contest: Contest, number: int, filmed: bool, progress: Progres
     assert player.state is not None
     time_s, xy, yaw, phase = zip(*steps, strict=True)
     columns = (np.array(column) for column in (time_s, xy, yaw, phase))
-    return Driven(venue, graph, journey, played, int(player.state.goal[0]), *columns, views=views, log=log)
+    node, goals = int(player.state.goal[0]), player.goal_images[0]
+    return Driven(venue, graph, journey, played, node, *columns, views=views, goal_images=goals, log=log)
 
 
 def _log_lines(graph: TopologicalMap, state: State) -> Iterator[str]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.collections import LineCollection
 
 from topological_nav.figures.maps import map_figure
 from topological_nav.scenes.space import FreeSpace
@@ -21,7 +22,8 @@ def built() -> Any:
 
 
 def test_a_map_has_a_bar_numbers_apart_and_its_route():
-    (axis, scale) = map_figure(built(), SimpleNamespace(nodes=(0, 1, 3), cost=1.0)).axes  # type: ignore[arg-type]
+    there, route = built(), SimpleNamespace(nodes=(0, 1, 3), cost=1.0)
+    axis, scale = map_figure(there.space, [there.map], route).axes  # type: ignore[arg-type]
     assert [text.get_text() for text in axis.texts] == ["2 m", "0", "1", "3"]
     bar, route = axis.lines
     assert np.ptp(np.asarray(bar.get_xdata(), float)) == 2.0
@@ -29,4 +31,17 @@ def test_a_map_has_a_bar_numbers_apart_and_its_route():
     assert scale.get_xlabel() == "probability that the way is free"
     low, high = axis.get_ylim()
     assert low < np.asarray(bar.get_ydata(), float)[0] < 0.0 < 4.0 < high
+    plt.close("all")
+
+
+def test_two_maps_stand_side_by_side():
+    there = built()
+    sparse = SimpleNamespace(**{**vars(there.map), "edges": there.map.edges[:1], "p": there.map.p[:1]})
+    axes: Any = map_figure(there.space, [there.map, sparse]).axes  # type: ignore[list-item]
+    titles = [axis.get_title() for axis in axes[:2]]
+    assert titles == ["room: 4 nodes, 4 directed edges", "room: 4 nodes, 1 directed edges"]
+    # The surest are drawn last; each edge reaches half of the way.
+    (ways,) = (c for c in axes[0].collections if isinstance(c, LineCollection))
+    assert np.asarray(ways.get_array()).tolist() == [0.1, 0.5, 0.8, 0.9]
+    np.testing.assert_array_equal(ways.get_segments()[-1], [[1, 1], [2, 1]])
     plt.close("all")
