@@ -20,8 +20,8 @@ from scenes_mjcf.sets import scene_folders
 from topological_nav import adaptation
 from topological_nav import config as configs
 from topological_nav.config import ADAPTED, DATASET, DRIVES, PASSAGE_POLICY, RUNS, MapConfig
-from topological_nav.data.dataset import load_passages, load_rooms, make_dataset
-from topological_nav.data.domains import AdaptConfig, as_seen, preset
+from topological_nav.data.dataset import load_rooms, make_dataset
+from topological_nav.data.domains import AdaptConfig
 from topological_nav.data.folders import folder_bytes
 from topological_nav.drives.dataset import draw_drives, simulate_drives, summary
 from topological_nav.drives.driving import embed_drives, load_policy
@@ -30,7 +30,7 @@ from topological_nav.evaluate import scores
 from topological_nav.evaluate.contest import Contest, contest_scenes, play_contest, tracks_of
 from topological_nav.figures import learning as figures
 from topological_nav.figures.maps import dataset_figure, drive_episode, film, journeys_figure, map_figure, save
-from topological_nav.figures.report import draw_report
+from topological_nav.figures.report import draw_report, transferred
 from topological_nav.learn.networks import in_words
 from topological_nav.learn.training import load_networks, train
 from topological_nav.maps.build import Built, build_map, forget
@@ -134,8 +134,9 @@ def run_navigate(arguments: Any) -> None:
     contest = _contest(arguments, [arguments.scene], ["sparse" if arguments.sparse else "dense"], RUNS)
     name = Path(arguments.scene).resolve().name
     out = arguments.out or RUNS / "navigate" / f"{name}-{arguments.episode}.png"
+    (venue,) = contest_scenes(contest)
     with bar() as report:
-        driven = drive_episode(contest, arguments.episode, bool(arguments.video), report)
+        driven = drive_episode(venue, contest.contenders[0], arguments.episode, bool(arguments.video), report)
     for line in driven.log:
         print(line)
     save(driven.figure(), out)
@@ -379,10 +380,8 @@ def _adapt_features(arguments: Any, config: AdaptConfig, host: Host) -> None:
 def _adapt_passages(arguments: Any, config: AdaptConfig, host: Host) -> None:
     out = arguments.out or ADAPTED / "passages"
     results = adaptation.passage_configurations(arguments.detector, arguments.target, out, config, host)
-    images = load_passages(arguments.target).images
-    captured = as_seen(images, preset(config.domain))
-    figure = figures.passages_figure(images, captured, read_metrics(out / "metrics.jsonl"), results)
-    save(figure, out / "configurations.png")
+    for _, figure in transferred(out, arguments.target, arguments.detector):
+        save(figure, out / "configurations.png")
     for name, (from_source, tunes) in adaptation.CONFIGURATIONS.items():
         row, start = results[name], "the source's weights" if from_source else "fresh weights"
         how = f"{start}{', fine-tuned' if tunes else ''}"

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
@@ -141,7 +140,13 @@ def features_figure(
     source: np.ndarray, target: np.ndarray, lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
 ) -> Figure:
     """Draw images [n, H, W, 3] u8 of both domains, the game's course, and localisation before and after."""
-    figure, course, scores = _domains(source, target)
+    figure, (above, below) = parts((8, 5.6), [1.0, 1.15])
+    grid, (course, scores) = above.subplots(2, PAIRS), below.subplots(1, 2)
+    for line, images, name in zip(grid, (source, target), ("as rendered", "target"), strict=True):
+        for axis, row in zip(line, np.linspace(0, len(images) - 1, PAIRS).astype(int), strict=True):
+            axis.imshow(images[row])
+            axis.set_axis_off()
+        line[0].set_title(name, loc="left")
     course.axhline(0.5, color="0.5", linewidth=0.8, zorder=0, label="accuracy by chance")
     labels = {"loss": "extractor's loss", "critic_loss": "critic's loss", "critic_accuracy": "critic's accuracy"}
     curves(course, lines, labels, marker=".")
@@ -149,7 +154,8 @@ def features_figure(
     kinds = (("node", "nearest node"), ("room", "right room"))
     for k, (name, colour) in enumerate(_STAGES.items()):
         values = [results[name]["mean"][kind] for kind, _ in kinds]
-        _bars(scores, np.arange(2) + 0.27 * (k - 1), values, 0.25, colour, name)
+        bars = scores.bar(np.arange(2) + 0.27 * (k - 1), values, 0.25, color=colour, label=name)
+        scores.bar_label(bars, fmt="%.2f", fontsize=8)
     for x, (kind, _) in enumerate(kinds):
         best = results["source"]["mean"][kind]
         scores.plot([x - 0.45, x + 0.45], [best, best], "k--", linewidth=1, label="in the source" if not x else None)
@@ -157,41 +163,6 @@ def features_figure(
     scores.set(xticks=[0, 1], xticklabels=[label for _, label in kinds], ylim=(0, 1), title=title)
     scores.legend(loc="upper left")
     return figure
-
-
-@plt.rc_context(RC)  # type: ignore[reportCallIssue]
-def passages_figure(
-    source: np.ndarray, target: np.ndarray, lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
-) -> Figure:
-    """Draw images of both domains, fine-tuning, and accuracy of the four configurations; see `features_figure`."""
-    figure, course, scores = _domains(source, target)
-    for name, label in (("B", "B: fresh weights"), ("D", "D: the source's")):
-        curves(course, [line for line in lines if line["phase"] == name], {"accuracy": label}, marker=".")
-    course.set(xlabel="epoch of fine-tuning", ylim=(0, 1), title="accuracy on the images learned from")
-    _bars(scores, np.arange(4), [results[name]["accuracy"] for name in "ABCD"], 0.6, BLUE, None)
-    scores.axhline(0.5, color="0.5", linewidth=0.8)
-    words = ("A\nfresh", "B\nfresh,\nfine-tuned", "C\nsource", "D\nsource,\nfine-tuned")
-    title = f"accuracy on {results['tested_on']} held-out target images"
-    scores.set(xticks=range(4), xticklabels=words, ylim=(0, 1), title=title)
-    return figure
-
-
-def _domains(source: np.ndarray, target: np.ndarray) -> tuple[Figure, Axes, Axes]:
-    """Return a figure with images of both domains, and its axes for the course of learning and for the scores."""
-    figure, (above, below) = parts((8, 5.6), [1.0, 1.15])
-    grid = above.subplots(2, PAIRS, squeeze=False)
-    for line, images, name in zip(grid, (source, target), ("as rendered", "target"), strict=True):
-        rows = np.linspace(0, len(images) - 1, PAIRS).astype(int)
-        for axis, row in zip(line, rows, strict=True):
-            axis.imshow(images[row])
-            axis.set_axis_off()
-        line[0].set_title(name, loc="left")
-    return figure, *below.subplots(1, 2)
-
-
-def _bars(axis: Axes, at: np.ndarray, values: Sequence[float], width: float, colour: str, label: str | None) -> None:
-    bars = axis.bar(at, values, width, color=colour, label=label)
-    axis.bar_label(bars, fmt="%.2f", fontsize=8)
 
 
 def export_figure(compared: Compared) -> Figure:

@@ -22,7 +22,7 @@ from interactive_nav_common.figures import BLUE, GREEN, ORANGE, PINK, SKY, VERMI
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.jobs.progress import Progress
 from topological_nav.data.dataset import load_plan, load_rooms, read_header
-from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
+from topological_nav.evaluate.contest import ContestScene
 from topological_nav.evaluate.evaluation import DrivenEpisodes, NavigatorPlayer, Played
 from topological_nav.maps.graph import Route, TopologicalMap
 from topological_nav.navigate.navigator import FACE, PHASES, State
@@ -285,13 +285,7 @@ class Driven:
         return np.concatenate([np.asarray(image), np.asarray(beside)], 1)
 
 
-def drive_episode(contest: Contest, number: int, filmed: bool, progress: Progress) -> Driven:
-    """Drive one of the episodes of a contest's only scene, as the contest's only contender."""
-    (venue,) = contest_scenes(contest)
-    return drive_in(venue, contest.contenders[0], number, filmed, progress)
-
-
-def drive_in(venue: ContestScene, contender: str, number: int, filmed: bool, progress: Progress) -> Driven:
+def drive_episode(venue: ContestScene, contender: str, number: int, filmed: bool, progress: Progress) -> Driven:
     """Drive one of a scene's episodes."""
     contest = venue.contest
     if not 0 <= number < len(venue.episodes):

@@ -22,7 +22,7 @@ from topological_nav.drives.dataset import drive_images, load_drives, read_drive
 from topological_nav.drives.driving import TrainedPolicy, load_policy
 from topological_nav.drives.imitation import classes
 from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
-from topological_nav.figures.maps import FREE, Driven, drive_in, floor_plan, map_figure, save
+from topological_nav.figures.maps import FREE, Driven, drive_episode, floor_plan, map_figure, save
 from topological_nav.learn.networks import squares_between
 from topological_nav.learn.training import load_trained
 from topological_nav.maps.build import judged_by
@@ -80,13 +80,15 @@ def strip_figure(driver: TrainedPolicy, images: np.ndarray, commands: np.ndarray
 
 
 def rounds(venue: ContestScene) -> Iterator[tuple[str, Figure]]:
-    """Yield the detector's answers at the node whose edges it judges least alike (10), and in another room (11)."""
+    """Yield the detector's answers at the node whose edges it judges least alike (10), and in another room (11), and
+    both maps (18)."""
     graph = venue.map
     judged = (graph.p[graph.edges[:, 0] == node] for node in range(len(graph.xy_w)))
     apart = np.array([np.ptp(p) if len(p) else 0.0 for p in judged])
     first = int(apart.argmax())
     yield "10", round_figure(venue, first)
     yield "11", round_figure(venue, int(np.where(graph.room == graph.room[first], -1.0, apart).argmax()))
+    yield "18", map_figure(venue.space, [graph, venue.map_of("sparse")])
 
 
 def round_figure(venue: ContestScene, node: int) -> Figure:
@@ -128,7 +130,7 @@ def episodes(venue: ContestScene, progress: Progress) -> Iterator[tuple[str, Fig
     """Yield the first episode that is won (13 to 15), and the first that is lost (16, 17), on either map."""
     count, names = min(venue.contest.config.episodes or TRIED, len(venue.episodes)), {True: "13-15", False: "16-17"}
     for contender, number in ((of, k) for of in ("dense", "sparse") for k in range(count)):
-        driven = drive_in(venue, contender, number, True, progress)
+        driven = drive_episode(venue, contender, number, True, progress)
         if name := names.pop(bool(driven.played.success[0]), ""):
             yield name, episode_figure(driven, contender)
         if not names:
@@ -182,12 +184,12 @@ def errors(free: np.ndarray, p: np.ndarray) -> list[np.ndarray]:
     return [rows[np.argsort(-np.abs(p[rows] - 0.5))] for rows in map(np.flatnonzero, missed)]
 
 
-def transferred(runs: Path, detector: Path) -> Iterator[tuple[str, Figure]]:
-    """Yield the target's labels (22), and the errors there of the detector as it was (23) and fine-tuned (24)."""
-    tuned, path = load_trained(runs / "adapted-passages"), runs / "adapted-passages" / "config.yaml"
+def transferred(run: Path, target: Path, detector: Path) -> Iterator[tuple[str, Figure]]:
+    """Yield a target's labels (22), and the errors there of a detector as it was (23) and fine-tuned (24) by a run."""
+    tuned, path = load_trained(run), run / "config.yaml"
     stored, known = RUNS.decoded(path.read_bytes(), "YAML", str(path)), to_dict(AdaptConfig())
     config = overlay(AdaptConfig(), {name: stored[name] for name in known if name in stored}, str(path))
-    _, tested = labelled(runs / "data-unseen", tuned.about["lengths_m"], config)
+    _, tested = labelled(target, tuned.about["lengths_m"], config)
     ahead_m = tested.lengths_m[tested.scored]
     detectors = {"before (C)": load_trained(detector), "fine-tuned (D)": tuned}
     judged = {name: of.passage(tested.images, ahead_m) for name, of in detectors.items()}
@@ -218,10 +220,9 @@ def draw_report(contest: Contest, runs: Path, progress: Progress) -> None:
     (venue,) = contest_scenes(contest)
     for numbers, drawn in (
         ("8 and 9", strips(runs / "drives", contest.policy, venue.scene.name)),
-        ("10 and 11", rounds(venue)),
+        ("10, 11 and 18", rounds(venue)),
         ("13 to 17", episodes(venue, progress)),
-        ("18", iter([("18", map_figure(venue.space, [venue.map, venue.map_of("sparse")]))])),
-        ("22 to 24", transferred(runs, contest.detector)),
+        ("22 to 24", transferred(runs / "adapted-passages", runs / "data-unseen", contest.detector)),
     ):
         try:
             for number, figure in drawn:

@@ -140,8 +140,9 @@ def test_one_command_draws_all(drawn):
 def test_listed_errors_are_those_of_the_confusion(drawn, made, monkeypatch):
     kept = {}
     monkeypatch.setattr(report, "errors_figure", lambda images, free, judged: kept.update(free=free, judged=judged))
-    assert [name for name, _ in report.transferred(drawn, made.passages)] == ["22-24"]
-    results = RUNS.json(drawn / "adapted-passages" / "results.json")
+    run = drawn / "adapted-passages"
+    assert [name for name, _ in report.transferred(run, made.data, made.passages)] == ["22-24"]
+    results = RUNS.json(run / "results.json")
     for name, p in zip("CD", kept["judged"].values(), strict=True):
         (_, positives), (negatives, _) = results[name]["confusion"]
         assert [len(rows) for rows in errors(kept["free"], p)] == [positives, negatives]

@@ -5,7 +5,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from topological_nav.figures.learning import features_figure, passages_figure
+from topological_nav.figures.learning import features_figure
 
 IMAGES = np.zeros((7, 8, 8, 3), np.uint8)
 
@@ -30,14 +30,4 @@ def test_localisation_before_and_after_stands_beside_the_source():
     assert values(chance)[0] == 0.5 and values(loss) == [1.0, 0.9, 0.8]
     assert heights(scores) == [0.2, 0.4, 0.3, 0.5, 0.6, 0.7]
     assert [values(line)[0] for line in scores.lines] == [0.9, 0.95]
-    plt.close("all")
-
-
-def test_the_four_configurations_of_passages_have_a_bar_each():
-    lines = [{"epoch": k, "phase": name, "accuracy": 0.5 + 0.1 * k} for name in "BD" for k in range(3)]
-    accuracy = {"A": 0.5, "B": 0.7, "C": 0.6, "D": 0.8}
-    results = {name: {"accuracy": value} for name, value in accuracy.items()} | {"tested_on": 40}
-    *_, course, scores = passages_figure(IMAGES, IMAGES, lines, results).axes
-    assert [values(line) for line in course.lines] == [[0.5, 0.6, 0.7]] * 2
-    assert heights(scores) == list(accuracy.values()) and "40 held-out" in scores.get_title()
     plt.close("all")
