@@ -7,16 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from interactive_nav.camera_config import CameraNoise, CameraView, FovDeg, ImageSide
-from interactive_nav_common.config import (
-    AtLeastOne,
-    Bounds,
-    Natural,
-    NotNegative,
-    Positive,
-    Settings,
-    Share,
-    overlay,
-)
+from interactive_nav_common.config import AtLeastOne, Bounds, Natural, NotNegative, Positive, Settings, Share, overlay
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.records import read_packaged
 from scenes_mjcf.categories import MaskClasses

@@ -182,10 +182,7 @@ def _dense(path: np.ndarray, step_m: float = 0.03) -> np.ndarray:
 
 
 def write_video(
-    compositor: Compositor,
-    path: Path,
-    every: int = 1,
-    on_progress: Callable[[int], None] = lambda frames: None,
+    compositor: Compositor, path: Path, every: int = 1, on_progress: Callable[[int], None] = lambda frames: None
 ) -> int:
     """Write a video (.mp4, .gif or .webp) in real time, whole or not at all; return the number of different frames.
 

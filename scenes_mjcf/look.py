@@ -279,12 +279,7 @@ class GlPainter:
     """Draws one model, one camera after the other; it must stay in the thread that created it."""
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        width: int,
-        height: int,
-        sky: tuple[int, ...] | None = SKY,
-        shadows: bool = False,
+        self, model: mujoco.MjModel, width: int, height: int, sky: tuple[int, ...] | None = SKY, shadows: bool = False
     ):
         """Create a context for pictures of so many pixels; `sky` is the colour of the background (None: the model's).
 

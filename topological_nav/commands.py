@@ -23,6 +23,7 @@ from topological_nav.config import ADAPTED, DATASET, DRIVES, PASSAGE_POLICY, RUN
 from topological_nav.data.dataset import load_rooms, make_dataset
 from topological_nav.data.domains import AdaptConfig
 from topological_nav.data.folders import folder_bytes
+from topological_nav.drives.dagger import simulate_driven
 from topological_nav.drives.dataset import draw_drives, simulate_drives, summary
 from topological_nav.drives.driving import embed_drives, load_policy
 from topological_nav.drives.imitation import grid_table, train_grid, train_policy
@@ -57,9 +58,8 @@ def bar(signals: list[int] | None = None) -> Iterator[Progress]:
     console = SafeConsole(stderr=True)
     collected = stop_signals() if signals is None else nullcontext(signals)
     with collected as stops, progress_bar(console, "starting") as update:
-        tenths = 0
         # Neither compiling before the first step nor what an earlier run has done says how fast it goes.
-        first: tuple[float, int] | None = None
+        tenths, first = 0, None
 
         def report(what: str, done: int, total: int) -> None:
             nonlocal tenths, first
@@ -272,7 +272,7 @@ def _drives(arguments: Any) -> None:
     out, scenes = arguments.out or DRIVES, [Path(s) for s in scene_folders(arguments.scenes)]
     with stop_signals() as stops:
         with bar(stops) as report:
-            drives = simulate_drives(scenes, out, config, report)
+            drives = (simulate_driven if config.driver else simulate_drives)(scenes, out, config, report)
         with bar(stops) as report:
             draw_drives(scenes, out, report)
     save(figures.drives_figure(scenes, out), out / "preview.png")

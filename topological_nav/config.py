@@ -117,8 +117,7 @@ class NetworkTrainConfig(Settings):
     hidden: Natural = 512
     """Units of each of the two layers behind the backbone; 0: no layers."""
     first_stage: Annotated[int, Bounds(1, 3)] = 2
-    """Stage of ResNet-18 that gives the embedding's first feature map; the fourth gives the second. With 1 and width
-    64, the report's, an embedding has 64 + 512 numbers."""
+    """Stage of ResNet-18 whose map joins the fourth's in the embedding. The report's is 1, with width=64: 64 + 512."""
     init: str = "scratch"
     """Where the backbone starts: scratch, selfsup (first learns without labels), or a run folder to take it from."""
     pitch: Literal["all", "up", "level", "down"] = "all"
@@ -185,8 +184,7 @@ class NavigatorConfig(Settings):
     images: Annotated[int, Bounds(1, 1000)] = 18
     """Images that one localisation looks at, evenly about; a divisor of the map's images a node."""
     goal_images: Annotated[int | None, Bounds(1, 1000)] = None
-    """Images of the goal, evenly about from a heading that each episode draws; auto: as `images`, from the world's x
-    axis on."""
+    """Images of the goal, evenly from a heading that each episode draws; auto: as `images`, from the world's x axis."""
     match: Literal["aligned", "nearest"] = "aligned"
     """An image is compared with the nodes' images of the same heading, and all are summed (aligned); or with all of
     them, and the nearest of all decides (nearest)."""
@@ -197,8 +195,7 @@ class NavigatorConfig(Settings):
     swings: Annotated[int, Bounds(1, 1000)] = 4
     """Steps to each side before an edge counts as blocked."""
     ahead_m: Annotated[float, Bounds(0.05, 100.0)] = 2.0
-    """Facing an edge, the way must be free for the edge's length less `slack_m`, at most this far: a run leads no
-    farther at 0.4 m/s."""
+    """The way must be free for an edge's length less `slack_m`, at most this far: a run leads no farther at 0.4 m/s."""
     slack_m: Annotated[float, Bounds(0.0, 100.0)] = 0.3
     """The robot is not exactly at its node; at most half of the edge's length."""
     clear_m: Annotated[float, Bounds(0.05, 100.0)] = 1.0
@@ -211,14 +208,12 @@ class NavigatorConfig(Settings):
     run_s: Annotated[float, Bounds(0.1, 1e6)] = 5.0
     """Length of a run."""
     glance: bool = True
-    """After every run, judge by the image ahead whether the robot is still at its node or at one joined to it, and plan
-    again from there."""
+    """After each run, judge by the image ahead whether the robot is at its node or at one joined to it; plan anew."""
     watch_s: Annotated[float, Bounds(0.0, 1e6)] = 0.5
     """How often to look, within a run, whether the edge's head is passed (nearest of all, and getting farther), which
     ends the run; 0: never. Needs `glance`."""
     metre_cost: Annotated[float, Bounds(0.0, 1e6)] = 0.3
-    """Added to the cost of an edge, -log p, for each of its metres: of ways that are all but surely free the shorter is
-    taken; 0: the report's."""
+    """Added to an edge's cost, -log p, for each metre, so that of free ways the shorter wins; 0: the report's."""
     retry_cost: Annotated[float, Bounds(0.0, 1e6)] = 1.0
     """Added to the cost of an edge each time that it was driven and the robot was then not nearer to its head."""
     limit_s: Annotated[float, Bounds(0.1, 1e6)] = 1800.0
@@ -316,6 +311,10 @@ class DriveConfig(ExpertConfig, CameraConfig):
     """Drives at once: what an interrupted simulation loses at most."""
     drives: Count = 400
     """Begun in each scene."""
+    driver: str = ""
+    """Run folder of a local policy that drives, while the expert labels what it would command (DAgger)."""
+    expert_share: Share = 0.0
+    """With `driver`: probability that a control step executes the expert's command instead."""
     legs: Count = 3
     """Edges a drive, at most: on from each node by a random edge that turns less than `turn_deg`."""
     turn_deg: Annotated[float, Bounds(0.0, 180.0)] = 30.0
@@ -338,6 +337,7 @@ class DriveConfig(ExpertConfig, CameraConfig):
     """Share of the nodes whose drives are for testing only."""
     shard: Count = 10
     """Drives a file of images."""
+    IDLE = (("expert_share", "driver=RUN", lambda c: bool(c.driver)),)
 
 
 @dataclasses.dataclass(frozen=True)

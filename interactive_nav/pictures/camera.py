@@ -105,12 +105,7 @@ class PictureCamera:
         return self._painter.engine
 
     def frame(
-        self,
-        state: Any,
-        width: int = 512,
-        height: int = 512,
-        streams: tuple[str, ...] = ("rgb",),
-        view: str = "robot",
+        self, state: Any, width: int = 512, height: int = 512, streams: tuple[str, ...] = ("rgb",), view: str = "robot"
     ) -> dict[str, np.ndarray]:
         """Draw pictures, `width` by `height` pixels, of where a state is now.
 

@@ -165,13 +165,7 @@ class RosSensors:
 class RosSimulator(RosSensors):
     """Simulate one robot in one environment, which observes `NEEDED` and takes velocity commands."""
 
-    def __init__(
-        self,
-        env: Any,
-        seed: int = 0,
-        start: tuple[float, ...] = (),
-        engine: str | None = None,
-    ):
+    def __init__(self, env: Any, seed: int = 0, start: tuple[float, ...] = (), engine: str | None = None):
         """Place the robot at `start` (x, y in m and yaw in rad, world; empty: drawn) and compile.
 
         `engine` of `PictureCamera` draws the colours of the robot's camera; None: as the environment observes.

@@ -45,6 +45,8 @@ class HostPolicy:
     """A remark to print beside its scores."""
     observes = True
     """Whether it reads `state.obs`; without it environments are stepped faster."""
+    remembers: MemoryPolicy | None = None
+    """Whose memory travels in `state.info["policy"]`: `act` then returns the new one as the third part of a tuple."""
 
     def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> Any:
         """Return the actions [N, A] of one control step; or a tuple of them and which episodes are over, [N] bool.
@@ -178,8 +180,9 @@ class Player:
         episode_of = np.arange(size)  # episode played by each place in the batch
         finished = episode_of >= count
         act: Any = policy  # a pytree argument of the program, so that its numbers are none of its constants
-        if hasattr(policy, "start") and not isinstance(policy, HostPolicy):
-            memory = self._remember(policy, state, jnp.asarray(done + episode_of))
+        remembers: Any = policy.remembers if isinstance(policy, HostPolicy) else policy
+        if hasattr(remembers, "start"):
+            memory = self._remember(remembers, state, jnp.asarray(done + episode_of))
             state = state.replace(info=state.info | {"policy": memory})
         elif not isinstance(policy, (jax.tree_util.Partial, HostPolicy)):
             act = jax.tree_util.Partial(policy)
@@ -260,7 +263,9 @@ class Player:
             if not running.any():
                 break
             acted = policy.act(carry[0], episode_of, running, step + t)
-            actions, over = acted if isinstance(acted, tuple) else (acted, None)
+            actions, over, *memory = acted if isinstance(acted, tuple) else (acted, None)
+            if memory:
+                carry = (carry[0].replace(info=carry[0].info | {"policy": memory[0]}), *carry[1:])
             with signals_wait():
                 carry, track = jax.block_until_ready(self._step(carry, actions, over, observe=policy.observes))
             tracks.append(jax.tree.map(np.asarray, track))

@@ -179,10 +179,7 @@ class LocalLauncher(Launcher):
 
 
 def run_jobs(
-    launcher: Launcher,
-    jobs: Iterable[Any] | Callable[[], Iterable[Any] | None],
-    grace_s: float,
-    poll_s: float = POLL_S,
+    launcher: Launcher, jobs: Iterable[Any] | Callable[[], Iterable[Any] | None], grace_s: float, poll_s: float = POLL_S
 ) -> Generator[tuple[Any, int], None, None]:
     """Run jobs where there is room; yield each, with its exit code, as it ends: one that fails stops no other.
 

@@ -7,21 +7,23 @@
            preview.png             the drives on the floor plans, and images of some
 
 Kept are drives that reached their last node and touched nothing: then the furniture still stands at rest, as it is
-drawn. What is decided depends on scenes and settings only. Simulating and drawing skip files that exist.
+drawn. A drive of a policy ends where it touches something, and is kept. What is decided depends on scenes and settings
+only. Simulating and drawing skip files that exist.
 """
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav import get_robot, load_scene
 from interactive_nav.scenes.scene import Scene
-from interactive_nav.task.rollout import Player
+from interactive_nav.task.rollout import HostPolicy, Player
 from interactive_nav_common.errors import ConfigError, FileError
 from interactive_nav_common.files import alone_in, write_arrays
 from interactive_nav_common.jobs.progress import Progress
@@ -29,7 +31,7 @@ from interactive_nav_common.rotations import wrap_angle
 from scenes_mjcf.look import CameraPose
 from topological_nav.config import DataConfig, DriveConfig, MapConfig
 from topological_nav.data.folders import Folder, draw_missing, load_scenes, numbered, read_arrays, read_shards
-from topological_nav.drives.expert import CONTROL_S, RECORDERS, Tasks, Terrain, drive, drive_env, way_field
+from topological_nav.drives.expert import CONTROL_S, RECORDERS, Expert, Tasks, Terrain, drive, drive_env, way_field
 from topological_nav.maps.graph import angles, near_pairs, place_nodes
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.space import FreeSpace, free_space, scene_rooms
@@ -73,6 +75,8 @@ class Drives:
     """[n] bool: physics failed."""
     goal_w: np.ndarray
     """[n, 2] m, the last node."""
+    labelled: np.ndarray
+    """[n] bool: a policy drove until it touched something, and the commands are what the expert would have done."""
 
     def __len__(self) -> int:
         return len(self.scene)
@@ -94,8 +98,8 @@ class Drives:
 
     @property
     def kept(self) -> np.ndarray:
-        """Return which reached their last node and touched nothing, [n] bool: they are drawn and learned from."""
-        return self.reached & ~self.broken & ~self.touched
+        """Return which are drawn and learned from, [n] bool: of the expert's those that arrived and touched nothing."""
+        return ~self.broken & (self.labelled | (self.reached & ~self.touched))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,9 +222,13 @@ def _terrain(spaces: Sequence[FreeSpace], fields: Sequence[np.ndarray]) -> Terra
 
 
 def simulate_drives(
-    scene_folders: Sequence[Path], out: Path, config: DriveConfig, progress: Progress = lambda *_: None
+    scene_folders: Sequence[Path],
+    out: Path,
+    config: DriveConfig,
+    progress: Progress = lambda *_: None,
+    pupil: Callable[[Expert, np.ndarray], HostPolicy] | None = None,
 ) -> Drives:
-    """Simulate all drives, or those that are missing."""
+    """Simulate all drives, or those that are missing; a pupil drives beside an expert, by the drives' numbers."""
     scenes = load_scenes(scene_folders, config.engine)
     header = DRIVES.describe(config, [{"name": s.name, "digest": s.digest, "split": s.split} for s in scenes])
     with DRIVES.claimed(out, header):
@@ -241,7 +249,9 @@ def simulate_drives(
 
                 # Padded by its last drive: one size, one program.
                 rows = np.minimum(mine[0] + np.arange(config.batch), total - 1)
-                driven = drive(player, terrain, tasks.take(rows), config, report)
+                part = tasks.take(rows)
+                expert = Expert(terrain, jax.tree.map(jnp.asarray, part), player.env, config)
+                driven = drive(player, part, pupil(expert, rows) if pupil else expert, report)
                 driven = {name: values[: len(mine)] for name, values in driven.items()}
                 on = np.arange(driven["pose_w"].shape[1]) < driven["steps"][:, None]  # not after its end
                 write_arrays(path, **{n: row[on] if row.shape[:2] == on.shape else row for n, row in driven.items()})
@@ -305,7 +315,8 @@ def load_drives(folder: Path) -> Drives:
     plan = read_arrays(folder / "plan.npz", AGAIN)
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     first = np.concatenate([[0], np.cumsum(joined.pop("steps"))])
-    return Drives(scene=plan["scene"], test=plan["test"], goal_w=plan["goal_w"], first=first, **joined)
+    joined |= {name: plan[name] for name in ("scene", "test", "goal_w")}
+    return Drives(first=first, labelled=np.full(len(plan["scene"]), bool(config.driver)), **joined)
 
 
 def summary(drives: Drives) -> dict[str, float]:

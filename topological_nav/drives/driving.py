@@ -170,10 +170,8 @@ class Frames:
         return len(self.features) > len(self.drives.command)
 
 
-def embed_drives(folder: Path, localiser_run: Path, detector_run: Path, mirror: bool, host: Host = ALONE) -> Frames:
-    """Embed the images of all kept drives."""
-    header, config = read_drives_header(folder)
-    drives, networks = load_drives(folder), load_networks(localiser_run, detector_run, classifies=True, same=SAME)
+def need_camera(folder: Path, header: Mapping[str, Any], networks: Networks) -> None:
+    """Refuse a folder of drives, by its description, of another camera than that which the networks learned from."""
     mine, theirs = {**header["settings"], "fov_deg": header["fov_deg"]}, camera_settings(networks.localiser)
     for name in SAME:
         if mine[name] != theirs[name]:
@@ -181,6 +179,13 @@ def embed_drives(folder: Path, localiser_run: Path, detector_run: Path, mirror: 
                 f"{folder}: images have {name} = {mine[name]!r}, the networks learned from {theirs[name]!r}; drive "
                 f"again with {name}={theirs[name]}"
             )
+
+
+def embed_drives(folder: Path, localiser_run: Path, detector_run: Path, mirror: bool, host: Host = ALONE) -> Frames:
+    """Embed the images of all kept drives."""
+    header, config = read_drives_header(folder)
+    drives, networks = load_drives(folder), load_networks(localiser_run, detector_run, classifies=True, same=SAME)
+    need_camera(folder, header, networks)
     count, total, done = len(drives.command), int(drives.steps[drives.kept].sum()), 0
     features: np.ndarray | None = None
 
@@ -231,11 +236,11 @@ class TrainedPolicy:
         """Take what `load_policy` read; compile at the first step of each batch size."""
         self.about: dict[str, Any] = about
         """Content of network.json."""
-        self._networks: Networks = networks
+        self.networks: Networks = networks
         self._policy = policy
-        data = self._networks.localiser.about["data"]
+        data = self.networks.localiser.about["data"]
         self._shape = (data["height"], data["width"], 3)
-        weights = {"policy": variables, "embedders": [n.variables for n in self._networks]}
+        weights = {"policy": variables, "embedders": [n.variables for n in self.networks]}
         self._weights = jax.tree.map(jnp.asarray, weights)
         self._step = jax.jit(self._stepped)
 
@@ -252,7 +257,7 @@ class TrainedPolicy:
 
     def probabilities(self, images: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return those of linear [T, L] and angular [T, A] classes in a run that sees images [T, H, W, 3] u8."""
-        embeddings = np.concatenate([network.embed(images) for network in self._networks], -1)
+        embeddings = np.concatenate([network.embed(images) for network in self.networks], -1)
         weights = self._weights["policy"]
         x = standardised(jnp.asarray(embeddings), weights["scale"])
         logits = unrolled(self._policy, weights["params"], x[None])
@@ -266,7 +271,7 @@ class TrainedPolicy:
         return state, tuple(one.argmax(-1) for one in logits)
 
     def _stepped(self, weights, state, images):
-        return self.step(state, embedded(self._networks, weights["embedders"], images), weights["policy"])
+        return self.step(state, embedded(self.networks, weights["embedders"], images), weights["policy"])
 
 
 def load_policy(

@@ -21,7 +21,7 @@ import scipy.ndimage
 from scipy.sparse.csgraph import dijkstra
 
 from interactive_nav import InteractiveNav
-from interactive_nav.task.rollout import Player, Recorder
+from interactive_nav.task.rollout import HostPolicy, Player, Recorder
 from interactive_nav.types import LOST
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.grids import MOVES_32, cell_centres, grid_graph, nearest_cell
@@ -293,15 +293,14 @@ RECORDERS |= {"touching": Recorder(lambda state, action: state.info["nav"].memor
 
 
 def drive(
-    player: Player, terrain: Terrain, tasks: Tasks, config: DriveConfig, on_progress: Callable[[int], None]
+    player: Player, tasks: Tasks, policy: Expert | HostPolicy, on_progress: Callable[[int], None]
 ) -> dict[str, np.ndarray]:
-    """Drive a batch of tasks to their ends, with a player that has `RECORDERS`.
+    """Drive a batch of tasks to their ends, with a player that has `RECORDERS`, by the expert or beside it.
 
     Return fields of `dataset.Drives`: those of control steps [B, T, ...], where rows after a drive's `steps` [B] mean
     nothing; and `reached` and `broken` [B].
     """
     starts = episode_starts(tasks.start_xy_w, tasks.start_yaw_rad, tasks.goals_w[:, 0], 0, tasks.scene)
-    policy = Expert(terrain, jax.tree.map(jnp.asarray, tasks), player.env, config)
     keys = jnp.zeros((len(tasks), 2), jnp.uint32)
     result = player.rollout(policy, keys, starts, on_progress=lambda ended, step: on_progress(ended))
     return {"steps": result.num_steps, **result.values}

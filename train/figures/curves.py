@@ -11,11 +11,7 @@ from interactive_nav_common.figures import draw_means, legend, panels
 from interactive_nav_common.statistics import estimate
 from train.figures import style
 
-CURVES = (
-    ("episode/success", "success"),
-    ("episode/ins_0.5", "INS$_{0.5}$"),
-    ("episode/sum_reward", "episode reward"),
-)
+CURVES = (("episode/success", "success"), ("episode/ins_0.5", "INS$_{0.5}$"), ("episode/sum_reward", "episode reward"))
 GOALS = "goals_per_1000_steps"
 GOALS_LABEL = "goals reached in 1,000 env steps"
 """Of sweeps: their runs may end before every environment has had the time of a whole episode, and until then the

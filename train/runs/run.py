@@ -230,10 +230,7 @@ def check_fits(meta: CheckpointMeta, path: Path, config: EnvConfig, env: Any) ->
 
 
 def train_run(
-    config: TrainConfig,
-    console: Console,
-    build_env: Callable[[EnvConfig], Any] = build_env,
-    resume_from: str = "last",
+    config: TrainConfig, console: Console, build_env: Callable[[EnvConfig], Any] = build_env, resume_from: str = "last"
 ) -> tuple[TrainResult, RunFolder, int | None]:
     """Train as configured, beginning or continuing the run folder.
 

@@ -56,13 +56,7 @@ class BatchPlayer(Player):
         self.cached: dict[Any, Any] = {}
         """Functions of learned policies, by kind: see `load_policy`."""
 
-    def play(
-        self,
-        policy: PolicyFn | HostPolicy,
-        keys: jax.Array,
-        record: int = 0,
-        **how: Any,
-    ) -> PlayedEpisodes:
+    def play(self, policy: PolicyFn | HostPolicy, keys: jax.Array, record: int = 0, **how: Any) -> PlayedEpisodes:
         """Play every episode to its end; `how` and the rest are as `Player.rollout` takes them."""
         played = self.rollout(policy, keys, record=None if self.demonstrate else record, **how)
         first, values, xy = played.first, played.values, played.values["robot_xy_w"][:record]

@@ -179,11 +179,7 @@ def _joins(
 
 
 def _doorways(
-    layout: Layout,
-    uses: Sequence[str],
-    shared: dict[tuple[int, int], Wall],
-    cfg: HomeConfig,
-    rng: np.random.Generator,
+    layout: Layout, uses: Sequence[str], shared: dict[tuple[int, int], Wall], cfg: HomeConfig, rng: np.random.Generator
 ) -> list[Doorway]:
     """Draw the doorways; those of rooms that people do not walk through are narrow enough for a leaf, in a corner."""
     height, out = snap(rng.uniform(2.06, 2.12)), []
@@ -259,11 +255,7 @@ def _windows(
 
 
 def _built(
-    layout: Layout,
-    uses: Sequence[str],
-    shared: dict[tuple[int, int], Wall],
-    cfg: HomeConfig,
-    rng: np.random.Generator,
+    layout: Layout, uses: Sequence[str], shared: dict[tuple[int, int], Wall], cfg: HomeConfig, rng: np.random.Generator
 ) -> Plan | None:
     """Return the plan of a layout whose rooms have these uses; None where no outer wall takes the front door."""
     doorways = _doorways(layout, uses, shared, cfg, rng)

@@ -198,11 +198,7 @@ def _built_in(items: Sequence[Instance]) -> list[Chart]:
 
 
 def model_building(
-    plan: Plan,
-    items: Sequence[Instance],
-    uses: Sequence[str],
-    rng: np.random.Generator,
-    palette: Sequence[str] = (),
+    plan: Plan, items: Sequence[Instance], uses: Sequence[str], rng: np.random.Generator, palette: Sequence[str] = ()
 ) -> tuple[Scan, Atlas]:
     """Model and paint the structure; no vertex of the mesh is in faces of two labels.
 

@@ -30,6 +30,7 @@ def drives_of(*commands) -> Drives:
         flags,
         ~flags,
         np.zeros((len(steps), 2)),
+        ~flags,
     )
 
 

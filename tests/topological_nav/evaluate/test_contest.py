@@ -212,7 +212,7 @@ def test_a_map_collected_in_the_target_domain_is_driven_on_there(contest, made, 
     there = dataclasses.replace(contest, maps=maps, localiser=adapted, domain="light")
     (venue,) = contest_scenes(there)
     policy = venue.navigator("dense").policy
-    assert policy._networks[0].about["digest"] == saved.about["digest"]  # type: ignore[attr-defined]
+    assert policy.networks[0].about["digest"] == saved.about["digest"]  # type: ignore[attr-defined]
     # Not through others that it never met.
     saved = save_trained(adapted, dataclasses.replace(saved, about={**about, "adapted_from": "another"}))
     (venue,) = contest_scenes(there)
