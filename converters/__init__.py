@@ -1,5 +1,1 @@
-"""Raw scan + CAD models + alignments in, scene folder (`scene.xml`, `scene.json`, `maps.npz`, `assets/`) out.
-
-Files are touched by the readers and by the writer only; every stage between is a function of arrays.
-The order of the stages is in `pipeline.py`.
-"""
+"""Convert a raw scan, CAD models and alignments to a scene folder; `pipeline.py` has the order of the stages."""

@@ -16,11 +16,7 @@ Report = Callable[[str, float], None]
 
 
 def peak_memory_mib(pid: int | str = "self") -> float:
-    """Return the most memory that a process has held, MiB; 0 where the system does not say, or it has ended.
-
-    VmHWM and not `getrusage`: Linux keeps the latter's `ru_maxrss` through fork and exec, so a process started by a
-    large one reports its parent's.
-    """
+    """Return a process's peak memory, MiB, or 0 if unknown; `ru_maxrss` would include the parent's peak."""
     with contextlib.suppress(OSError):
         if match := re.search(r"VmHWM:\s+(\d+) kB", Path("/proc", str(pid), "status").read_text()):
             return int(match[1]) / 1024

@@ -1,8 +1,7 @@
-"""Convert raw folders, and generate sets of scenes, side by side, resumable, on this machine or on many.
+"""Convert raw folders, and generate sets of scenes, in parallel and resumably, on one machine or several.
 
-Each source has a process (`python -m converters.many JSON`), which writes its row of `conversions.parquet`, and so have
-up to `TOGETHER` scenes (`generate-scenes --only NAME ...`): one that fails costs no other. A process that is killed
-costs the scene that it works on; the others of its scenes get another process.
+Each source, or batch of up to `TOGETHER` scenes, has a process. If a process is killed, only its current scene is lost;
+another process continues the batch.
 """
 
 import contextlib
@@ -82,9 +81,9 @@ def convert_many(
     sources: Sequence[Path], into: Path, config: ConvertConfig, launcher: Launcher, side_by_side: int,
     report: Callable[[str, float], None], log: Callable[[str], None],
 ) -> list[str]:  # fmt: skip
-    """Convert what has not been converted with these options; the row of each is written as it ends.
+    """Convert sources that have no result with these options yet, and write each one's row when it ends.
 
-    Return the names of the sources without a scene, or with a gate that fails, whether tried now or before.
+    Return the names of all sources without a scene or with a failed gate.
     """
     named: dict[str, Path] = {}
     for source in sources:
@@ -206,11 +205,7 @@ def begin_set(out: Path, tier: str, count: int, seed: int = SEEDS) -> None:
 
 
 def list_set(recipes: Recipes, out: Path, log: Callable[[str], None] = lambda line: None) -> SceneSet:
-    """Write `set.json` beside the scenes: which there are to be, and the digests of those that are there.
-
-    A scene whose digest is not the one that the file already lists is reported and stays listed as it was: generated
-    elsewhere, it should be the same up to rounding.
-    """
+    """Write `set.json`: the set's scenes and their digests; report and keep a listed digest that differs."""
     path = out / FILE
     members = dict(read_set(path).scenes) if path.is_file() else {}
     for recipe in recipes.scenes:
@@ -241,10 +236,7 @@ def make_launcher(launcher: str, address: str | None, jobs: int, count: int) -> 
 def run_commands(
     commands: Mapping[str, list[str]], launcher: Launcher, folder: Path, report: Report, what: str
 ) -> Generator[tuple[str, int, str], None, None]:
-    """Run commands, several at a time; yield the name, exit code and output of each as it ends.
-
-    Closed early, by a signal or an error, it ends what runs.
-    """
+    """Run commands in parallel and yield each one's name, exit code and output; closing the generator ends them."""
     folder.mkdir(parents=True, exist_ok=True)
     report(f"0/{len(commands)} {what}", 0.0)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".jobs-") as logs:
@@ -257,10 +249,7 @@ def run_commands(
 
 
 def generate_scenes(wanted: Any, report: Report, log: Callable[[str], None]) -> list[str]:
-    """Generate and list the scenes that are not there yet; return the names of those that fail, or fail a gate.
-
-    `wanted`: the command `converters.generating.GenerateScenes`.
-    """
+    """Generate and list missing scenes of a `GenerateScenes` command; return the names of those that fail."""
     if wanted.tier and wanted.count is not None and wanted.seed is not None:
         begin_set(wanted.out, wanted.tier, wanted.count, wanted.seed)
     path = wanted.recipes or wanted.out / RECIPES
@@ -301,9 +290,7 @@ def make_packaged(
 ) -> list[str]:
     """Generate scenes of the package's sets in the cache folder, unless the package has them.
 
-    `wanted_set`: the command `converters.generating.GenerateScenes`, with what its options have in common.
-
-    Replace cached folders that hold a scene other than the listed one. Return the names of scenes that fail, miss a
+    Cached folders with other scenes than the listed ones are replaced. Return the names of scenes that fail, miss a
     gate, or differ from the set's list.
     """
     sets = {name: packaged_set(name).scenes for name in PACKAGED}

@@ -315,12 +315,12 @@ def convert_building(
     floors: int | None = None,
     annotations: Path | None = None,
 ) -> tuple[Converted, ...]:
-    """Convert one raw folder, floor by floor; the scene folders appear whole and together, or not at all.
+    """Convert one raw folder, floor by floor; either all scene folders appear, or none.
 
-    A building of several floors makes `<target>_0`, `<target>_1` and so on, from the lowest floor up; `floors` is the
-    number that it must have. `cache` keeps hulls and stage results by content (default: `cache_folder()`). `warn` gets
-    what is wrong with the source as soon as it is read. `annotations` is Scan2CAD's file, in place of the source's; its
-    models are those of `config.library`. Raises `SceneRejected`, `FileError` (of the target) or `StageFailed`.
+    A building of several floors gives `<target>_0`, `<target>_1` and so on, from the lowest up; `floors` is their
+    required number. `cache` keeps hulls and stage results by content (default: `cache_folder()`). `warn` receives
+    defects of the source. `annotations`, Scan2CAD's file, replaces the source's, with models of `config.library`. Raise
+    `SceneRejected`, `FileError` (of the target) or `StageFailed`.
     """
     clock = Clock(report or (lambda stage, share: None))
     if config.library is None and (source / "cad").is_dir():

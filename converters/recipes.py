@@ -1,7 +1,6 @@
-"""Generate, convert and draw every scene of a recipe file.
+"""Generate, convert and draw every scene of a recipe file, reproducibly to the byte.
 
-A recipe names a seed, a split, a tier and how the building departs from the tier's defaults; the split decides
-which CAD models may be used. The same recipes give the same scenes, byte for byte.
+A recipe names a seed, a split (which decides the CAD models), a tier and deviations from the tier's defaults.
 """
 
 import dataclasses
@@ -97,10 +96,7 @@ def _value(value: Any, hint: Any, where: str) -> Any:
 
 
 def building_of(tier: str, settings: dict[str, Any], split: str, where: str) -> HomeConfig:
-    """Return what to build, from one of `TIERS` and settings of `HomeConfig` as a recipe or command gives them.
-
-    The split decides the CAD models.
-    """
+    """Return the building of one of `TIERS` with settings of `HomeConfig`; the split decides the CAD models."""
     if tier not in TIERS:
         raise GenerationError(f"{where}: tier is {tier!r}, expected one of {', '.join(TIERS)}")
     fields = home_fields()
@@ -146,10 +142,7 @@ def load_recipes(path: Path) -> Recipes:
 
 
 def missed(building: HomeConfig, result: Converted) -> str:
-    """Return which share a converted home should have and lacks, or which gates it fails; empty: none.
-
-    Things stand as coacd's boxes let them, not as they were placed: a passage may have closed.
-    """
+    """Return the failed gates, or the share missed because conversion closed passages; an empty string if neither."""
     if failed := [gate.name for gate in result.gates if not gate.passed]:
         return f"gates that fail once converted: {', '.join(failed)}"
     for robot, (low, high) in building.must_push.items():
@@ -160,9 +153,9 @@ def missed(building: HomeConfig, result: Converted) -> str:
 
 
 def with_seeds(seed: int, attempt: Callable[[int], T]) -> tuple[T, str]:
-    """Return the result of an attempt with the first seed that suits, and that seed in words.
+    """Return the result of the first attempt that succeeds, and its seed in words.
 
-    An attempt raises a `GenerationError` that names its seed where the next one should be taken.
+    An attempt raises a `GenerationError` that names its seed to request the next seed.
     """
     words, refused = f"seed {seed}", None
     for one in range(seed, seed + MOST_SEEDS * NEXT_SEED, NEXT_SEED):
@@ -200,8 +193,7 @@ def make_scene(
 ) -> tuple[list[str], str]:
     """Generate, convert and draw one scene; return the names of the gates that fail, and its seed in words.
 
-    `folder` is created or replaced, whole or not at all. `conversion` are settings of `ConvertConfig`, `jobs` is the
-    number of decompositions side by side.
+    `folder` is replaced atomically. `conversion` are settings of `ConvertConfig`, `jobs` parallel decompositions.
     """
     with part_folder(folder, overwrite=True) as work:
         config = ConvertConfig(format="gibson", split=recipe.split, jobs=jobs, keep=False, **conversion)
@@ -217,10 +209,7 @@ def chosen(
     recipes: Recipes, out: Path, names: tuple[str, ...] = (), overwrite: bool = False,
     log: Callable[[str], None] = lambda line: None,
 ) -> tuple[SceneRecipe, ...]:  # fmt: skip
-    """Return the recipes, of all or of these names, whose scenes are not there yet, or all with `overwrite`.
-
-    `log` is called with one line for each that is there and kept.
-    """
+    """Return the recipes in `names` (empty: all) without a scene, or all with `overwrite`; log the ones kept."""
     every = [r.name for r in recipes.scenes]
     for name in (name for name in names if name not in every):
         raise GenerationError(f"no recipe named '{name}'{nearest(name, every)}; known: {', '.join(every)}")
@@ -236,10 +225,9 @@ def make_scenes(
     todo: Sequence[SceneRecipe], conversion: dict[str, Any], out: Path, overwrite: bool = False, jobs: int = 2,
     report: Report = lambda stage, share: None, log: Callable[[str], None] = lambda line: None,
 ) -> dict[str, list[str]]:  # fmt: skip
-    """Generate scenes one after the other; return name -> gates that fail, of the scenes generated now.
+    """Generate scenes one after the other; return name -> failed gates of the scenes generated now.
 
-    After an interruption, `chosen` names those that are left: a scene is there whole or not at all. `log` is called
-    with one line for each scene, in which one that gives no scene says why; if it is the only one, it raises its error.
+    `log` receives one line for each scene, also if it fails; the error of a single scene is raised instead.
     """
     weight = [sum(r.building.floor_area_m2) for r in todo]
     failed: dict[str, list[str]] = {}

@@ -1,7 +1,6 @@
-"""Convert one mesh or URDF to a folder with an MJCF body (`object.xml`), its description (`object.json`) and assets.
+"""Convert one mesh or URDF to a folder with an MJCF body (`object.xml`), `object.json` and assets.
 
-The body's frame is a scene object's: origin at the middle of the base, z up. `object.xml` holds the body alone,
-with a free joint, so that it can be attached to any model; it stands as it comes to rest on a level floor.
+Body frame: origin at the middle of the base, z up. The body has a free joint and rests on a level floor.
 """
 
 import dataclasses
@@ -67,10 +66,7 @@ def read_object(path: Path, config: ObjectConfig) -> tuple[RigidObject, SourceFo
 
 
 def _level_feet(points: np.ndarray, foot_m: float) -> Hull:
-    """Return the hull of (n, 3) points, body frame, with the lowest ones brought down to the base z = 0.
-
-    A plate that is thickened (`convex_hull`) grows to both sides; what then stands below the base is lifted.
-    """
+    """Return the hull of (n, 3) points, body frame, with its lowest points at the base z = 0, also after thickening."""
     level = points.copy()
     level[level[:, 2] < foot_m, 2] = 0.0
     hull = convex_hull(np.vstack([points, level]))
@@ -95,13 +91,9 @@ def convert_object(
     cache: Path | None = None,
     warn: Callable[[str], None] = lambda warning: None,
 ) -> dict[str, Any]:
-    """Convert one mesh or URDF; `target` appears whole or not at all.
+    """Convert one mesh or URDF atomically to the folder `target`; return the content of `object.json`.
 
-    The URDF's mass, friction and collision mesh are used; its inertia is not (released ones are placeholders): it
-    follows from the hulls at that mass.
-
-    `config`: choices; they win over the URDF's values.
-    Returns the content of `object.json`.
+    The URDF gives mass, friction and collision mesh unless `config` sets them. Inertia follows from hulls and mass.
     """
     if not path.is_file():
         raise SceneRejected(f"{path}: no such file; give a mesh (OBJ, PLY, STL, GLB, ...) or a URDF")

@@ -1,7 +1,4 @@
-"""Serve the annotation page (viser): one scene and one state for everybody who has it open.
-
-Every change is in the `Session`, and is saved before it is shown: closing the page loses nothing.
-"""
+"""Serve the annotation page (viser); all visitors share one scene, and every change is saved before it is shown."""
 
 import concurrent.futures
 import contextlib
@@ -52,10 +49,9 @@ def around(mesh: trimesh.Trimesh, item: Item) -> trimesh.Trimesh:
 
 
 def view_of(item: Item, cad: CadModel | None, raw: RawScene) -> tuple[Alignment, np.ndarray, np.ndarray]:
-    """Show the object on the left, the model on the right, from the room's middle so that walls stand behind.
+    """Show the object on the left and its model on the right, facing the camera.
 
-    Return the pose of the model beside its object, facing the camera (CAD frame -> scan frame), where the camera
-    stands, and where it looks: between the two, (3,) m each, scan frame.
+    Return the model's pose (CAD frame -> scan frame), and the camera's position and target, (3,) m each, scan frame.
     """
     inwards = raw.scan.vertices[:, :2].mean(axis=0) - item.centre[:2]
     far = float(np.linalg.norm(inwards))

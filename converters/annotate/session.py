@@ -1,7 +1,4 @@
-"""Hold a person's annotations of a scan: objects, their models and keypoint pairs; as files, and back.
-
-Nothing here depends on a browser. An action returns a new `Session`; `Store` writes it after each.
-"""
+"""Hold a person's annotations of a scan, and read and write them; actions return a new `Session`."""
 
 from __future__ import annotations
 

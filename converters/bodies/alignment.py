@@ -1,8 +1,4 @@
-"""Solve for the placement of least residual of keypoint pairs.
-
-The seven free parameters (three scales, three translations, yaw; roll and pitch fixed) are those of the
-original annotation (Interactive Gibson, section III-B).
-"""
+"""Fit scales, translation and yaw to keypoint pairs by least squares (Interactive Gibson, section III-B)."""
 
 import dataclasses
 import itertools
@@ -57,11 +53,7 @@ class Alignment:
 
 
 def _check_spread(points: np.ndarray) -> None:
-    """Refuse keypoints that leave one of the seven parameters open.
-
-    Roll and pitch being fixed, height separates from the rest: the z scale needs extent along z, the two
-    horizontal scales and the yaw need points that do not lie on one line from above.
-    """
+    """Refuse keypoints without extent along z, or on one line seen from above: they leave parameters undetermined."""
     centred = points - points.mean(axis=0)
     spread = np.sqrt((centred**2).mean(axis=0))
     _, singular, axes = np.linalg.svd(centred, full_matrices=False)
@@ -91,12 +83,11 @@ def _check_spread(points: np.ndarray) -> None:
 def least_squares(
     p: np.ndarray, q: np.ndarray, round_model: bool = False, weights: np.ndarray | None = None
 ) -> Alignment:
-    """Fit by least squares over all pairs, in closed form where all scales come out positive.
+    """Fit by least squares over all pairs, in closed form if all scales come out positive.
 
-    For a fixed yaw the best scales are one-dimensional regressions, and the explained variance left as a
-    function of (cos, sin) is a quadratic form: its leading eigenvector is the yaw. A mirrored optimum (a
-    negative scale) is refused; the best yaw with positive scales is then searched for. `p` are (k, 3) in the CAD frame,
-    `q` in the scan frame, m, and `weights` (k,) those of the squared distances.
+    For a fixed yaw, each scale is a one-dimensional regression, and the remaining variance is a quadratic form in (cos,
+    sin) of the yaw. `p` (k, 3) is in the CAD frame, `q` in the scan frame, m; `weights` (k,) apply to squared
+    distances.
     """
     _check_spread(p)
     share = np.full(len(p), 1.0 / len(p)) if weights is None else weights / weights.sum()
@@ -143,11 +134,7 @@ def _squared(fit: Alignment, p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def _best_without(p: np.ndarray, q: np.ndarray, count: int, round_model: bool) -> tuple[np.ndarray, Alignment] | None:
-    """Return the fit of least residual over the pairs that stay when `count` are left out (least trimmed squares).
-
-    All choices are tried where they are few; else random starts are refined until the pairs that stay are those
-    of least residual (Rousseeuw and Van Driessen 1999, C-steps).
-    """
+    """Return the least trimmed squares fit without `count` pairs (Rousseeuw and Van Driessen 1999, C-steps)."""
     k = len(p)
     best: tuple[np.ndarray, Alignment] | None = None
 
@@ -178,11 +165,7 @@ def _best_without(p: np.ndarray, q: np.ndarray, count: int, round_model: bool) -
 
 
 def _inliers(p: np.ndarray, q: np.ndarray, round_model: bool) -> np.ndarray:
-    """Return (k,) bool: pairs that are no gross outliers.
-
-    Leaving pairs out always lowers the residual. They count as outliers where it falls by more than chance
-    allows: an F test of the fit with against the fit without them, at `OUTLIER_P` shared among the choices.
-    """
+    """Return (k,) bool, False for gross outliers by an F test at `OUTLIER_P`, shared among all choices of pairs."""
     k = len(p)
     every = np.ones(k, bool)
     try:
@@ -209,16 +192,11 @@ def _inliers(p: np.ndarray, q: np.ndarray, round_model: bool) -> np.ndarray:
 
 
 def solve_alignment(cad_points: np.ndarray, scan_points: np.ndarray, symmetry: str = "__SYM_NONE") -> Alignment:
-    """Solve for scales, translation and yaw of least squared point-to-point distance, without gross outliers.
+    """Fit scales, translation and yaw by least squares, robust to one gross outlier in eight pairs.
 
-    Robust to one gross outlier in eight pairs (see `_inliers`); `rms_m` is over the pairs that were kept.
-
-    A model with a rotational symmetry may be clicked on any of its equivalent points: each pair then takes the
-    equivalent CAD point that fits, and the pose is the equivalent one of smallest yaw. The axis of symmetry is
-    the CAD frame's z axis, as in ShapeNet. A round model (`__SYM_ROTATE_UP_INF`) keeps one horizontal scale.
-
-    Points are (k, 3), k >= 6, in a z-up CAD frame, unscaled, and row by row the same physical points in the scan frame,
-    m; `symmetry` is a key of `SYMMETRY_PERIOD_RAD`.
+    Points are (k, 3), k >= 6: unscaled and z up in the CAD frame, and the same physical points in the scan frame, m.
+    `symmetry`, about the CAD frame's z axis, is a key of `SYMMETRY_PERIOD_RAD`: each pair takes the equivalent CAD
+    point that fits best, and the result has the smallest yaw. `rms_m` covers the pairs that were kept.
     """
     p, q = np.asarray(cad_points, float), np.asarray(scan_points, float)
     if p.shape != q.shape or p.ndim != 2 or p.shape[1] != 3:

@@ -1,9 +1,7 @@
-"""Decompose CAD meshes into convex hulls: coacd in one process per model, results cached by content.
+"""Decompose CAD meshes into convex hulls with coacd, and cache the results by content.
 
-A model on which coacd fails or runs past the time limit gets its convex hull instead, and the result names it.
-
-coacd runs outside this process because it prints its log to the terminal, may crash on bad meshes, and
-cannot be interrupted from Python. A model is decomposed once, unscaled: scaling keeps a hull convex.
+Each model has a process, because coacd may crash and cannot be interrupted from Python. If coacd fails or runs out of
+time, the model's convex hull is the result, and a reason comes with it.
 """
 
 import contextlib
@@ -43,8 +41,7 @@ class DecomposeConfig:
 
 
 DOOR_OVERRIDES = {"threshold": 0.02, "max_convex_hull": 4, "preprocess_resolution": 60}
-"""Parameters of doors. coacd measures in half heights: with the quick settings handles 5 cm off the leaf are
-within the threshold, and a voxel is 7 cm, so that a leaf of 4 cm would become a slab of 9."""
+"""Parameters of doors. With coacd's quick settings, in half heights, a voxel of 7 cm would thicken a 4 cm leaf to 9."""
 
 
 def cache_folder() -> Path:
@@ -73,10 +70,7 @@ def decompose_all(
     overrides: Mapping[str, Mapping[str, float]] | None = None,
     strict: bool = False,
 ) -> Decomposition:
-    """Decompose every mesh, name -> (vertices (n, 3), faces (m, 3)), `jobs` processes at a time.
-
-    `overrides`: name -> parameters that differ from the config's.
-    """
+    """Decompose meshes, name -> (vertices (n, 3), faces (m, 3)), in `jobs` processes; `overrides` is by name."""
     changes = overrides or {}
     configs = {name: dataclasses.replace(config, **changes.get(name, {})) for name in meshes}  # pyright: ignore
     stored = StageCache(cache)

@@ -53,11 +53,7 @@ def to_world(placed: PlacedObject, points_b: np.ndarray) -> np.ndarray:
 
 
 def flatten_feet(hull: Hull) -> Hull:
-    """Cut a hull at the body frame's z = 0 and bring what ends within `FOOT_M` above it down to it.
-
-    Decomposition works on voxels: hulls stand out of the model by some millimetres and feet come out of
-    unequal length; the object would rest tilted on its hulls and upright on its boxes.
-    """
+    """Make a hull level at z = 0 (body frame): cut off what is below, and extend it down if it ends within `FOOT_M`."""
     points = hull.vertices * [1.0, 1.0, 1.0]
     points[:, 2] = np.maximum(points[:, 2], 0.0)
     feet = points[points[:, 2] < FOOT_M] * [1.0, 1.0, 0.0]
@@ -110,9 +106,9 @@ def place_object(
     floor_height_m: float,
     walls_yaw: float,
 ) -> PlacedObject:
-    """Scale a CAD model and its hulls, move the origin to the middle of the base and state the world pose.
+    """Scale a CAD model and its hulls, move the origin to the middle of the base and compute the world pose.
 
-    The world's z is the scan's less `floor_height_m`; `walls_yaw` is the main direction of the building, rad.
+    The world's z is the scan's minus `floor_height_m`; `walls_yaw` is the building's main direction, rad.
     """
     vertices, look = cad.vertices * pose.scale, cad.surface
     low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -163,10 +159,7 @@ class Physical:
 def physical_properties(
     category: str, hulls: tuple[Hull, ...], mass_kg: float | None = None, friction: float | None = None
 ) -> Physical:
-    """Return mass, moments (body frame, m, kg) and friction; moments scale with the mass.
-
-    The mass is density x summed hull volume, clipped to the category's range, unless the source gives one.
-    """
+    """Return mass (density x hull volume within the category's range, unless given), moments (m, kg) and friction."""
     material = MATERIALS[category]
     # The moments of closed surfaces add up; at unit density.
     whole = trimesh.triangles.mass_properties(np.concatenate([hull.vertices[hull.faces] for hull in hulls]))
@@ -182,10 +175,7 @@ LYING_DEG = 15.0
 
 
 def upright(pose: np.ndarray, pivot_cad: np.ndarray) -> tuple[alignment.Alignment, float]:
-    """Take the small roll and pitch out of an annotated pose (4, 4), turning about a point (3,) of the CAD frame.
-
-    Return the upright pose (`rms_m` is nan: nothing was fitted) and the tilt that was removed, rad.
-    """
+    """Remove roll and pitch from a pose (4, 4) about a CAD point (3,); return the pose and the removed tilt, rad."""
     scale = np.linalg.norm(pose[:3, :3], axis=0)
     turn = pose[:3, :3] / scale
     yaw = math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])

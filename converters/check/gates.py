@@ -48,8 +48,7 @@ def judge(name: str, value: float, warnings: tuple[str, ...] = ()) -> Gate:
 def collide_with(spec: mujoco.MjSpec, shape: str) -> mujoco.MjModel:
     """Compile a scene with the movables colliding by their hulls or by their boxes.
 
-    The switch is thrown in the spec: a compiled model's bounding-volume trees hold colliding geoms only, so
-    that setting `geom_contype` afterwards leaves contacts out.
+    Set this in the spec: a compiled model's bounding-volume trees leave out geoms that did not collide.
     """
     for geom in spec.geoms:
         for kind in ("hull", "box"):
@@ -65,10 +64,7 @@ def run(model: mujoco.MjModel, data: mujoco.MjData, seconds: float) -> None:
 
 
 def started_over(data: mujoco.MjData) -> bool:
-    """Return whether MuJoCo met a bad position, velocity or acceleration.
-
-    It then starts the simulation over and only counts a warning: the state alone would look sound.
-    """
+    """Return whether MuJoCo reset the simulation after a bad position, velocity or acceleration."""
     bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
     return any(data.warning[int(w)].number for w in bad)
 
@@ -146,10 +142,7 @@ def free_space_values(maps: SceneMaps) -> dict[str, float]:
 
 
 def free_space_warnings(maps: SceneMaps) -> tuple[str, ...]:
-    """Name the free floor that the robot cannot reach, when it is more than corners and rims.
-
-    Those are within two radii of where its middle may be; of the rest, less than the disc's area is no matter.
-    """
+    """Return warnings about free floor that the robot cannot reach, apart from corners, rims and small areas."""
     _, distance = _largest_piece(maps)
     cell_m2 = maps.resolution_m**2
     lost_m2 = float((maps.traversable & (distance > 2 * ROBOT_RADIUS_M)).sum()) * cell_m2
@@ -182,10 +175,7 @@ def evaluate(
     kept: Mapping[str, float] | None = None,
     shares: Mapping[str, float | None] | None = None,
 ) -> tuple[Gate, ...]:
-    """Return every gate in the table's order.
-
-    `kept`: object -> share of its model's area that is drawn; older scenes do not say it.
-    """
+    """Return every gate in the table's order; `kept` is the drawn share of each object's model area, if known."""
     object_names = [o.name for o in objects]
     try:
         model = collide_with(spec, "hull")
@@ -252,11 +242,10 @@ def check_folder(folder: Path) -> tuple[SceneManifest, tuple[Gate, ...]]:
 
 
 def wall_values(model: mujoco.MjModel, maps: SceneMaps) -> dict[str, float]:
-    """Return the shares of the free floor's rim that no wall box bounds, and of the free floor within one.
+    """Return the shares of the free floor's rim without a wall box beside it, and of the free floor inside a box.
 
-    A cell is bounded where a box comes within a cell's diagonal of its middle; it lies within a box one cell deep,
-    for the map's cells are turned against the boxes'. The rim within reach of a hinge is not required: where a door's
-    leaf turns no wall stands.
+    A box bounds a cell within a cell's diagonal of its middle, and contains it if one cell deep, as the map's grid is
+    turned against the boxes. The rim near a hinge is exempt: no wall stands where a leaf turns.
     """
     side, pad = maps.resolution_m, 2
     free = np.pad(maps.traversable, pad)
@@ -293,10 +282,7 @@ def wall_values(model: mujoco.MjModel, maps: SceneMaps) -> dict[str, float]:
 def manifest_values(
     model: mujoco.MjModel, objects: Sequence[SceneObject]
 ) -> tuple[dict[str, float], dict[str, tuple[str, ...]]]:
-    """Return values of the gates on masses, friction and physics, and by gate the lines that name what is off.
-
-    `objects`: as `scene.json` lists them; one that the model lacks is another gate's matter.
-    """
+    """Return values of the gates on masses, friction and physics, and for each gate the lines that name failures."""
     ratios, friction, differs = [1.0], [1.0], differences(model, objects)
     for item in objects:
         body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, item.name)
@@ -328,20 +314,16 @@ def manifest_values(
 SPACING_M = 0.04
 """Of the points on hulls and visuals."""
 HIDDEN_M, BARE_M = 0.1, 0.05
-"""A hull's side farther than the first from all that is drawn is hit unseen; what is drawn farther than the second
+"""A hull's side farther than the first from the drawn surface is hit unseen; drawn surface farther than the second
 outside of all hulls is driven through."""
 KEPT_M, POINTS = 0.15, 50_000
-"""A scan's point so near to the drawn structure is kept: floors are levelled by up to 0.12 m. Points that are looked
-at, about."""
+"""Scan points this near to the drawn structure are kept (floors move by up to 0.12 m); number of points compared."""
 SIDE = 0.7
 """Largest vertical component of the normal of what counts as a side: robots come along the floor."""
 
 
 def kept_share(vertices: np.ndarray, faces: np.ndarray, drawn: tuple[np.ndarray, np.ndarray]) -> float:
-    """Return the share of a scan's area, without furniture that was cut out, within `KEPT_M` of the drawn structure.
-
-    `drawn`: vertices (k, 3) m and faces of the drawn structure.
-    """
+    """Return the share of a scan's area within `KEPT_M` of the drawn structure, without furniture that was cut out."""
     area = face_areas(vertices, faces)
     if not area.sum():
         return 1.0
@@ -378,10 +360,7 @@ def body_shares(drawn: tuple[np.ndarray, np.ndarray], hulls: list[np.ndarray]) -
 def surface_values(
     model: mujoco.MjModel, kept: Mapping[str, float]
 ) -> tuple[dict[str, float], dict[str, tuple[str, ...]]]:
-    """Return the worst object's values of the gates on surfaces, and by gate the line that names it.
-
-    `kept`: object -> share of its model's area that is drawn, where it is given.
-    """
+    """Return the worst object's values of the gates on surfaces, and for each gate the line that names this object."""
     worst: dict[str, tuple[float, str]] = {"unseen_hulls": (0.0, ""), "unsolid_surface": (0.0, "")}
     worst["surface_kept"] = min(((share, name) for name, share in kept.items()), default=(1.0, ""))
     shares: dict[bytes, tuple[float, float]] = {}

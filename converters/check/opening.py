@@ -53,10 +53,9 @@ def _points_w(model: mujoco.MjModel, data: mujoco.MjData, body: int, value: floa
 
 
 def blocked_fronts(model: mujoco.MjModel) -> tuple[str, ...]:
-    """Return a line for each front that hits walls, heavy furniture or other fronts before it is open.
+    """Return a line for each front that hits walls, heavy furniture or other fronts before it is fully open.
 
-    What of a front comes out of its cabinet may be nowhere within the structure, not even within what it touches while
-    it is shut. `model`: a scene's, its boxes colliding, without exclusions.
+    The part that leaves its cabinet must not enter the structure. `model`'s boxes collide, without exclusions.
     """
     data, lines = mujoco.MjData(model), []
     walls = np.flatnonzero(model.geom_bodyid == model.body("structure").id)

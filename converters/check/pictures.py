@@ -1,6 +1,4 @@
-"""Draw pictures of textured meshes: of compiled scenes, slantwise from the south, from above and at eye height, and
-of CAD models, each from the front, the right and above; in NumPy: neither display nor GPU is needed.
-"""
+"""Draw compiled scenes and CAD models with their textures in NumPy, without a display or a GPU."""
 
 import dataclasses
 import math
@@ -132,10 +130,7 @@ def _areas(corners: np.ndarray) -> np.ndarray:
 def _fitted(
     texture: np.ndarray, uv_areas: np.ndarray, pixels: np.ndarray, depth: np.ndarray
 ) -> tuple[np.ndarray, bool]:
-    """Return the texture with no more texels than it has pixels in the picture, and whether one shows as a square.
-
-    Areas are of faces (m,), in texture coordinates and pixels; what was cut at the near plane does not count.
-    """
+    """Return the texture with at most as many texels as pixels it covers, and whether single texels are visible."""
     rows, columns = texture.shape[:2]
     front = depth > 2 * NEAREST_M
     per_pixel = np.sqrt(uv_areas[front].sum() * rows * columns / max(pixels[front].sum(), 1.0))
@@ -184,10 +179,7 @@ def _taken(pose: CameraPose, lens: Lens, surfaces: Surfaces, cut_m: float = np.i
 
 
 def from_the_south(surfaces: Surfaces, maps: SceneMaps, low: np.ndarray, high: np.ndarray, pixels: int) -> np.ndarray:
-    """Draw everything from (2,) low to (2,) high x and y, m, slantwise, `pixels` wide.
-
-    Walls are cut at `CUT_M`; no ceiling or near wall hides a room.
-    """
+    """Draw the area from (2,) low to (2,) high x and y, m, seen slantwise, `pixels` wide, with walls cut at `CUT_M`."""
     sin, cos = math.sin(ELEVATION_RAD), math.cos(ELEVATION_RAD)
     axes_w = np.array([[1.0, 0.0, 0.0], [0.0, sin, cos], [0.0, -cos, sin]])
     half = np.array([high[0] - low[0], sin * (high[1] - low[1]) + cos * CUT_M]) / 2

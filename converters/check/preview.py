@@ -1,7 +1,4 @@
-"""Draw the stages of a conversion from above in one PNG, from a scene folder and the raw folder it came from.
-
-Drawn by matplotlib's Agg, which needs neither display nor GPU.
-"""
+"""Draw the stages of a conversion from above into one PNG, from a scene folder and its raw folder."""
 
 import dataclasses
 import math
@@ -140,10 +137,7 @@ def _draw_ground(axes: Axes, scene: _Scene) -> None:
 
 
 def apart(centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return centres [N, 2] of labels, moved up or down as little as it takes for none to lie on an earlier one.
-
-    `sizes`: [N, 2], width and height of each.
-    """
+    """Return label centres [N, 2], moved vertically until no two overlap; `sizes` [N, 2] are width, height."""
     placed = centres.astype(float)
     for i, (x, y) in enumerate(centres):
         beside = np.abs(placed[:i, 0] - x) < (sizes[:i, 0] + sizes[i, 0]) / 2
@@ -205,10 +199,7 @@ def _placed(scene: _Scene) -> tuple[PlacedObject, ...]:
 
 
 def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) -> RawScene:
-    """Read the raw folder that a scene was converted from.
-
-    `floor_height_m`: of the scene's floor in the scan's frame: which one is drawn of several.
-    """
+    """Read a scene's raw folder; `floor_height_m`, in the scan's frame, chooses the storey."""
     from converters.read import source as sources
     from converters.read.surfaces import split_storeys
 
@@ -313,10 +304,7 @@ def draw_object(folder: Path) -> Figure:
 
 
 def preview(folder: Path, target: Path, source: Path | None = None) -> None:
-    """Draw a scene or object folder into a PNG of few colours, whole or not at all.
-
-    `folder`: of the scene, or of an object written by `python -m converters object`.
-    """
+    """Draw a scene folder, or an object folder of `python -m converters object`, into a PNG, atomically."""
     if (folder / "object.json").is_file():
         if source is not None:
             raise SceneError(f"{folder}: is a single object, which has no scan to draw; leave --source out")

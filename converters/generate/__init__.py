@@ -70,10 +70,7 @@ def render_building(building: Building, seed: int, config: HomeConfig, progress:
 def generate_building(
     out_dir: Path, seed: int, progress: Report | None = None, config: HomeConfig | None = None
 ) -> None:
-    """Write a raw building folder, whole or not at all; the same seed and configuration give the same bytes.
-
-    `progress` is called with a stage's name and the share done, 0..1.
-    """
+    """Write a raw building folder atomically and reproducibly; `progress` takes a stage and the share done, 0..1."""
     out_dir = Path(out_dir)
     if out_dir.exists() and (not out_dir.is_dir() or any(out_dir.iterdir())):
         raise GenerationError(f"{out_dir} exists and is not an empty folder: name a new folder or remove it")

@@ -79,10 +79,7 @@ def hull_of(points: np.ndarray) -> Hull:
 
 
 def convex_hull(points: np.ndarray) -> Hull:
-    """Return the convex hull of a point cloud; one without volume is first thickened to `MIN_THICKNESS_M` across.
-
-    Points are rounded to a nanometre, so that processors that round differently give the same vertices and faces.
-    """
+    """Return the convex hull of points, rounded to 1 nm for reproducibility; flat ones get `MIN_THICKNESS_M`."""
     points = np.asarray(points, float)
     centre = points.mean(axis=0)
     _, _, axes = np.linalg.svd(points - centre, full_matrices=True)
@@ -103,10 +100,9 @@ def convex_hull(points: np.ndarray) -> Hull:
 def upright_box(points: np.ndarray, prefer_yaw: float = 0.0, round_fill: float = 1.0) -> OrientedBox:
     """Return the smallest box with a vertical axis around (n, 3) points.
 
-    Round things have no smallest direction: where the box along `prefer_yaw` is at most `PREFER_SLACK`
-    larger in area it is taken, so that a round table's box stands square to the walls and not with a corner
-    in one. With `round_fill` only where the outline fills at most this share of its smallest box (a circle: 0.79): the
-    box of a long thing a degree off would stand out of it by a sixtieth of its length.
+    The box along `prefer_yaw` is preferred if it is at most `PREFER_SLACK` larger in area, so that a round table's box
+    is parallel to the walls. With `round_fill`, this applies only if the outline fills at most that share of its
+    smallest box (a circle: 0.79), because the box of a long object turned by a degree would be noticeably too wide.
     """
     shadow = ConvexHull(points[:, :2])
     outline = points[shadow.vertices, :2]
@@ -126,10 +122,7 @@ def upright_box(points: np.ndarray, prefer_yaw: float = 0.0, round_fill: float =
 
 
 def least_turned(rotation: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the same axes (3, 3 columns), named and directed so that they are turned least, and right-handed.
-
-    `along`: (3,) what belongs to each of them, such as a box's half sizes; it is returned in the new order.
-    """
+    """Return the axes (3, 3 columns), permuted and flipped to the least rotation, and `along` (3,) permuted."""
     turns = np.einsum("ij,pjk->pik", rotation, AXES)
     turns = turns[np.linalg.det(turns) > 0]
     order = np.lexsort(np.round([*turns.reshape(-1, 9).T, -np.trace(turns, axis1=1, axis2=2)], TIE_DIGITS))
@@ -138,14 +131,11 @@ def least_turned(rotation: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, n
 
 
 def fit_box(hull: Hull, lowest_m: float, prefer_yaw: float = 0.0, round_fill: float = 1.0) -> OrientedBox:
-    """Return the box that stands for a hull (body frame, m) where collisions are boxes, `MIN_THICKNESS_M` or thicker.
+    """Return the collision box of a hull (body frame, m), at least `MIN_THICKNESS_M` thick.
 
-    The general smallest box of a slanted leg reaches below the leg's foot and would lift the object off
-    the floor; where it would go below `lowest_m` (the object's lowest point), and where it gains little, the box keeps
-    a vertical axis.
-    Such a box is drawn in horizontally until its cross-section equals the hull's shadow (at most to
-    `MIN_DRAW_IN`): the corners of the box around a round table top would otherwise stand a fifth of its
-    width outside it. `prefer_yaw`: direction of the walls in the body frame, rad.
+    The axis is vertical if the smallest box would reach below `lowest_m` (the object's lowest point) or gains little.
+    Such a box shrinks horizontally to the hull's cross-section (at most to `MIN_DRAW_IN`), as corners around a round
+    table top would stick out. `prefer_yaw`: direction of the walls in the body frame, rad.
     """
     box = upright_box(hull.vertices, prefer_yaw, round_fill)
     shadow = float(ConvexHull(hull.vertices[:, :2]).volume)  # scipy: `volume` of a planar hull is its area
@@ -167,10 +157,10 @@ def fit_box(hull: Hull, lowest_m: float, prefer_yaw: float = 0.0, round_fill: fl
 def convex_pieces(
     vertices: np.ndarray, faces: np.ndarray, most: int = MAX_PIECES, slack: float | None = None
 ) -> tuple[tuple[np.ndarray, np.ndarray], ...] | None:
-    """Return vertices and faces of the hull of each connected piece of a mesh, or None where one is not convex.
+    """Return vertices and faces of the hull of each connected piece of a mesh, or None if one is not convex.
 
-    Pieces are connected through shared vertex indices, as V-HACD writes them (neighbours only touch); the closest are
-    joined, see `merge_pieces`. `slack`: how much joining may add, as a share of the mesh's bounding box.
+    Pieces share vertex indices, as V-HACD writes them; `merge_pieces` joins close ones if that adds at most the share
+    `slack` of the mesh's bounding box.
     """
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     groups = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(faces)), min_len=1)

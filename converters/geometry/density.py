@@ -1,7 +1,4 @@
-"""Measure on rasters of floor how much of a home is behind furniture.
-
-Rasters are (rows, columns) bool, True where free, of square cells.
-"""
+"""Measure how much of a home is behind furniture, on rasters of square cells: (rows, columns) bool, True if free."""
 
 from __future__ import annotations
 
@@ -30,10 +27,9 @@ class Ways(NamedTuple):
         return cls(radius_m, label(clearance(static_free, cell_m) >= radius_m)[0])
 
     def must_push_share(self, room_m: np.ndarray) -> float:
-        """Return the share of the pairs of places between which no path of the disc avoids everything.
+        """Return the share of connected pairs of places between which every path of the disc hits a movable.
 
-        Counted are all pairs of places where the disc touches nothing and that it gets between with the movables away;
-        0 where nothing is in the way, and where the disc fits nowhere.
+        A pair counts if the disc gets between the two without movables; the result is 0 if the disc fits nowhere.
         """
         here = (room_m >= self.radius_m) & (self.region > 0)
         now, cells = label(here)[0], np.flatnonzero(here)
@@ -44,10 +40,7 @@ class Ways(NamedTuple):
 
 
 def must_push_shares(static_free: np.ndarray, free: Mapping[str, np.ndarray], cell_m: float) -> dict[str, float]:
-    """Return `Ways.must_push_share` by robot, of a floor with and without its movables.
-
-    `static_free`: (rows, columns) bool, without movables.
-    """
+    """Return `Ways.must_push_share` by robot; `static_free` (rows, columns) bool is the floor without movables."""
     return {
         robot: Ways.of(static_free, cell_m, disc.radius_m).must_push_share(clearance(free[robot] & static_free, cell_m))
         for robot, disc in ROBOTS.items()

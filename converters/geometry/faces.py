@@ -53,10 +53,7 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def corner_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return (m, 3, 3) unit normals at the corners of the faces, smooth over edges that are no creases.
-
-    Faces around a corner are weighted by area and angle there, so it does not matter how polygons are triangulated.
-    """
+    """Return (m, 3, 3) unit normals at face corners, smooth except at creases, weighted by area and angle."""
     corners, count, at = vertices[faces], faces.size, weld(vertices)[1][faces]
     after = np.roll(np.arange(count).reshape(-1, 3), -1, axis=1).ravel()
     start, end = at.ravel(), at.ravel()[after]
@@ -86,11 +83,10 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def sample_faces(
     vertices: np.ndarray, faces: np.ndarray, spacing_m: float, most_steps: int = math.isqrt(2 * BLOCK)
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (k, columns) on every face no further apart than the spacing, and (k,) the face of each.
+    """Return points (k, columns) on every face, no further apart than the spacing, and (k,) the face of each.
 
-    Points lie at even barycentric steps (no chance involved), or in even rows on faces with more than `most_steps` of
-    these: long thin ones then need few. Vertices (n, 3 or more) may have more columns than x, y and z (m), such as
-    texture coordinates.
+    Points lie at even barycentric steps, or in even rows on faces with more than `most_steps` of these. Vertices (n, 3
+    or more) may have more columns than x, y and z (m), such as texture coordinates.
     """
     if len(faces) == 0:
         return np.zeros((0, vertices.shape[1])), np.zeros(0, np.int64)
@@ -160,10 +156,7 @@ def _steps(corners: np.ndarray, spacing_m: float) -> np.ndarray:
 
 
 def weld(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Group vertices (n, 3) at equal positions, to 1e-6 of the extent.
-
-    Returns first (k,), the index of one vertex of each group, sorted by position, and group (n,) of each vertex.
-    """
+    """Group vertices (n, 3) at equal positions; return (k,) one index of each group, sorted, and (n,) the group."""
     step = max(float(np.ptp(vertices, axis=0).max(initial=0.0)), 1e-9) * 1e-6
     cell = np.round(vertices / step).astype(np.int64)
     cell -= cell.min(axis=0) if len(cell) else 0
@@ -173,11 +166,7 @@ def weld(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def loose_parts(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return the number (m,) of the connected part that each face belongs to.
-
-    Faces connect where vertices lie at equal positions, so that a mesh split at its texture seams, or one whose
-    triangles share no vertices, has the parts of the same mesh with shared vertices.
-    """
+    """Return the connected part (m,) of each face; faces connect where vertices have equal positions."""
     joined = weld(vertices)[1][faces]
     edges = np.vstack([joined[:, :2], joined[:, 1:]])
     return trimesh.graph.connected_component_labels(edges, len(vertices))[joined[:, 0]]
@@ -197,10 +186,7 @@ def stacked(parts: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray,
 
 
 def merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Join vertices at equal positions (to 1e-6 of the extent) and drop faces that collapse.
-
-    Returns vertices (n', 3), faces (m', 3) and (m',) the indices of the faces that stayed.
-    """
+    """Join vertices at equal positions and drop collapsed faces; return vertices, faces and kept face indices (m',)."""
     first, group = weld(vertices)
     faces = group[faces]
     keep = np.flatnonzero((faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0]))
@@ -249,10 +235,7 @@ class Surface:
         self._tree = KDTree(samples, balanced_tree=False)  # as exact, and sooner built
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return (n,) distances of points, m, to the nearest of the faces whose samples are nearest.
-
-        At most the samples' spacing too large, which is a share of the mesh's size.
-        """
+        """Return (n,) distances of points, m, to the nearest faces, too large by at most the samples' spacing."""
         vertices, faces = self._mesh
         index = self._tree.query(points, k=min(NEAREST, self._tree.n))[1].reshape(len(points), -1)
         corners = vertices[faces[self._face[index]]].reshape(-1, 3, 3)
@@ -301,10 +284,7 @@ def _simplified(vertices: np.ndarray, faces: np.ndarray, most_m: float, least: f
 def simplify_within(
     vertices: np.ndarray, faces: np.ndarray, most_m: float = MOST_M, least: float = LEAST_AREA
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mesh with as few faces as leave each loose part within `most_m` and its area above a share `least`.
-
-    Equal positions are joined.
-    """
+    """Return a mesh of few faces, each loose part within `most_m`, its area at least the share `least` of the old."""
     vertices, faces, _ = merge_vertices(vertices, faces)
     part = loose_parts(vertices, faces)
     pieces = [compacted(vertices, faces[part == k]) for k in np.unique(part)]
@@ -329,10 +309,9 @@ def surface_loss(
 
 
 def simplify_open(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Simplify a surface with holes to at most about so many faces, and keep the holes' rims.
+    """Simplify a surface with holes to about this many faces, and keep the holes' rims.
 
-    Quadrics do not see a rim: windows and doorways would fray. So each edge of a rim gets a face that stands upright on
-    it, and takes part, but is not in the result.
+    Each edge of a rim gets a temporary upright face, because quadrics alone would fray windows and doorways.
     """
     vertices, faces, _ = merge_vertices(vertices, faces)
     if len(faces) <= most_faces:
@@ -363,12 +342,11 @@ def simplify_open(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> t
 
 
 def simplify_parts(parts: tuple[tuple[np.ndarray, np.ndarray], ...], max_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return all parts as one mesh of about so many faces, shared out by the roots of their areas.
+    """Return all parts as one mesh of about this many faces, shared out by the square roots of their areas.
 
-    What plain parts leave of their shares goes to the others; one that has too many faces still is simplified within
-    `MOST_M` and `LEAST_AREA`, and further only where all together have too many then. A level plane that is simplified
-    as part of a larger mesh loses its outline; by itself it has few enough faces to stay. A small thing of many loose
-    pieces, which cannot be simplified so far, becomes its convex hull.
+    Faces that simple parts do not need go to the others. Parts are simplified within `MOST_M` and `LEAST_AREA`, and
+    further only if the total is too large. A level plane is kept by itself, as it would lose its outline. A small
+    object of many loose pieces becomes its convex hull.
     """
     done = [merge_vertices(*part)[:2] for part in parts]
     weight = np.sqrt([face_areas(*part).sum() for part in done])

@@ -1,4 +1,4 @@
-"""Fetch furniture libraries, and build the packaged furniture: scaled, simplified, textured, decomposed.
+"""Download furniture libraries and build the packaged furniture: scaled, simplified, textured, decomposed.
 
 `selection.yaml` names the models of each category and split; no creator is in both splits.
 """
@@ -270,10 +270,7 @@ def checked(place: Path, name: str, data: bytes | None) -> bytes:
 
 
 def fetch(given: Path | None, target: Path, overwrite: bool = False) -> tuple[Path, ...]:
-    """Put the libraries into a folder, all or none, and return their paths.
-
-    `given`: the Debian package, or a folder that holds the files somewhere; None: download the package.
-    """
+    """Put all libraries into a folder, atomically; `given` is the Debian package or a folder (None: download it)."""
     with whole_folder(target, overwrite) as folder, tempfile.TemporaryDirectory(prefix="library-") as scratch:
         if (place := given) is None:
             if shutil.which("apt-get") is None:

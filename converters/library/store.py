@@ -1,7 +1,6 @@
-"""Read the packaged furniture: an index of models with their credits, each one's surface, texture and convex hulls.
+"""Read the packaged furniture, `models.zip`: an index with credits, and each model's surface, texture and convex hulls.
 
-One archive, `models.zip`: `index.json`, and for each model its arrays and its texture. Frame of a model: metres, y up,
-front along +z, the middle of its base at the origin.
+Frame of a model: metres, y up, front along +z, the middle of its base at the origin.
 """
 
 import dataclasses

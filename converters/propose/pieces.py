@@ -1,6 +1,4 @@
-"""Group labelled points into pieces of one class: connected voxels, merged, then split at necks, in rows and by tops.
-
-Tables and desks are split where two tops meet in a step, or make the outline of two rectangles."""
+"""Group labelled points into connected pieces of one class, merged, and split at necks, in rows and by tops."""
 
 from __future__ import annotations
 
@@ -153,9 +151,9 @@ def same_box(one: Piece, other: Piece) -> bool:
 
 
 def _basins(mask: np.ndarray) -> np.ndarray:
-    """Return (rows, columns) numbers of basins around the peaks of the distance to the outline, the nearest's outside.
+    """Return (rows, columns) basin numbers around the peaks of the distance to the outline, the nearest one's outside.
 
-    A basin is parted at a neck where the distance is less than `NECK_SHARE` of the greatest on either side.
+    Basins are separate if the distance at the neck is below `NECK_SHARE` of that at either peak.
     """
     distance = ndimage.gaussian_filter(np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1))), 0.7)[1:-1, 1:-1]
     distance, (basin, _) = np.where(mask, distance, 0.0), label(mask)

@@ -1,10 +1,8 @@
-"""Propose furniture instances with class, box and confidence of a labelled scan (section III-B's region proposals).
+"""Propose furniture instances of a labelled scan with class, box and confidence (section III-B's region proposals).
 
-The labels are put into a voxel grid; connected voxels of one class are an instance. What a scan tears apart
-(the seat of a swivel chair above its base: the thin column is missing) or names twice (table and desk) is
-merged by footprint. Things of one class that touch are split where their common footprint has a neck, and where it is
-too long for one of its class; tables and desks also where two tops meet in a step, or make an outline that two
-rectangles have and one has not.
+An instance is a set of connected voxels of one class. Fragments, and objects with two labels, are merged by footprint.
+Touching objects are split where their footprint has a neck or is too long for the class; tables and desks also by their
+tops.
 """
 
 import collections
@@ -41,10 +39,9 @@ def _inside_range(value: float, limits: tuple[float, float]) -> float:
 
 
 def _confidence(category: str, extent: np.ndarray, purity: float, n_voxels: int, voxel_m: float) -> float:
-    """Return the product of three shares: usual size for the class, labels in the box that agree, and visible surface.
+    """Return the product of three shares: usual size for the class, agreeing labels in the box, and visible surface.
 
-    `purity` is the class's share of the box's furniture voxels. Surface counts as enough when the voxels cover
-    half of one side and the top of the box.
+    `purity` is the class's share of the box's furniture voxels. Half of one side plus the top is enough surface.
     """
     wide, high = pieces.SIZES_M[category]
     size = _inside_range(float(max(extent[:2])), wide) * _inside_range(float(extent[2]), high)
@@ -95,10 +92,10 @@ def scan2cad_model(
     symmetry: str = "__SYM_NONE",
     pairs: tuple[np.ndarray, np.ndarray] = (NO_POINTS, NO_POINTS),
 ) -> dict[str, Any]:
-    """Return one model of Scan2CAD's list, whose world is y up; arguments are z up.
+    """Return one model of Scan2CAD's list, whose world is y up, from z-up arguments.
 
-    `pose` is the upright model's scale (3,), yaw (rad) and translation (3,) m; `vertices` (n, 3) are in the CAD frame.
-    `pairs` are (k, 3) points of the model under its pose and of the scan, m, that were clicked.
+    `pose` is scale (3,), yaw (rad) and translation (3,) m; `vertices` (n, 3) are in the CAD frame. `pairs` are clicked
+    points (k, 3) of the posed model and of the scan, m.
     """
     (scale, yaw, translation), (low, high) = pose, bounds(vertices @ Y_UP_TO_Z_UP)
     return {
@@ -120,10 +117,10 @@ def scan2cad_model(
 
 
 def as_scan2cad(scan_id: str, proposals: tuple[Proposal, ...], chosen: dict[int, Any] | None = None) -> list[dict]:
-    """Return the proposals in the shape of Scan2CAD's annotation list, for an annotation tool to take further.
+    """Return the proposals as a Scan2CAD annotation list with one extra key, `proposal`, for the measurements.
 
-    A proposal without a model is a unit cube with `id_cad` "" and the box as its pose; keypoints are empty. Each
-    has one key more, `proposal`, with what was measured. `chosen`: proposal's index -> `Retrieval` (model and pose).
+    A proposal without a model is a unit cube with `id_cad` "", posed as its box; keypoints are empty. `chosen`:
+    proposal's index -> `Retrieval` (model and pose).
     """
     models = []
     for k, proposal in enumerate(proposals):
@@ -261,10 +258,7 @@ def propose(
     library: Mapping[str, CadModel] | None = None,
     report: Callable[[str, float], None] = lambda stage, share: None,
 ) -> Proposed:
-    """Find instances, with a library of models by id also their models, and write both files into a folder.
-
-    The folder is created if absent; on failure older files in it stay as they were. `report`: stage and share.
-    """
+    """Propose instances, and models if there is a library, and write both files; older files survive a failure."""
     report("propose", 0.0)
     proposals = propose_instances(raw.scan)
     if not proposals:

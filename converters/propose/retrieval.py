@@ -1,8 +1,7 @@
-"""Find for each proposal the model of a CAD library and the pose that fit best, and how sure that is.
+"""Choose the CAD model and pose that fit each proposal best, and rate how certain the choice is.
 
-The paper had people choose and align models. Here every model of the class is fitted from several yaws by a
-two-sided iterative closest point scheme with the same seven parameters (three scales, position, yaw), and
-judged by how far the scan lies from the model and the model from the scan.
+In the paper, people chose and aligned models. Here, two-sided iterative closest point fits every model of the class
+from several yaws with the same seven parameters, and the distances between scan and model in both directions decide.
 """
 
 import bisect
@@ -65,9 +64,9 @@ class Retrieval:
 
 
 def read_library(root: Path | None, source: Path | None = None) -> dict[str, CadModel]:
-    """Read every model under `root/cad/<synset>/<id>/models/model_normalized.obj` of a class that is looked for, by id.
+    """Read by id the models `root/cad/<synset>/<id>/models/model_normalized.obj` of the wanted classes.
 
-    `root`: folder that holds `cad/`; None: the source's folder if it does, else the packaged furniture.
+    `root` None: the source's folder if it contains `cad/`, else the packaged furniture.
     """
     if root is None and source is not None and (source / "cad").is_dir():
         root = source
@@ -273,8 +272,7 @@ def compare_retrieval(
 ) -> tuple[str, ...]:
     """Compare a retrieval with a person's annotation of the same object; return `COMPARED` in words.
 
-    Yaw and scale can only be compared for the same model, so the annotated model's best fit stands for them
-    where another one was chosen.
+    Yaw and scale are compared for the same model: if another was chosen, by the annotated model's best fit.
     """
     cad = cads[annotation.cad_id]
     pivot = (cad.vertices.min(axis=0) + cad.vertices.max(axis=0)) / 2

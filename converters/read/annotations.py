@@ -1,7 +1,7 @@
-"""Read a ScanNet scan with Scan2CAD's annotation, and the same list of annotations as Gibson's `alignments.json`.
+"""Read a ScanNet scan with Scan2CAD's annotation, and the same list as Gibson's `alignments.json`.
 
-Frames of the file (Avetisyan et al. 2019): an annotation world, y up; the scan's `trs` leads scan -> world,
-each model's `trs` CAD -> world, and both keypoint sets stand in that world (the CAD's after its `trs`).
+Frames of the file (Avetisyan et al. 2019): the annotation world is y up; the scan's `trs` leads scan -> world, each
+model's `trs` CAD -> world, and both keypoint sets are in that world (the CAD's after its `trs`).
 """
 
 from collections.abc import Mapping
@@ -114,9 +114,9 @@ def parse_annotations(data: Any, path: Path) -> tuple[str, tuple[tuple[str, Anno
 
 
 def gap_to_scan(annotation: Annotation, cad_vertices: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Return the distance from an object's upright bounding box to the scan's surface, m; 0 where that reaches in.
+    """Return the distance from an object's upright bounding box to the scan's surface, m; 0 if they intersect.
 
-    The box and each triangle are convex: projecting from one to the other by turns leads to their nearest points.
+    Alternating projections between box and triangle, both convex, converge to their nearest points.
     """
     placed = transformed(cad_vertices, annotation.pose)
     low, high = placed.min(axis=0), placed.max(axis=0)
@@ -155,10 +155,7 @@ def inside_scan(
 
 
 def read_cad(source: SourceFolder, synset: str, cad_id: str) -> CadModel:
-    """Read `cad/<synset>/<id>/models/model_normalized.obj` and turns it to z up.
-
-    A `collision.obj` beside it, of convex pieces, saves the decomposition.
-    """
+    """Read a normalised ShapeNet OBJ, turned to z up, with the convex pieces of a `collision.obj` beside it."""
     category = category_of_id(synset, f"{source.root}: CAD model {cad_id} has category id")
     relative = f"cad/{synset}/{cad_id}/models/model_normalized.obj"
     mesh, image, images = read_painted_obj(

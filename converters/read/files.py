@@ -296,9 +296,9 @@ def _from_the_end(word: str, n_vertices: int, n_uv: int) -> str:
 
 
 def _corner_indices(corners: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return (c,) vertex and (c,) texture indices, from 1; None where no corner has a texture coordinate.
+    """Return (c,) vertex and (c,) texture indices, from 1; None if no corner has a texture coordinate.
 
-    Where some have none (faces of plain materials), they take the first: a plain colour is the same everywhere.
+    Corners without one take the first, which is correct for faces of plain colour.
     """
     if not corners:
         return np.zeros(0, np.int64), None

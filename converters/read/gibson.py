@@ -1,9 +1,8 @@
-"""Read a raw Gibson folder, with labels, alignments and maps where there are any, or one of the interactive set.
+"""Read a raw Gibson folder (iGibson 0.0.4, `dataset.md`) or one of the interactive set; z up, metres.
 
-Files of the release: iGibson 0.0.4, `dataset.md`; z up, metres, maps of 0.01 m a pixel whose middle is
-the world's origin. `floors.txt` has one height a line; number k of the map files counts them from the lowest. In the
-interactive set `mesh_z_up_cleaned.obj` is the scan without the annotated furniture, `plane_z_up_<f>.obj` floor for the
-holes it left, `alignment_centered_<i>_<synset>.urdf` a piece of furniture whose orientation and scale are baked into
+Maps have 0.01 m a pixel, with the world's origin in the middle. `floors.txt` has one height a line; map numbers count
+from the lowest. In the interactive set `mesh_z_up_cleaned.obj` is the scan without the annotated furniture,
+`plane_z_up_<f>.obj` floor for the holes, `alignment_centered_<i>_<synset>.urdf` furniture with orientation and scale in
 its mesh, and `pos_<i>_<synset>.txt` the x y z of its origin.
 """
 
@@ -136,9 +135,9 @@ def read_windows(source: SourceFolder) -> tuple[Window, ...]:
 
 
 def read_traversable(source: SourceFolder, number: int, mesh_xy: np.ndarray, floor_xy: np.ndarray) -> GivenMap | None:
-    """Return a floor's traversable map less its obstacles; None without a file.
+    """Return a floor's traversable map less its obstacles, checked against the mesh; None without a file.
 
-    It must fit the mesh, whose vertices are at `mesh_xy` (n, 2), those of this floor at `floor_xy` (k, 2), m.
+    The mesh's vertices are at `mesh_xy` (n, 2), those of this floor at `floor_xy` (k, 2), m.
     """
     name, obstacle_name = f"floor_trav_{number}.png", f"floor_{number}.png"
     if not source.has(name):
@@ -207,9 +206,8 @@ SAME_SHARE = 0.5
 def read_interactive_gibson(root: Path, strict: bool = False) -> RawScene:
     """Read cleaned mesh, floor planes, furniture, floor heights and maps.
 
-    The furniture keeps its mass, friction and collision meshes. A door's yaw is taken out of its mesh and
-    goes into its pose, so that the leaf lies along its body's x axis; its hinge is assumed at the edge that stands
-    at a wall, and turns as far as walls let it.
+    Furniture keeps its mass, friction and collision meshes. A door's yaw moves from its mesh to its pose, so that the
+    leaf lies along its body's x axis; `assume_hinge` adds the hinge.
     """
     source = SourceFolder(root, strict)
     mesh = read_scan_obj(source, CLEANED, "expected the scan without its furniture")
@@ -256,12 +254,11 @@ def leaf_turn(leaf: np.ndarray) -> np.ndarray:
 
 
 def assume_hinge(leaf: np.ndarray, pose: np.ndarray, structure: np.ndarray) -> ScannedHinge:
-    """Return the upright hinge of a door that came without one.
+    """Return the upright hinge of a door without one: at the end of the leaf with more structure around it.
 
-    Of the leaf's two ends the hinge is the one with more structure around it; the leaf turns both ways from where it
-    stands until structure lies in it, by 120 degrees at most. What lies in the leaf as it stands is taken for the
-    scanned leaf itself. `leaf` (n, 3) lies along x in the CAD frame, its `pose` (4, 4) is upright and unscaled;
-    `structure` (m, 3) are points of the scan.
+    The leaf turns both ways until it meets structure, by 120 degrees at most; structure inside the leaf counts as the
+    scanned leaf. `leaf` (n, 3) lies along x in the CAD frame, its `pose` (4, 4) is upright and unscaled; `structure`
+    (m, 3) are points of the scan.
     """
     low, high = leaf.min(axis=0), leaf.max(axis=0)
     local = (structure - pose[:3, 3]) @ pose[:3, :3]
@@ -311,10 +308,7 @@ def _without_doubles(
 def _with_plane(
     source: SourceFolder, number: int, height_m: float, mesh: TexturedMesh, labels: np.ndarray
 ) -> tuple[TexturedMesh, np.ndarray]:
-    """Return the scan with squares of 0.1 m of the release's floor plane, with its texture.
-
-    They lie inside the mesh and on the map, where the scan shows no floor.
-    """
+    """Return the scan with added 0.1 m squares of the release's floor plane where mesh and map lack visible floor."""
     name = f"plane_z_up_{number}.obj"
     if not source.has(name):
         source.note(f"{name} is absent: the floor under the furniture is patched from the floor around it")

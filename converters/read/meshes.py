@@ -1,7 +1,7 @@
 """Read a mesh file of any kind that trimesh reads, as a `TexturedMesh` in metres and z up.
 
-trimesh reads the files that a model names through `SourceResolver`: within the source folder, hashed, and with a
-report of what is missing. A COLLADA file states its unit and up axis; the other formats do not.
+trimesh reads referenced files through `SourceResolver`: only within the source folder, hashed, with missing ones
+reported. Only COLLADA files state their unit and up axis.
 """
 
 from __future__ import annotations
@@ -64,10 +64,7 @@ UP_AXES = {
 
 
 def beside(path: Path, ending: str) -> Path:
-    """Return the place of a file about a mesh file, such as `scan.obj.labels.npz` with the ending `labels.npz`.
-
-    A file without the suffix (`scan.labels.npz`) is taken where no other mesh could be meant.
-    """
+    """Return the path of a mesh's companion: `scan.obj.labels.npz`, or `scan.labels.npz` if it is unambiguous."""
     full, short = path.with_name(f"{path.name}.{ending}"), path.with_name(f"{path.stem}.{ending}")
     meshes = [p for p in path.parent.iterdir() if p.stem == path.stem and p.suffix.lower() in SUFFIXES]
     return short if short.is_file() and not full.is_file() and len(meshes) == 1 else full
@@ -173,7 +170,7 @@ def read_single_mesh(
 ) -> RawScene:
     """Read a scan that is one mesh file; without labels beside it, structure is recognised by its shape.
 
-    What the file names must lie in its folder. `up` is a word of `AXES`, `unit` one of `UNITS_M`; `auto` detects them.
+    Referenced files must lie in its folder. `up` is a key of `AXES`, `unit` of `UNITS_M`; `auto` detects them.
     """
     source = SourceFolder(path.parent, strict)
     mesh = read_surface(source, source.inside(path), "give a mesh file")
@@ -246,10 +243,7 @@ def colours_of_faces(mesh: obj.TexturedMesh) -> np.ndarray:
 def clean_surface(
     source: SourceFolder, where: str, mesh: obj.TexturedMesh, colours: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Join vertices, drop faces without area and report what else is wrong; open surfaces are left as they are.
-
-    Decomposition rebuilds such surfaces as closed ones (coacd's manifold preprocessing), so that they need no repair
-    here; their hulls are a voxel thicker.
+    """Join vertices, drop faces without area and report other defects; decomposition closes open surfaces itself.
 
     `colours`: (m, 3) of the faces; None: `colours_of_faces`.
     """

@@ -1,7 +1,6 @@
-"""Read a textured OBJ and its MTL as a `TexturedMesh`: vertices in the file's order, one image.
+"""Read a textured OBJ and its MTL as a `TexturedMesh` with one image, vertices in the file's order.
 
-Names of files that an OBJ or MTL gives are sought generously, for folders travel between machines; what is
-missing costs colour only and is a warning.
+File names are matched leniently; a missing texture file is only a warning.
 """
 
 import collections
@@ -80,9 +79,9 @@ def use_named(source: SourceFolder, folder: Path, name: str, by: str) -> Path | 
 def read_materials(
     source: SourceFolder, obj: Path, libraries: tuple[str, ...]
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return the image of every material of an OBJ's MTL files, and the `texture_options` of those that have any.
+    """Return the image (h, w, 3) uint8 of every material of an OBJ's MTL files, and the known `texture_options`.
 
-    An image is (h, w, 3) uint8; a material without a usable texture has one pixel of its colour (Kd).
+    A material without a usable texture has one pixel of its colour (Kd).
     """
     where = source.relative(obj) or obj.name
     each = [[n] if find_file(source, obj.parent, n) else n.split() for n in libraries]  # a line may name several
@@ -157,10 +156,10 @@ PLAIN = np.array([[1.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 1.0]])
 
 
 def texture_options(text: str, unused: collections.Counter[str]) -> tuple[str, np.ndarray]:
-    """Split the value of a `map_Kd` into the name of its file and its options; count those that are not read.
+    """Split a `map_Kd` into file name and options, and count the options that are not supported.
 
-    The options (4, 2) are the scale and the offset of texture coordinates, 1 or 0 (they are clamped or repeat), and the
-    base and the gain of the image.
+    The options (4, 2) are the scale and the offset of texture coordinates, clamp or repeat (1 or 0), and the base and
+    gain of the image.
     """
     placing = PLAIN.copy()
     while len(words := text.split(None, 1)) > 1 and words[0].startswith("-"):
@@ -184,11 +183,10 @@ def texture_options(text: str, unused: collections.Counter[str]) -> tuple[str, n
 def wrapped(
     uv: np.ndarray, images: list[np.ndarray], modes: tuple[str, str]
 ) -> tuple[np.ndarray, list[np.ndarray], bool]:
-    """Return texture coordinates and images that show by repeating what other ways of wrapping show.
+    """Return texture coordinates and images that repeat, equivalent to those of other wrapping modes.
 
     `uv` (m, 3, 2) has its origin at the lower left, `images` are of one size, `modes` (`repeat`, `mirror` or `clamp`)
-    are along u and v. Return also whether a face lies across an edge at which its texture is clamped: it shows the
-    texture up to there, stretched.
+    are along u and v. Return also whether each face crosses an edge at which its texture is clamped.
     """
     across = False
     for k, mode in enumerate(modes):
@@ -209,10 +207,9 @@ def wrapped(
 def read_painted_obj(
     source: SourceFolder, relative: str, remedy: str, builtin: Callable[[str], np.ndarray] | None = None
 ) -> tuple[ObjMesh, np.ndarray, list[np.ndarray]]:
-    """Read an OBJ with all its materials.
+    """Read an OBJ with all its materials; `builtin` returns the image of a material that no file defines.
 
-    `builtin`: return the image of a material that is in no file; the default warns, and takes grey.
-    Returns the mesh, (m,) image of each face, the images (h, w, 3) uint8: none where the file has no colour at all.
+    Return the mesh, (m,) image of each face, and the images (h, w, 3) uint8, none if the file has no colour at all.
     """
     path = source.use(relative, remedy)
     mesh = read_obj(path)
@@ -277,10 +274,9 @@ def texels(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 def join_textures(corner_uv: np.ndarray, number: np.ndarray, images: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Put several images above one another and move texture coordinates along.
+    """Stack images vertically and map texture coordinates to the joint image; return both.
 
-    `corner_uv` (m, 3, 2) has its origin at the lower left of each face's image, whose `number` is (m,), and may leave
-    [0, 1] (repeats). Return it as it is in the joint image, and that (h, w, 3) uint8.
+    `corner_uv` (m, 3, 2), origin at the lower left of the image `number` (m,) of each face, may leave [0, 1] (repeats).
     """
     if len(images) == 1 and images[0].size > 3:
         return corner_uv, images[0]

@@ -48,11 +48,7 @@ def long_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def welded(mesh: TexturedMesh) -> TexturedMesh:
-    """Return the mesh with vertices at equal positions joined; texture coordinates belong to corners and stay.
-
-    Files split a surface at its texture seams, or give every triangle separate vertices. Shapes are recognised by
-    normals and neighbours, which must not depend on that.
-    """
+    """Return the mesh with vertices at equal positions joined, so that normals and neighbours ignore texture seams."""
     first, group = weld(mesh.vertices)
     order = np.argsort(first)  # as in the file: labels refer to it
     return dataclasses.replace(mesh, vertices=mesh.vertices[first[order]], faces=np.argsort(order)[group[mesh.faces]])
@@ -61,7 +57,7 @@ def welded(mesh: TexturedMesh) -> TexturedMesh:
 def with_split_corners(mesh: TexturedMesh) -> TexturedMesh:
     """Return the mesh with separate corners for its long faces, after its vertices.
 
-    Labels stand at vertices, and the corners of a modelled room belong to its floor and to two walls.
+    Labels are stored at vertices, and a modelled room's corners belong to its floor and two walls.
     """
     long = np.flatnonzero(long_faces(mesh.vertices, mesh.faces))
     faces = mesh.faces.copy()
@@ -109,11 +105,11 @@ def floor_level(vertices: np.ndarray, faces: np.ndarray, where: str) -> float:
 
 
 def structure_labels(vertices: np.ndarray, faces: np.ndarray, floor_height_m: float) -> np.ndarray:
-    """Return (n,) NYU40 labels of z-up vertices (n, 3) m by shape: floor, wall, ceiling; the rest stays unlabelled.
+    """Return (n,) NYU40 labels of z-up vertices (n, 3) m by shape: floor, wall, ceiling or unlabelled.
 
-    Floor is level, faces up and lies at the floor's height; ceiling faces down, 1.8 m above it or more; wall is
-    steep in a column that shows steep surface over most of 0.2 to 1.8 m (furniture is lower). A long face, whose
-    corners must be separate (`with_split_corners`), is wall if most of it is.
+    Floor is level, faces up and lies at the floor's height; ceiling faces down, 1.8 m above it or more; wall is steep,
+    in a column that is steep over most of 0.2 to 1.8 m (furniture is lower). A long face, whose corners must be
+    separate (`with_split_corners`), is wall if most of it is.
     """
     normal, area = vertex_vectors(vertices, faces), face_vectors(vertices, faces)
     length = np.linalg.norm(normal, axis=1)
@@ -156,10 +152,7 @@ def _in_wall_columns(vertices: np.ndarray, z: np.ndarray, steep: np.ndarray) -> 
 def check_upright(
     where: str, vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray | None, height_m: float
 ) -> None:
-    """Refuse meshes that are not z up, or whose floor faces down.
-
-    The floor is what the NYU40 `labels` (n,) say, or without any the level faces at `height_m`.
-    """
+    """Refuse a mesh that is not z up or has a floor facing down, by NYU40 `labels` or level faces at `height_m`."""
     check_extent(where, vertices)
     area, axis, shows = face_vectors(vertices, faces) / 2, None, "the floor"
     if labels is not None:
@@ -222,10 +215,10 @@ def label_storeys(vertices: np.ndarray, faces: np.ndarray, heights_m: tuple[floa
 
 
 def split_storeys(raw: RawScene) -> tuple[RawScene, ...]:
-    """Return one scene a floor, from the lowest up; a building with one floor as it is.
+    """Return one scene for each floor, from the lowest up, in the building's frame.
 
-    A face belongs to the storey that its middle lies in, a long one to all that it reaches into, an object to the
-    highest floor that its base is not half a metre below. Frames stay the building's own.
+    A face belongs to the storey of its middle, a long one to all storeys that it touches, and an object to the highest
+    floor that is at most half a metre above its base.
     """
     if len(raw.storeys) < 2:
         return (raw,)
@@ -299,11 +292,10 @@ def _extent(values: np.ndarray, area: np.ndarray) -> tuple[float, float]:
 
 
 def find_up(vertices: np.ndarray, faces: np.ndarray, where: str) -> np.ndarray:
-    """Return (3,) unit vector that points up in a room's scan of any unit, whose faces' front is to the room.
+    """Return the unit vector (3,) that points up in a room's scan of any unit, whose faces' front is to the room.
 
-    Rooms are level and upright: nearly all area lies along or across three directions that are square to each other.
-    Of these the storey's height is the shortest extent. What the scan shows of furniture are tops and not undersides,
-    and a floor without a ceiling looks up: that shows the sense.
+    Nearly all area lies along three orthogonal directions, and the storey's height is the shortest extent. Up is the
+    side that furniture tops and an uncovered floor face.
     """
     normal, area = unit_normals(vertices, faces), face_areas(vertices, faces)
     if not area.sum() > 0:
@@ -361,9 +353,9 @@ def turn_upright(up: np.ndarray) -> np.ndarray:
 
 
 def faces_away(vertices: np.ndarray, faces: np.ndarray) -> bool:
-    """Return whether a room's floor faces down, or its ceiling up: it is mirrored, or its faces' order is wrong.
+    """Return whether a room's floor faces down or its ceiling up: it is mirrored, or its faces' order is wrong.
 
-    The outer sides of slabs do so too, but have another side near them that does not. `vertices`: m, z up or down.
+    Outer sides of slabs, which have an opposite side nearby, do not count. `vertices`: m, z up or down.
     """
     normal, area = unit_normals(vertices, faces), face_areas(vertices, faces)
     height = vertices[faces, 2].mean(axis=1)

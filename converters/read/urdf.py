@@ -1,7 +1,6 @@
 """Read a URDF of one rigid object: its surface, convex pieces, mass and friction.
 
-Inertia is not read: released URDFs carry placeholders (1 kg m2 about every axis), and it follows
-from mass and hulls.
+Inertia follows from mass and hulls, as released URDFs have placeholders (1 kg m2 about every axis).
 """
 
 import dataclasses
@@ -63,11 +62,7 @@ class RigidObject:
 def read_urdf(
     source: SourceFolder, relative: str, remedy: str, hold: bool = False, only: Collection[str] | None = None
 ) -> RigidObject:
-    """Read a URDF whose links, if several, hang together by fixed joints.
-
-    `hold`: take joints that move as fixed where they are at 0.
-    `only`: names of the links that are read; None: all.
-    """
+    """Read a URDF's links (`only` these, None: all), joined by fixed joints, or with `hold` by joints fixed at 0."""
     path = source.use(relative, remedy)
     with readable(path, SceneRejected, "fetch the file again", " as URDF"):
         root = ElementTree.parse(path).getroot()
@@ -286,10 +281,7 @@ SHAPES = {
 
 
 def primitive(path: Path, kind: str, text: Callable[[str], str | None]) -> TexturedMesh:
-    """Build an uncoloured shape of `SHAPES`.
-
-    `text`: a dimension's name -> its text, m.
-    """
+    """Build an uncoloured shape of `SHAPES`; `text` gives dimensions by name, m."""
     if kind not in SHAPES:
         raise SceneRejected(f"{path}: geometry <{kind}>, expected mesh, {', '.join(SHAPES)}")
     count = SHAPES[kind][0]
@@ -308,10 +300,7 @@ def solid(kind: str, size: np.ndarray) -> TexturedMesh:
 
 
 def height_field(height_m: np.ndarray, half_m: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertices and faces of a surface over the plane around the origin.
-
-    `height_m`: [rows along y, columns along x].
-    """
+    """Return vertices and faces of a surface of `height_m` [rows along y, columns along x], centred on the origin."""
     rows, columns = height_m.shape
     x, y = np.meshgrid(np.linspace(-half_m[0], half_m[0], columns), np.linspace(-half_m[1], half_m[1], rows))
     number = np.arange(rows * columns).reshape(rows, columns)

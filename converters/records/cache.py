@@ -1,8 +1,7 @@
-"""Keep results of pure functions in a folder, by the content of their arguments.
+"""Cache results of pure functions in a folder, which may be deleted at any time, by content.
 
-A key covers the arguments, the sources of the function's module and of all that it imports from the project, and the
-versions of the libraries that compute. An entry is therefore never stale, and the folder may be deleted at any time.
-Entries are pickles that joblib writes: nobody else may be able to write to the folder.
+A key covers the arguments, the sources of the function's module and its imports from the project, and the versions of
+libraries, so entries are never stale. Entries are pickles by joblib: nobody else may have write access to the folder.
 """
 
 import ast
@@ -39,8 +38,7 @@ MISSING = object()
 
 @functools.cache
 def fingerprint(module: str) -> str:
-    """Return a digest of the libraries' versions, of a module, of what it imports from the project, and of the YAML
-    tables that have these modules' names."""
+    """Return a digest of the libraries' versions, a module, its imports from the project and their YAML tables."""
     contents: dict[str, bytes] = {}
     left = [module]
     while left:
@@ -102,20 +100,14 @@ class StageCache:
         return value
 
     def store(self, key: str, value: Any) -> None:
-        """Write an entry, whole or not at all, and keep the folder within its limit.
-
-        If the folder cannot be written (full disk, read-only home), the next run takes longer and this one goes on.
-        """
+        """Write an entry atomically and prune the folder; if it cannot be written, continue without the entry."""
         with contextlib.suppress(FileError), whole_file(self.folder / key) as partial:
             joblib.dump(value, partial)
         prune(self.folder, self._limit_bytes, time.time())
 
 
 def prune(folder: Path, limit_bytes: int, now_s: float) -> None:
-    """Delete the least recently used entries until the folder is within the limit.
-
-    Those of the last `KEEP_S` stay. Unfinished files of killed writers are deleted in any case.
-    """
+    """Delete the least recently used entries over the limit, older than `KEEP_S`, and leftovers of killed writers."""
     entries = []
     for path in folder.glob("*.pkl"):
         with contextlib.suppress(OSError):

@@ -1,8 +1,7 @@
-"""Hold what every reader fills and every stage takes: scan, CAD library, annotations, and what is drawn.
+"""Define what readers fill and stages take: scan, CAD library, annotations and drawn surfaces.
 
-Frames: *scan frame* = the scan's, z up, floor anywhere; *CAD frame* = the library's model turned to z
-up, not scaled; *world frame* (`_w`) = scan frame with the floor at z = 0; *body frame* (`_b`) = a placed
-object's.
+Frames: *scan frame* = the scan's, z up, floor anywhere; *CAD frame* = the library's model turned to z up, not scaled;
+*world frame* (`_w`) = scan frame with the floor at z = 0; *body frame* (`_b`) = a placed object's.
 """
 
 import dataclasses
@@ -35,8 +34,7 @@ UNLABELLED, WALL, FLOOR, CEILING, WINDOW, DOOR = 0, 1, 2, 22, 9, 8
 OTHER_PROP = 40
 """NYU40 id of small things; where a structure without furniture has them, they stand on it, in no robot's way."""
 STRUCTURE_LABELS = (WALL, FLOOR, DOOR, WINDOW, 11, 13, 16, 19, CEILING, 28, 30, 38)
-"""Wall, floor, door, window, picture, blinds, curtain, mirror, ceiling, shower curtain, whiteboard,
-otherstructure."""
+"""Wall, floor, door, window, picture, blinds, curtain, mirror, ceiling, shower curtain, whiteboard, otherstructure."""
 SMALL_LABELS = (UNLABELLED, 18, 20, 21, 23, 26, 27, 29, 35, 37, 40)
 """Unlabelled, pillow, mat, clothes, books, paper, towel, box, lamp, bag, otherprop: may lie on furniture."""
 CATEGORY_LABELS = {category.name: category.labels for category in TABLE if category.labels}

@@ -1,8 +1,7 @@
-"""Label the vertices of an unlabelled scan with NYU40 ids, and score how well they fit those of a labelled one.
+"""Label the vertices of an unlabelled scan with NYU40 ids, and score labels against those of a labelled scan.
 
-A 3-D U-Net, whose finest maps have half the resolution, scores the classes of every voxel of dense tiles: each cell of
-2 x 2 x 2 voxels is one place with eight times the channels, on the way in and out: an eighth of the work, and nothing
-is lost. Normalisation is over channels alone, so that a tile's size changes nothing.
+A 3-D U-Net scores the classes of all voxels of dense tiles. It packs each 2 x 2 x 2 cell into channels for an eighth of
+the work, and normalises over channels only, so that the tile's size does not matter.
 """
 
 import dataclasses
@@ -96,7 +95,7 @@ def _unfold(x: jax.Array) -> jax.Array:
 def dense(index: jax.Array, features: jax.Array, shape: tuple[int, int]) -> jax.Array:
     """Return [N, X, Y, LAYERS, FEATURES + 2] tiles: occupied, height over the floor (in 3 m), then the features.
 
-    Rows of the index [N, K, 3] with a negative x are none; features are [N, K, FEATURES] int8.
+    Rows of the index [N, K, 3] with a negative x are padding; features are [N, K, FEATURES] int8.
     """
     height = (index[..., 2:] + 0.5) * (VOXEL_M / 3) - BELOW_M / 3
     given = jnp.concatenate([jnp.ones_like(height), height, features.astype(jnp.float32) / 127], axis=-1)

@@ -1,7 +1,4 @@
-"""Generate labelled crops of furnished buildings, as a hand-held sensor would have scanned them, and worse.
-
-Frame: scan x, y, height above the floor; metres.
-"""
+"""Generate labelled crops of furnished buildings, scanned as by a hand-held sensor (scan x, y, height; metres)."""
 
 import dataclasses
 from pathlib import Path
@@ -134,10 +131,7 @@ def make_crop(surface: Surface, classes: np.ndarray, rng: np.random.Generator, s
 
 
 def generate_crops(task: tuple[Path, int, str, int, int]) -> Path:
-    """Write crops of one building (path, seed, split, count, side), unless they are there.
-
-    One that cannot be built gives its place to the next of 1,000,000 seeds on.
-    """
+    """Write missing crops of one building (path, seed, split, count, side); on failure, try the seed plus 1,000,000."""
     path, seed, split, count, side = task
     if path.exists():
         return path

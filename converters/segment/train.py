@@ -137,10 +137,7 @@ def score_crops(net: VoxelNet, params: Any, crops: Sequence[Crop], config: Segme
 
 
 def train(out: Path, config: SegmentConfig, report: Callable[[str, float], None], log: Callable[[str], None]) -> dict:
-    """Train, or continue; save however it ends. Return the IoU by class on held-out crops, and `mean`.
-
-    `report` takes progress: stage and share.
-    """
+    """Train or resume, and save at the end or on interruption; return held-out IoU by class and `mean`."""
     tasks = []
     for folder, split, seed, count, crops in (
         ("held_out", "test", HELD_OUT_SEED, config.held_out, 8),

@@ -1,6 +1,6 @@
 """Turn a scan's surface into occupied voxels with features, and scores of points into those of vertices.
 
-Frame: the scan's, z up; voxels are counted from `Voxels.origin`, which lies `BELOW_M` under the floor.
+Voxels count from `Voxels.origin`, `BELOW_M` under the floor, in the scan's frame, z up.
 """
 
 import dataclasses

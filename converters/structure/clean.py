@@ -15,8 +15,7 @@ from converters.records.raw import CATEGORY_LABELS, FLOOR, SMALL_LABELS, STRUCTU
 from interactive_nav_common.rotations import matrix_from_quat
 
 LIFT_M = 0.004
-"""The picture's floor lies this far above the collision plane, so that the two do not flicker into one
-another."""
+"""The picture's floor lies this far above the collision plane, so that the two do not flicker."""
 LEVEL_M = 0.12
 """Floor-labelled vertices within this of the floor's plane are put on the level."""
 TOLERANCE_M = 0.025
@@ -49,10 +48,9 @@ class FloorFit:
 def fit_floor(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, near_m: float | None = None) -> FloorFit:
     """Fit the floor's plane by RANSAC (Fischler and Bolles 1981) over the faces labelled floor.
 
-    A draw is three such faces' middles, drawn by area; its support is the area within `TOLERANCE_M` of the plane
-    through them. Planes steeper than `MAX_TILT_DEG` are no floors. The best is refined by least squares over its
-    support, twice. Mislabelled furniture, steps and reflections below the floor do not move it as they move a mean, and
-    not even half of them does as it would a median. The scan is z up, its labels are NYU40's.
+    A draw is three such faces' middles, by area; its support is the area within `TOLERANCE_M`. Planes steeper than
+    `MAX_TILT_DEG` are rejected. Least squares over the support refines the best one twice. Unlike a mean or median, it
+    tolerates mislabelled furniture, steps and reflections below the floor. The scan is z up, with NYU40 labels.
     """
     labelled = int((labels == FLOOR).sum())
     if labelled < MIN_LABELS:
@@ -96,10 +94,7 @@ def fit_floor(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, near_
 
 
 def level_floor(vertices_w: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Return (n, 3) vertices with tilt and waves of the reconstructed floor removed: the collision floor is level.
-
-    The floor is near z = 0; a scan without enough of it is returned as it is.
-    """
+    """Return vertices (n, 3) without the tilt and waves of the floor near z = 0; unchanged if too little is visible."""
     result = vertices_w.copy()
     try:
         fit = fit_floor(vertices_w, faces, labels, near_m=0.0)
@@ -172,12 +167,10 @@ def cut_furniture(
     objects: tuple[PlacedObject, ...],
     furnished: bool = True,
 ) -> CutResult:
-    """Decide which scan faces are annotated furniture.
+    """Decide which scan faces are annotated furniture (floor at z = 0, NYU40 labels); floor and walls stay.
 
-    Floor and walls stay, whatever stands against them: only faces with the object's label, with no
-    label or of small things lying on it, and other furniture faces that touch the model, go. Of a part that loses
-    faces, pieces smaller than `DEBRIS_AREA_M2` go too; a part that loses none stays whole, however small it is.
-    The scan's floor is at z = 0, its labels are NYU40's.
+    Removed are faces with the object's label, unlabelled ones, small objects on it, and other furniture faces that
+    touch the model. Remains of a part that loses faces are removed below `DEBRIS_AREA_M2`.
     """
     if not furnished:
         return CutResult(np.ones(len(faces), bool), np.full(len(faces), -1, np.int64))

@@ -1,9 +1,7 @@
 """Patch the holes that furniture left in floor and walls of a cleaned scan, by plane pieces behind them.
 
-Wall planes are fitted by RANSAC, as the floor's is (`converters.structure.clean`), whose waves are taken out by now. On
-a raster of each plane a cell is patched that ought to be surface and that the scan does not show. A patch
-lies behind the scan and reaches under its border on all sides, so that no crack shows from within the room.
-The picture's mesh never collides: nothing needs to be joined.
+Wall planes are fitted by RANSAC, as the levelled floor's is. A raster of each plane marks missing surface. A patch
+reaches under the scan's border on all sides, so that no crack is visible; it never collides.
 """
 
 from __future__ import annotations
@@ -96,11 +94,9 @@ class Plane:
 def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> list[Plane]:
     """Fit vertical planes of the walls by sequential RANSAC (Fischler and Bolles 1981), the largest first.
 
-    A draw is one upright face: its middle and the horizontal direction of its normal are a hypothesis; its
-    support is the area of the faces within `WALL_TOLERANCE_M` whose normals agree within 25 degrees. The best
-    of `RANSAC_DRAWS` is refined by least squares over its support, and over the support of that while it grows (Chum,
-    Matas and Kittler 2003, Locally optimized RANSAC), which is then taken out. A plane's normal looks
-    to the side that its faces look to: the room, as scans are taken from inside.
+    A draw is one upright face: its middle and horizontal normal are a hypothesis; its support is the area of the faces
+    within `WALL_TOLERANCE_M` with normals within 25 degrees. The best of `RANSAC_DRAWS` is refined by least squares
+    while its support grows (Chum, Matas and Kittler 2003, Locally optimized RANSAC). Normals point into the room.
     """
     label, area, normal = face_labels(labels, faces), face_areas(vertices, faces), unit_normals(vertices, faces)
     left = np.isin(label, [v for v in STRUCTURE_LABELS if v not in (FLOOR, CEILING)]) & (np.abs(normal[:, 2]) < 0.3)
@@ -141,10 +137,7 @@ def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> 
 
 
 def faces_in_plane(vertices: np.ndarray, faces: np.ndarray, plane: Plane) -> np.ndarray:
-    """Return indices of the faces that show the plane: within `BESIDE_M` of it, and look as it does.
-
-    Panels and pillars that stand out of a wall are among them: a patch over them would be a second layer.
-    """
+    """Return indices of the faces within `BESIDE_M` of the plane and of like direction, panels and pillars included."""
     candidates = np.flatnonzero(np.abs(plane.distance(vertices))[faces].max(axis=1) < BESIDE_M)
     normal = face_vectors(vertices, faces[candidates])
     along = normal @ plane.normal
@@ -206,7 +199,7 @@ def _beside(mask: np.ndarray, plan: FloorPlan, shown: Shown, above_m: float) -> 
 def _extent(plan: FloorPlan, shown: Shown) -> np.ndarray:
     """Return (rows, columns) bool: from the floor to the visible wall's top, where wall is visible or in a corner.
 
-    A column in which too little is visible is as high as the lower of the visible ones beside it.
+    Columns with too little visible wall take the lower height of their visible neighbours.
     """
     rows, columns = shown.visible.shape
     walled = np.flatnonzero(shown.visible.sum(axis=0) * shown.cell_m > COLUMN_VISIBLE_M)
@@ -226,10 +219,9 @@ def _extent(plan: FloorPlan, shown: Shown) -> np.ndarray:
 
 
 def hidden_wall(plan: FloorPlan, shown: Shown, objects: tuple[PlacedObject, ...]) -> np.ndarray:
-    """Return (rows, columns) bool: what furniture hid of a wall; doors hide nothing.
+    """Return (rows, columns) bool: each near object's shadow on a wall, down to the floor; doors hide nothing.
 
-    The shadow of each near object on the wall, down to the floor, where there is wall; pieces that touch too little
-    visible wall are left open.
+    Pieces that touch too little visible wall are left open.
     """
     shadow, doors = np.zeros((2, *shown.visible.shape), bool)
     for placed in objects:
@@ -255,9 +247,9 @@ def hidden_wall(plan: FloorPlan, shown: Shown, objects: tuple[PlacedObject, ...]
 def fill_holes(
     planes: list[Plane], plan: FloorPlan, objects: tuple[PlacedObject, ...], cloud: ColourCloud, scan: Mesh
 ) -> tuple[Mesh, list[ColourCloud]]:
-    """Patch what furniture hid of floor and walls; return vertices and faces of the patches, and coloured points there.
+    """Patch floor and walls behind furniture of the `scan` (vertices (n, 3) m, faces (m, 3)) that is drawn.
 
-    `scan`: vertices (n, 3) m and faces (m, 3) that are drawn.
+    Return vertices and faces of the patches, and coloured points on them.
     """
     cell_m, turn = plan.grid.resolution_m / 2, yaw_matrix(plan.grid.yaw)
     ground = Plane(turn @ [*plan.grid.origin, LIFT_M], turn[:, 0], turn[:, 1])

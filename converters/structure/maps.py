@@ -1,8 +1,7 @@
 """Compute a grid of floor, obstacles and traversable cells from a cleaned scan and objects' footprints.
 
-The working grid is turned by the building's main direction, so that its walls run along rows and columns
-(fewer and flatter wall boxes); `resample` brings the result to the axis-aligned map that the scene folder
-stores.
+The grid is turned to the building's main direction for fewer and flatter wall boxes; `resample` makes the stored,
+axis-aligned map.
 """
 
 from __future__ import annotations
@@ -43,8 +42,7 @@ MIN_FREE_M2 = 0.25
 AWAY_SHARE = 0.4
 """Of what stands around a piece of floor, if so much faces away, it is the inside of a solid."""
 MIN_APART_M2 = 2.25
-"""Least area of a piece of floor that is cut off from the largest: no path leads into less, which is the inside of a
-cabinet or of a pillar."""
+"""Least area of floor that is cut off from the largest piece; smaller pieces are insides of cabinets or pillars."""
 PAD_M = 0.4
 HEIGHT_STEP_M = 0.1
 """Heights of low static furniture are rounded up to this: few boxes."""
@@ -59,8 +57,7 @@ OPENINGS_M = (1.3, 2.0, 2.8)
 LEAST_INSIDE_M2 = 3.0
 """Least floor of a home."""
 RIGHT_SHARE, HOME_SHARE = 0.5, 0.25
-"""Least share of the floor within the hull that lies inside: for a width to be right at once, and for a home without
-furniture."""
+"""Least share of the hull's floor that lies inside: to accept a width at once, and for a home without furniture."""
 
 
 PIECE = 16_384
@@ -125,8 +122,7 @@ class FloorPlan:
     """(rows, columns) bool: wall that a door's leaf touches as it turns, at the hinge mostly, cells being coarser than
     leaves. Not traversable, but no box may stand there. None: no such cell."""
     height_m: np.ndarray | None = None
-    """(rows, columns) m: how high what stands in a cell is; the wall's height where walls stand or nothing was scanned.
-    None: the wall's height everywhere."""
+    """(rows, columns) m: height of the structure in each cell; None: the wall's height everywhere."""
     unseen_m2: float = 0.0
     """Traversable floor that the scan does not show."""
     open_share: float = 0.0
@@ -153,10 +149,7 @@ def _drop_small(mask: np.ndarray, least_cells: int) -> np.ndarray:
 
 
 def _fill_holes(floor: np.ndarray, occupied: np.ndarray, resolution_m: float) -> np.ndarray:
-    """Add hidden regions enclosed by floor, where nothing stands, and small ones between floor and wall.
-
-    The small ones are corners that furniture hid; the inside of a wall touches no floor and stays out.
-    """
+    """Add hidden regions enclosed by floor, and small ones between floor and wall: corners that furniture hid."""
     covered = floor | occupied
     enclosed = np.asarray(ndimage.binary_fill_holes(covered), bool) & ~covered
     holes, count = label(enclosed)
@@ -184,9 +177,9 @@ def _bridge(floor: np.ndarray, occupied: np.ndarray, resolution_m: float) -> np.
 
 
 def _without_insides(free: np.ndarray, shown: _Shown, resolution_m: float) -> np.ndarray:
-    """Return the pieces of floor that one may stand on: the largest, and others that are no insides of closed solids.
+    """Return the pieces of floor to stand on: the largest, and others that are not inside closed solids.
 
-    What stands around a room faces it; the sides of a solid face away from its inside.
+    The walls of a room face it; the sides of a solid face away from its inside.
     """
     pieces, count = label(free)
     size = np.bincount(pieces.ravel(), minlength=count + 1) * resolution_m**2
@@ -211,7 +204,7 @@ def make_floor_plan(
     exact: bool = False,
     resolution_m: float = RESOLUTION_M,
 ) -> FloorPlan:
-    """Read floor and obstacles off the cleaned scan, whose floor is at z = 0, after the cut, and its NYU40 labels.
+    """Compute floor and obstacles from the cleaned scan (floor at z = 0, NYU40 labels) after the cut.
 
     `given` is the source's traversable map; `yaw` of the grid is the building's `main_direction`, rad.
     """
@@ -318,10 +311,10 @@ def _shown(grid: Grid, vertices_w: np.ndarray, faces: np.ndarray, of_face: np.nd
 
 
 def _heights(shown: _Shown, occupied: np.ndarray, around: int) -> np.ndarray:
-    """Return (rows, columns) m: height of what stands in each cell, see `FloorPlan.height_m`.
+    """Return (rows, columns) m, the height of the structure in each cell; see `FloorPlan.height_m`.
 
-    A cell is low where no wall, window or the like is labelled in the robot's band and the highest point lies
-    within it; the highest of so many cells around counts, so that a scan's ragged edge does not lower a cabinet.
+    A cell is low if the robot's band shows no label such as wall or window and its highest point lies in the band. The
+    highest neighbour counts, so that ragged edges do not lower a cabinet.
     """
     tall_m = shown.wall_height_m
     low = occupied & (shown.structure < 3) & (shown.top_m < BAND_M[1])
@@ -346,11 +339,10 @@ def beyond_obstacles(occupied: np.ndarray, resolution_m: float) -> np.ndarray:
 
 
 def floor_outside(floor: np.ndarray, occupied: np.ndarray, furniture: np.ndarray, resolution_m: float) -> np.ndarray:
-    """Return the part of a floor that lies outside of the walls of a home; all masks are (rows, columns) bool.
+    """Return the part of a floor outside the walls of a home; all masks are (rows, columns) bool.
 
-    Outside is what a disc that comes from beyond all obstacles covers, if it does not fit through doorways. Nothing is
-    outside where no floor lies beyond the obstacles, or where the walls enclose no home: too little floor, or less
-    than half of the furniture, which is the footprints of movable objects.
+    A disc too wide for doorways covers it from beyond all obstacles. Nothing is outside if no floor lies beyond the
+    obstacles, or if the walls enclose too little floor or less than half of the movables' footprints.
     """
     cell_m2 = resolution_m**2
     beyond = beyond_obstacles(occupied, resolution_m)
@@ -380,7 +372,7 @@ def _inside(floor: np.ndarray, occupied: np.ndarray, beyond: np.ndarray, width: 
 
 
 def resample(grid: Grid, mask: np.ndarray, resolution_m: float) -> tuple[np.ndarray, tuple[float, float]]:
-    """Resample a mask to an axis-aligned grid, conservatively: a cell is true where its middle and corners are.
+    """Resample a mask to an axis-aligned grid; a cell is true if its middle and corners are.
 
     Return the mask [rows along y, columns along x], and the x, y of the outer corner of cell [0, 0], m.
     """

@@ -14,16 +14,13 @@ from converters.structure.maps import FloorPlan
 from interactive_nav_common.rotations import yaw_matrix
 
 DEPTH_CELLS = 4
-"""How far a box may reach into what is not traversable: thick boxes merge ragged walls and are hard to
-tunnel."""
+"""How far a box may reach into non-traversable cells: thick boxes merge ragged walls and are hard to tunnel."""
 _Run = tuple[int, int, int, int, int, int, int, int]
 """1 along a column or 0 along a row, which one, start, stop; rows and columns of the rectangle grown from it."""
 
 
 def main_direction(vertices_w: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> float:
-    """Return the direction of the walls modulo 90 degrees, rad in [-pi/4, pi/4): mode of wall normals, by area.
-
-    Less than 1 degree counts as 0: the map then needs no turning."""
+    """Return the walls' direction, rad in [-pi/4, pi/4): the mode of normals by area, 0 if below 1 degree."""
     wall = np.isin(face_labels(labels, faces), [v for v in STRUCTURE_LABELS if v not in (FLOOR, CEILING)])
     normal = face_vectors(vertices_w, faces[wall])
     length = np.linalg.norm(normal, axis=1)
@@ -49,9 +46,9 @@ def border_cells(traversable: np.ndarray) -> np.ndarray:
 
 
 def cover_rectangles(needed: np.ndarray, allowed: np.ndarray) -> Iterator[tuple[int, int, int, int]]:
-    """Cover the needed cells with rectangles of allowed cells, which contain them, the most useful first.
+    """Cover needed cells greedily with rectangles of allowed cells, none inside another.
 
-    Yield (row0, row1, column0, column1), half-open, none inside another.
+    Yield (row0, row1, column0, column1), half-open.
     """
     assert not (needed & ~allowed).any()
     left = needed.copy()
@@ -98,10 +95,9 @@ def _runs(grid: np.ndarray, upright: int) -> Iterator[_Run]:
 
 
 def wall_boxes(plan: FloorPlan) -> tuple[OrientedBox, ...]:
-    """Build boxes from the floor up around everything traversable, each as high as what stands there.
+    """Build boxes from the floor up around everything traversable, except where a door's leaf turns.
 
-    No box stands where a door's leaf turns. A box may reach over what is higher than itself (which has separate
-    boxes), never over what is lower.
+    A box may cover higher structure (which has separate boxes), never lower structure.
     """
     free = plan.traversable if plan.leaf is None else plan.traversable | plan.leaf
     needed = border_cells(free)

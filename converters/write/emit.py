@@ -1,7 +1,4 @@
-"""Write placed objects, physical properties, walls and visual meshes as an `MjSpec` with assets.
-
-Conventions of the written MJCF (classes, groups, names) are in `scenes_mjcf/README.md`.
-"""
+"""Write a scene as an `MjSpec` with assets, by the MJCF conventions in `scenes_mjcf/README.md`."""
 
 import dataclasses
 import math
@@ -21,11 +18,9 @@ from scenes_mjcf.agreement import light_evenly
 
 TIMESTEP_S = 0.005
 HINGED, SLIDING = (0.4, 0.25), (15.0, 3.0)
-"""Damping, N m s/rad and N s/m, and dry friction, N m and N, of what opens: a drawer of 5 kg that is let go at 0.5 m/s
-goes 0.1 m on."""
+"""Damping, N m s/rad and N s/m, and dry friction, N m and N, of joints: a 5 kg drawer at 0.5 m/s slides on by 0.1 m."""
 HINGES = {"door": (2.0, 0.4)}
-"""The same of a category: a pushed interior door stops after about a second. No latch, only this dry friction keeps it
-where it was left, half a newton at the handle."""
+"""The same by category: a pushed interior door stops after about a second, and half a newton at the handle moves it."""
 ONE = (1.0, 1.0, 1.0)
 SAME_M = 5e-5
 """Meshes no farther apart are one; half of what a file's last digit is."""
@@ -170,10 +165,7 @@ def share_assets(parts: SceneParts) -> Assets:
 
 
 def build_spec(parts: SceneParts, assets: Assets | None = None) -> mujoco.MjSpec:
-    """Build the scene as an `MjSpec`.
-
-    `assets`: names of files in `assets/`; None keeps hulls inside the spec and leaves visuals out (settling).
-    """
+    """Build the scene as an `MjSpec`; `assets` are file names, or None for inline hulls without visuals (settling)."""
     spec = _empty_spec(parts.name)
     lit = parts.structure_visual is not None and parts.structure_visual.exact
     _add_surroundings(spec, parts.walls, lit)
@@ -233,13 +225,11 @@ def _add_surroundings(spec: mujoco.MjSpec, walls: tuple[OrientedBox, ...], lit: 
 
 
 def paired(faces: np.ndarray, corners: np.ndarray) -> list[list[int]]:
-    """Return triangles, and quads in place of two that share an edge.
+    """Return triangles, with quads in place of two that share an edge.
 
-    Readers of OBJ cut a quad from its first corner to its third or along its shorter diagonal. The shared edge is both,
-    or the quad is a parallelogram, which is the same however it is cut.
-
-    `faces`: (m, 3) triangles of one orientation.
-    `corners`: (k, 5) position and texture coordinates of each corner, in units of their last digit.
+    Readers of OBJ split a quad from its first to its third corner or along its shorter diagonal. Both are the shared
+    edge here, unless the quad is a parallelogram, where either gives the same surface. `faces` (m, 3) have one
+    orientation; `corners` (k, 5) are position and texture coordinates in units of their last digit.
     """
     polygons: list[list[int]] = []
     free: dict[tuple[int, int], int] = {}
@@ -297,10 +287,7 @@ def write_obj(
     uv_decimals: int = 4,
     smooth: bool = False,
 ) -> None:
-    """Write a triangle mesh as OBJ, 0.1 mm by default; with texture coordinates in as few bytes as possible.
-
-    With normals if it is to be `smooth`, is textured and is curved somewhere.
-    """
+    """Write a triangle mesh as a compact OBJ, with normals if it is `smooth`, textured and curved somewhere."""
     if uv is None or uv_faces is None:
         lines = [f"v {x:.{decimals}f} {y:.{decimals}f} {z:.{decimals}f}" for x, y, z in vertices + 0.0]
         lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]

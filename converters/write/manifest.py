@@ -50,9 +50,8 @@ def specific_surface_1_m(surfaces: Sequence[tuple[np.ndarray, np.ndarray]]) -> f
 def navigation_complexity(free: np.ndarray, cell_m: float, radius_m: float) -> float:
     """Return the largest ratio of shortest path to straight line of two places a metre or more apart.
 
-    Paths lead through the middles of cells of `NAVIGATION_CELL_M`, along rows, columns and diagonals, in the largest
-    region that a disc's middle may be in; 1 where there is no such pair. Diagonals may cut corners, so that
-    `grids.grid_graph`, whose paths go round them, gives larger values than those in the packaged scenes.
+    Paths are 8-connected over cells of `NAVIGATION_CELL_M` in the largest region for a disc's middle; the result is 1
+    without such a pair. Diagonals may cut corners, unlike those of `grids.grid_graph`, which would give larger values.
     """
     step = max(round(NAVIGATION_CELL_M / cell_m), 1)
     mask = largest_component((clearance(free, cell_m) >= radius_m)[step // 2 :: step, step // 2 :: step])
@@ -82,9 +81,8 @@ def navigation_complexity(free: np.ndarray, cell_m: float, radius_m: float) -> f
 def measure_scene(parts: SceneParts, maps: SceneMaps) -> dict[str, Any]:
     """Measure a scene with its visuals.
 
-    Returns `movable_share`: share of the traversable floor (built-in furniture is no part of it) below movables;
-    `must_push_share`: robot -> `converters.geometry.density.Ways.must_push_share`; `specific_surface_1_m` and
-    `navigation_complexity`, the latter for the smallest robot with the movables where they stand.
+    Return `movable_share`: share of the traversable floor below movables; `must_push_share`: robot -> share (see
+    `converters.geometry.density`); `specific_surface_1_m`; and `navigation_complexity` for the smallest robot.
     """
     structure, objects = parts.structure_visual, parts.objects
     assert structure is not None
@@ -132,9 +130,9 @@ def make_manifest(
     fallbacks: dict[str, str],
     maps: SceneMaps,
 ) -> SceneManifest:
-    """Measure a scene; collect what it is, where it came from and which gates it passed; all paths are relative.
+    """Return a scene's manifest: measurements, sources and gates, with relative paths.
 
-    `fallbacks` names the models whose one convex hull stands for them, and why.
+    `fallbacks` names the models that one convex hull replaces, and why.
     """
     parameters = {k: v for k, v in dataclasses.asdict(decompose).items() if k != "timeout_s"}
     return SceneManifest(

@@ -1,7 +1,7 @@
-"""Export a scene folder as a Sweet Home 3D drawing (`.sh3d`, a ZIP with `Home.xml` and models) to edit there.
+"""Export a scene folder as an editable Sweet Home 3D drawing (`.sh3d`, a ZIP with `Home.xml` and models).
 
 Frames: a scene is metres, z up, y to the back of the plan; a drawing is cm, its y points down and its angles turn
-clockwise; models are y up with their front along +z. A door's frame is z up, x along the wall that it stands in.
+clockwise; models are y up, front along +z. A door's frame is z up, x along its wall.
 """
 
 import io

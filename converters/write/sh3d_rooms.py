@@ -113,10 +113,7 @@ def wall_between(stands: Any, ends: np.ndarray, height: float) -> Wall:
 
 
 def rooms_of(maps: SceneMaps, low: Any, high: Any, least_m2: float, slack_m: float) -> list[Any]:
-    """Return (k) outlines of rooms, the largest first.
-
-    `slack_m`: how far walls that lie across the map's axes leave free between its cells and themselves.
-    """
+    """Return (k) room outlines, the largest first; `slack_m` is the gap between diagonal walls and the map's cells."""
     res, (x0, y0) = maps.resolution_m, maps.origin_w
     rows, columns = (np.arange(n) for n in maps.traversable.shape)
     x, y = np.meshgrid(x0 + (columns + 0.5) * res, y0 + (rows + 0.5) * res)

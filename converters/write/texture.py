@@ -22,8 +22,7 @@ from interactive_nav_common.rotations import matrix_from_quat
 VISIBLE_M = 0.08
 """A scan point this close to the model's surface shows it: alignments are off by several centimetres."""
 AGREE = 0.5
-"""Least |cosine| between the normals of model and scan (CAD models do not agree with themselves on inside
-and out)."""
+"""Least |cosine| between the normals of model and scan (CAD normals may point inwards or outwards)."""
 TEXTURE_SPACING_M = 0.025
 """Sampling of a textured scan's surface; a vertex-coloured scan is sampled at its vertices."""
 LEVELS = 63
@@ -59,10 +58,7 @@ def textured_cloud(mesh: TexturedMesh, spacing_m: float) -> ColourCloud:
 
 
 def unwrap(vertices: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the texture atlas of a mesh.
-
-    Returns uv (k, 2) in [0, 1], uv_faces (m, 3).
-    """
+    """Compute the texture atlas of a mesh: uv (k, 2) in [0, 1], uv_faces (m, 3)."""
     atlas = xatlas.Atlas()
     atlas.add_mesh(vertices.astype(np.float32), faces.astype(np.uint32))
     chart, pack = xatlas.ChartOptions(), xatlas.PackOptions()
@@ -82,9 +78,9 @@ def box_pixels(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def barycentric(corners: np.ndarray, points: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (n,) weights of the second and the third corner of triangles (n, 3, 2) at points (n, 2).
+    """Return (n,) weights of the second and third corner of triangles (n, 3, 2) at points (n, 2), and their validity.
 
-    Where the triangle, twice as large as its area, is below `least`, which the third result says, it counts as that.
+    Where twice the area is at most `least`, the weights are invalid, and `least` replaces it in the division.
     """
     (ax, ay), (bx, by), (cx, cy) = (corners[:, k].T for k in range(3))
     (px, py), d = (points - corners[:, 0]).T, (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
@@ -96,10 +92,7 @@ def barycentric(corners: np.ndarray, points: np.ndarray, least: float) -> tuple[
 def texel_surface(
     vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, uv_faces: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find where each covered texel lies on the surface.
-
-    Returns texel (k,) flat index into the (size, size) image, point (k, 3) m, face (k,).
-    """
+    """Return each covered texel's flat index (k,) into (size, size), its point (k, 3) m and its face (k,)."""
     corners = uv[uv_faces] * size
     corners[..., 1] = size - corners[..., 1]  # image rows run downwards
     low = np.clip(np.floor(corners.min(axis=1)).astype(int), 0, size - 1)
@@ -143,9 +136,9 @@ def quantise(image: np.ndarray, colours: int) -> Image.Image:
 
 
 def share_plain(visual: VisualMesh) -> VisualMesh:
-    """Return the same picture in fewer bytes: faces of one colour look up one place, and unused texels are blank.
+    """Return the picture in fewer bytes: plain faces share one place, and unused texels are blank.
 
-    Returns vertices and faces as they were, with another `uv` and `uv_faces`, and an image of the same size.
+    Vertices, faces and the image's size stay; `uv` and `uv_faces` change.
     """
     side, faces = len(visual.image), np.arange(len(visual.faces))
     if visual.image.shape[1] != side or not len(faces):
@@ -186,9 +179,8 @@ def bake_structure(
 ) -> VisualMesh:
     """Bake a texture of the simplified scan from coloured points (three nearest, by inverse distance).
 
-    `size` is in pixels. `turned_m` says how much farther a point counts for each unit between its normal and the
-    surface's: both sides of a thin wall keep their colours. With `light` that falls on it, the image is exact, with few
-    levels a channel, which make a smaller file.
+    `size` is in pixels. `turned_m` is the added distance for each unit between the normals of point and surface, which
+    separates the sides of thin walls. With `light`, the image is exact, with few levels a channel, for a smaller file.
     """
     uv, uv_faces = unwrap(vertices, faces, size)
     texel, point, face = texel_surface(vertices, faces, uv, uv_faces, size)
@@ -216,10 +208,9 @@ def bake_object(
 ) -> tuple[VisualMesh, float]:
     """Bake a simplified CAD model, retextured from the scan points that showed the object.
 
-    A texel takes the mean of the near scan points whose normal agrees. One that no scan point shows is
-    in-painted from the eight nearest shown texels of the same CAD material, else of any; an object that the scan
-    does not show at all keeps its CAD colours. Return the mesh, which stays in the world's frame, and the share of
-    texels that the scan showed.
+    A texel takes the mean of near scan points with a similar normal, else of the eight nearest such texels of its CAD
+    material, or of any. An object that the scan does not show keeps its CAD colours. Return the mesh, in the world's
+    frame, and the share of texels that the scan showed.
     """
     low_vertices, low_faces = low
     uv, uv_faces = unwrap(low_vertices, low_faces, size)
@@ -288,9 +279,9 @@ def as_it_is(mesh: TexturedMesh, most_faces: int, size: int) -> VisualMesh | Non
 def draw_objects(
     objects: Sequence[PlacedObject], clouds: Sequence[ColourCloud], most_faces: int, size: int
 ) -> list[Drawn]:
-    """Draw objects of one model and size: simplify the model once, by an error first, then to a number of faces.
+    """Draw objects of one model and size (`size`: the texture's, pixels), simplified once by error, then by number.
 
-    One that the scan shows takes the scan's colours, any other one its model's. `size` is the texture's, in pixels.
+    Objects take the scan's colours if it shows them, otherwise the model's.
     """
     first, unscanned = objects[0], None
     surface, mesh = first.surface_b, (first.vertices_b, first.faces)

@@ -1,12 +1,9 @@
-"""Choose models for a group of furniture and stand them against each other, by the tables of `groups.yaml`.
+"""Choose models for a group of furniture and arrange them by the tables of `groups.yaml`.
 
-Frame of a group: v points away from the wall behind the anchor (or to its front, where it has no wall), u to the right
-of who looks along v; the anchor's middle has u = 0, the wall's face v = 0. A piece's turn is counter-clockwise
-from above, 0 where it faces along v.
-
-Facts of which furniture homes have in which rooms, whether it stands at walls, in corners or in the middle, in which
-groups (chairs pushed 0.1 m under tables and turned by up to 27 degrees, sofas 2.2 m from the television's bench, lamps
-beside armchairs), follow the databases of ProcTHOR (github.com/allenai/procthor, Apache-2.0).
+Frame of a group: v points away from the wall behind the anchor (or to its front, if it has no wall), u to the right
+when looking along v; the anchor's middle has u = 0, the wall's face v = 0. A piece's turn is counter-clockwise from
+above, 0 if it faces along v. Rooms, places and groups follow the databases of ProcTHOR (github.com/allenai/procthor,
+Apache-2.0).
 """
 
 from __future__ import annotations
@@ -89,8 +86,7 @@ class Tables:
     rooms: dict[str, RoomSet]
     """Use of a room -> what it has."""
     most: dict[str, tuple[int, int]]
-    """Category -> most in one room and in a home of `PLENTY_M2`; more in a larger one. Of others, as `Group.most`
-    says."""
+    """Category -> most in one room and in a home of `PLENTY_M2`, more in a larger one; else `Group.most` applies."""
     light: tuple[str, ...]
     """Categories that a small robot can push."""
     strewn: tuple[str, ...]
@@ -183,9 +179,9 @@ def stand(piece: GroupMember, origin: np.ndarray, facing_rad: float) -> Instance
 
 
 def draw_set(models: Models, rng: np.random.Generator) -> Callable[..., GroupMember]:
-    """Return what draws a piece of a category and role at the origin, facing along v.
+    """Return a function that draws a piece of a category and role at the origin, facing along v.
 
-    Each category is of one model and size, as a table's chairs are; of boxes no two are alike.
+    Pieces of one category share a model and size, except boxes, which all differ.
     """
     drawn: dict[str, GroupMember] = {}
 
@@ -223,10 +219,7 @@ def _facing(
     turn_rad: float,
     others: list[GroupMember],
 ) -> GroupMember | None:
-    """Return a piece at a side of its host (0 front, 1 left, 2 back, 3 right), facing it; as near as parts allow.
-
-    `gap_m` is where it should be; under the host it is drawn out step by step until nothing touches.
-    """
+    """Return a piece that faces a side of its host (0 front, 1 left, 2 back, 3 right), `gap_m` away or little more."""
     width, _, depth = host.size_m
     reach = (depth if side % 2 == 0 else width) / 2 + seat.size_m[2] / 2
     away = side * math.pi / 2
@@ -242,9 +235,9 @@ def _facing(
 
 
 def _seats(host: GroupMember, count: int, at_wall: bool) -> list[tuple[int, float]]:
-    """Return (side, slide along it) of up to so many seats round a table, spread evenly.
+    """Return (side, offset along it) of up to this many seats, spread evenly: long sides first, then the ends.
 
-    Opposite long sides are taken in turns, then the ends; a table at a wall has its ends first.
+    A table at a wall has its ends first.
     """
     width, _, depth = host.size_m
     order = [(1, 3), (0,)] if at_wall else [(0, 2), (1, 3)] if width >= depth else [(1, 3), (0, 2)]
@@ -318,10 +311,7 @@ def anchored(group: Group, piece: GroupMember, rng: np.random.Generator) -> Grou
 
 
 def arrange(name: str, models: Models, rng: np.random.Generator, fewer: int = 0) -> Arrangement | None:
-    """Choose models for a group and stand them against each other.
-
-    Return None without a model of its anchor, or where fewer pieces than it needs find a place beside each other.
-    """
+    """Choose and arrange models for a group; return None if the anchor has no model or too few pieces fit."""
     group = group_of(name)
     if not models.has(group.anchor, group.role):
         return None

@@ -1,7 +1,6 @@
-"""Describe a home: rectangles, walls, doorways, its plan and what stands in it.
+"""Describe a home: rectangles, walls, doorways, its plan and its furniture.
 
-Frame: x, y of the scan (z up), metres; heights are above the floor. All horizontal coordinates are whole
-centimetres, so that a map of 1 cm a pixel shows the walls exactly.
+Frame: x, y of the scan (z up), metres, heights above the floor. Horizontal coordinates are whole centimetres.
 """
 
 from __future__ import annotations
@@ -173,8 +172,7 @@ class Building:
     uses: tuple[str, ...] = ()
     """Use of each room, keys of `converters.generate.homes.plans.USES`."""
     measured: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """How much of the floor furniture covers (`furniture_share`), and how much of it is behind furniture: robot ->
-    share of the pairs of places between which it has no path round the movables (`must_push_share`)."""
+    """The achieved `furniture_share`, and robot -> `must_push_share` of pairs of places that need a push."""
 
 
 def snap(value: float) -> float:
@@ -206,10 +204,9 @@ def cut(rect: Rect, axis: int, at: float, thick: float) -> tuple[Rect, Wall, Rec
 def split(
     rect: Rect, weights: Sequence[float], spread: float, cfg: HomeConfig, rng: np.random.Generator
 ) -> tuple[list[Rect], list[Wall]]:
-    """Cut a rectangle into rooms, mostly across its longer side.
+    """Cut a rectangle into rooms with areas proportional to `weights`, mostly across its longer side.
 
-    `weights` are the rooms' areas against each other, in the order in which they lie; a cut is up to the share `spread`
-    of the side away from where they have it.
+    Each cut deviates at random by up to the share `spread` of the side.
     """
     n = len(weights)
     if n == 1:

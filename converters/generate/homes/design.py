@@ -1,8 +1,4 @@
-"""Draw the plan of a home, furnish it, and meet the shares that must be pushed.
-
-These by a bounded search: one light piece is taken from where it stands and put into a passage or out of the way, what
-is then reached is measured, and the piece stays there where that is nearer to the wanted ranges.
-"""
+"""Draw the plan of a home, furnish it, and move light pieces until the shares that must be pushed are in range."""
 
 import dataclasses
 import math
@@ -86,10 +82,7 @@ class Passages:
         """Id of a piece -> whether it bars a passage as the furniture stands; others were not looked at."""
 
     def nearer(self, standing: list[Standing]) -> tuple[dict[str, Shares], dict[str, np.ndarray]] | None:
-        """Return `shares` and `room_m` as the furniture stands now, where it stood as listed when they were measured.
-
-        None where they are no nearer to the wanted ranges: what misses them most is measured first, as mostly it stays.
-        """
+        """Return the current `shares` and `room_m` if they are nearer to the wanted ranges than before, else None."""
         unknown = dict.fromkeys(self.ways, Shares(math.inf, -math.inf))  # misses nothing
 
         def with_one(shares: dict[str, Shares], robot: str, bound: str, share: float) -> dict[str, Shares]:

@@ -1,7 +1,4 @@
-"""Hang open leaves into the doorways of a home.
-
-Frame: scan x, y; heights above the floor. The sweep of each leaf meets neither another sweep nor another leaf.
-"""
+"""Hang open leaves into doorways (scan x, y; heights above the floor) so that their sweeps do not overlap."""
 
 import dataclasses
 import math
@@ -29,8 +26,8 @@ def door_leaf(
 ) -> tuple[Instance, shapely.Polygon]:  # fmt: skip
     """Hang an open leaf into a doorway; return it, and the floor that it sweeps from closed to fully open.
 
-    The hinge line is the leaf's edge at the jamb, `proud_m` before the wall's face on the side it opens to: into the
-    room on the high side of the doorway's axis where `high_side`. Closed, the leaf lies inside the opening.
+    The hinge is at the jamb, `proud_m` before the wall's face, in the room on the high side of the doorway's axis if
+    `high_side`. The closed leaf lies inside the opening.
     """
     axis, along = doorway.axis, 1 - doorway.axis
     closed, into, hinge = np.zeros(2), np.zeros(2), np.empty(2)
@@ -107,10 +104,9 @@ class _Leaves:
 def hang_doors(
     plan: Plan, cfg: HomeConfig, rng: np.random.Generator, first: Sequence[int] = (), always: Sequence[int] = ()
 ) -> tuple[list[tuple[Instance, int]], list[shapely.Polygon]] | None:
-    """Hang as many leaves as a plan has doorways for, up to `cfg.n_doors`; doorways of the rooms `first` come first.
+    """Hang up to `cfg.n_doors` leaves; the rooms in `first` come first, those in `always` get all of theirs.
 
-    Doorways of the rooms `always` all get one, at a side wall or not. Return each leaf with the room that it opens
-    into, and the floor that they sweep; None where too few fit.
+    Return each leaf with the room that it opens into, and the swept floor, or None if too few fit.
     """
     leaves = _Leaves(plan, cfg, rng)
     low, high = (min(n, len(plan.doorways)) for n in cfg.n_doors)

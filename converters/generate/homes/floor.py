@@ -1,7 +1,6 @@
-"""Keep what stands in a home and what must stay free on a raster: look up where a group fits, all places at once.
+"""Rasterise furniture and the floor that must stay free, and find where a group fits.
 
-Rasters are (rows, columns), rows along +y and columns along +x, cells of `CELL_M`, cell [0, 0] at the lower left
-corner of the building's outline.
+Rasters are (rows along +y, columns along +x), cells of `CELL_M`, [0, 0] at the lower left of the building's outline.
 """
 
 import dataclasses
@@ -205,10 +204,7 @@ class Floor:
     # -- where groups fit -----------------------------------------------
 
     def _sums(self, room: int, *layers: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lower left corner of a room's window and running sums of the cells there with any of the layers.
-
-        Layers are "wall", "covered" and the names of this class's rasters.
-        """
+        """Return a room's lower left cell and running sums of its cells in any layer: "wall", "covered" or a raster."""
         rows, columns = self.cells(self.plan.rooms[room])
         window = slice(max(rows.start - 8, 0), rows.stop + 8), slice(max(columns.start - 8, 0), columns.stop + 8)
         memo, key = self._passing[room] if "covered" in layers else self._lasting, (room, *layers)
@@ -286,11 +282,7 @@ class Floor:
     # -- whether one still gets through ---------------------------------
 
     def reach(self, room: int, radius_m: float, boxes: Iterable[Rect] = ()) -> tuple[bool, float]:
-        """Return what a disc reaches of a room with the furniture where it stands.
-
-        That is whether it gets from each doorway of the room to each other one inside of the room, and the area, m2, in
-        which its middle could be but to which it does not get from there.
-        """
+        """Return whether a disc gets between all of a room's doorways, and the area (m2) cut off from them."""
         passing = self._passing[room]
         if radius_m not in passing:
             passing[radius_m] = self._middles(room, radius_m)

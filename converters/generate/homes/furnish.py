@@ -179,10 +179,7 @@ def _few(home: Home, arrangement: Arrangement, room: int) -> Arrangement | None:
 
 
 def try_group(home: Home, name: str, room: int, radius_m: float) -> bool:
-    """Try to stand a group in a room, with several models and shorter rows; return whether it stands.
-
-    It does not where it does not fit, or is more than the wanted share or than rooms have of a kind.
-    """
+    """Try several models of a group, and shorter rows, in a room; return whether one fits within all limits."""
     if not home.takes([TABLES.groups[name].anchor if name in TABLES.groups else name], room):
         return False
     rows = any(s.relation == "next" for s in TABLES.groups[name].satellites) if name in TABLES.groups else False

@@ -1,7 +1,4 @@
-"""Lay out a home: an outline, a corridor or hall, rooms of given weights and the walls between and around them.
-
-Frame and units as in `converters.generate.homes.building`.
-"""
+"""Lay out a home: an outline, a corridor or hall, rooms of given weights, and walls (units as in `building`)."""
 
 import dataclasses
 import itertools

@@ -38,10 +38,9 @@ def _reach(front: Instance, around: Sequence[Slab]) -> float:
 def open_fronts(
     plan: Plan, built_in: Sequence[Instance], others: Sequence[Instance], opening: str
 ) -> tuple[tuple[Instance, ...], tuple[Instance, ...]]:
-    """Return the built-in furniture without the fronts that open, and these; `others` is what stands around.
+    """Return the built-in furniture without its opening fronts, and these fronts; `others` is the furniture around it.
 
-    Light pieces are in no front's way: they are pushed. Raise `GenerationError` where a front of a kitchen does not
-    open; others then stay shut.
+    Raise `GenerationError` if a kitchen's front is blocked; other blocked fronts stay part of their cabinet.
     """
     rects = [w.rect.grown(TOUCH_M, TOUCH_M) for w in plan.walls]
     walls = [(rect.polygon, w.low[2], w.high[2]) for rect, w in zip(rects, plan.walls, strict=True)]

@@ -1,7 +1,4 @@
-"""Draw the plan of a home: an outline, rooms with uses, doorways that suit the uses, a front door and windows.
-
-Frame and units as in `converters.generate.homes.building`.
-"""
+"""Draw a home's outline, rooms with uses, doorways, front door and windows (units as in `building`)."""
 
 import dataclasses
 import itertools
@@ -114,11 +111,7 @@ def _relations(layout: Layout, need_m: float) -> tuple[Relations, dict[tuple[int
 
 
 def misfit(relations: Relations, uses: Sequence[str]) -> float:
-    """Return how badly uses suit rooms, 0 being perfect; from `FORBIDDEN` on the plan is of no use.
-
-    That counts areas off by a factor, sides too short, no neighbour of the right use, and rooms that people reach only
-    through rooms that they should not walk through or that lack an outer wall for their window.
-    """
+    """Return how badly uses suit rooms (area, sides, neighbours, access, windows): 0 is best, `FORBIDDEN` unusable."""
     rooms, joined = relations.rooms, relations.joined
     total, weight = sum(r.area_m2 for r in rooms), sum(USES[u].weight for u in uses)
     through = np.array([USES[u].through > 0 for u in uses])

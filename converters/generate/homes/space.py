@@ -1,6 +1,6 @@
-"""Draw grids of free floor from a plan and furniture, and compute what a disc can reach on them.
+"""Draw grids of free floor and compute what a disc can reach on them.
 
-Grids are (n, n) bool, rows along +y and columns along +x, cells of `GRID_M`, the scan frame's origin in the middle.
+Grids are (n, n) bool, rows along +y, columns along +x, cells of `GRID_M`, the scan frame's origin in the middle.
 """
 
 import dataclasses

@@ -1,9 +1,7 @@
-"""Build CAD furniture by name, as ShapeNet-like normalised models of convex parts, and place it on a floor.
+"""Build CAD furniture by name, from the packaged library or drawn, and place it on a floor.
 
-Frame of a CAD model: y up, front along +z, normalised so that the diagonal of the bounding box is 1. Each model is a
-union of overlapping convex parts, so most are not watertight as a whole. Homes take the packaged library's models, with
-a textured surface, and drawn ones; each also in other tints: `Scopia/puff~moss` is that pouf in the colour of the
-material moss.
+Frame of a CAD model: y up, front along +z, normalised so that the bounding box's diagonal is 1, as in ShapeNet. Models
+are unions of overlapping convex parts. `Scopia/puff~moss` is a pouf in the colour of the material moss.
 """
 
 import dataclasses
@@ -170,10 +168,7 @@ MODELS = {"train": HOME_TRAIN_MODELS, "test": HOME_TEST_MODELS}
 
 @functools.cache
 def cad_model(name: str) -> CadModel:
-    """Draw and normalise one model: in its CAD frame the bounding box's diagonal is 1, y is up.
-
-    The CAD origin is a little off the box centre, by an amount that depends on the name: ShapeNet's models are so too.
-    """
+    """Draw a model, y up, with a bounding box diagonal of 1; like ShapeNet's, its origin is a little off-centre."""
     plain, _, tint = name.partition("~")
     model = _tinted(_empty(plain), tint) if tint else _empty(plain)
     if plain not in LOOKS.holds or model.look is None:

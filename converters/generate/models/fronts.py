@@ -1,9 +1,8 @@
-"""Cut models at their doors and drawers: a carcass that stands fast, and fronts that turn or slide.
+"""Split models at their doors and drawers into a static carcass, and fronts that turn or slide.
 
-A model's pieces are what its surface, or its drawing, consists of. A thin upright piece at its front is a panel, and
-what lies within a panel's outline (a handle, a window, a gasket, the box of a drawer) goes with it. A handle beside
-the middle makes it a door, hinged at the other side; else a low panel is a drawer's, and an oven's a flap. A high one
-whose edge is before or behind another's slides to that side.
+A thin upright piece at the front is a panel and takes along the pieces within its outline. A handle off the middle
+makes it a door, hinged at the opposite side; otherwise a low panel is a drawer's, an oven's is a flap, and a high one
+that overlaps another slides.
 """
 
 import dataclasses

@@ -1,7 +1,4 @@
-"""Model what hangs on the walls of kitchens and bathrooms (cupboards, hoods, mirrors, towels) and stands on counters.
-
-What stands out of walls by more than a towel begins above all robots: it needs no collision.
-"""
+"""Model what hangs on the walls of kitchens and bathrooms or stands on counters, too high or thin to collide."""
 
 from collections.abc import Iterable, Iterator, Sequence
 

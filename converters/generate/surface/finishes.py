@@ -98,7 +98,7 @@ INK, MID, ACCENT, LIGHT = 1, 2, 3, 4
 
 
 def _motifs(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> list[tuple[str, np.ndarray, int]]:
-    """Return what pictures show: its name, a layer of it, which is where that is positive, and its colour; back first.
+    """Return motifs, back first: name, a layer that is positive where the motif shows, and its colour.
 
     `x`, `y` are (n,) places in halves of the short side from the middle, `r` three numbers in -1..1.
     """
@@ -129,10 +129,7 @@ def _motifs(x: np.ndarray, y: np.ndarray, r: np.ndarray) -> list[tuple[str, np.n
 
 
 def framed(at: np.ndarray, half: np.ndarray, frame: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Paint one of `_motifs` behind a mount, at (n, 2) places -1..1, right and up on the picture.
-
-    `half` is (2,) half its width and height, m; `frame` (3,) the colour of its rim.
-    """
+    """Paint a motif behind a mount, at (n, 2) places -1..1; `half` (2,) is in m, `frame` (3,) the rim's colour."""
     sky, land = PRINTS[rng.integers(len(PRINTS))] + rng.uniform(-0.05, 0.05, (2, 3))
     colours = np.array([sky, land, 0.55 * land + 0.45 * sky, rng.choice(ACCENTS), (0.97, 0.92, 0.76)])
     (x, y), inner = (at * half / half.min()).T, sky

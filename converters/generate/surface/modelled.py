@@ -1,7 +1,4 @@
-"""Build the exact structure of a home from its plan: a finely painted mesh of rooms and what is built in, lit by lamps.
-
-Frame: scan x, y, height above the floor; metres.
-"""
+"""Build a home's exact structure from its plan, painted and lit (scan x, y, height above the floor; metres)."""
 
 import dataclasses
 import math
@@ -200,10 +197,7 @@ def _built_in(items: Sequence[Instance]) -> list[Chart]:
 def model_building(
     plan: Plan, items: Sequence[Instance], uses: Sequence[str], rng: np.random.Generator, palette: Sequence[str] = ()
 ) -> tuple[Scan, Atlas]:
-    """Model and paint the structure; no vertex of the mesh is in faces of two labels.
-
-    Rugs and pale curtains are of a `palette`.
-    """
+    """Model and paint the structure, with textiles of a `palette`; faces of two labels share no vertex."""
     shades = np.array([MATERIALS[name] for name in palette])
     # As many as without a palette: pictures, which collide, are drawn from the same stream.
     rugs, cloths = (shades[: len(RUGS)], 0.5 + 0.5 * shades[: len(CLOTHS)]) if palette else (RUGS, CLOTHS)

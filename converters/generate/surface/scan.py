@@ -1,9 +1,8 @@
-"""Scan plan and furniture into a labelled mesh, as a depth camera would.
+"""Scan a plan and its furniture into a labelled mesh, as a depth camera would.
 
-Solids are fused on a voxel grid and contoured; what no camera position sees is dropped (behind sofas, under
-desks, outside faces, the tops of walls), as is glass; the rest is thinned to the wanted number of faces, gets
-noise along the normals, and labels that are sometimes wrong near a border. There is no ceiling: nothing in
-this project looks at it. Frame: scan x, y, height above the floor; metres.
+Solids are fused on a voxel grid and contoured. Glass and surfaces that no camera position sees are dropped, and the
+rest is simplified. Vertices get noise along the normals, and some labels near borders are wrong. There is no ceiling.
+Frame: scan x, y, height above the floor; metres.
 """
 
 import dataclasses
@@ -109,11 +108,7 @@ def fuse(solids: list[Solid], low: np.ndarray, high: np.ndarray, voxel_m: float)
 
 
 def surface_nets(volume: Volume) -> tuple[np.ndarray, np.ndarray]:
-    """Extract the zero surface: vertices (n, 3) in the volume's frame, faces (m, 3) counter-clockwise from outside.
-
-    Surface nets (one vertex per cell that the surface crosses, at the mean of its edge crossings) give the evenly
-    sized triangles and rounded edges that fused depth images give.
-    """
+    """Return the zero surface by surface nets: vertices (n, 3), and faces (m, 3) counter-clockwise from outside."""
     sdf = volume.sdf
     shape = np.array(sdf.shape)
     strides = np.array([shape[1] * shape[2], shape[2], 1])
@@ -249,10 +244,7 @@ def compact(vertices: np.ndarray, faces: np.ndarray, min_faces: int) -> tuple[np
 
 
 def nearest_solids(points: np.ndarray, solids: list[Solid], reach_m: float = 0.12) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each of (n, 3) points the index of the solid whose surface is nearest, and the label of another class.
-
-    That is the nearest other class within 0.05 m, or 0.
-    """
+    """Return for points (n, 3) the nearest solid's index, and the nearest other class within 0.05 m, or 0."""
     best = np.full(len(points), np.inf)
     index = np.zeros(len(points), np.int64)
     by_label = {s.label: np.full(len(points), np.inf) for s in solids}

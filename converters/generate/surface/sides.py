@@ -1,6 +1,6 @@
-"""Model what is on a room's walls: faces with holes, boards, casings, panes, curtains, a front door.
+"""Model a room's walls: faces with holes, boards, casings, panes, curtains and a front door.
 
-A place at a wall is (along, out, z): metres along the wall, out of its face into the room, above the floor.
+A place is (along, out, z): metres along the wall, out of its face into the room, and above the floor.
 """
 
 import dataclasses
@@ -85,10 +85,7 @@ class Side:
 
     def slab(self, along: Span, out: Span, z: Span, label: int, paint: Colouring, texels_per_m: float = 40.0,
              skip: str = "b", thin: bool = True) -> list[Chart]:  # fmt: skip
-        """Return a box at the wall: its faces but those in `skip` (f front, b back, l, r along, t top, u under).
-
-        The edges of what is `thin` are as bright as its front.
-        """
+        """Return a box at the wall without the faces in `skip` (f front, b back, l, r along, t top, u under)."""
         ranges = (along, out, z)
         faces = {"l": (0, 0), "r": (0, 1), "b": (1, 0), "f": (1, 1), "u": (2, 0), "t": (2, 1)}
         charts = []

@@ -1,8 +1,7 @@
-"""Unwrap a scan into a texture atlas: charts by dominant direction, packed into rows, painted procedurally.
+"""Unwrap a scan into a texture atlas of charts, packed into rows and painted procedurally.
 
-Each chart is a connected patch of faces that look mostly along the same axis, projected along that axis; so a
-texel knows its place in the building, and a floor board runs on across chart borders. What is modelled consists of such
-charts already. Faces are one-sided, counter-clockwise from their visible side.
+Each chart is a connected patch of faces of similar direction, projected along an axis, so that each texel has a place
+in the building and patterns continue across charts. Faces are one-sided, counter-clockwise from their visible side.
 """
 
 import dataclasses
@@ -65,10 +64,7 @@ def charts_of(faces: np.ndarray, axes: np.ndarray) -> tuple[int, np.ndarray]:
 
 
 def pack_rows(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
-    """Pack rectangles of (n, 2) width and height, texels, into rows, tallest first.
-
-    Return the (n, 2) lower corner of each, and the height used.
-    """
+    """Pack rectangles (n, 2) of width and height, texels, into rows; return lower corners (n, 2) and the height."""
     corner = np.zeros_like(sizes)
     x = y = row = 0
     for k in np.lexsort((np.arange(len(sizes)), -sizes[:, 0], -sizes[:, 1])):
@@ -81,10 +77,7 @@ def pack_rows(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
 
 
 def unwrap(vertices: np.ndarray, faces: np.ndarray, texels_per_m: float) -> tuple[np.ndarray, np.ndarray, int]:
-    """Lay the faces out on a square sheet.
-
-    Return uv (k, 2) in texels, face_uv (m, 3), and the sheet's side (a power of two, so resolution may come out lower).
-    """
+    """Return uv (k, 2) in texels, face_uv (m, 3), and the side of the square sheet, a power of two."""
     axes = face_axes(vertices, faces)
     n, chart = charts_of(faces, axes)
     # One UV per (vertex, chart).
@@ -148,10 +141,7 @@ def paint(
     ids: np.ndarray,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Return colours (n, 3) in 0..1 of points (n, 3) on faces `ids` (n,) of the scan, by the nearest solid's material.
-
-    Walls and floors differ by room.
-    """
+    """Return colours (n, 3) in 0..1 of points (n, 3) on faces `ids` (n,), by the nearest solid's material and room."""
     corner = scan.solid[scan.faces[ids]]
     # Two of three corners decide, so that a border follows edges rather than zigzags.
     solid = np.where(corner[:, 1] == corner[:, 2], corner[:, 1], corner[:, 0])

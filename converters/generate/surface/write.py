@@ -1,6 +1,6 @@
-"""Write meshes, images and annotations in the raw Gibson layout. Same input, same bytes.
+"""Write meshes, images and annotations reproducibly in the raw Gibson layout.
 
-Frames: the scan is z up; the annotations' world is y up (`trs` of the scan turns -90 degrees about x and centres it).
+The scan is z up; the annotations' world is y up (the scan's `trs` turns -90 degrees about x and centres it).
 """
 
 import io
@@ -119,11 +119,7 @@ def pose_in_world(item: Instance, scan_to_world_m: np.ndarray, floor_height_m: f
 
 
 def pick_keypoints(item: Instance, scanned: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Choose (n, 3) points of the CAD, CAD frame: corners that the scan shows, far from one another.
-
-    A candidate is a vertex of a part; those near a scanned point of the object come first. Spread is by farthest
-    points, so that all three scales can be determined.
-    """
+    """Choose (n, 3) vertices, CAD frame, far from one another; those near a scanned point of the object come first."""
     candidates = np.unique(np.round(np.concatenate([p.vertices for p in item.model.parts]), 5), axis=0)
     placed = item.to_floor(candidates)
     if len(scanned):
@@ -144,11 +140,10 @@ def pick_keypoints(item: Instance, scanned: np.ndarray, n: int, rng: np.random.G
 def annotate_items(
     items: list[Instance], scan: Scan, floor_height_m: float, cfg: HomeConfig, seed: int, rng: np.random.Generator
 ) -> list[dict[str, Any]]:
-    """Return the content of `alignments.json`, a list of one scan: noisy poses and keypoint pairs, as people give.
+    """Return the content of `alignments.json`, a list of one scan: noisy poses and keypoint pairs.
 
-    A pose composes as in Scan2CAD: world = T * R * S * cad. `bbox` holds half extents and `center` the centre of the
-    CAD's bounding box, both in the CAD frame. Keypoints of both kinds are in world coordinates, those of the CAD
-    through the annotated pose.
+    As in Scan2CAD, world = T * R * S * cad. `bbox` (half extents) and `center` of the bounding box are in the CAD
+    frame, and keypoints of scan and CAD are in world coordinates, the CAD's through the annotated pose.
     """
     lift = np.array([0.0, 0.0, floor_height_m])
     centre = (scan.vertices.min(axis=0) + scan.vertices.max(axis=0)) / 2 + lift

@@ -1,7 +1,6 @@
-"""Read a scene of a published collection of scans into a labelled `RawScene`; the package scenezoo reads the files.
+"""Read a scene of a published scan collection into a `RawScene` with NYU40 labels, through the package scenezoo.
 
-The folder of one scene is the source, where its collection's own download put it. Labels become NYU40's by the names of
-their classes. scenezoo may fetch a collection's tables of splits and classes, where they do not lie beside the scans.
+The source is the scene's folder where the collection's download put it. scenezoo may download tables of classes.
 """
 
 import dataclasses

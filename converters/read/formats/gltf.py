@@ -1,8 +1,7 @@
 """Read glTF 2.0 files: placed meshes with the colours that viewers show in even white light.
 
-By the standard, factors and vertex colours are linear and images are sRGB. Products and sums are taken in linear light,
-and everything that leaves this module is sRGB, as in the other formats' images. trimesh writes all its colours as sRGB,
-and its default grey as the factor of every texture: in its files they are taken so.
+Factors and vertex colours are linear and images are sRGB, by the standard; results are sRGB. Files by trimesh are an
+exception: it writes all colours as sRGB, and its default grey as the factor of every texture.
 """
 
 import base64

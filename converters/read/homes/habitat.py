@@ -1,9 +1,7 @@
-"""Read a scene of a Habitat dataset (ReplicaCAD, HSSD).
+"""Read a scene of a Habitat dataset (ReplicaCAD, HSSD), whose world is y up.
 
-Layout: one or several `*.scene_instance.json` anywhere; stages, objects and articulated objects have the
-names of their `*.stage_config.json`, `*.object_config.json` and URDFs, or are mesh files themselves. Habitat's world is
-y up. Objects that a class lexicon numbers (`*semantic_lexicon.json`; HSSD names its objects by hashes) take the
-names of their classes.
+`*.scene_instance.json` may lie anywhere; stages, objects and articulated objects have the names of their configuration
+files and URDFs, or are mesh files. A `*semantic_lexicon.json` gives objects the names of their classes.
 """
 
 import collections

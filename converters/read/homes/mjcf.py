@@ -1,8 +1,7 @@
-"""Read any MJCF home: RoboCasa, MolmoSpaces, a scene of this project.
+"""Read an MJCF home (RoboCasa, MolmoSpaces, a scene of this project) through MuJoCo.
 
-MuJoCo itself reads and compiles it, after a check that every file that it names lies in the source's folder. What hangs
-on a free joint is a part; what no joint lets move is structure, body by body; what a hinge or slide with limits carries
-opens, if its piece stands fast.
+All files must lie in the source's folder. Bodies on a free joint are parts; bodies without joints are structure; a
+hinge or slide with limits opens if its furniture is fixed.
 """
 
 import collections

@@ -1,8 +1,7 @@
 """Turn the placed parts of a home into a scan of its structure, and models and annotations of its furniture.
 
-Authors of simulated homes fix most furniture to the world to save time. Here a part moves if its name says that it is
-of a movable category and it is no larger than those are, whatever its source calls it; what stands on such a part moves
-with it.
+A part moves if its name is that of a movable category and its size fits, even if its source fixes it to the world;
+objects on such a part move with it.
 """
 
 import collections
@@ -94,10 +93,9 @@ class HomePart:
 
 
 def category_of(name: str) -> Category | None:
-    """Return the category that a part's name says by its last words: an English compound is what its last word says.
+    """Return the category given by the last word of a part's name: `KitchenTable_01` is a table.
 
-    `DeskPortrait` is no desk, `KitchenTable_01` a table. Numbers and single letters are not counted, nor is what
-    RoboCasa adds: `stool_1_island_group_main` is a stool.
+    Numbers, single letters and RoboCasa's additions are ignored: `stool_1_island_group_main` is a stool.
     """
     bare = re.sub(r"(_[a-z]+_group)?(_(main|root))+$", "", name)
     words = [w.lower() for w in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", bare) if len(w) > 1]
@@ -223,10 +221,10 @@ def _shown(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def _on_floors(
     source: SourceFolder, parts: list[HomePart], floors_m: tuple[float, ...]
 ) -> tuple[list[HomePart], tuple[float, ...]]:
-    """Return the parts with what shows of a plane without an end, and the heights of the floors.
+    """Return the parts, with an infinite plane cut to the extent of the others, and the heights of the floors.
 
-    The plane reaches as far as all other parts. It is the floor unless others, a little higher, cover so much of it
-    that they are: then it is the ground that the home stands on, and drawn only where it is no lower than a doorstep.
+    The plane is the floor unless other parts slightly above cover enough of it: then it is the ground outside, drawn
+    only if it is at most a doorstep lower.
     """
     planes = [p for p in parts if p.endless]
     rest = [p for p in parts if not p.endless] or planes
@@ -276,11 +274,10 @@ def triangles(polygon: Any) -> list[np.ndarray]:
 
 
 def _by_size(source: SourceFolder, parts: list[HomePart], weighed: bool) -> list[HomePart]:
-    """Return the parts as their sizes and masses allow: a name alone makes no furniture of a wall.
+    """Return the parts, reclassified if their sizes or masses do not fit the category of their name.
 
-    A static part whose size or mass is none of its category's is built in; a loose one is of the category `other`, or
-    built in where it is too large or too heavy to be moved. Masses count where they are `weighed`: others than Gazebo's
-    are often placeholders.
+    A static part becomes built in; a loose one becomes `other`, or built in if it is too large or too heavy to move.
+    Masses count only if `weighed`, as many formats have placeholders.
     """
     result, changed = [], collections.defaultdict(list)
     for part in parts:

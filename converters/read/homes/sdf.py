@@ -1,8 +1,7 @@
-"""Read a Gazebo world (SDF 1.4 to 1.12) with its models.
+"""Read a Gazebo world (SDF 1.4 to 1.12) with its models; `sdf.yaml` lists the supported elements.
 
-Layout: `worlds/<name>.world` (or `.sdf`, there or in the folder itself) and `models/<name>/` with `model.config` and
-the SDF that it names. Links of a model are one rigid part, but for level planes, which have no end, and for what opens
-of one that stands fast. `sdf.yaml` lists the elements that are read.
+Layout: `worlds/<name>.world` (or `.sdf`, or in the folder itself) and `models/<name>/model.config`, which names the
+model's SDF. A model is one rigid part, except for infinite planes and the opening links of a static one.
 """
 
 import collections

@@ -1,7 +1,7 @@
-"""Read a home drawn in Sweet Home 3D (`.sh3d`, with the `Home.xml` of version 5.3 and later).
+"""Read a Sweet Home 3D drawing (`.sh3d` with the `Home.xml` of version 5.3 or later).
 
-Walls, rooms, and what doors and windows cut out of them become structure, levels become storeys, door leaves on hinges
-swing, furniture is what its catalogue id or its name says.
+Walls, rooms and openings become structure, levels storeys, and door leaves hinged; catalogue ids or names classify
+furniture.
 """
 
 import collections
@@ -289,10 +289,7 @@ def _footprint(e: ElementTree.Element) -> Any:
 
 
 def _axis(e: ElementTree.Element, sash: ElementTree.Element) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return a leaf's (2,) hinge in the door's frame, its angles at the start and end of its swing, its width (m).
-
-    Angles turn as in the plan: -90 degrees is towards the front.
-    """
+    """Return a leaf's (2,) hinge in the door's frame, its start and end angles (-90 degrees: front), its width (m)."""
     width, depth = metres(e, "width", "depth")
     side = -1.0 if e.get("modelMirrored") == "true" else 1.0
     at = np.array([side * (number(sash, "xAxis") - 0.5) * width, (0.5 - number(sash, "yAxis")) * depth])

@@ -1,4 +1,4 @@
-"""Read the models of a Sweet Home 3D drawing: furniture is turned, sized, mirrored and coloured as drawn.
+"""Read the models of a Sweet Home 3D drawing: turned, sized, mirrored and coloured as drawn.
 
 Models are y up, front along +z. A piece's local frame is z up, front along -y, the middle of its base at the origin.
 """

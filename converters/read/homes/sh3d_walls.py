@@ -1,7 +1,7 @@
 """Build the structure of a Sweet Home 3D drawing from its walls, rooms and openings.
 
-Frame: metres, z up, x to the right of the plan, y against the plan's, which points down. The left side of a wall is to
-the left of one who walks from its start to its end.
+Frame: metres, z up, x to the right of the plan, y opposite to the plan's. A wall's left side is to the left when
+walking from its start to its end.
 """
 
 import dataclasses
