@@ -2,9 +2,8 @@
 
 `python -m interactive_nav.episodes make --robot turtlebot --scenes DIR ... --episodes N --seed S -o FILE`
 
-A file names its scenes by the digest of what decides the task in them (`Scene.task_digest`), so the same file means
-the same episodes on every machine and backend; with other scenes, another robot or other objects it is refused.
-Files from before that digest name the digest of scene.xml and maps.npz, and are held to that.
+A file identifies its scenes by digests (`Scene.task_digest`; in old files, of scene.xml and maps.npz), so it means the
+same episodes on every machine and backend. Other scenes, robots or objects are refused.
 """
 
 import dataclasses
@@ -82,7 +81,7 @@ _FILES = Reader(EpisodeFileError, "make it again")
 
 
 def draw_episode_file(env: InteractiveNav, episodes: int, seed: int) -> EpisodeFile:
-    """Draw episodes: number i depends on the seed and i alone, and is what `env.reset` gives for that key.
+    """Draw episodes; number i depends on the seed and i alone, and equals `env.reset` for that key.
 
     The environment is not batched; fewer than one episode raises `ConfigError`.
     """

@@ -1,8 +1,7 @@
-"""Build the graph of convex corners that holds every geodesic distance and shortest path of an occupancy grid.
+"""Compute geodesic distances and shortest paths of an occupancy grid by a graph of its convex corners.
 
-Among blocked squares a shortest path is straight except where it bends round a corner, so the corners' mutual
-distances, and which corners each place sees, give every distance from anywhere to anywhere
-(`interactive_nav.navigation.lookup` looks them up inside jit).
+Shortest paths are straight except at corners, so the distances between corners, and the corners visible from each
+place, give every distance (`interactive_nav.navigation.lookup` does this inside jit).
 """
 
 import dataclasses
@@ -78,18 +77,18 @@ def distance_field(
 def navigation_grid(traversable: np.ndarray, resolution_m: float, radius_m: float, cell_m: float) -> np.ndarray:
     """Return the largest connected component of the `cell_m` squares at whose centre a body of `radius_m` fits.
 
-    `traversable` is [rows, columns] bool, the result [ceil(rows * resolution / cell), ...] with the same origin. The
-    erosion is measured at the map's resolution, so a coarse grid does not widen walls.
+    `traversable` is [rows, columns] bool, the result [ceil(rows * resolution / cell), ...] with the same origin.
+    Erosion uses the map's resolution, so that a coarse grid does not widen walls.
     """
     return largest_component(sampled_clearance(traversable, resolution_m, cell_m) >= max(radius_m, 1e-6))
 
 
 @dataclasses.dataclass(frozen=True)
 class CornerGraph:
-    """All shortest paths among blocked squares, for goals anywhere: V corners, n nodes, at most K visible from one.
+    """Hold all shortest paths among blocked squares: V corners, n nodes, at most K corners visible from a node.
 
-    Nodes stand for the cells of a coarser grid; a cell without free ground borrows its nearest node, so a
-    robot pressed against a wall still has a distance and a path.
+    Nodes stand for cells of a coarser grid; a cell without free ground uses its nearest node, so that a robot pressed
+    against a wall still has a distance and a path.
     """
 
     free: np.ndarray
@@ -154,8 +153,8 @@ _CELLS_APART = 2**0.5
 def sees(room: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return [P] bool: which pairs of points [P, 2] (column, row) in cells see each other over free cells.
 
-    `room` is [R, C] `clearance` in cells, 0 where a cell is not free. Halving: the middle first, so that most blocked
-    pairs cost a few samples; a part within what is certainly free around its middle is not halved further.
+    `room` is [R, C] `clearance` in cells, 0 in blocked cells. Segments are halved, middle first, until the clearance
+    around their middle covers them, so most blocked pairs cost few samples.
     """
     room = np.pad(room, 1)
     columns, clear, step = room.shape[1], room.ravel(), b - a
@@ -178,10 +177,10 @@ def sees(room: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _visible_corners(
     room: np.ndarray, points: np.ndarray, corners: np.ndarray, into: np.ndarray, slack: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs (point, corner) in sight of which a shortest path may bend at the corner.
+    """Return visible pairs (point, corner) at whose corner a shortest path may bend.
 
-    A path that comes from the quadrant opposite the blocked cell could be cut short, so it never bends there;
-    `slack` (cells) widens what counts, for a point that stands for its surroundings.
+    Paths from the quadrant opposite the blocked cell never bend there. `slack` (cells) widens the test for a point that
+    stands for its surroundings.
     """
     firsts, seconds = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     if not len(corners):
@@ -215,10 +214,9 @@ def _nodes(room: np.ndarray, ratio: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def corner_graph(free: np.ndarray, fine_m: float, cell_m: float, origin_w: tuple[float, float]) -> CornerGraph:
-    """Prepare shortest paths between all places on the largest component of a map of free cells [R, C].
+    """Prepare shortest paths on the largest component of a map of free cells [R, C] of side `fine_m`.
 
-    A cell's side is `fine_m`; a node's `cell_m` must be a whole multiple of it. Raises `ValueError` otherwise, and if
-    nothing is free.
+    Raise `ValueError` if `cell_m`, a node's side, is not a whole multiple of it, or if nothing is free.
     """
     ratio = round(cell_m / fine_m)
     if ratio < 1 or abs(cell_m / fine_m - ratio) > 1e-6:

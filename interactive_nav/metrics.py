@@ -1,8 +1,4 @@
-"""Compute the Interactive Navigation Score of episode totals with pure functions on NumPy or JAX arrays.
-
-Interactive Gibson (Xia et al. 2020), section IV. Every function takes any leading batch axes and
-returns arrays of those axes; nothing here reads a simulator.
-"""
+"""Compute the Interactive Navigation Score (Xia et al. 2020, section IV) of NumPy or JAX arrays of any batch axes."""
 
 from interactive_nav_common.rotations import Array, namespace
 

@@ -1,7 +1,6 @@
-"""Import MJX quietly where the optional Warp is missing.
+"""Import MJX quietly if the optional Warp is missing: `mujoco.mjx.warp` would print a line on stdout.
 
-`mujoco.mjx.warp` prints `Failed to import warp: ...` on stdout wherever that package is not installed, which is what
-a base install is. Brax imports it too, so the modules of this package that use MJX are no place to catch it.
+Brax imports MJX too, so catching it in this package's modules that use MJX would be too late.
 """
 
 import importlib.util

@@ -1,10 +1,7 @@
-"""Run `python -m interactive_nav.record REPLAY -o out.mp4`: draw a replay as a video.
+"""Run `python -m interactive_nav.record REPLAY -o out.mp4`: draw a replay as a video or as a Rerun recording.
 
-The picture: the robot from behind, its goal and path painted on the floor; beside it what the robot's camera
-sees, as colour, depth and class mask; below, the step and its reward, force and touches. Or, with `--views`, the home
-with its textures from where somebody would film it. `--rerun` writes what can be looked at from anywhere, in Rerun.
-
-Playing a policy is for `train` to do: `python -m train.record RUN` plays an episode of a run, and has it drawn here.
+The picture shows the robot from behind with its goal and path, its camera's images, and a panel with reward, force and
+touches; `--views` shows the home instead. `python -m train.record RUN` plays and draws a run's episode.
 """
 
 import dataclasses
@@ -60,8 +57,8 @@ class Compositor:
     def __init__(self, replay: Replay, scene: Scene, height: int = 360, views: Sequence[str] = ()):
         """Compile the scene that the replay was recorded in; raise `ReplayError` if it has changed since.
 
-        `height` is that of the view from behind, a multiple of 12, so that every part has whole, even pixels. `views`
-        of `VIEWS` stand side by side in place of the view from behind and the robot's camera.
+        `height` of the view from behind is a multiple of 12, for whole, even pixels. `views` of `VIEWS` replace it and
+        the robot's camera.
         """
         check_height(height)
         check_replay_scene(replay, scene)
@@ -184,9 +181,9 @@ def _dense(path: np.ndarray, step_m: float = 0.03) -> np.ndarray:
 def write_video(
     compositor: Compositor, path: Path, every: int = 1, on_progress: Callable[[int], None] = lambda frames: None
 ) -> int:
-    """Write a video (.mp4, .gif or .webp) in real time, whole or not at all; return the number of different frames.
+    """Write a video (.mp4, .gif, .webp) in real time, atomically; return the number of different frames.
 
-    A frame is `every` control steps apart from the next; `on_progress` gets the number of frames written.
+    Frames are `every` control steps apart; `on_progress` receives the number of frames written.
     """
     check_format(path)
     steps = [*range(0, compositor.replay.num_steps, every), compositor.replay.num_steps]
@@ -204,9 +201,9 @@ def write_video(
 
 
 def write_mp4(frames: Iterable[np.ndarray], path: Path, rate: float, hold_s: float = 0.0) -> int:
-    """Write H.264 of one or more [rows, columns, 3] u8 frames of even sides; return the number of different frames.
+    """Write H.264 of even-sided [rows, columns, 3] u8 frames at `rate` Hz; return the number of different frames.
 
-    `rate` is in frames a second; the last frame stays for `hold_s`.
+    The last frame stays for `hold_s`.
     """
     count, writer, frame = 0, None, np.zeros((2, 2, 3), np.uint8)
     settings: dict[str, Any] = {"fps": rate, "quality": 7, "codec": "libx264", "macro_block_size": 2}

@@ -1,8 +1,7 @@
-"""Run `python -m interactive_nav.topdown REPLAY... -o out.png`: draw maps of who went where and moved what.
+"""Run `python -m interactive_nav.topdown REPLAY... -o out.png`: draw maps of paths and moved objects.
 
-One panel a replay, as in figures 7 and 8 of Interactive Gibson: furniture and small objects in outline where
-they stood at the start and filled where they stand at the end, an arrow from the one to the other, and the
-robot's path coloured by time or by what it touched.
+One panel a replay, as in figures 7 and 8 of Interactive Gibson: objects in outline at the start and filled at the end,
+arrows between, and the robot's path coloured by time or contact.
 """
 
 import dataclasses

@@ -15,7 +15,7 @@ OF_OBJECTS = ("object_path_m", "object_contact_steps", "object_force_sum_n")
 
 @flax.struct.dataclass
 class SceneTables:
-    """Constants of all scenes on the device; S scenes, M movable slots, padded alike.
+    """Hold constants of all scenes on the device; S scenes, M movable slots, padded alike.
 
     Navigation: n nodes, V corners, of which a node sees at most K; index V means none, infinitely far.
     """

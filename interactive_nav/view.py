@@ -1,6 +1,6 @@
-"""Run `python -m interactive_nav.view SCENE`: open a scene in MuJoCo's viewer with a robot and clutter in it.
+"""Run `python -m interactive_nav.view SCENE`: open a scene with a robot and clutter in MuJoCo's viewer.
 
-A window where the machine has a screen, else a page in the browser (mjviser, an optional dependency).
+Without a screen, it opens a page in the browser (mjviser, an optional dependency).
 """
 
 import contextlib

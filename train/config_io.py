@@ -25,10 +25,7 @@ def to_yaml(config: TrainConfig) -> str:
 
 
 def from_dict(plain: Any, base: TrainConfig | None = None, where: str = "config") -> TrainConfig:
-    """Return `base` with nested plain values laid over it.
-
-    `base`: what `plain` does not name; the defaults where None.
-    """
+    """Return `base` (None: the defaults) with nested plain values laid over it."""
     return overlay(base or TrainConfig(), plain, where, elsewhere=list(flatten(TrainConfig())))
 
 

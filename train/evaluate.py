@@ -14,10 +14,7 @@ from train.scoring.command import Evaluate
 
 @reports_errors("train.evaluate")
 def main(argv: Sequence[str] | None = None, build_env: Callable[..., Any] | None = None) -> int:
-    """Evaluate; return 0 when done, 2 on a user's error, 128 + signal when stopped, which keeps what is played.
-
-    `build_env`: `train.runs.run.build_env` if None.
-    """
+    """Evaluate; return 0, 2 on a user's error, or 128 + signal when stopped, which keeps the results so far."""
     kept: dict[Path, str] = {}
     try:
         with interrupts_heard(*STOPS, at_once=False):  # progress raises it, between two chunks

@@ -1,7 +1,4 @@
-"""Run `python -m train.record RUN_DIR --episode K -o out.mp4`: replay an episode of a run and draw a video of it.
-
-This is `python -m train.replay`, then `python -m interactive_nav.record` of the replay.
-"""
+"""Run `python -m train.record RUN_DIR --episode K -o out.mp4`: replay an episode of a run and draw a video of it."""
 
 import dataclasses
 import sys

@@ -1,9 +1,7 @@
 """Run `python -m train.replay RUN_DIR --episodes 0,1 --policies learned,follower`: record episodes step by step.
 
-Episode K starts as row K of `python -m train.evaluate` with the same seed or file: same place, goal and objects. The
-numbers that a network computes may differ in their last bits with the size of the batch, so a close call may
-end otherwise; a replay carries its scores. Videos and maps are drawn from its files:
-`python -m train.record`, `python -m interactive_nav.topdown`.
+Episode K starts as row K of `python -m train.evaluate` with the same seed or file. A network's numbers may differ in
+their last bits with the batch size, so close calls may end otherwise; a replay carries its scores.
 """
 
 import dataclasses

@@ -244,8 +244,8 @@ def check_folder(folder: Path) -> tuple[SceneManifest, tuple[Gate, ...]]:
 def wall_values(model: mujoco.MjModel, maps: SceneMaps) -> dict[str, float]:
     """Return the shares of the free floor's rim without a wall box beside it, and of the free floor inside a box.
 
-    A box bounds a cell within a cell's diagonal of its middle, and contains it if one cell deep, as the map's grid is
-    turned against the boxes. The rim near a hinge is exempt: no wall stands where a leaf turns.
+    A box bounds a cell within a cell's diagonal of its middle, and contains it if the middle is one cell deep, because
+    the map's grid is turned against the boxes. The rim near a hinge is exempt: no wall stands where a leaf turns.
     """
     side, pad = maps.resolution_m, 2
     free = np.pad(maps.traversable, pad)

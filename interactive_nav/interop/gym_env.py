@@ -79,9 +79,9 @@ def register_envs() -> None:
 
 
 def observation_space_of(env: InteractiveNav) -> spaces.Space:
-    """Return a `Box` for a flat observation, a `Dict` of boxes for one in parts.
+    """Return a `Box` for a flat observation (unbounded float32), or a `Dict` of boxes for one in parts.
 
-    The vector is unbounded float32; images are 0 to 255 as uint8, else 0 (normals: -1) to 1 in their dtype.
+    Images are 0 to 255 as uint8, else 0 (normals: -1) to 1 in their dtype.
     """
     key = jax.ShapeDtypeStruct((2,), jnp.uint32)
     obs = jax.eval_shape(env.reset, key).obs

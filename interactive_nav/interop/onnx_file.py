@@ -52,10 +52,7 @@ def convert(
     expected: Mapping[str, np.ndarray],
     about: Mapping[str, Any],
 ) -> bytes:
-    """Return a function of arrays [N, ...], by name, as an ONNX model with its description.
-
-    Raise `OnnxError` where one of its outputs, in order, differs from what is `expected` of it by name.
-    """
+    """Return a function of named arrays [N, ...] as an ONNX model, or raise `OnnxError` if it misses `expected`."""
     jax2onnx = optional("jax2onnx", missing("export", "jax2onnx", "onnx"))
     runtime = optional("onnxruntime", NEEDED)
     logging.getLogger("onnx_ir").setLevel(logging.ERROR)  # it warns of values that it leaves out

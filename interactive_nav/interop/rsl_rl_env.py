@@ -11,11 +11,11 @@ TensorDict = optional("tensordict", MISSING).TensorDict
 
 
 class RslRlVecEnv(optional("rsl_rl.env", MISSING).VecEnv):
-    """`TorchVectorEnv` behind rsl_rl's interface, on its device.
+    """Adapt `TorchVectorEnv` to rsl_rl's interface, on its device.
 
-    A flat observation is the group `policy`. One in parts has a group for each, images as floats with their channels
-    first (u8 becomes 0 to 1). Time limits are in `extras["time_outs"]`, mean scores of finished episodes in
-    `extras["log"]`. rsl_rl may assign to `episode_length_buf`, to spread the ends of first episodes.
+    A flat observation is the group `policy`. One in parts has a group for each, images as floats, channels first (u8
+    becomes 0 to 1). Time limits are in `extras["time_outs"]`, mean scores of finished episodes in `extras["log"]`.
+    rsl_rl may assign to `episode_length_buf` to spread the ends of first episodes.
     """
 
     episode_length_buf = property(

@@ -24,10 +24,10 @@ def _to_numpy(tree: Any) -> Any:
 
 
 class SB3VecEnv(optional("stable_baselines3.common.vec_env", MISSING).VecEnv):
-    """`TorchVectorEnv` behind Stable-Baselines3's interface, which wants NumPy arrays: copies.
+    """Adapt `TorchVectorEnv` to Stable-Baselines3's interface of NumPy arrays, by copies.
 
-    A finished episode's info has `terminal_observation`, `TimeLimit.truncated`, its scores
-    (`env.metric_names`) and Monitor's `episode` with return `r` and length `l`, so no `VecMonitor` is needed.
+    A finished episode's info has `terminal_observation`, `TimeLimit.truncated`, its scores (`env.metric_names`) and
+    Monitor's `episode` with return `r` and length `l`, so no `VecMonitor` is needed.
     """
 
     def __init__(self, envs: TorchVectorEnv, render_mode: str | None = None):

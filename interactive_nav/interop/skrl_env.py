@@ -12,10 +12,7 @@ flatten = optional("skrl.utils.spaces.torch", MISSING).flatten_tensorized_space
 
 
 class SkrlEnv(optional("skrl.envs.wrappers.torch", MISSING).Wrapper):
-    """`TorchVectorEnv` behind skrl's interface, on its device; an observation in parts is flattened, as skrl has it.
-
-    Mean scores of finished episodes are in `info["episode"]`, which skrl's trainers log.
-    """
+    """Adapt `TorchVectorEnv` to skrl's interface, with flat observations and mean scores in `info["episode"]`."""
 
     def __init__(self, envs: TorchVectorEnv):
         """Wrap a batch, which need not have `final_obs`."""

@@ -26,10 +26,10 @@ def to_torch(tree: Any) -> Any:
 
 
 def to_jax(tree: Any) -> Any:
-    """Convert the PyTorch tensors of a pytree to JAX arrays on the same device, without a copy; keep other leaves.
+    """Convert PyTorch tensors of a pytree to JAX arrays on the same device; keep other leaves.
 
-    A tensor that is not contiguous, or on the CPU not aligned to 64 bytes, such as a slice, is copied. One that
-    requires a gradient is a `ConfigError`.
+    Only tensors that are not contiguous, or on the CPU not aligned to 64 bytes, are copied. One that requires a
+    gradient raises `ConfigError`.
     """
     torch = optional("torch", MISSING)
 
@@ -46,12 +46,11 @@ def to_jax(tree: Any) -> Any:
 
 
 class TorchVectorEnv:
-    """N environments as one compiled program, with tensors in and out; a new episode follows a finished one at once.
+    """Step N environments as one compiled program on tensors; finished episodes are followed by new ones at once.
 
-    Where an episode ended, `obs` is the first observation of the new one; everything else is of the step. `info` is
-    empty where none ended, otherwise it has `final_obs` [N, ...] and `final_info`, name -> [N], the scores
-    (`env.metric_names`, `length`, `sum_reward`), whose rows count where an episode ended, and `episode`, their means
-    over these rows.
+    After an episode's end `obs` belongs to the new one, everything else to the step. `info` is empty unless an episode
+    ended; then it has `final_obs` [N, ...], `final_info`, name -> [N] scores (`env.metric_names`, `length`,
+    `sum_reward`), valid where an episode ended, and `episode`, their means.
     """
 
     def __init__(self, env: Any, num_envs: int, cpu: bool = False, final_obs: bool = True):

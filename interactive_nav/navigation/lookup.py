@@ -1,9 +1,8 @@
 """Look up the distance to the goal and the path ahead of a position in scene tables, inside jit.
 
-A shortest path is straight but where it bends round a corner (`interactive_nav.geodesic.CornerGraph`). Once
-an episode, `goal_field` solves every corner's distance to the goal; from then on a distance is the least, over
-the corners in sight, of the way there plus what the corner has left. Which corners are in sight is tabulated at
-nodes 0.1 m apart and blended between the four nearest, so the distance is continuous.
+Once an episode, `goal_field` computes every corner's distance to the goal (`interactive_nav.geodesic.CornerGraph`). A
+distance is then the minimum over the visible corners. Visibility is tabulated at nodes 0.1 m apart and blended between
+the four nearest, so the distance is continuous.
 """
 
 import math
@@ -82,10 +81,7 @@ def _from_node(
 
 
 def geodesic_at(tables: SceneTables, scene: jax.Array, goal: GoalField, xy: jax.Array) -> jax.Array:
-    """Return the geodesic distance [] f32, m, to a goal from a world point (2,), continuous.
-
-    Within centimetres of structure, where the body cannot be, it is that of the nearest node's view.
-    """
+    """Return the continuous geodesic distance [], m, from a world point (2,); near walls, that of the nearest node."""
     rows, columns = tables.node_of_cell.shape[1:]
     u = (xy - tables.grid_origin_w[scene]) / tables.cell_m - 0.5
     low = jnp.floor(u)
@@ -135,10 +131,10 @@ def waypoints_at(
 def grid_waypoints_at(
     tables: SceneTables, scene: jax.Array, goal: GoalField, xy: jax.Array, count: int, spacing_m: float
 ) -> jax.Array:
-    """Return waypoints as the original's code had them (reference benchmark, section 1.2), from cell to cell.
+    """Return waypoints as in the original's code (reference benchmark, section 1.2), from cell to cell.
 
-    The first is the robot's cell; from there every second node (spacing / cell) of a path that steps to
-    one of eight neighbours, so 0.2 m apart along an axis and 0.283 m on diagonals; then the goal, repeated.
+    They are the robot's cell, then every second node (spacing / cell) of an 8-connected path, so 0.2 m apart along an
+    axis and 0.283 m on diagonals, then the goal, repeated.
     """
     points = _path(tables, scene, goal, cell_centre(tables, scene, xy), _hops(tables, 1.5 * count * spacing_m))
     # A step to one of eight neighbours advances the larger of the two differences by one cell.

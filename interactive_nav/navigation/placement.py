@@ -1,8 +1,7 @@
 """Draw an episode's start, goal and clutter from random keys and scene tables, inside jit.
 
-Each draw is uniform over tabulated free places and judged from a bounded number of candidates, so nothing
-retries for ever; a small object that finds no place is parked outside, and counted. Where no pair of start and goal is
-drawn at the required distances, a fallback pair of the scene takes its place.
+Draws are uniform over tabulated free places, with a bounded number of candidates. A small object without a place is
+parked outside and counted; without a suitable pair of start and goal, a fallback pair is used.
 """
 
 import math
@@ -123,12 +122,11 @@ def draw_episode(
     rules: TaskRules,
     scene: jax.Array | None = None,
 ) -> EpisodeStart:
-    """Draw scene, start, goal and small objects uniformly (paper section IV).
+    """Draw scene (if None), start, goal and small objects uniformly (paper section IV).
 
-    Start and goal are the first of independent uniform pairs that are as far apart as required, so uniform among
-    such pairs; in `MAX_ROUNDS` without one, it is one of `tables.fallback_pairs_xy_w`, of the same distances. Each
-    small object, of radii [k], lies at the first of `CLUTTER_CANDIDATES` uniform places that is clear of what lies
-    already, of the robot at the start and, with `goal_clear`, at the goal. A `scene` of None is drawn.
+    Start and goal are the first of up to `MAX_ROUNDS` uniform pairs at the required distance, else one of
+    `tables.fallback_pairs_xy_w`. Each small object, of radii [k], takes the first of `CLUTTER_CANDIDATES` uniform
+    places clear of earlier objects, the robot at the start and, with `goal_clear`, the goal.
     """
     key_scene, key_start, key_goal, key_yaw, key_place, key_turn = jax.random.split(key, 6)
     if scene is None:

@@ -70,7 +70,7 @@ def friction_share(world: World, index: int) -> np.ndarray:
 
 
 def round_tables(world: World, tables: SceneTables, rules: TaskRules, limit: float) -> SceneTables:
-    """Return the tables with shortest paths that also avoid furniture at rest of more than this `friction_share`.
+    """Return the tables with shortest paths that also avoid resting furniture of more than this `friction_share`.
 
     Doors, drawers and other bodies on a hinge or slide are not obstacles.
     """

@@ -1,7 +1,6 @@
-"""Plan paths between starts and goals in a scene's state, on the host.
+"""Plan paths in a scene's state on the host by Dijkstra, around movable objects or, at a price, through them.
 
-The planner is Dijkstra on a grid, round everything that can be moved or, at a price, through it (navigation among
-movable obstacles; Stilman and Kuffner 2005, Interactive Gibson section II-D).
+This is navigation among movable obstacles (Stilman and Kuffner 2005, Interactive Gibson section II-D).
 """
 
 from typing import Any
@@ -119,10 +118,7 @@ class _SceneGrid:
 
 
 class PathGrid:
-    """Paths over one grid by Dijkstra over 16 moves; the graph is built once.
-
-    `free` is [rows, columns] bool, and `cost`, at least 1 per metre, alike.
-    """
+    """Plan over one grid by Dijkstra with 16 moves; `free` and `cost` (1 per metre or more) are [rows, columns]."""
 
     def __init__(self, free: np.ndarray, cost: np.ndarray):
         self._shape = rows, columns = free.shape
@@ -134,10 +130,7 @@ class PathGrid:
         self._graph = grid_graph(free, cost, CELL_M, MOVES_16, corners=False)
 
     def path(self, start: tuple[int, int], goal: tuple[int, int]) -> np.ndarray:
-        """Return the cheapest path between two cells (row, column), for which the nearest free ones stand.
-
-        It is [p, 2] (row, column), both ends included; [0, 2] where there is none.
-        """
+        """Return the cheapest path [p, 2] (row, column) between the free cells nearest to two cells; [0, 2] if none."""
         if not self._any:
             return np.zeros((0, 2), np.int64)
         begin, end = self._nearest[:, start[0], start[1]], self._nearest[:, goal[0], goal[1]]
@@ -149,12 +142,11 @@ class PathGrid:
 
 
 class Ways:
-    """Plans paths in every scene of an environment.
+    """Plan paths in every scene of an environment.
 
-    A weight of 0 takes the shortest path, whatever stands in it; between 0 and 1, a metre through an object of mass m
-    and friction mu costs w / (1 - w) * mu m / m_0 metres of detour, its friction's work over the robot's weight; 1 goes
-    through something only where no path is free. What the robot cannot push (friction above its weight) costs as much
-    as at 1. None: nothing is touched.
+    A weight w of 0 gives the shortest path through everything. Between 0 and 1, a metre through an object of mass m and
+    friction mu costs w / (1 - w) * mu m / m_0 metres of detour: its friction's work over the robot's weight. With 1, or
+    for an object too heavy to push, paths lead through it only if no other exists. None: nothing is touched.
     """
 
     def __init__(self, env: Any, weight: float | None):

@@ -28,10 +28,9 @@ def resolve_backend(name: str) -> str:
 
 
 def keep_programs() -> None:
-    """Keep programs that JAX compiles for an accelerator in the cache folder, from which later processes load them.
+    """Keep programs that JAX compiles for an accelerator in the cache folder, or in JAX_COMPILATION_CACHE_DIR.
 
-    JAX names them by their source, the device and the versions. Those that call Warp name the call alone:
-    the kernels themselves come from each process's tracing. A JAX_COMPILATION_CACHE_DIR that is set is kept.
+    Entries are named by source, device and versions; for Warp calls they hold the call, not the kernels.
     """
     chosen = "JAX_COMPILATION_CACHE_DIR" in os.environ or jax.config.jax_compilation_cache_dir
     if not chosen and jax.default_backend() != "cpu":
@@ -40,10 +39,10 @@ def keep_programs() -> None:
 
 @functools.cache
 def compiler_options() -> dict[str, Any] | None:
-    """Return options for programs that step environments with images: on a CPU without XLA's YNNPACK, whose steps take
-    a sixth to a third longer (jax issue 37465; measured by `docs.studies.policies.cpu_programs`).
+    """Return compiler options for stepping environments with images on a CPU, else None.
 
-    None elsewhere, or where XLA knows no such option.
+    They disable YNNPACK, with which steps take a sixth to a third longer (jax issue 37465; measured by
+    `docs.studies.policies.cpu_programs`).
     """
     if jax.default_backend() != "cpu":
         return None

@@ -1,7 +1,7 @@
-"""Define what every physics backend offers: it steps batched states by commands and returns contact signals.
+"""Define the interface of physics backends: step batched states by commands and return contact signals.
 
-The state that travels is small and the same on every backend (`qpos`, `qvel`, the solver's warm start),
-so resets are `jnp.where`, checkpoints are portable and nothing engine-specific leaks into the loop.
+The carried state is small and the same on every backend (`qpos`, `qvel`, the solver's warm start), so resets are
+`jnp.where` and checkpoints are portable.
 """
 
 import abc
@@ -110,8 +110,8 @@ class Physics(abc.ABC):
     ) -> tuple[PhysicsState, StepSignals]:
         """Return the states and signals, leaves [N, ...], one control period later.
 
-        `scene` is [N] i32; `command` [N, A] f32 is held over the period, and the robot's control law turns it into
-        actuator controls; `time_s` [N] f32 is since the start of the episode.
+        `scene` is [N] i32; `command` [N, A] f32 is held and goes through the robot's control law; `time_s` [N] f32
+        counts from the start of the episode.
         """
 
     def step(
@@ -122,9 +122,9 @@ class Physics(abc.ABC):
 
 
 def uncommitted(tree: Any) -> Any:
-    """Return the tree with its arrays on no device in particular, as constants of a program on several must be.
+    """Return the tree with its arrays on no device in particular, as constants of a sharded program must be.
 
-    By `device_put`, which compiles nothing; `jnp.asarray` compiles a program for each shape.
+    `device_put` compiles nothing, unlike `jnp.asarray`, which compiles a program for each shape.
     """
     return jax.tree.map(lambda x: jax.device_put(np.asarray(x)) if isinstance(x, jax.Array) else x, tree)
 
@@ -136,10 +136,10 @@ PAPER_FORCE = TaskRules()
 def summarise_forces(
     force_w: Any, xp: Any = jnp, contacts: Any = None, options: TaskRules = PAPER_FORCE
 ) -> dict[str, Any]:
-    """Return the fields of `StepSignals` that hold forces, from the contact forces of all substeps.
+    """Return the force fields of `StepSignals` from the contact forces of all substeps.
 
-    `force_w` [..., substeps, M + 1, 3], N, is the net force on each slot, the structure last; `contacts` are of
-    `from_sensors`, leaves [..., substeps, (3)], or None where no option needs them.
+    `force_w` [..., substeps, M + 1, 3], N, is the net force on each slot, the structure last; `contacts` come from
+    `from_sensors`, leaves [..., substeps, (3)], or are None if no option needs them.
     """
     each = xp.sqrt((force_w**2).sum(-1)).max(-2)
     vector = force_w.sum(-2) if contacts is None or options.force_part == "full" else contacts[0]

@@ -1,9 +1,8 @@
 """Step with both implementations of MuJoCo MJX: `warp` (NVIDIA) and `jax` (any XLA device).
 
-Environments differ only in model fields: each fills the slots of one small model from its scene's tables
-(`window.py`). The engine's data is rebuilt from a template at every control step, so only `PhysicsState` is carried.
-A step costs as the degrees of freedom that it solves for, and the robot touches nothing in most steps: on `warp`, what
-rests in the window sleeps, as it does in C MuJoCo.
+Each environment fills the slots of one small model from its scene's tables (`window.py`). The engine's data is rebuilt
+from a template at every control step, so only `PhysicsState` is carried. On `warp`, objects at rest sleep, as in C
+MuJoCo, which saves most of the solver's cost.
 """
 
 import abc
@@ -279,9 +278,9 @@ def _engine_step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def measure_buffers(world: World, window: PhysicsWindow, dofs: int, head_room: float = 1.6) -> tuple[int, int]:
     """Return contact slots and constraint rows per environment that the window needs, measured at rest.
 
-    Everything rests, the small objects laid out on the floor; the window holds the bodies with the most contacts, of
-    which those are awake that have room in `dofs` degrees of freedom beside the robot. What sleeps makes no contacts.
-    `head_room` leaves place for a robot that pushes objects into each other. Metrics count what overflows anyway.
+    The small objects lie on the floor, and the window holds the bodies with the most contacts; those awake fit in
+    `dofs` degrees of freedom with the robot, and sleeping ones make no contacts. `head_room` allows for pushed objects
+    that touch each other. Metrics count overflows anyway.
     """
     contacts = rows = 0
     for model, qpos in zip(world.models, world.rest_qpos, strict=True):

@@ -1,8 +1,7 @@
 """Step C MuJoCo on CPU threads behind `jax.pure_callback`: the default without a GPU.
 
-With sleep on, objects at rest cost nothing until touched. Which of them sleep is engine state that does
-not travel in `PhysicsState`; it is kept beside the batch as a cache, and dropped for every environment
-whose incoming state is not, to the bit, the one that the batch returned last.
+Objects at rest sleep until touched. Sleep is engine state outside `PhysicsState`: it is cached beside the batch, and
+dropped for environments whose incoming state is not, to the bit, the one last returned.
 """
 
 import dataclasses
@@ -27,10 +26,10 @@ _OVERFLOWS = [_W.mjWARN_CONTACTFULL.value, _W.mjWARN_CNSTRFULL.value]
 
 
 def with_feet_apart(spec: mujoco.MjSpec, names: Sequence[str]) -> mujoco.MjModel:
-    """Return a scene's model that steps as its spec's does, to the bit, and faster.
+    """Return a scene's model that steps bit for bit as its spec's does, and faster.
 
-    MuJoCo's broadphase measures each geom of each body that can collide, asleep or not, and most geoms are feet. Here
-    the feet of `names` are on separate bodies that can collide with nothing; pairs name the floor for them.
+    The broadphase measures every geom of colliding bodies, and most are feet. Here the feet of `names` are on separate
+    bodies that collide with nothing, and explicit pairs let them touch the floor.
     """
     spec = spec.copy()
     floor = spec.geom("floor")

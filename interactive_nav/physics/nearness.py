@@ -1,8 +1,7 @@
-"""Measure how near each movable slot and wall is to the robot and to moving objects, from the world's state.
+"""Measure how near each movable slot and wall is to the robot and to moving objects.
 
-A slot's body is the box that bounds it in the body's frame, so a bed or a sofa is near where its side is near, at
-whatever turn. Gaps are planar and never larger than the true ones: the largest of the gaps across the edges of
-the boxes' shadows and between their centres (separating axes).
+A slot's body is its oriented bounding box. Gaps are planar lower bounds of the true ones, by separating axes: the
+largest of the gaps across the edges of the boxes' shadows and between their centres.
 """
 
 import functools
@@ -127,10 +126,10 @@ class Nearness:
         return gap
 
     def measure(self, scene: Array, state: PhysicsState, reach_m: float) -> Measured:
-        """Return how far each slot is from where it can be met: within `reach_m` of the robot or `TOUCH_M` of movers.
+        """Return each slot's distance beyond its range: `reach_m` of the robot or `TOUCH_M` of moving objects.
 
-        This is [M] m, negative where it can be met, `FAR_M` for empty slots; then come [M] whether it moves, and [W] m
-        to where each wall can be met, see `_walls_gap_m`.
+        This is [M] m, negative within range, `FAR_M` for empty slots; then [M] whether it moves, and [W] m of the
+        walls, see `_walls_gap_m`.
         """
         boxes, occupied = self.boxes(scene, state), jnp.asarray(self.world.slots.occupied)[scene]
         gap = boxes.gap_m(state.qpos[self._robot], jnp.eye(2), jnp.zeros(2)) - reach_m

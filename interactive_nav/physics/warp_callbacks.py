@@ -1,11 +1,9 @@
-"""Keep Python's garbage collector out of the calls by which JAX reaches Warp, and Warp's lines off the console.
+"""Pause Python's garbage collector in calls from JAX to Warp, and keep Warp's lines off the console.
 
-Such a call captures a CUDA graph whenever XLA has moved a buffer, and runs Python for up to a second. What the
-collector finds dead meanwhile is destroyed on the device at once, and no capture survives that: a program that JAX has
-compiled ends it (CUDA error 901; NVIDIA/warp#401 and #992, mujocolab/mjlab#821), and an old `wp.Stream`
-takes XLA's stream, which it shares, out of Warp's books (error 900, "unknown stream"). The latter happens without the
-collector too, if somebody holds the frame of an old call and drops it within a new one, as samplers of
-`sys._current_frames` do: profile from outside of the process.
+Such a call may capture a CUDA graph. If the collector destroys a JAX program meanwhile, the capture fails (CUDA error
+901; NVIDIA/warp#401 and #992, mujocolab/mjlab#821). When an old `wp.Stream` is destroyed, it unregisters the stream
+that it shares with XLA (error 900, "unknown stream"). This also happens without the collector, when somebody drops the
+frame of an old call within a new one, as samplers of `sys._current_frames` do: profile from outside of the process.
 """
 
 import functools

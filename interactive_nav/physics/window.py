@@ -1,9 +1,7 @@
-"""Select the part of a `World` that can move near a robot: what MJX steps instead of the whole building.
+"""Select the part of a `World` that can move near a robot, for MJX to step instead of the whole building.
 
-Objects at rest far from the robot stay where they are, so only the nearest ones need to be simulated. C
-MuJoCo leaves the others out by letting them sleep; MJX steps every body of its model, and its cost grows
-with the number of bodies, contacts and pairs of boxes. Here the model has a few empty slots and walls, and at
-every control step each environment fills them with what is nearest to its robot. All slots give the whole building.
+MJX steps every body of its model, and its cost grows with bodies, contacts and pairs of boxes. Here the model has a few
+empty slots and walls, which each environment fills at every control step with the bodies nearest to its robot.
 """
 
 from __future__ import annotations
@@ -103,7 +101,7 @@ class PhysicsWindow:
 
     @functools.cached_property
     def awake_at_rest(self) -> int:
-        """Return the degrees of freedom of the robot and of what it meets at 999 of 1,000 random places.
+        """Return the degrees of freedom of the robot and the objects near it at 999 of 1,000 random places.
 
         They are rounded up to one less than a multiple of the solver's tile, which costs the same.
         """
@@ -127,10 +125,10 @@ class PhysicsWindow:
         return inner[0], {name: np.stack(values) for name, values in tables.items()}
 
     def _build_tables(self) -> list[tuple[np.ndarray, dict[str, jax.Array]]]:
-        """Return all that rows of the window's model can be, so that one gather makes a field.
+        """Return tables of all possible rows of the window's model, so that one gather makes a field.
 
-        A field's table has the rows of each scene's slots and walls, then those of the window's model. [4, rows] tell
-        where the window's are: at `of_scene * scene + first + step * pick[at]`, with what `select` chose in `pick`.
+        A field's table has the rows of each scene's slots and walls, then those of the window's model. [4, rows] locate
+        the window's rows: at `of_scene * scene + first + step * pick[at]`, with the indices `pick` of `select`.
         """
         base, *every = [_values(model) for model in (self.model, *self.world.models)]
         scenes, geoms, walls = len(every), self.world.layout.wall_geoms, (*_GEOM, *_POSE)
@@ -160,11 +158,7 @@ class PhysicsWindow:
         return self._nearness.measure(scene, state, self._reach_m)
 
     def select(self, measured: Measured) -> tuple[tuple[jax.Array, ...], jax.Array, jax.Array]:
-        """Return what goes into the window of one environment.
-
-        This is, per group, [width] indices into its slots; [walls] indices of walls; [] i32, 1 if something within
-        reach had to be left out.
-        """
+        """Return [width] slot indices per group, [walls] wall indices, and [] i32, 1 if something was left out."""
         near, moving, walls = measured
         chosen, missed = [], jnp.zeros((), bool)
         for group in self.groups:

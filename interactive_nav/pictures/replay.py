@@ -1,7 +1,6 @@
-"""Play an episode step by step into a `Replay` of world poses, and keep it in a file.
+"""Play an episode step by step into a `Replay` of named bodies' world poses, and keep it in a file.
 
-A replay names bodies and holds their poses in the world frame, so that it can be drawn from the scene folder
-alone: without the policy, the physics, or the other scenes of the environment that it was played in.
+A replay can be drawn from the scene folder alone, without the policy, the physics or the environment.
 """
 
 import dataclasses
@@ -116,10 +115,10 @@ def _read(state: Any, action: jax.Array) -> dict[str, Any]:
 
 
 class EpisodePlayer(Player):
-    """Plays episodes of one environment, not batched, with one policy, compiled once.
+    """Play episodes of one unbatched environment with one policy, compiled once.
 
-    The policy is a pure (observation, key) -> action (A,) in [-1, 1], or one on the host; its `name` and `label`, where
-    it comes from, are for captions.
+    The policy is a pure (observation, key) -> action (A,) in [-1, 1], or one on the host; `name` and `label` (its
+    origin) are for captions.
     """
 
     def __init__(self, env: InteractiveNav, policy: PolicyFn | HostPolicy, name: str = "policy", label: str = ""):
@@ -135,10 +134,7 @@ class EpisodePlayer(Player):
         on_progress: Callable[[int], None] = lambda step: None,
         start: EpisodeStart | None = None,
     ) -> Replay:
-        """Play one episode, drawn from the key or from `start` (leaves [1, ...]), to its end.
-
-        `on_progress` is called with the number of steps now and then.
-        """
+        """Play one episode from the key or `start` (leaves [1, ...]); call `on_progress` with the number of steps."""
         played = self.rollout(self.policy, key[None], start, on_progress=lambda finished, step: on_progress(step))
         first, values = jax.tree.map(lambda x: x[0], (played.first, played.values))
         return _replay_of(self, episode, first, values)

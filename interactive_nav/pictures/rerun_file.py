@@ -34,10 +34,9 @@ def need_rerun() -> Any:
 def write_recording(
     replay: Replay, view: SceneView, path: Path, side: int, every: int, on_progress: Callable[[int], None]
 ) -> int:
-    """Write a recording, whole or not at all, and return the number of its sets of images.
+    """Write a recording atomically and return its number of image sets: one every few control steps and one at the end.
 
-    There is one every so many control steps, and one at the end; `side` is an image's, in pixels. An older replay is
-    written without waypoints and reward terms, which it does not have.
+    `side` is in pixels. Older replays lack waypoints and reward terms, and so do their recordings.
     """
     rr, dt_s = need_rerun(), replay.control_dt_s
     steps = [*range(0, replay.num_steps, every), replay.num_steps]

@@ -1,7 +1,6 @@
 """Build MuJoCo models for pictures of a scene with a robot and small objects.
 
-Every picture and viewer starts from `furnished_spec`. `SceneModel` is what pictures are taken of: its bodies are put
-where a caller wants them, and rays are cast into it.
+All pictures and viewers start from `furnished_spec`. `SceneModel` poses bodies freely and casts rays.
 """
 
 import functools
@@ -37,10 +36,10 @@ def furnished_spec(
     cut_walls: bool = False,
     for_people: bool = True,
 ) -> mujoco.MjSpec:
-    """Return the scene of `scene.xml` with a robot and small objects added, which are boxes and stand at the origin.
+    """Return the scene of `scene.xml` with a robot and small objects, which are boxes at the origin.
 
-    With `cut_walls` the walls are there once more, cut low. `for_people`: its structure is drawn as
-    `scenes_mjcf.look.spec_for_people` has it, and not as observations show it, and one sees through glass.
+    With `cut_walls`, a copy of the walls is cut low. With `for_people`, glass is transparent and the structure looks as
+    in `scenes_mjcf.look.spec_for_people`, not as in observations.
     """
     spec = spec_for_people(scene.path) if for_people else mujoco.MjSpec.from_file(str(scene.path / "scene.xml"))
     if for_people:
@@ -63,10 +62,9 @@ def picture_spec(
     classes: MaskClasses | None = None,
     for_people: bool = False,
 ) -> mujoco.MjSpec:
-    """Return `furnished_spec` in the groups of pictures, lit by one more lamp, with a camera named `view`.
+    """Return `furnished_spec` in the groups of pictures, with another lamp and a camera named `view`.
 
-    Visual meshes are drawn, and the boxes of bodies that have none. `classes` is the setting `segmentation_classes` by
-    which boxes are coloured; None leaves their colours as they are stored.
+    Bodies without visual meshes show boxes, coloured by the setting `segmentation_classes`; None keeps their colours.
     """
     spec = furnished_spec(scene, robot, small, cut_walls=robot is not None, for_people=for_people)
     robot_bodies = {b.name for b in spec.body(robot.base_body).find_all("body")} | {robot.base_body} if robot else set()
@@ -192,10 +190,10 @@ def _add_cut_walls(spec: mujoco.MjSpec, walls: np.ndarray) -> None:
 
 
 def world_poses(world: World, scene: int, qpos: np.ndarray) -> tuple[tuple[str, ...], int, np.ndarray, np.ndarray]:
-    """Return world poses of the robot's bodies and of a scene's movable objects, for `qpos` [T, nq].
+    """Return world poses of the robot's bodies and a scene's movable objects, for `qpos` [T, nq].
 
-    These are names (B), how many of them are the robot's, positions [T, B, 3] and orientations [T, B, 4]. A row of
-    `qpos` that is not finite repeats the one before it.
+    These are names (B), the number of robot bodies, positions [T, B, 3] and orientations [T, B, 4]. A non-finite row of
+    `qpos` repeats the one before it.
     """
     layout, slots, model = world.layout, world.slots, world.models[scene]
     data = mujoco.MjData(model)

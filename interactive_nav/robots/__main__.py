@@ -1,7 +1,4 @@
-"""Run `python -m interactive_nav.robots`: print the table of robots.
-
-Exit status: 0; 2 for a question that cannot be answered, with one line that says why.
-"""
+"""Run `python -m interactive_nav.robots`: print the table of robots; exit with 0, or 2 for a user's error."""
 
 import dataclasses
 import sys

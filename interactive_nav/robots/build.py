@@ -153,9 +153,9 @@ def _limits(child: mujoco.MjSpec, joint: Joint) -> tuple[tuple[float, float] | N
 
 
 def _law(base: WheeledBase, mode: str, child: mujoco.MjSpec, actions: list[_Action]) -> ControlLaw | None:
-    """Return the law controls = matrix @ command + offset, plus the joint's position where the command is an advance.
+    """Return the law controls = matrix @ command + offset, plus the joint's position for relative commands.
 
-    With a yaw gain a commanded turn is raised by the gain times its error. None: the command is the controls.
+    A yaw gain adds the gain times the turn's error to a commanded turn. None: the command is the controls.
     """
     joints, model = base.joints, child.copy().compile()
     matrix = np.stack([action.gain for action in actions], 1)
@@ -238,10 +238,10 @@ def wheeled_robot(
     rolling: tuple[str, ...] = (),
     **figures: Any,
 ) -> RobotSpec:
-    """Return the spec of a wheeled robot in a control mode, from a parsed file or the builtin one of its name.
+    """Return the spec of a wheeled robot in a control mode, from a parsed or builtin file.
 
-    `base_body` is the file's body with the free joint; bodies of the camera and of wheels (`rolling`; by default the
-    driven ones) are without the robot's name.
+    `base_body` has the free joint; names of the camera's and the wheels' bodies (`rolling`; by default the driven ones)
+    omit the robot's name.
     """
     check_mode(base.name, control_mode, base.modes)
     prefix = f"{base.name}_"

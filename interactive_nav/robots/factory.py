@@ -1,8 +1,7 @@
 """Build a robot that `make` accepts from a user's MJCF or URDF and a few facts (see `docs/add-a-robot.md`).
 
-What the task's physics needs and a file may lack is put right, each with a warning that says what was done (see
-`repair.py`); meshes that collide, links without inertia or shape and joints without torque limits are refused.
-Control modes come from `build.py`.
+`repair.py` adds what physics needs, each with a warning. Refused are colliding meshes, links without inertia or shape,
+and joints without torque limits. Control modes come from `build.py`.
 """
 
 import functools

@@ -1,8 +1,7 @@
-"""Make a user's parsed robot file fit for the task's physics; every change is warned of.
+"""Adapt a user's parsed robot file to the task's physics; every change produces a warning.
 
-What is needed and may lack is put right: wheels become spheres that roll on the floor only, with a box in front of
-furniture; cylinders become boxes; links without inertia take their shapes'; driven joints get a servo. Actuators,
-sensors and options of the file go.
+Wheels become spheres that roll on the floor only, with a box for contact with furniture; cylinders become boxes; links
+without inertia take that of their shapes; driven joints get a servo. Actuators, sensors and options are removed.
 """
 
 import dataclasses

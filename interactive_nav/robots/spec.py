@@ -61,7 +61,7 @@ def set_servo(
 ) -> None:
     """Turn an actuator into a servo of its joint with stiffness and damping, or, without gains, a motor.
 
-    Without stiffness the control is a velocity, else a position; it may be any where `control_range` is None.
+    Without stiffness the control is a velocity, else a position; a `control_range` of None is unlimited.
     """
     stiffness, damping = gains or (0.0, 0.0)
     actuator.gaintype = mujoco.mjtGain.mjGAIN_FIXED

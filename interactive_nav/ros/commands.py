@@ -26,7 +26,7 @@ def need_ros(program: str) -> Any:
 
 @contextlib.contextmanager
 def beside(command: str, stops: list[int]) -> Iterator[Callable[[], bool]]:
-    """Run a command in a process of its own, and yield whether to stop: after a signal, or when the command failed.
+    """Run a command in a separate process; yield a function that returns whether to stop (signal or failure).
 
     Topics stay on this machine unless ROS_AUTOMATIC_DISCOVERY_RANGE says otherwise.
     """

@@ -15,10 +15,9 @@ from interactive_nav.ros.simulator import compose
 
 
 class DriveNode(DrivingNode):
-    """Hand what sensors measure to a policy, and publish its velocities.
+    """Pass sensor measurements to a policy, and publish its velocities; without a goal the robot stands.
 
-    It acts when the odometry is a control period newer than at the last action and every needed topic has news, so that
-    time is the sensors'. Without a goal the robot stands.
+    It acts when the odometry is a control period newer and every needed topic has news, so time is the sensors'.
     """
 
     def __init__(

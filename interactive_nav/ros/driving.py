@@ -16,10 +16,10 @@ from scenes_mjcf.look import Lens
 
 
 class DrivingNode:
-    """Publish velocities that follow from the topics of sensors.
+    """Publish velocities computed from sensor topics.
 
-    The robot stands, with one line, while a needed topic is silent, after a message that cannot be read, when time
-    jumps back, and while the dead man's button is released. A second publisher of velocities ends the node.
+    The robot stops, with one line, while a needed topic is silent, after an unreadable message, when time jumps back,
+    and while the dead man's button is released. A second publisher of velocities ends the node.
     """
 
     def __init__(self, node: Node, name: str, silence_s: float, say: Say, button: int | None = None):

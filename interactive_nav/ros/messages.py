@@ -1,7 +1,7 @@
-"""Convert arrays to ROS 2 messages and back; name the topics, their types and the frames.
+"""Convert arrays to ROS 2 messages and back; define topics, types and frames.
 
-Units are SI and frames right-handed as in REP 103: x forward, y left, z up; in a camera's optical frame z points
-forward, x right, y down. Frames are named as in REP 105, topics as in Nav2.
+Units are SI and frames right-handed (REP 103): x forward, y left, z up; optical frames: z forward, x right, y down.
+Frame names follow REP 105, topics Nav2.
 """
 
 import array
@@ -81,9 +81,9 @@ class MessageError(UserError):
 
 
 def qos(topic: str, depth: int = 10, reading: bool = False, lossless: bool = False) -> QoSProfile:
-    """Return how a topic is published or read: sensors' data best effort, unless all of it must be `lossless`.
+    """Return a topic's quality of service: best effort for sensors, unless all data must be `lossless`.
 
-    The odometry and contacts are published reliably and read as some robots offer them, best effort.
+    Odometry and contacts are published reliably and read best effort, as some robots offer only that.
     """
     lossy = topic.startswith("/camera/") or topic in (SCAN, HEADING)
     lossy |= reading and topic in (ODOMETRY, MOVABLE, STRUCTURE, FORCE)
@@ -186,9 +186,9 @@ def info_lens(message: CameraInfo) -> Lens:
 
 
 def seen_through(image: np.ndarray, fov_deg: float, lens: Lens) -> np.ndarray:
-    """Return what a narrower or coarser pinhole lens on the same axis would show of a picture [H, W, ...].
+    """Return the view [h, w, ...] of a narrower or coarser pinhole lens on the same axis, from a picture [H, W, ...].
 
-    It is [h, w, ...], the middle of the picture: colours averaged over each wanted pixel, else the nearest pixel's.
+    Colours are averaged over each pixel; other images take the nearest pixel.
     """
     height, width, *channels = image.shape
     have = Lens(width, height, fov_deg)
@@ -211,8 +211,8 @@ def scan_message(
 ) -> LaserScan:
     """Return a scan of the lidar of `interactive_nav.sensing.sensors`.
 
-    Readings [n] in [0, 1] are distances over `range_max_m`, 1 where nothing is nearer, from right to left; the
-    message's ranges are in m, positive infinity where nothing was met (REP 117).
+    Readings [n] in [0, 1] are distances over `range_max_m`, from right to left, 1 without a hit, which becomes infinity
+    (REP 117); the message's ranges are in m.
     """
     step, first = math.radians(fov_deg) / len(readings), -math.radians(fov_deg) / 2
     ranges = np.where(readings < 1.0, np.asarray(readings, np.float64) * range_max_m, np.inf)

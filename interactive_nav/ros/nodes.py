@@ -64,9 +64,9 @@ class SimulatorNode:
     """Publish the sensors of a simulated robot, and drive it by velocity commands."""
 
     def __init__(self, node: Node, robot: Any, pace: Pace, say: Say = lambda _: None):
-        """Subscribe on a node of `ros_node`; in lockstep it starts when somebody reads pictures or the odometry.
+        """Subscribe on a node of `ros_node`; in lockstep, start when somebody reads pictures or the odometry.
 
-        `robot` is a `RosSimulator`, or a `RosSensors` of states that somebody else steps.
+        `robot` is a `RosSimulator`, or a `RosSensors` of states that the caller steps.
         """
         self._node, self._robot, self._pace, self._say = node, robot, pace, say
         self._news = threading.Condition()

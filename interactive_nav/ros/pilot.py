@@ -32,7 +32,7 @@ class Pilot:
     ):
         """Refuse a policy whose inputs no topic carries, or that gives no velocity.
 
-        `limits` are of forward m/s and turn rad/s (None: the policy's); `odom_in_map` is a pose, m and rad.
+        `limits` are forward m/s and turn rad/s (None: the policy's); `odom_in_map` is a pose, m and rad.
         """
         about, self._policy, self._scene = policy.about, policy, scene
         self.inputs: dict[str, Any] = about["inputs"]
@@ -61,9 +61,9 @@ class Pilot:
         self.goal, self._start = goal, None
 
     def decide(self, values: Mapping[str, np.ndarray]) -> tuple[float, float]:
-        """Return the velocity, m/s forward and rad/s to the left: zero without a goal, and where it is reached.
+        """Return the velocity, m/s forward and rad/s to the left: zero without a goal or at the goal.
 
-        `values` are the policy's inputs in their units as far as sensors give them, and `pose`, (3,) of the odometry.
+        `values` are the policy's inputs in sensor units, as far as sensors measure them; `pose` (3,) is the odometry's.
         """
         x, y, yaw = pose = compose(self.odom_in_map, values["pose"])
         if self.goal is None:

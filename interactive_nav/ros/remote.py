@@ -22,10 +22,10 @@ _GOAL_ARRIVES_S = 0.1
 
 
 class RosPolicy(HostPolicy):
-    """Send what the robot senses and its goals to topics, and drive as the answers on cmd_vel say.
+    """Publish the robot's sensors and goals, and drive by the commands on cmd_vel.
 
-    Each control step waits for its command, so that scores do not depend on the computer's speed. The clock goes on
-    from one episode to the next, where the robot's pose jumps.
+    Each control step waits for its command, so scores do not depend on the computer's speed. The clock continues across
+    episodes, where the robot's pose jumps.
     """
 
     def __init__(self, env: Any):

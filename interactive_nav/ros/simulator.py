@@ -93,9 +93,9 @@ class Tally:
 
 
 class RosSensors:
-    """Read from an environment's states what a robot's sensors measure; its odometry's frame is the map.
+    """Read a robot's sensor values from an environment's states; its odometry frame is the map.
 
-    A scan and velocities are read where the environment observes `lidar` and `velocity`.
+    Scans and velocities are available if the environment observes `lidar` and `velocity`.
     """
 
     range_min_m = LIDAR_NEAR_M
@@ -166,9 +166,9 @@ class RosSimulator(RosSensors):
     """Simulate one robot in one environment, which observes `NEEDED` and takes velocity commands."""
 
     def __init__(self, env: Any, seed: int = 0, start: tuple[float, ...] = (), engine: str | None = None):
-        """Place the robot at `start` (x, y in m and yaw in rad, world; empty: drawn) and compile.
+        """Place the robot at `start` (x, y in m and yaw in rad, world; empty: random) and compile.
 
-        `engine` of `PictureCamera` draws the colours of the robot's camera; None: as the environment observes.
+        `engine` of `PictureCamera` draws the robot camera's colours; None: as the environment observes.
         """
         super().__init__(env)
         self._camera = PictureCamera(env, engine) if engine else None

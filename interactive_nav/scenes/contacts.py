@@ -1,11 +1,8 @@
-"""Read single contacts of the robot, for the options that each body's net force does not answer.
+"""Read single contacts of the robot, for options that each body's net force cannot answer.
 
-The original's code leaves out friction and wheels, and could sum the contacts' norms instead of their vectors
-(reference benchmark, section 11, rows 4, 6 and 7). MuJoCo's contact sensors list contacts of a whole robot, so wheels
-are taken off again: what the robot does to a body, less what its rolling parts do to it. These sensors are added only
-when an option asks for them.
-
-What rolls are a robot's `rolling_bodies` and its casters: frictionless geoms (condim 1) of other bodies.
+The original's code leaves out friction and wheels, and could sum the contacts' norms (reference benchmark, section 11,
+rows 4, 6 and 7). MuJoCo's contact sensors cover a whole robot, so the forces of its rolling parts are subtracted: those
+are `rolling_bodies` and casters, frictionless geoms (condim 1) of other bodies.
 """
 
 from typing import Any

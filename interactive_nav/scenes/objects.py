@@ -1,9 +1,8 @@
-"""Build the small objects strewn about each episode of parametric boxes with real-world masses (kg) and sizes (m).
+"""Build the small objects of each episode from parametric boxes with real-world masses (kg) and sizes (m).
 
-Four kinds as in the paper (section IV): baskets, shoes, pots, toys. The original's meshes are not public
-with textures, so these are ours: unions of boxes, which every physics backend collides alike, and primitives
-to look at. All models of a kind have equally many boxes, so that scenes of one batch may hold different models.
-`NavConfig.objects` names folders of `python -m converters object` in their place.
+The four kinds are the paper's (section IV): baskets, shoes, pots, toys. The original's meshes are not public with
+textures; ours are unions of boxes with visual primitives. Models of a kind have equal numbers of boxes, so that a batch
+may mix them. `NavConfig.objects` names folders of `python -m converters object` to use instead.
 """
 
 import dataclasses
@@ -232,10 +231,10 @@ MODELS: dict[str, dict[str, tuple[SmallObject, ...]]] = {
 
 
 def pick(num_objects: int, split: str = "train", variant: int = 0) -> tuple[SmallObject, ...]:
-    """Return a set of small objects: two models of each kind, as many copies as it takes.
+    """Return a set of small objects: two models of each kind, repeated in turn.
 
-    Slot i holds the same kind, with the same number of boxes, whatever the split and the variant: which two models of
-    each kind, 0 the default set; they come round again. Ten objects are 3 baskets, 3 shoes, 2 pots, 2 toys.
+    Slot i holds the same kind and number of boxes for every split and variant; these select the two models (variant 0
+    is the default). Ten objects are 3 baskets, 3 shoes, 2 pots, 2 toys.
     """
     if num_objects < 0:
         raise ConfigError(f"num_objects is {num_objects}, expected 0 or more")

@@ -285,10 +285,9 @@ def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, fri
 
 
 def load_scene(folder: str | Path) -> Scene:
-    """Read and check a scene folder: scene.xml, scene.json, maps.npz; one that is `installed`, too.
+    """Load and check scene.xml, scene.json and maps.npz of a scene folder, or of an `installed` scene.
 
-    Raises:
-        SceneError: no such folder, a file that is missing or damaged, or files that disagree.
+    Raise `SceneError` if the folder or a file is missing or damaged, or if files disagree.
     """
     folder, word = installed(folder), str(folder)
     if not folder.exists():

@@ -1,8 +1,7 @@
 """Build a `World` from a robot, small objects and scenes: MuJoCo models of equal layout, one per scene.
 
-All scenes are padded to common slots (movable bodies, boxes per body, walls), so that one compiled
-program steps any mix of them: what differs between the models is numbers, never structure. An empty
-slot is a body without a place: it waits at its parking spot and never counts.
+All scenes are padded to common slots (movable bodies, boxes per body, walls), so that one compiled program steps any
+mix of them. The body of an empty slot waits at its parking spot and never counts.
 """
 
 import dataclasses
@@ -68,11 +67,9 @@ class World:
 
 
 def foot_points(boxes: np.ndarray) -> np.ndarray:
-    """Return [at most `FEET`, 3] points, m, at which a body of boxes can rest on a plane, its outermost corners.
+    """Return [at most `FEET`, 3] outermost corners, m, on which a body of boxes can rest, bottom ones first.
 
-    A rigid body touches a plane at vertices of its convex hull only. Boxes against the floor would make four
-    contacts each (a chair of twelve boxes has 16 where 4 carry it), and the solver's cost grows with them. Those of the
-    bottom come first, then those of the top.
+    Boxes would make four floor contacts each (16 for a chair that rests on 4), and the solver's cost grows with them.
     """
     corners, rotation, signs = [], np.zeros(9), np.array(list(itertools.product((-1, 1), repeat=3)))
     for row in boxes:
@@ -109,10 +106,9 @@ def _add_feet(body: mujoco.MjsBody, name: str, boxes: np.ndarray, hidden_m: np.n
 
 
 def _nothing(slot: int, kind: str) -> Movable:
-    """Return what stands in an empty slot, at its parking spot.
+    """Return the body of an empty slot, at its parking spot.
 
-    It is off-centre and turned: MuJoCo gives a body whose frame is its inertia's a sparser mass matrix, and the models'
-    structure must be equal.
+    It is off-centre and turned, because a body frame equal to its inertia's would give a sparser mass matrix.
     """
     joint = Joint(np.array([0, 0, 1]), np.zeros(3), None, 0.1, frictionloss=0.0, slides=kind == "slide")
     joint = joint if kind in ("hinge", "slide") else None
@@ -200,9 +196,9 @@ def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
 def build_empty_spec(
     robot: RobotSpec, slots: tuple[tuple[str, int], ...], n_walls: int, config: NavConfig
 ) -> tuple[mujoco.MjSpec, mujoco.MjModel, Layout]:
-    """Return a model whose movable slots and walls are all empty: its numbers are filled in per environment.
+    """Return spec, model and layout with all movable slots and walls empty; each environment fills in numbers.
 
-    `slots` are (kind, number of boxes) each. Returns spec, compiled model and layout, with sensors as `build_world`'s.
+    `slots` are (kind, number of boxes) each; sensors are those of `build_world`.
     """
     spec = _empty_spec(robot, config)
     named = [(f"{kind}_{i}", kind) for i, (kind, _) in enumerate(slots)]

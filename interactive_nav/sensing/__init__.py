@@ -9,7 +9,7 @@ from scenes_mjcf.look import CameraPose, Lens, look_along
 def make_renderer(tables: BoxTables, lens: Lens, name: str, backend: str, meshes: World | None = None) -> Renderer:
     """Build a renderer: warp (MJX-Warp's), rays (plain JAX), or auto: warp beside physics on warp, rays elsewhere.
 
-    With `meshes` its visual meshes are drawn, by a Warp kernel whatever the name; else boxes.
+    With `meshes`, a Warp kernel draws visual meshes instead of boxes, whatever the name.
     """
     from interactive_nav.physics import resolve_backend
 

@@ -1,6 +1,6 @@
-"""Define what every renderer offers: images of scenes, `qpos` and camera poses, for a batch at once.
+"""Define the renderer interface: images of scenes, `qpos` and camera poses, for a batch at once, lit alike.
 
-Those that draw boxes compute depth, class, normal and colour from the box that each pixel shows. All are lit alike.
+Box renderers compute depth, class, normal and colour from the box that each pixel shows.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Look:
 def draw_look(key: jax.Array, colours: float, light: float, classes: MaskClasses) -> Look:
     """Draw an episode's look with standard deviations `colours` and `light`.
 
-    `light` is in stops of brightness, and of each component of the vector to the sun before it has length 1.
+    `light` applies to the brightness, in stops, and to the components of the sun's direction before normalisation.
     """
     tint, sun, bright = jax.random.split(key, 3)
     sun_w = _LIGHT_W + light * jax.random.normal(sun, (3,))
@@ -92,10 +92,10 @@ class Renderer(abc.ABC):
     def images_batch(
         self, names: tuple[str, ...], scene: jax.Array, qpos: jax.Array, camera: CameraPose, look: Look | None = None
     ) -> dict[str, jax.Array]:
-        """Draw a batch as `render_batch`, in several ways; without a `look` objects keep their colours.
+        """Draw several kinds of images of a batch; without a `look` objects keep their colours.
 
-        Depth and segmentation are as there; rgb is [N, H, W, 3] f32 in [0, 1]; normals [N, H, W, 3] f32 are unit
-        vectors in the camera's frame (right, up, towards the viewer), 0 where nothing is.
+        Depth and segmentation are as in `render_batch`; rgb is [N, H, W, 3] f32 in [0, 1]; normals [N, H, W, 3] f32 are
+        unit vectors in the camera's frame (right, up, towards the viewer), 0 in empty pixels.
         """
 
     def images(
@@ -130,10 +130,10 @@ def paint(
     index: jax.Array,
     look: Look | None = None,
 ) -> dict[str, jax.Array]:
-    """Return images, as `Renderer.images_batch` has them, from the boxes that a renderer has met.
+    """Return images, as `Renderer.images_batch` does, from the box of each pixel.
 
-    Each ray meets its box once more, so that depth and face are exact and the same with every renderer. Leading
-    axes are [N]; `index` [N, H, W] is of `BoxRenderer.trace_batch`; a `look` of None leaves things as they are.
+    Each ray meets its box again, so that depth and face are exact and equal for all renderers. `index` [N, H, W] comes
+    from `BoxRenderer.trace_batch`; a `look` of None changes nothing.
     """
     n, shape = len(scene), index.shape
     assert tables.colour is not None
@@ -176,9 +176,9 @@ def lit_images(
     ids: jax.Array,
     look: Look | None = None,
 ) -> dict[str, jax.Array]:
-    """Return images `rgb` and `normals` of `base` colours in [0, 1] and `normal_w`, both [N, H, W, 3], 0 where none.
+    """Return images `rgb` and `normals` of `base` colours in [0, 1] and `normal_w`, both [N, H, W, 3], 0 if empty.
 
-    Light falls where `shaded`, [N, H, W] bool; else the colours stay. A `look` of None leaves things as they are.
+    Light falls on `shaded` pixels, [N, H, W] bool; others keep their colours. A `look` of None changes nothing.
     """
     forward, right, up = (camera.axes_w[:, None, None, :, i] for i in range(3))
     sideways, upward, away = ((normal_w * axis).sum(-1) for axis in (right, up, forward))

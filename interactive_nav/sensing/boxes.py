@@ -1,7 +1,6 @@
-"""Build the tables of collision boxes with class ids that cameras and scanners see, and compute their world poses.
+"""Build tables of collision boxes with class ids for cameras and scanners, and compute their world poses.
 
-Every backend draws the same boxes and the floor, the plane z = 0. Where the settings include the robot, it is among
-them; else it is invisible to itself.
+All backends draw these boxes and the floor, the plane z = 0. Settings decide if the robot sees itself.
 """
 
 import dataclasses
@@ -164,7 +163,7 @@ def _colours_of_slots(world: World, s: int, ids: np.ndarray, classes: MaskClasse
 def build_boxes(world: World, classes: MaskClasses = 4, colours: bool = False, robot: bool = False) -> BoxTables:
     """Collect the boxes of every scene into common slots.
 
-    `colours` reads the textures, for images in colour; with `robot` its bodies are visible, each geom as a box.
+    `colours` reads textures for colour images; `robot` makes each of its geoms visible as a box.
     """
     slots, model = world.slots, world.models[0]
     body, rows, ids = slots.box_slot, slots.boxes_b, slots.class_ids(classes)
@@ -201,9 +200,9 @@ def compose(first: jax.Array, second: jax.Array) -> jax.Array:
 
 
 def swing(axis: Array, anchor_m: Array, angle_rad: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return a hinged body's frame in its frame at rest: place [..., 3], m, and axes as columns [..., 3, 3].
+    """Return a hinged body's frame in its rest frame: place [..., 3], m, and axes as columns [..., 3, 3].
 
-    `axis`, [..., 3] of length 1, and `anchor_m`, [..., 3], are in the body's frame; `angle_rad` is [...].
+    The unit `axis` [..., 3] and `anchor_m` [..., 3] are in the body's frame; `angle_rad` is [...].
     """
     half = 0.5 * angle_rad[..., None]
     turned = matrix_from_quat(jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], -1))
@@ -213,8 +212,8 @@ def swing(axis: Array, anchor_m: Array, angle_rad: jax.Array) -> tuple[jax.Array
 def body_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return world frames of the bodies, for scenes [...] i32 and qpos [..., nq].
 
-    These are positions [..., M + 1, 3], m, and axes as columns [..., M + 1, 3, 3]; the last is the standing body. The
-    robot's bodies follow, if it is visible.
+    These are positions [..., M + 1, 3], m, and axes as columns [..., M + 1, 3, 3]; the last is the static body,
+    followed by the robot's bodies if it is visible.
     """
     lead, slots, address = qpos.shape[:-1], tables.world.slots, tables.world.layout.slot_qpos
     held = slots.held  # which `find_slots` puts last
@@ -244,9 +243,9 @@ def box_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[jax
 
 
 def slab(eye: jax.Array, half: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return where rays enter and leave the space between two opposite faces of a box, in units of their directions.
+    """Return where rays enter and leave the slab between two opposite faces, in units of their directions.
 
-    `eye` is the rays' origin along the faces' normal, from the box's centre, and `half` is from there to a face, m.
+    `eye` (origin relative to the box's centre) and `half` are along the faces' normal, m.
     """
     # A ray in a face's plane would divide by 0.
     inverse = 1.0 / (direction + _TINY)

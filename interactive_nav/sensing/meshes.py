@@ -1,8 +1,7 @@
 """Draw textured visual meshes for a batch that mixes scenes, with one Warp kernel, on GPU and CPU.
 
-MJX has one set of meshes for a whole batch, so its renderer cannot mix scenes. Here all meshes of all scenes lie in one
-`wp.Mesh`, each a group with a separate tree that is built once; what an environment shows is a list of instances
-(which mesh, which body), and a ray is taken into each body's frame that it may meet. Nothing is refitted.
+MJX's renderer cannot mix scenes. Here one `wp.Mesh` holds all meshes, each as a group with a tree that is built once.
+An environment is a list of instances (which mesh, which body), and rays are transformed into the body's frame.
 """
 
 # What a kernel computes with is none of Python's types.

@@ -31,11 +31,10 @@ def task_observation(
     goal_xy_w: jax.Array,
     waypoints_b: jax.Array,
 ) -> dict[str, jax.Array]:
-    """Return the task's parts of the observation of one environment, name -> (n,) f32, in the vector's order.
+    """Return the task's parts of one environment's observation, name -> (n,) f32, in the vector's order.
 
-    `pos_w` (3,) is in m, `rotation` (3, 3) has the base's axes as columns, `linear_velocity_w` (3,) is in m/s,
-    `angular_velocity_b` (3,) in rad/s in the base frame, `goal_xy_w` (2,) in m on the floor z = 0, `waypoints_b` (W, 2)
-    in m.
+    `pos_w` (3,) m, `rotation` (3, 3) base axes as columns, `linear_velocity_w` (3,) m/s, `angular_velocity_b` (3,)
+    rad/s, `goal_xy_w` (2,) m on the floor z = 0, `waypoints_b` (W, 2) m.
     """
     goal_w = jnp.concatenate([goal_xy_w, jnp.zeros(1)])
     return {
@@ -50,8 +49,8 @@ def advance_odometry(
 ) -> jax.Array:
     """Advance the dead reckoning `pose` (3,) x, y (m), yaw (rad, not wrapped) by one control step.
 
-    It is in the frame of the episode's start. `moved_w` (2,) m is the true displacement, `noise` (2,) the relative
-    error of the distance and of the angle of this step.
+    It is relative to the episode's start. `moved_w` (2,) m is the true displacement, `noise` (2,) the relative error of
+    distance and angle.
     """
     cos, sin = jnp.cos(yaw_rad), jnp.sin(yaw_rad)
     ahead, left = cos * moved_w[0] + sin * moved_w[1], -sin * moved_w[0] + cos * moved_w[1]

@@ -82,7 +82,7 @@ def _greater(a, b):
 
 
 def enter_and_leave(eye, half, directions) -> tuple[jax.Array, jax.Array]:
-    """Return distances (entry, exit) at which rays enter and leave a box, in units of the direction; met: entry < exit.
+    """Return distances (entry, exit) of rays through a box, in units of the direction; it is hit if entry < exit.
 
     `eye`, the rays' origin in the box's frame, `half` and `directions` are three arrays each, broadcast.
     """
@@ -135,7 +135,7 @@ def _tile_side(size: int) -> int:
 
 
 def _shows(boxes: dict[str, jax.Array], edges: np.ndarray, axis: int) -> jax.Array:
-    """Return which boxes may show between neighbouring planes through the eye, [N, B, k]: not all on one side.
+    """Return [N, B, k]: whether boxes may show between neighbouring planes through the eye.
 
     `edges` are [k + 1] rising offsets at depth 1, along the camera's right (axis 1) or up (axis 2).
     """
@@ -235,9 +235,9 @@ def _tiles(boxes: dict[str, jax.Array], camera: CameraPose, lens: Lens, mask: in
 def cast_fan(
     tables: BoxTables, scene: jax.Array, qpos: jax.Array, origin_w: jax.Array, directions_w: jax.Array
 ) -> jax.Array:
-    """Return distances along a few rays of one environment, in units of their length: a lidar's beams.
+    """Return lidar distances [R] f32 from `origin_w` (3,), m, along `directions_w` [R, 3], in units of their length.
 
-    From `origin_w` (3,), m, along `directions_w` [R, 3]: [R] f32, infinite where nothing is met; the floor is met too.
+    The floor counts; distances are infinite without a hit.
     """
     centre, axes = box_poses(tables, scene, qpos)
     inverse = jnp.swapaxes(axes, -1, -2)

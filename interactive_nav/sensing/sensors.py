@@ -98,10 +98,9 @@ LIDAR_NEAR_M = 0.05
 
 
 def stream(rng: jax.Array, name: str, step_count: jax.Array) -> jax.Array:
-    """Return a sensor's key of one control step.
+    """Return a sensor's key of one control step, by folding its name into the episode's key.
 
-    Its name is folded into the episode's key, so that each sensor has a separate stream. A small number would not
-    do: `fold_in(key, 1)` is `split(key)[1]`, which the next episode is drawn from.
+    A small number would not do: `fold_in(key, 1)` is `split(key)[1]`, from which the next episode is drawn.
     """
     return jax.random.fold_in(jax.random.fold_in(rng, zlib.crc32(name.encode())), step_count)
 
@@ -123,10 +122,7 @@ class Sensors:
     renderer: Renderer | None
 
     def __init__(self, world: World, config: NavConfig, backend: str, extra: Mapping[str, int] | None = None):
-        """Build tables, and the renderer if images are observed.
-
-        `extra` are parts appended to the vector -> their lengths; `observe` is given their values.
-        """
+        """Build tables, and a renderer if images are observed; `extra` is name -> length of appended parts."""
         self._layout, self._config = world.layout, config
         model = world.models[0]
         # The robot's joints but its free one: addresses in qpos and qvel, and whether they turn without limit.
@@ -178,9 +174,9 @@ class Sensors:
     def observe(
         self, physics: PhysicsState, nav: NavInfo, rng: jax.Array, remembered: Mapping[str, jax.Array] | None = None
     ) -> jax.Array | dict[str, jax.Array]:
-        """Return the observation of one environment; `rng`, the episode's key, is read for noise and not consumed.
+        """Return one environment's observation; noise uses the episode's key `rng` without consuming it.
 
-        `remembered` has the values of `odometry`, `trail` and the `extra` parts where they are observed.
+        `remembered` has the observed values among `odometry`, `trail` and the `extra` parts.
         """
         vector = self._vector(physics, nav, rng, remembered or {})
         if not self._images:
@@ -329,10 +325,9 @@ def blurred(image: jax.Array, deviation_px: float) -> jax.Array:
 def noisy_depth(
     noise: CameraNoise, lens: Lens, depth: jax.Array, normals: jax.Array | None, key_of: KeyOf
 ) -> jax.Array:
-    """Return [H, W] m as a sensor of structured light reads it; 0 where it reads nothing.
+    """Return [H, W] m as a structured-light sensor reads it; 0 without a reading.
 
-    It measures disparity, the reciprocal of depth times a constant: an even error of disparity is one of depth that
-    grows with its square.
+    The sensor measures disparity, so a constant disparity error gives a depth error that grows with its square.
     """
     met, out = depth > 0, depth
     near = jnp.maximum(depth, 1e-3)

@@ -1,8 +1,7 @@
-"""Draw with MJX-Warp's batched renderer (NVIDIA): the same boxes as everywhere, in a model that holds nothing else.
+"""Draw with MJX-Warp's batched renderer (NVIDIA): the common boxes, in a model that holds nothing else.
 
-The engine's kinematics are not run: poses of boxes and camera are computed here and written into the data, so
-that all backends draw the same numbers. MJX allocates a context for a number of environments, outside JAX;
-one is created for each batch size and kept.
+Poses of boxes and cameras are computed here and written into the data, so that all backends draw alike. MJX allocates a
+context for each batch size outside JAX; it is kept.
 """
 
 import copy
@@ -104,10 +103,9 @@ class WarpRenderer(BoxRenderer):
 
 
 def morton_codes(xy_m: jax.Array, hidden: jax.Array) -> jax.Array:
-    """Return places [N, B] i32 on a Z-order curve: neighbours on it are neighbours in the plane; hidden ones come last.
+    """Return places [N, B] i32 on a Z-order curve, where planar neighbours are near; hidden boxes [N, B] come last.
 
-    The renderer's tree of boxes keeps its shape, halves of halves of their order, and only its bounds follow
-    the boxes: it is as good as that order. Hidden boxes, [N, B] bool, have no part in the curve's extent.
+    The renderer's tree halves this order and only refits bounds, so its quality depends on the order.
     """
     low = jnp.min(jnp.where(hidden[..., None], jnp.inf, xy_m), 1, keepdims=True)
     high = jnp.max(jnp.where(hidden[..., None], -jnp.inf, xy_m), 1, keepdims=True)
@@ -123,7 +121,7 @@ class WarpColour:
     def __init__(self, model: mujoco.MjModel, lens: Lens, n: int, groups: list[int]):
         """Create a context; the first picture compiles.
 
-        The model has visual meshes and one camera; `n` is pictures a call, `groups` are the geom groups that are drawn.
+        `model` has visual meshes and one camera; `n` is pictures a call, `groups` are the geom groups that are drawn.
         """
         keep_collector_out()
         model = copy.copy(model)

@@ -1,7 +1,6 @@
-"""Define InteractiveNav, a Brax environment from keys and actions to states; it only wires parts together.
+"""Define InteractiveNav, a Brax environment with pure `reset` and `step`, by wiring parts together.
 
-`reset` and `step` are pure, jit-able and vmap-able; every constant is built in `__init__`. Episodes follow
-section IV of Interactive Gibson (Xia et al. 2020); where paper and code differ, `docs/design.md` says which.
+Episodes follow section IV of Interactive Gibson (Xia et al. 2020); `docs/design.md` lists where paper and code differ.
 """
 
 import dataclasses
@@ -59,14 +58,10 @@ class InteractiveNav(Env):
     """
 
     def __init__(self, robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig, terms: Sequence[Term] = ()):
-        """Build models, tables and the physics backend, for one loaded scene or more.
+        """Build models, tables and the physics backend for loaded scenes, with reward `terms` added to the benchmark's.
 
-        Args:
-            terms: added to the benchmark's (`interactive_nav.task.terms`).
-
-        Raises:
-            ConfigError: settings that do not fit each other or the backend, or two terms of one name.
-            SceneError: a scene with no room.
+        Raise `ConfigError` for settings that do not fit each other or the backend, or terms of equal names, and
+        `SceneError` for a scene without room.
         """
         robot = robot.symmetric() if config.symmetric_actions else robot
         self.robot, self.scenes, self.config = robot, scenes, config
@@ -195,10 +190,7 @@ class InteractiveNav(Env):
         return jax.tree.map(lambda new, old: old if new is old else jnp.where(again, new, old), first, nav)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advance one environment by one control period.
-
-        `action` is (A,) in [-1, 1]; it is clipped, and non-finite entries count as 0.
-        """
+        """Advance one environment by a control period; clip `action` (A,) to [-1, 1], with non-finite entries as 0."""
         state = self.advance(state, action)
         return self.observe(state, blank=state.metrics["nonfinite"] > 0)
 

@@ -24,9 +24,9 @@ PolicyFn = Callable[[Any, jax.Array], jax.Array]
 
 
 class MemoryPolicy(Protocol):
-    """A pytree with pure methods of one environment, which remembers, and decides when an episode is over.
+    """Define a pytree policy with pure methods of one environment, which has memory and decides when episodes end.
 
-    Its memory travels in `state.info["policy"]`, where recorders can read it. The environment's `done` ends nothing.
+    Recorders read the memory in `state.info["policy"]`. The environment's `done` ends nothing.
     """
 
     def start(self, state: Any, episode: jax.Array) -> Any:
@@ -49,10 +49,10 @@ class HostPolicy:
     """Whose memory travels in `state.info["policy"]`: `act` then returns the new one as the third part of a tuple."""
 
     def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> Any:
-        """Return the actions [N, A] of one control step; or a tuple of them and which episodes are over, [N] bool.
+        """Return the actions [N, A] of one control step, or a tuple of them and [N] bool of episodes that are over.
 
-        Such an episode was over before this step, and the environment's `done` ends nothing. The leaves [N, ...] of the
-        `state` are overwritten by the step that follows on `warp`. Actions of what is not `running` [N] have no effect.
+        With the tuple, episodes end before this step, and the environment's `done` ends nothing. On `warp`, the next
+        step overwrites `state`. Actions for environments not `running` [N] have no effect.
         """
         raise NotImplementedError
 
@@ -98,10 +98,10 @@ def policy_key_of(key: jax.Array) -> jax.Array:
 
 
 class Player:
-    """Plays episodes of one environment, not batched and not resetting itself.
+    """Play episodes of one environment that is neither batched nor resetting itself.
 
-    Compiled programs are kept: policies that are each a `jax.tree_util.Partial` of one function share one, as do
-    chunks of one size.
+    Compiled programs are shared by chunks of one size, and by policies that are each a `jax.tree_util.Partial` of one
+    function.
     """
 
     def __init__(self, env: Any, recorders: Mapping[str, Recorder]):
@@ -137,11 +137,10 @@ class Player:
     ) -> Rollout:
         """Play every episode to its end.
 
-        An episode is drawn, and its policy's randomness is, from its key of `keys` [N, 2] alone, or `starts` (an
-        `EpisodeStart` with leaves [N, ...]) are played; `scene_index` [N] i32 says in which scene one is drawn.
-        `record` episodes (None: all) pass the recorders at each step. `batch` are played at a time: half as many are
-        tried where memory lacks room, on the CPU no fewer than about `fewest`. `on_progress` gets the numbers of
-        finished episodes and of steps.
+        An episode and its policy's randomness depend on its key of `keys` [N, 2] alone; `starts` (an `EpisodeStart`,
+        leaves [N, ...]) replace drawn ones, and `scene_index` [N] i32 fixes their scenes. `record` episodes (None: all)
+        pass the recorders at each step. `batch` is halved if memory lacks room; on the CPU it shrinks as
+        episodes end, to about `fewest`. `on_progress` receives the numbers of finished episodes and of steps.
         """
         count = len(keys)
         size, record = min(batch or count, count), count if record is None else record
@@ -223,9 +222,9 @@ class Player:
         return (state, ended, (state.info["nav"].step_count, ends)), starts
 
     def _play_step(self, carry: Any, action: jax.Array, over: Any = None, observe: bool = True) -> tuple[Any, Any]:
-        """Step all environments; what belongs to an episode is frozen at the step that ended it.
+        """Step all environments; freeze the values of ended episodes.
 
-        `over` [N] bool: the policy ended these before the step; None: environments end their own.
+        `over` [N] bool: episodes that the policy ended before the step; None: environments end their own.
         """
         state, ended, kept = carry
         if over is not None:
@@ -279,11 +278,7 @@ def rollout(env: Any, policy: Policy, starts: Any, recorders: Mapping[str, Recor
 
 
 def going_on(over: np.ndarray, fewest: int = FEWEST) -> np.ndarray:
-    """Return the places of a batch that go on: all that run, then as many others as fill it.
-
-    [n] i64, n the smallest of N's sizes (see `FEWEST`) that holds all that run. So all batches of N episodes have the
-    same few, and what is compiled for one serves the next.
-    """
+    """Return indices [n] i64 of the running episodes, filled up to one of a few batch sizes (see `FEWEST`)."""
     size, running = len(over), int((~over).sum())
     while size > fewest and running <= (smaller := -(-size * 3 // 4) if size > MANY else -(-size // 2)):
         size = smaller

@@ -34,9 +34,9 @@ DRAW_SHARE = 16
 
 
 def reset_all(env: InteractiveNav, keys: jax.Array, slot: jax.Array | None = None) -> State:
-    """Return N new episodes of [N, 2] keys, consumed, each in the scene that its environment keeps, if it keeps one.
+    """Return N new episodes of [N, 2] keys, consumed, each in the scene that its environment keeps, if any.
 
-    `slot` is [N] i32, numbers of the environments where these are a part of a larger batch; None: 0 to N - 1.
+    `slot` [N] i32 numbers the environments of a part of a larger batch; None: 0 to N - 1.
     """
     if env.config.scene_choice != "slot":
         return jax.vmap(env.reset)(keys)
@@ -46,8 +46,7 @@ def reset_all(env: InteractiveNav, keys: jax.Array, slot: jax.Array | None = Non
 def draw_where(env: InteractiveNav, current: tuple, over: jax.Array) -> tuple:
     """Return physics, `nav` and `rng` of N environments with new episodes where `over` [N], whose `rng` is consumed.
 
-    They are drawn for a part of the batch at a time: few end in one step. An environment that keeps its scene stays in
-    it.
+    They are drawn in small groups, as few end in one step. Environments may keep their scene.
     """
     n = over.shape[0]
     share = max(1, n // DRAW_SHARE)
@@ -245,8 +244,7 @@ class ShardedEnv(Wrapper):
 def start_distributed(coordinator: str, num_processes: int, process_id: int) -> None:
     """Join processes, on one machine or several, into one JAX program.
 
-    Every process runs the same script with another `process_id`; afterwards `jax.devices()` are the devices
-    of all of them and `ShardedEnv` spreads over all.
+    Every process runs the same script with another `process_id`; `jax.devices()` then lists all devices.
     """
     if not 0 <= process_id < num_processes:
         raise ConfigError(f"process_id is {process_id}, expected 0 to {num_processes - 1}")

@@ -111,9 +111,9 @@ def _aspect(paths: Mapping[str, np.ndarray], policy: str, episode: int) -> float
 
 
 def side_by_side(records: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Join what `train.evaluate` recorded of several runs into one record, as `trajectories` takes it.
+    """Join records of several runs by `train.evaluate` into one for `trajectories`, with labels as policies.
 
-    A label becomes a policy; only episodes that start alike in all of them are left, in the first one's scenes.
+    Only episodes with equal starts in all of them remain, in the first one's scenes.
     """
     first = next(iter(records.values()))
     count = min(len(record["learned/goal_xy_w"]) for record in records.values())

@@ -56,10 +56,7 @@ class Results:
 
 
 def figures_of(results: Path | Results, split: str | None = "auto") -> Iterator[tuple[str, Callable[[], Figure]]]:
-    """Yield every picture that the files under a folder, or one file, give: (name, how to draw it).
-
-    `split`: train or test scenes, None for all, auto for test where there are rows of them.
-    """
+    """Yield (name, how to draw it) for every picture of a folder or file; `split`: train, test, None (all) or auto."""
     files = results if isinstance(results, Results) else Results(results)
     facts = {run: fact for run in files.curves if (fact := files.facts(run))}
     if files.swept:

@@ -140,7 +140,7 @@ def robots_plane(rows: pa.Table, split: str | None) -> Figure:
 def effort_terms(rows: pa.Table, split: str | None) -> Figure:
     """Draw the kinematic against the dynamic term of E_eff (paper, figure 10): runs large, some episodes as dots.
 
-    Forces on walls count in the dynamic term, so episodes that touched one look different.
+    Forces on walls count in the dynamic term, so episodes that touched a wall have another colour.
     """
     means = run_means(rows, split)
     looks = style.Looks(cells(means))
@@ -222,9 +222,9 @@ def _chain(axis: Axes, runs: Sequence[RunMean], looks: style.Looks, look: dict[s
 
 
 def _baselines(axis: Axes, rows: pa.Table, robot: str, split: str | None) -> None:
-    """Draw policies that never learned, in grey: the planner's weights as a line, the others as named points.
+    """Draw policies without learning in grey: the planner's weights as a line, the others as named points.
 
-    What lies far from runs and planners is named in a corner instead: the runs would be one blot beside it.
+    Distant outliers are listed in a corner instead, to keep the scale of the runs.
     """
     rows, places = where(rows, robot=robot, split=split), {}
     for name in (name for name in rows["policy"].unique().to_pylist() if name != "learned"):

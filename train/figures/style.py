@@ -1,7 +1,4 @@
-"""Choose what stands for what: an algorithm is a colour and a marker, k_int a fill and a line style.
-
-Without colour, too, they can be told apart.
-"""
+"""Choose colour and marker by algorithm, fill and line style by k_int, also distinguishable without colour."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,15 +1,13 @@
-"""Define the off-policy actor-critics: what they share, SAC with Brax's losses, and DDPG in the same shape.
+"""Define the off-policy actor-critics: shared parts, SAC with Brax's losses, and DDPG in the same form.
 
-Soft actor-critic (Haarnoja et al. 2018, arXiv:1812.05905) has Brax's losses, optimisers and order of steps: a test
-compares the parameters after a gradient step with Brax's arithmetic. What differs is in `train.learners.offpolicy`: one
-device, a compact replay, images, resuming.
+SAC (Haarnoja et al. 2018, arXiv:1812.05905) takes Brax's losses, optimisers and order of steps; a test compares the
+parameters after a gradient step. `train.learners.offpolicy` differs: one device, a compact replay, images, resuming.
+DDPG (Lillicrap et al. 2016, arXiv:1509.02971) is the original benchmark's: Huber loss, target networks,
+Ornstein-Uhlenbeck noise (reference benchmark, section 8.2), optionally with several critics and the least as target
+(Fujimoto et al. 2018, arXiv:1802.09477).
 
-Deep deterministic policy gradient (Lillicrap et al. 2016, arXiv:1509.02971) is as the original benchmark has it: Huber
-loss, target networks of policy and critic, Ornstein-Uhlenbeck noise (reference benchmark, section 8.2). Several
-critics with the least of them as target (Fujimoto et al. 2018, arXiv:1802.09477) are an option.
-
-Time limits: the critics' losses leave out a step with `truncation` = 1, because its next state is unknown (the
-environment shows a new episode's observation); it says nothing about the step's value, so nothing is learned from it.
+Time limits: the critics' losses leave out a step with `truncation` = 1, because its next state is unknown: the
+environment shows a new episode's observation.
 """
 
 import abc
@@ -152,8 +150,8 @@ class ActorCritic(abc.ABC):
     ) -> tuple[dict[str, Any], dict[str, jax.Array]]:
         """Step critics and policy, each from the other's parameters before the step.
 
-        The actor's loss is (whole policy's parameters, normalizer_params, q_params, *actor_inputs) -> (); a shared
-        encoder does not move with it. Return the learner's fields that change, without its targets, and scalar metrics.
+        The actor's loss is (whole policy's parameters, normalizer_params, q_params, *actor_inputs) -> (); it does not
+        move a shared encoder. Return the changed fields, except targets, and scalar metrics.
         """
 
         def policy_loss(policy_params: Any, q_params: Any, *rest: Any) -> jax.Array:

@@ -1,7 +1,4 @@
-"""Clone behaviour: fit PPO's policy network to recorded actions by maximum likelihood.
-
-Environments are stepped between the gradient steps only to score the policy on the way, as other algorithms do.
-"""
+"""Clone behaviour: fit PPO's policy network to recorded actions by maximum likelihood; environments only score it."""
 
 import dataclasses
 from pathlib import Path

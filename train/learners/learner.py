@@ -108,11 +108,7 @@ def reset_envs(agent: Any, env: Env, key: jax.Array) -> PyTree:
 def run_loop(
     update_fn: UpdateFn, start: Snapshot, steps_per_update: int, run: RunConfig, callbacks: Callbacks
 ) -> TrainResult:
-    """Update until `run.num_timesteps`, reporting and saving on the way.
-
-    Logs and checkpoints fall on fixed update counts, so a run that was killed and resumed takes the same
-    updates as one that was not.
-    """
+    """Update until `run.num_timesteps`, with logs and checkpoints at fixed update counts, so that resuming is exact."""
     total = whole_updates(run.num_timesteps, steps_per_update)
     log_every = whole_updates(run.log_every_steps, steps_per_update)
     save_every = log_every * whole_updates(run.checkpoint_every_steps, log_every * steps_per_update)
@@ -177,9 +173,9 @@ def interval_metrics(updates: list[Update]) -> dict[str, float]:
 
 
 def episode_sums(info: dict[str, Any]) -> dict[str, jax.Array]:
-    """Return scalar sums over the episodes that ended, and `episodes`, their number, from an environment's `info`.
+    """Return scalar sums over the episodes that ended, and their number `episodes`, from an environment's `info`.
 
-    Of `episode_metrics` {name: [...]} those values count where `episode_done` [...] is set, not even NaN elsewhere.
+    Only values of `episode_metrics` {name: [...]} where `episode_done` [...] is set count; others may be NaN.
     """
     ended = info["episode_done"] > 0
     sums = {name: jnp.sum(jnp.where(ended, value, 0.0)) for name, value in info["episode_metrics"].items()}

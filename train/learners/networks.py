@@ -1,13 +1,10 @@
 """Build actor and critic networks for the shapes of observations, as Brax's losses take them.
 
-A vector goes through Brax's multi-layer perceptrons. With images the networks are the original benchmark's
-(reference benchmark, section 8.1): images stacked as channels into three convolutions, the vector
-into a separate layer, both concatenated, then the head. An action enters a critic through a separate layer.
-
-Parameters of a network with images are `{"encoder": ..., "head": ...}`, so that learners can share the encoder:
-a `Split` holds both parts.
-
-Images are u8 (divided by 255 here) or floats in [-1, 1], as each is; only the vector is normalised.
+Vectors go through Brax's multi-layer perceptrons. With images the networks are the original benchmark's (reference
+benchmark, section 8.1): images stacked as channels into three convolutions, the vector into a separate layer, both
+concatenated, then the head. An action enters a critic through a separate layer. Their parameters are `{"encoder": ...,
+"head": ...}`, so that learners can share the encoder: a `Split` holds both. Images are u8 (divided by 255 here) or
+floats in [-1, 1]; only the vector is normalised.
 """
 
 import dataclasses
@@ -96,8 +93,8 @@ conv_for_cpu.defvjp(_as_product, lambda _, back, by_result: back(by_result))
 def conv_in_blocks(images: jax.Array, kernel: jax.Array, strides: Sequence[int], *_: Any, **__: Any) -> jax.Array:
     """Return the `VALID` convolution of [N, H, W, C] and [K, K, C, F], for GPUs.
 
-    Tensor cores take channels by eights. Images of fewer are regrouped: a block of one stride's pixels becomes one
-    pixel of as many more channels, and the stride 1. The numbers are the same, but for the order of their sums.
+    Tensor cores process channels by eights, so images of fewer become blocks: a stride's pixels become one pixel with
+    more channels, and the stride 1. Only the order of the sums differs.
     """
     k, step, channels = kernel.shape[0], strides[0], images.shape[-1]
     dimensions = ("NHWC", "HWIO", "NHWC")

@@ -1,19 +1,17 @@
-"""Act into the replay, learn from it, start and resume: what off-policy algorithms share.
+"""Act into the replay, learn from it, start and resume: the common part of off-policy algorithms.
 
 One update steps every environment `steps_per_update` times and then takes `grad_steps_per_update` gradient steps, each
-on a new batch. Until the replay holds `min_replay_size` transitions it takes none (`gradient_steps` in the
-metrics says so), and a learner that never took any acts at random meanwhile, so every update is one and the same
-program and logs and checkpoints fall where they always do.
+on a new batch. Until the replay holds `min_replay_size` transitions it takes none (metric `gradient_steps`), and a
+learner without any gradient step acts at random; the compiled program is always the same.
 
-The replay is data, not learner: it travels with the environments in `Snapshot.env_state`, is donated to the compiled
-update and written in place, and a checkpoint that has no room for it (`run.env_state_limit_mb`) leaves it out. Such a
-run begins new episodes when resumed and fills the replay with the policy it has before it learns on; those steps
-count like any others.
+The replay travels with the environments in `Snapshot.env_state`, is donated to the compiled update and written in
+place. A checkpoint without room for it (`run.env_state_limit_mb`) leaves it out: the resumed run starts new episodes
+and fills the replay with its policy before it learns on; these steps count.
 
-It is a ring [slots, envs, ...]: one slot holds what every environment observed and did in one step. The next
-observation of a step is the observation in the next slot, so nothing is stored twice, and the newest `n_steps` slots
-cannot be drawn yet. Where an episode ended, the next slot belongs to another episode: its discount is 0, or, at a time
-limit, its truncation is 1 and the losses leave it out (see `sample`).
+It is a ring [slots, envs, ...] of observations and actions. The next observation of a step is the next slot's, so
+nothing is stored twice, and the newest `n_steps` slots cannot be drawn yet. After an episode's end the next slot
+belongs to another one: the discount is 0, or, at a time limit, the truncation is 1 and the losses leave it out (see
+`sample`).
 """
 
 import functools
@@ -87,8 +85,8 @@ def insert(
 ) -> ReplayBuffer:
     """Return the ring with one step of every environment in place of its oldest.
 
-    The observation [envs, ...] is that before the step, action is [envs, A], the others are [envs]: `done` is not 0
-    where the step ended an episode, `truncated` where the time limit did.
+    The observation [envs, ...] is that before the step, action is [envs, A], the others are [envs]: `done` is nonzero
+    if the step ended an episode, `truncated` if the time limit did.
     """
     at, slots = replay.position, replay.reward.shape[0]
 
@@ -173,8 +171,7 @@ def collect(
 ) -> tuple[OffPolicyData, Any]:
     """Act for one update: take `steps_per_update` steps of every environment into the replay.
 
-    Return the data after them, and those steps without their images, leaves [steps, envs, ...], with `sums` over ended
-    episodes.
+    Return the new data, the steps without images, leaves [steps, envs, ...], and `sums` over ended episodes.
     """
     assert agent.config.steps_per_update, "the config must be resolved"
     at_random = learner.gradient_steps == 0
@@ -210,8 +207,7 @@ def learn(
 ) -> tuple[Any, dict[str, jax.Array], Any]:
     """Take gradient steps, if the replay is full enough.
 
-    Return the learner; means of its metrics, 0 where no step was taken; and one batch learned from, the first that
-    metrics were not finite on if there is one.
+    Return the learner, mean metrics (0 without a step), and one batch: the first with non-finite metrics, if any.
     """
     c = agent.config
     assert c.grad_steps_per_update and c.batch_size and c.min_replay_size, "the config must be resolved"

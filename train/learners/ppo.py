@@ -1,20 +1,16 @@
 """Train a policy by PPO in a batched environment, with Brax's losses, networks and unrolls.
 
-Brax's `ppo.train` cannot be stopped and continued: it gives out parameters only, not the optimiser or the
-random key, and keeps its loop to itself. So the loop is ours (`learner.run_loop`) and the update below is
-Brax's, with its keys split in the same places: a test compares the parameters after an update with those of
-`brax.training.agents.ppo.train`. What differs is jit instead of pmap, and less memory: episode scores
-are summed before learning, and a sequence keeps only its last next-observation (the loss reads no other).
+Brax's `ppo.train` cannot be resumed, so the loop is ours (`learner.run_loop`), and the update is Brax's, with keys
+split in the same places: a test compares parameters after an update with those of `brax.training.agents.ppo.train`. We
+use jit instead of pmap, sum episode scores before learning, and keep only a sequence's last next-observation.
 
-With `run.devices` above 1 the environments are a `ShardedEnv`, and XLA reduces statistics and gradients over devices.
-Transitions stay on the device that collected them: each minibatch takes an equal share from each, and shuffling is
-within the shares. One device that shuffles within as many groups of its environments computes the same (a test).
+With `run.devices` above 1 the environments are a `ShardedEnv`, and XLA reduces statistics and gradients. Transitions
+stay on their device: each minibatch takes an equal share from each, shuffled within the shares. One device with as many
+groups of environments computes the same (a test).
 
-Time limits: an episode cut by the clock has `done` = 1 and `truncation` = 1. Brax's GAE then leaves the cut
-step out and bootstraps the step before it from V(observation at the cut step), which is a state of the right
-episode; nothing is counted twice. `bootstrap_on_timeout`, its other way (reward += discount * V), is for
-environments that report `truncation` = 0 there: with `truncation` = 1 it is masked out, it takes V before the
-cut for V after it, and it multiplies V by `reward_scaling`. We do not use it.
+An episode cut by the time limit has `done` = 1 and `truncation` = 1. Brax's GAE leaves the cut step out and bootstraps
+the step before it from V(observation at the cut step). We do not use `bootstrap_on_timeout` (reward += discount * V):
+it needs `truncation` = 0, takes V before the cut for V after it, and multiplies V by `reward_scaling`.
 """
 
 import dataclasses
@@ -130,10 +126,7 @@ def whole_params(params: ppo_losses.PPONetworkParams | SharedParams) -> tuple[An
 def collect(
     parts: PPOParts, env: Env, state: PPOState, env_state: Any, key: jax.Array
 ) -> tuple[Any, types.Transition, dict[str, jax.Array]]:
-    """Act for one update.
-
-    Return the environments' new state, transitions with leaves [sequences, time, ...], and sums over ended episodes.
-    """
+    """Act for one update; return environment state, transitions [sequences, time, ...], and ended episodes' sums."""
     act, config = parts.policy(state, deterministic=False), parts.config
     assert config.batch_size and config.num_minibatches and config.num_envs
 
@@ -176,10 +169,10 @@ def loss_of_images(
     key: jax.Array,
     **settings: Any,
 ) -> tuple[jax.Array, types.Metrics]:
-    """Return Brax's loss of the two heads, on features: of one encoder, computed once, or of one each.
+    """Return Brax's loss of the two heads, on features of one shared encoder or of one each.
 
-    They are computed before Brax puts time first: where devices share the sequences, a convolution over [time,
-    sequences] would gather all images on each.
+    Features are computed before Brax puts time first: otherwise a convolution over [time, sequences] would gather all
+    images on every device.
     """
     networks, whole = (both.policy_network, both.value_network), whole_params(params)
     encoders = [network.encoder.apply for network in networks]  # type: ignore[attr-defined]

@@ -64,7 +64,7 @@ class CheckpointMeta:
 
 
 def save_snapshot(root: Path, snapshot: Any, meta: CheckpointMeta, keep: int, env_state_limit_mb: float) -> Path:
-    """Write `root/<env steps>/` and remove what is no longer kept: the newest `keep` stay, and the best.
+    """Write `root/<env steps>/` and remove all but the newest `keep` snapshots and the best.
 
     Only the newest holds the environments, and only if they take no more than the limit.
     """
@@ -117,9 +117,9 @@ def best_checkpoint(checkpoints: list[CheckpointMeta]) -> CheckpointMeta | None:
 
 
 def find(root: Path, which: str) -> tuple[Path, CheckpointMeta]:
-    """Return a checkpoint's folder by `best`, `last` or its env steps; while none has a score, the last is the best.
+    """Return a checkpoint's folder by `best`, `last` or its env steps; without scores, `best` is the last.
 
-    `best` and `last` pass over damaged checkpoints with a warning; one named by its steps must be intact.
+    `best` and `last` skip damaged checkpoints with a warning; one named by its steps must be intact.
     """
     paths = [path for path in sorted(root.glob("[0-9]*")) if path.name.isdigit() and (path / META).exists()]
     if not paths:

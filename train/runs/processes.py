@@ -36,10 +36,10 @@ def join_processes() -> None:
 
 @contextlib.contextmanager
 def one_for_each_gpu(devices: int, command: Sequence[str]) -> Iterator[None]:
-    """Join the processes that the environment names; where it names none, start one for each of several GPUs.
+    """Join the processes named in the environment; if there are none, start one for each of several GPUs.
 
-    One process would wait for itself: MJX-Warp's calls hold Python's lock. The others run the same `command`, and end
-    with the block.
+    One process would wait for itself: MJX-Warp's calls hold Python's lock. The others run `command` and end with the
+    block.
     """
     gpus = [] if devices == 1 or os.environ.get(ADDRESS) else find_gpus()[:devices]
     if len(gpus) < devices or devices == 1:

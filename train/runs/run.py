@@ -54,10 +54,9 @@ SIZES = (*WINDOW, "active_dofs")
 def config_to_play(
     folder: RunFolder, words: Sequence[str], scenes: Sequence[str] | None, console: Console
 ) -> TrainConfig:
-    """Return a run's config with the environment to play in: the trained one, but for what a command line changes.
+    """Return a run's config with the environment to play in: the trained one with a command line's changes.
 
-    What a run learned on a GPU can be played without one: where its backend is not here, another one is taken. Scenes
-    are folders or sets; None: those that it was trained on.
+    If the run's backend is not available here, another replaces it. `scenes` are folders or sets; None: the run's own.
     """
     if "env.backend=native" in words:
         # It simulates everything, and takes no sizes of windows; those that the run learned with do no harm.
@@ -172,10 +171,10 @@ class FolderCallbacks:
             self.console.print(f"{reached}  {status}")
 
     def on_checkpoint(self, snapshot: Snapshot) -> None:
-        """Write a checkpoint; its score is the mean over the episodes of at least the time that one can take.
+        """Write a checkpoint, scored by the mean over the episodes of at least one time limit.
 
-        Where all environments began together, those that fail end together too, one time limit later, and what ends
-        in between are the short episodes, which succeed: a score is of a whole limit, and of none before the first.
+        Environments that start together also fail together, one time limit later; shorter windows would hold only
+        successes.
         """
         run = self.config.run
         limit = num_envs(self.config) * self.config.env.episode_steps
@@ -232,12 +231,11 @@ def check_fits(meta: CheckpointMeta, path: Path, config: EnvConfig, env: Any) ->
 def train_run(
     config: TrainConfig, console: Console, build_env: Callable[[EnvConfig], Any] = build_env, resume_from: str = "last"
 ) -> tuple[TrainResult, RunFolder, int | None]:
-    """Train as configured, beginning or continuing the run folder.
+    """Train as configured in a new or existing run folder; return result, folder, and signal that ended it, if any.
 
-    Return the result, the folder, and the signal that ended it early, if one did. An existing run continues from the
-    checkpoint `resume_from`: `last`, `best` or env steps; later ones are renamed. Raises `ConfigError` for settings
-    that exclude each other, `FileError` for the folder of another run or of one that is being trained,
-    `CheckpointError`, and `DivergedError` where a number is no longer finite.
+    An existing run continues from the checkpoint `resume_from`: `last`, `best` or env steps; later ones are renamed.
+    Raise `ConfigError` for conflicting settings, `FileError` for a folder of another run or of one in training,
+    `CheckpointError`, and `DivergedError` for non-finite numbers.
     """
     if config.run.wandb:
         tracking.import_wandb()

@@ -1,7 +1,6 @@
-"""Write a run's metrics to TensorBoard, and with `run.wandb=true` to Weights & Biases too.
+"""Write a run's metrics to TensorBoard, and with `run.wandb=true` also to Weights & Biases (an optional extra).
 
-The latter's package is an optional extra. Its settings say where it writes: WANDB_MODE=offline keeps everything in the
-run folder until `wandb sync`, WANDB_API_KEY or `wandb login` sends it; WANDB_ENTITY and the like work as always.
+WANDB_MODE=offline keeps everything in the run folder until `wandb sync`; other WANDB variables work as usual.
 """
 
 import contextlib
@@ -30,9 +29,9 @@ def import_wandb() -> Any:
 
 
 class Events:
-    """A run's values for TensorBoard: a file for each sitting, which hides what older ones hold after its `env_steps`.
+    """Write TensorBoard files, one a session; each hides older values after its `env_steps`.
 
-    Not tensorboardX's SummaryWriter: its thread dies of a full disk, and who logs on then waits for ever.
+    tensorboardX's SummaryWriter is no option: its thread dies if the disk is full, and logging then waits for ever.
     """
 
     def __init__(self, folder: Path, env_steps: int):

@@ -82,10 +82,10 @@ def load_policy(
     deterministic: bool,
     cached: dict[Any, Any] | None = None,
 ) -> tuple[PolicyFn, CheckpointMeta]:
-    """Load the policy of a checkpoint (`which`: best, last or env steps) to act in `env`; or raise `CheckpointError`.
+    """Load a checkpoint's policy (`which`: best, last or env steps) to act in `env`; raise `CheckpointError`.
 
-    A `deterministic` one takes the mode of its actions. `cached` is filled and used by calls for the same environment:
-    policies of equal networks then share one function, and what is compiled for it.
+    A `deterministic` one takes the mode of its actions. `cached` lets policies of equal networks in the same
+    environment share a compiled function.
     """
     path, meta = checkpoint.find(folder.checkpoints, which)
     check_fits(meta, path, dataclasses.replace(config.env, robot=env.robot.name), env)
@@ -109,10 +109,7 @@ def make_policies(
     deterministic: bool,
     cached: dict[Any, Any] | None = None,
 ) -> dict[str, tuple[Any, CheckpointMeta | None]]:
-    """Build policies by name, with the checkpoints of those that learned.
-
-    See `load_policy`, `make_baseline`, and `BroughtPolicy` for `name=module:factory`.
-    """
+    """Build policies by name; see `load_policy`, `make_baseline`, and `BroughtPolicy` for `name=module:factory`."""
 
     def build(name: str) -> tuple[Any, CheckpointMeta | None]:
         if name == LEARNED and folder:
@@ -141,8 +138,8 @@ def evaluate(
 ) -> Iterator[tuple[pa.Table, dict[str, PlayedEpisodes]]]:
     """Play the same episodes, drawn from a seed or `fixed` ones of a file, with each policy of the request.
 
-    Yield after each policy the rows of all that have played, one an episode, and their episodes by policy, with paths
-    of `record` of them. The folder is None for policies that never learned. `batch` episodes are played at a time.
+    Yield after each policy the rows of all so far, one an episode, and their episodes by policy, `record` of them with
+    paths. The folder is None for policies without learning. `batch` episodes are played at a time.
     """
     env = player.env
     # Everything that can be refused is refused before the first episode.

@@ -1,13 +1,11 @@
 """Choose actions without learning: at random, along the shortest path, or by a plan in the scene's state.
 
-A policy is a pure function (observation, key) -> action (A,) in [-1, 1] of one environment, its observation
-a vector (O,) or a dict with images; batch it with `jax.vmap` and a key for each, so that an episode does not
-depend on which others run beside it.
+A policy is a pure function (observation, key) -> action (A,) in [-1, 1] of one environment; batch it with `jax.vmap`
+and a key for each, so that episodes are independent.
 
-Planners run on the host, for many episodes at once. They bracket what any policy can reach (paper section IV): the
-avoider goes round every object, the NAMO-style planner weighs pushing against detour
-(`interactive_nav.navigation.ways`). Both read the state: where furniture, doors and small objects are, their mass and
-friction.
+Planners run on the host, for many episodes at once, and read the state: positions, mass and friction of objects. They
+bound other policies (paper section IV): the avoider goes around every object, the NAMO-style planner weighs pushing
+against detours (`interactive_nav.navigation.ways`).
 """
 
 import dataclasses
@@ -35,10 +33,7 @@ ALIGNED_RAD = jnp.pi / 3
 
 
 def steer(robot: RobotSpec, target_b: jax.Array) -> jax.Array:
-    """Return actions (A,) in [-1, 1] that lead to a point: turn towards it, and drive the faster the better aligned.
-
-    `target_b`: (2,) x forward, y left, m, robot frame.
-    """
+    """Return actions (A,) in [-1, 1] towards `target_b` (2,), m, robot frame: the faster, the better aligned."""
     assert robot.twist is not None
     bearing = jnp.arctan2(target_b[1], target_b[0])
     speed_m_s, turn_rad_s = velocity_towards(robot.twist, bearing, CRUISE_M_S, ALIGNED_RAD, jnp)
@@ -82,7 +77,7 @@ MAX_TURN_RAD_S = 2.0
 def velocity_towards(
     twist: TwistMap, bearing_rad: Any, cruise_m_s: float, aligned_rad: float, xp: Any
 ) -> tuple[Any, Any]:
-    """Return the linear (m/s) and angular (rad/s) velocity [...] towards points: the faster, the better aligned.
+    """Return linear (m/s) and angular (rad/s) velocity [...] towards points: the faster, the better aligned.
 
     `twist`: the robot's limits, of its control mode; `bearing_rad`: [...] of the points, 0 ahead, positive to the left.
     """
@@ -112,10 +107,7 @@ class PlannedRoute:
 
 
 class Planner(HostPolicy):
-    """Plan and steer many episodes: choose actions from the state.
-
-    `weight`: of `Ways`; 0 pushes what stands in the shortest path, None never pushes: the avoider.
-    """
+    """Plan and steer episodes from their states; `weight` of `Ways`: 0 pushes everything, None avoids everything."""
 
     def __init__(self, env: Any, weight: float | None):
         if weight is not None and not 0.0 <= weight <= 1.0:

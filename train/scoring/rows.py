@@ -87,10 +87,7 @@ def check_rows(rows: pa.Table, path: Path) -> None:
 def episode_table(
     episodes: PlayedEpisodes, scenes: Any, categories: Sequence[Sequence[str]], constants: dict[str, Any]
 ) -> pa.Table:
-    """Return one row for each episode; the columns of `constants` are the same in every row, and come first.
-
-    `categories` [S][M] are those of what is in each scene's slots, '' for nothing.
-    """
+    """Return one row for each episode, `constants` first; `categories` [S][M] are those in slots, '' if empty."""
     count = len(episodes.scene_index)
     columns: dict[str, Any] = {name: pa.array([value] * count, TYPES.get(name)) for name, value in constants.items()}
     columns["scene"] = [scenes[i].name for i in episodes.scene_index]

@@ -1,7 +1,7 @@
-"""Compute means of runs, intervals over seeds, and the tests behind the paper's claims from rows of episodes.
+"""Compute means of runs, intervals over seeds, and the tests of the paper's claims from rows of episodes.
 
-A run is the unit: its score is the mean over its fixed episodes, and intervals and tests are over runs that differ in
-their seed. Episodes of one run share a policy and are no independent trials of an algorithm.
+A run's score is the mean over its fixed episodes, and intervals and tests are over runs with different seeds: episodes
+of one run share a policy and are not independent.
 """
 
 import collections
@@ -109,9 +109,9 @@ def cells(means: Sequence[RunMean]) -> Cells:
 def contrast(
     means: Sequence[RunMean], axis: str, left: Any, right: Any, score: Callable[[RunMean], float], **fixed: Any
 ) -> Contrast | None:
-    """Compare two values of an axis; return None where a side has no runs.
+    """Compare two values of an axis; return None if a side has no runs.
 
-    Each seed counts once: its score is the mean over the settings of the other axes that both sides have.
+    A seed's score is the mean over the settings of the other axes that both sides have.
     """
     others = [name for name in ("robot", "algorithm", "k_int") if name != axis]
     by_setting = collections.defaultdict(dict)
@@ -248,10 +248,10 @@ def _of_penalties(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
 
 
 def claims(rows: pa.Table, split: str | None) -> list[Finding]:
-    """Return the paper's claims, one comparison a line; those whose runs are missing say so.
+    """Return the paper's claims, one comparison a line; claims without runs say so.
 
-    Cells with fewer runs than others are not compared: of a sweep that goes on they are not finished. All but the claim
-    about train and test scenes are about one `split` of the scenes; None: all.
+    Cells with fewer runs than others are skipped, as unfinished. `split` selects scenes (None: all), except in the
+    claim about train and test scenes.
     """
     runs = run_means(rows, split)
     most = max(map(len, cells(runs).values()), default=0)  # a seed counts only with all settings

@@ -1,7 +1,4 @@
-"""Export from a sweep's folder rows, thinned curves, origins and the best checkpoints.
-
-Rows become one file, which takes half of what a file a run does: many columns are the same in all of them.
-"""
+"""Export rows (as one compact file), thinned curves, origins and the best checkpoints from a sweep's folder."""
 
 import shutil
 from collections.abc import Sequence
@@ -42,10 +39,10 @@ UNSEEN_ONLY = {"by_category", "force_sum_n", "object_displacement_kg_m", "reward
 
 
 def export(folder: SweepFolder, out: Path, step: float = STEP) -> tuple[int, dict[tuple[Any, ...], str]]:
-    """Copy a sweep's results, in place of earlier ones of the same runs.
+    """Copy a sweep's results over earlier ones of the same runs.
 
-    Return the bytes of all that lies there, and by cell the run whose checkpoint was kept: that of the highest mean
-    INS_0.5 over its rows, on test scenes where there are any.
+    Return the total bytes, and by cell the run whose checkpoint was kept: the highest mean INS_0.5, on test scenes if
+    any.
     """
     runs = [run for run in folder.sweep.runs if (folder.runs / run.name / "metrics.jsonl").is_file()]
     if not runs:
@@ -144,10 +141,7 @@ def best_runs(folder: SweepFolder, runs: Sequence[RunSpec]) -> dict[tuple[Any, .
 
 
 def thinned(lines: Sequence[dict[str, Any]], most: int) -> list[dict[str, Any]]:
-    """Return at most so many lines of metrics: consecutive ones as one, scores as means over their episodes.
-
-    Losses are left out, and numbers rounded to five digits.
-    """
+    """Return at most this many lines of metrics, rounded, without losses; scores are means over their episodes."""
     size = -(-len(lines) // most)
     out = []
     for i in range(0, len(lines), max(size, 1)):

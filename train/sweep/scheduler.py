@@ -136,9 +136,9 @@ class Scheduler:
         """Finite once what runs was requested to end; -inf once it was killed."""
 
     def run(self, stops: list[int], time_limit_s: float | None = None, poll_s: float = POLL_S) -> Outcome:
-        """Work until nothing is left, the time is over, or a signal requests a stop; a second one does not wait.
+        """Work until nothing is left, the time is over, or a signal requests a stop; a second signal does not wait.
 
-        After the time limit, if any, all runs are stopped, with their checkpoints.
+        After the time limit, if any, all runs stop with a checkpoint.
         """
         ready = functools.partial(self._ready, stops, math.inf if time_limit_s is None else time_limit_s, self.clock())
         grace_s = self.folder.sweep.config.launch.grace_s

@@ -191,10 +191,7 @@ def expand(plain: Any, where: str, default_name: str) -> Sweep:
 
 
 def select(sweep: Sweep, where: Sequence[str], shard: str | None) -> Sweep:
-    """Return the part of a sweep that one machine takes.
-
-    A run must match all `setting=value[,value]` words of `where`. Shard `I/N`: every N-th run from the I-th on.
-    """
+    """Return one machine's part of a sweep: runs that match all `setting=value[,value]` of `where`, in shard `I/N`."""
     runs = list(sweep.runs)
     for word in where:
         axis, equals, text = word.partition("=")
