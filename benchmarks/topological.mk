@@ -3,6 +3,7 @@
 #   make -f benchmarks/topological.mk -j 8 RUNS=runs/topological-full            on a GPU machine (SIZE=full)
 #   make -f benchmarks/topological.mk -j 2 SIZE=cpu RUNS=runs/topological-cpu    on two CPU cores
 #   make -f benchmarks/topological.mk -j 8 SIZE=report RUNS=runs/report          the report's settings, ends in RUNS/tables.md
+#   make -f benchmarks/topological.mk -j 16 SIZE=homes RUNS=runs/homes           generated homes of two tiers in SCENES
 #   make -f benchmarks/topological.mk -n ...                                     only shows the commands
 #
 # What each command printed is in RUNS/log, how long it took in RUNS/times.txt. Interrupted, the same line goes on.
@@ -17,6 +18,7 @@ SIZE ?= full
 RUNS ?= runs/topological-$(SIZE)
 GPUS ?=
 SCAN ?=
+SCENES ?= scenes_mjcf
 SEEN = alder birch cedar elm hazel juniper linden maple
 UNSEEN = rowan willow
 ALL = $(SEEN) $(UNSEEN)
@@ -76,8 +78,23 @@ else ifeq ($(SIZE),report)
   PASSAGES_FROM = data-passages
   LEARNED = dense,sparse
   BASELINE = --contenders dense$(if $(PPO),$(comma)ppo)
+else ifeq ($(SIZE),homes)
+  # 40 furnished and cluttered homes and the eight early ones to learn from, ten others to test: see docs/topological-results.md.
+  SCENES = runs/homes/scenes
+  number = $(foreach tier,furnished cluttered,$(foreach n,$(1),$(tier)_0$(n)))
+  TESTS = $(call number,20 21 22 23 24)
+  SEEN := $(SEEN) $(call number,00 01 02 03 04 05 06 07 08 09 10 11 12 13 14 15 16 17 18 19)
+  UNSEEN := $(TESTS)
+  ALL = $(UNSEEN)
+  DATA = passage_sources=20
+  ROOMS = width=16 hidden=64 batch=128 learning_rate=1e-3 epochs=20
+  PASSAGES = width=16 batch=64 learning_rate=1e-3 epochs=40
+  DRIVES = backend=native drives=60 batch=60
+  POLICY = hidden=256 projection=128 learning_rate=1e-3 epochs=15
+  MAP = check=60
+  EVALUATION = backend=native limit_s=600
 else
-  $(error SIZE is '$(SIZE)', expected full, cpu or report)
+  $(error SIZE is '$(SIZE)', expected full, cpu, report or homes)
 endif
 DRIVEN_BY ?= $(RUNS)/policy
 PASSAGES_FROM ?= data
@@ -85,7 +102,7 @@ LEARNED ?= dense
 
 NAV = $(PY) -m topological_nav
 WITH = --localiser $(RUNS)/rooms --detector $(RUNS)/passages
-folders = $(addprefix scenes_mjcf/,$(1))
+folders = $(addprefix $(SCENES)/,$(1))
 comma := ,
 space := $() $()
 log = $(RUNS)/log/$(notdir $@).txt
@@ -98,8 +115,22 @@ run = @mkdir -p $(@D) $(RUNS)/log; echo "$(notdir $@): $(1)"; began=$$(date +%s)
 D = $(RUNS)/done
 MAPS = $(ALL:%=$(D)/map-%)
 .DEFAULT_GOAL := all
-.PHONY: all networks maps evaluation transfer transfer-policy renderer renderer-policy scan batch tables figures
-ifeq ($(SIZE),report)
+.PHONY: ladder hard all networks maps evaluation transfer transfer-policy renderer renderer-policy scan batch tables figures
+ifeq ($(SIZE),homes)
+all: ladder hard $(D)/export
+networks: $(D)/rooms $(D)/passages $(D)/passages-2m
+evaluation: $(D)/evaluation $(D)/evaluation-policy
+# Each home by itself, many at a time; the command for all of them finds the images and numbers the rooms.
+$(SEEN:%=$(D)/data.%): $(D)/data.%:
+	$(call run,$(NAV) data $(SCENES)/$* -o $(RUNS)/parts/$* $(DATA))
+$(D)/data: $(SEEN:%=$(D)/data.%)
+	@mkdir -p $(RUNS)/data; mv $(foreach name,$(SEEN),$(RUNS)/parts/$(name)/$(name)) $(RUNS)/data
+	$(call run,$(NAV) data $(call folders,$(SEEN)) -o $(RUNS)/data $(DATA))
+$(SEEN:%=$(D)/drives.%): $(D)/drives.%:
+	$(call run,$(NAV) data --drives $(SCENES)/$* -o $(RUNS)/drives/$* $(DRIVES))
+$(D)/policy: $(D)/rooms $(D)/passages $(SEEN:%=$(D)/drives.%)
+	$(call run,$(NAV) train policy --data $(SEEN:%=$(RUNS)/drives/%) $(WITH) -o $(RUNS)/policy $(POLICY))
+else ifeq ($(SIZE),report)
 all: tables
 networks: $(D)/rooms $(D)/rooms-up $(D)/rooms-down $(D)/passages $(D)/alexnet
 evaluation: $(D)/evaluation $(D)/evaluation-policy
@@ -126,8 +157,10 @@ renderer: $(D)/features-gl $(D)/adapted-passages-gl $(D)/evaluation-unadapted-gl
 renderer-policy: $(D)/evaluation-unadapted-gl-policy $(D)/evaluation-adapted-gl-policy
 scan: $(D)/features-scan $(D)/adapted-passages-scan $(D)/unadapted-map-scan $(D)/adapted-map-scan
 
+ifneq ($(SIZE),homes)
 $(D)/data:
 	$(call run,$(NAV) data $(call folders,$(SEEN)) -o $(RUNS)/data $(DATA))
+endif
 $(D)/data-more:
 	$(call run,$(NAV) data $(call folders,$(SEEN)) -o $(RUNS)/data-more $(MORE_POSITIONS))
 $(D)/data-passages:
@@ -149,7 +182,7 @@ $(D)/alexnet: $(D)/$(PASSAGES_FROM)
 	$(call run,$(NAV) train passages --data $(RUNS)/$(PASSAGES_FROM) -o $(RUNS)/alexnet network=alexnet $(ALEXNET))
 
 $(D)/map-%: $(D)/rooms $(D)/passages
-	$(call run,$(NAV) map scenes_mjcf/$* $(WITH) -o $(RUNS)/maps/$*.npz $(MAP))
+	$(call run,$(NAV) map $(SCENES)/$* $(WITH) -o $(RUNS)/maps/$*.npz $(MAP))
 $(D)/policy-grid:
 	$(call run,$(NAV) train policy --grid --data $(RUNS)/drives $(WITH) -o $(RUNS)/policy-grid $(GRID))
 
@@ -164,11 +197,11 @@ learned = $(call played,$(1)) --contenders $(LEARNED) --policy $(DRIVEN_BY)
 ahead1 = $(call played,$(1)) --contenders dense --policy passage ahead_m=1
 each = $(patsubst %,$(D)/$(1).%,$(ALL))
 $(call each,evaluation): $(D)/evaluation.%: $(D)/map-% $(if $(filter $(RUNS)/ppo,$(PPO)),$(D)/ppo)
-	$(call run,$(call baseline,scenes_mjcf/$*))
+	$(call run,$(call baseline,$(SCENES)/$*))
 $(call each,evaluation-policy): $(D)/evaluation-policy.%: $(D)/map-% $(D)/policy
-	$(call run,$(call learned,scenes_mjcf/$*))
+	$(call run,$(call learned,$(SCENES)/$*))
 $(call each,evaluation-ahead1): $(D)/evaluation-ahead1.%: $(D)/map-%
-	$(call run,$(call ahead1,scenes_mjcf/$*))
+	$(call run,$(call ahead1,$(SCENES)/$*))
 $(D)/evaluation: $(call each,evaluation)
 	$(call run,$(call baseline,$(call folders,$(ALL))))
 $(D)/evaluation-policy: $(call each,evaluation-policy)
@@ -176,9 +209,51 @@ $(D)/evaluation-policy: $(call each,evaluation-policy)
 $(D)/evaluation-ahead1: $(call each,evaluation-ahead1)
 	$(call run,$(call ahead1,$(call folders,$(ALL))))
 
+# From the report's navigator (0) to ours (8), a setting at a time: images, matching, glances, watching, metres, retries, slack,
+# and passages by length. The same images teach a detector that answers for 2 m alone, and build the maps of the others.
+$(D)/passages-2m: $(D)/data
+	@mkdir -p $(RUNS)/data-2m; cp -r $(foreach name,$(SEEN),$(RUNS)/data/$(name)) $(RUNS)/data-2m
+	$(call run,$(NAV) data $(call folders,$(SEEN)) -o $(RUNS)/data-2m $(DATA) passage_lengths_m=[2.0] && \
+	  $(NAV) train passages --data $(RUNS)/data-2m -o $(RUNS)/passages-2m $(PASSAGES))
+TWO = --localiser $(RUNS)/rooms --detector $(RUNS)/passages-2m
+$(ALL:%=$(D)/map-2m-%): $(D)/map-2m-%: $(D)/rooms $(D)/passages-2m
+	$(call run,$(NAV) map $(SCENES)/$* $(TWO) -o $(RUNS)/maps-2m/$*.npz $(MAP))
+images = $(if $(filter 0,$(1)),images=1 goal_images=1)
+match = $(if $(filter 0 1,$(1)),match=nearest)
+glance = $(if $(filter 0 1 2,$(1)),glance=false,$(if $(filter 3,$(1)),watch_s=0))
+metres = $(if $(filter 0 1 2 3 4,$(1)),metre_cost=0)
+retries = $(if $(filter 0 1 2 3 4 5,$(1)),retry_cost=0)
+slack = $(if $(filter 0 1 2 3 4 5 6,$(1)),slack_m=0)
+rung = $(foreach one,images match glance metres retries slack,$(call $(one),$(1)))
+STEPS = 0 1 2 3 4 5 6 7
+define of_rung
+$(ALL:%=$(D)/ladder-$(1).%): $(D)/ladder-$(1).%: $(D)/map-2m-% $(D)/policy
+	$$(call run,$(NAV) evaluate $(SCENES)/$$* --maps $(RUNS)/maps-2m $(TWO) $(EVALUATION) --contenders dense --policy $(DRIVEN_BY) \
+	  -o $(RUNS)/ladder-$(1) $(call rung,$(1)))
+endef
+$(foreach step,$(STEPS),$(eval $(call of_rung,$(step))))
+ladder: $(foreach step,$(STEPS),$(ALL:%=$(D)/ladder-$(step).%)) $(call each,evaluation-policy)
+
+# Small objects, and one of them in the narrowest place of the way: without metres, and where the robot pushes on (passable=0).
+objects-10 = objects=10
+objects-30 = objects=30
+metres-0 = metre_cost=0 slack_m=0
+hard = objects=1 blocked=true
+hard-metres-0 = $(hard) $(metres-0)
+hard-push = $(hard) passable=0
+VARIANTS = objects-10 objects-30 metres-0 hard hard-metres-0 hard-push
+define of_variant
+$(call each,$(1)): $(D)/$(1).%: $(D)/map-% $(D)/policy
+	$$(call run,$$(call learned,$(SCENES)/$$*) $$($(1)))
+endef
+$(foreach variant,$(VARIANTS),$(eval $(call of_variant,$(variant))))
+$(call each,hard-expert): $(D)/hard-expert.%:
+	$(call run,$(NAV) evaluate $(SCENES)/$* --contenders expert $(EVALUATION) -o $(RUNS)/hard-expert $(hard))
+hard: $(foreach variant,$(VARIANTS) hard-expert,$(call each,$(variant)))
+
 # All episodes of a scene at once.
 $(ALL:%=$(D)/evaluation-batch.%): $(D)/evaluation-batch.%: $(D)/map-% $(D)/policy
-	$(call run,$(NAV) evaluate scenes_mjcf/$* --maps $(RUNS)/maps $(WITH) --policy $(DRIVEN_BY) --contenders dense $(BATCH) \
+	$(call run,$(NAV) evaluate $(SCENES)/$* --maps $(RUNS)/maps $(WITH) --policy $(DRIVEN_BY) --contenders dense $(BATCH) \
 	  -o $(RUNS)/evaluation-batch)
 
 # Another camera: what the networks of the source see by it, and what adapting them brings. rowan and willow are new.
@@ -191,9 +266,9 @@ $(D)/adapted-passages: $(D)/passages $(D)/data-unseen
 	  $(ADAPT))
 ADAPTED = --localiser $(RUNS)/features --detector $(RUNS)/adapted-passages
 $(D)/unadapted-map-%: $(D)/rooms $(D)/passages $(D)/data-unseen
-	$(call run,$(NAV) adapt map scenes_mjcf/$* --target $(RUNS)/data-unseen $(WITH) -o $(RUNS)/maps-unadapted/$*.npz)
+	$(call run,$(NAV) adapt map $(SCENES)/$* --target $(RUNS)/data-unseen $(WITH) -o $(RUNS)/maps-unadapted/$*.npz)
 $(D)/adapted-map-%: $(D)/features $(D)/adapted-passages
-	$(call run,$(NAV) adapt map scenes_mjcf/$* --target $(RUNS)/data-unseen $(ADAPTED) -o $(RUNS)/maps-adapted/$*.npz)
+	$(call run,$(NAV) adapt map $(SCENES)/$* --target $(RUNS)/data-unseen $(ADAPTED) -o $(RUNS)/maps-adapted/$*.npz)
 DRIVER = --policy $(DRIVEN_BY)
 driven = $(NAV) evaluate $(call folders,$(UNSEEN)) --contenders dense$(1) -o $(RUNS)/$(notdir $@) $(SECONDARY)
 $(D)/evaluation-unadapted: $(UNSEEN:%=$(D)/unadapted-map-%)
@@ -221,9 +296,9 @@ $(D)/data-gl:
 $(D)/data-gl-unseen:
 	$(call run,$(NAV) data $(call folders,$(UNSEEN)) -o $(RUNS)/data-gl-unseen $(DATA) engine=gl)
 $(UNSEEN:%=$(D)/unadapted-map-gl-%): $(D)/unadapted-map-gl-%: $(D)/rooms $(D)/passages $(D)/data-gl-unseen
-	$(call run,$(NAV) adapt map scenes_mjcf/$* $(WITH) -o $(RUNS)/maps-unadapted-gl/$*.npz $(seen))
+	$(call run,$(NAV) adapt map $(SCENES)/$* $(WITH) -o $(RUNS)/maps-unadapted-gl/$*.npz $(seen))
 $(UNSEEN:%=$(D)/adapted-map-gl-%): $(D)/adapted-map-gl-%: $(D)/features-gl $(D)/adapted-passages-gl $(D)/data-gl-unseen
-	$(call run,$(NAV) adapt map scenes_mjcf/$* $(call ADAPTED_TO,gl) -o $(RUNS)/maps-adapted-gl/$*.npz $(seen))
+	$(call run,$(NAV) adapt map $(SCENES)/$* $(call ADAPTED_TO,gl) -o $(RUNS)/maps-adapted-gl/$*.npz $(seen))
 $(D)/evaluation-unadapted-gl: $(UNSEEN:%=$(D)/unadapted-map-gl-%)
 	$(call run,$(driven) --maps $(RUNS)/maps-unadapted-gl $(WITH))
 $(D)/evaluation-adapted-gl: $(UNSEEN:%=$(D)/adapted-map-gl-%)

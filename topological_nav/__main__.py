@@ -81,8 +81,8 @@ class Train(_Networks):
     LISTED = {"": configs.TASKS["rooms"], " of policy": configs.PolicyConfig()}
     task: Annotated[Literal["rooms", "passages", "policy"], *word("TASK")]
     """What to train: rooms, passages (whose defaults differ: batch=32 epochs=20 hidden=0) or policy."""
-    data: Annotated[Path | None, option(metavar="DIR")] = None
-    """The dataset."""
+    data: Annotated[tuple[Path, ...], option(metavar="DIR")] = ()
+    """The dataset; policy: one or more folders of drives."""
     grid: Flag = False
     """policy: train with several pairs of alpha and lambda."""
     out: Annotated[Path | None, option("-o", metavar="DIR")] = None

@@ -171,8 +171,7 @@ class MapConfig(Settings):
     passable: Share = 0.5
     """Edges with at least this probability count as open where connectedness is reported."""
     supersample: Annotated[int | None, Bounds(1, 16)] = None
-    """Images are drawn this many times larger along each side and averaged; auto: as the networks' were, on a CPU at
-    most 2 (docs/topological.md says what that changes)."""
+    """Images are drawn this many times larger along each side; auto: as for the networks, on a CPU at most 2."""
     check: Annotated[int, Bounds(0, 10**6)] = 0
     """Free places, drawn by chance, at which to try how well the finished map localises."""
 
@@ -250,9 +249,10 @@ class EvaluationConfig(GapConfig, NavigatorConfig):
     """Physics: as in `interactive_nav`."""
     objects: Annotated[int, Bounds(0, 100)] = 0
     """Small objects strewn over the floor; images of goals and maps are of the scene without them."""
+    blocked: bool = False
+    """The widest of them stands where the shortest path is narrowest, so that it blocks a passage of the map."""
     supersample: Annotated[int | None, Bounds(1, 16)] = None
-    """Images are drawn this many times larger along each side and averaged; auto: as the networks' were, on a CPU at
-    most 2."""
+    """Images are drawn this many times larger along each side; auto: as for the networks, on a CPU at most 2."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -89,7 +89,7 @@ def test_a_player_shows_the_last_image_and_the_compass_and_drives_what_is_execut
     mind = Mind()
     contender = NavigatorPlayer(player, config, mind, lambda xy, yaw, qpos: xy[:, 0])  # type: ignore[arg-type]
     two = np.zeros(2)
-    contender.begin(DrivenEpisodes(NUMBERS, np.zeros((2, 2)), two, np.zeros((2, 2)), two, two, two))
+    contender.begin(DrivenEpisodes(NUMBERS, np.zeros((2, 2)), two, np.zeros((2, 2)), two, two, two, two))
     actions = []
     for step in range(5):
         at = np.array([[step, 0.0], [10.0 + step, 0.0]])

@@ -101,6 +101,15 @@ class Drives:
         """Return which are drawn and learned from, [n] bool: of the expert's those that arrived and touched nothing."""
         return ~self.broken & (self.labelled | (self.reached & ~self.touched))
 
+    @classmethod
+    def joined(cls, parts: Sequence["Drives"]) -> "Drives":
+        """Return the drives of several folders, one after the other, with their scenes numbered on."""
+        columns = {f.name: [getattr(part, f.name) for part in parts] for f in dataclasses.fields(cls)}
+        scenes = np.cumsum([0, *(part.scene.max(initial=-1) + 1 for part in parts)])
+        columns["scene"] = [scene + int(before) for scene, before in zip(columns["scene"], scenes, strict=False)]
+        columns["first"] = [np.concatenate([[0], np.cumsum(np.concatenate([part.steps for part in parts]))])]
+        return cls(**{name: np.concatenate(values) for name, values in columns.items()})
+
 
 @dataclasses.dataclass(frozen=True)
 class Routes:

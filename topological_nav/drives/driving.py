@@ -169,6 +169,18 @@ class Frames:
         """Return whether there are mirrored ones."""
         return len(self.features) > len(self.drives.command)
 
+    @classmethod
+    def joined(cls, parts: Sequence["Frames"]) -> "Frames":
+        """Return the frames of several folders, which the same networks embed; the first has the settings."""
+        if len(parts) == 1:
+            return parts[0]
+        counts = [len(part.drives.command) for part in parts]
+        halves = [part.features[:count] for part, count in zip(parts, counts, strict=True)]
+        halves += [part.features[count:] for part, count in zip(parts, counts, strict=True)]
+        header = {"folders": [part.header for part in parts]}
+        drives = Drives.joined([part.drives for part in parts])
+        return dataclasses.replace(parts[0], drives=drives, header=header, features=np.concatenate(halves))
+
 
 def need_camera(folder: Path, header: Mapping[str, Any], networks: Networks) -> None:
     """Refuse a folder of drives, by its description, of another camera than that which the networks learned from."""

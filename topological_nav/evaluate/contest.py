@@ -64,7 +64,7 @@ EXPERT_WEIGHT = 1.0
 """Of path against effort: objects are pushed only where no way is free."""
 UNDECIDING = ("batch", "episodes", "supersample")
 """Settings that decide no row, or that enter the digest in another way."""
-LATER = ("goal_images", *(f.name for f in dataclasses.fields(GapConfig)))
+LATER = ("goal_images", "blocked", *(f.name for f in dataclasses.fields(GapConfig)))
 """Settings that older rows do not have; those count where the setting is at its default."""
 
 
@@ -100,6 +100,8 @@ class Contest:
                 raise ConfigError(f"contender is '{name}', expected a choice from {', '.join(CONTENDERS)}")
         if len(set(self.contenders)) < len(self.contenders):
             raise ConfigError(f"contenders are {', '.join(self.contenders)}, expected each once")
+        if self.config.blocked and not self.config.objects:
+            raise ConfigError("blocked=true needs a small object to block the way with; set objects=1 or more")
         if "ppo" in self.contenders and self.ppo is None:
             raise ConfigError("contender ppo needs the run folder of a trained policy: --ppo RUN")
         if preset(self.domain) != preset("clean") and self.truth:

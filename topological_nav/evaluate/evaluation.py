@@ -7,7 +7,7 @@ navigator localises at the goal's node; it is lost after `limit_s` of simulated 
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -18,6 +18,7 @@ from interactive_nav.metrics import path_efficiency
 from interactive_nav.navigation.ways import PathGrid
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.task.rollout import HostPolicy, Player, episode_keys
+from interactive_nav.types import EpisodeStart
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.grids import label
 from interactive_nav_common.rows import Rows, column, fresh
@@ -31,6 +32,7 @@ CONNECTED_M = 0.25
 """Start and goal are joined by a way with this clearance: half of TTbot's width and the grid's rounding."""
 LEAST, MOST, PER_M2 = 25, 60, 0.5
 """Episodes a scene."""
+APART_M = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +53,8 @@ class DrivenEpisodes(Rows):
     shortest_m: np.ndarray
     """[n] length of the shortest way round walls and furniture, for half of the robot's width, over a grid of 16
     directions: at most 2.7 % too long."""
+    narrow_xy_w: np.ndarray
+    """[n, 2] m: where that way is narrowest, at least `APART_M` from both ends where it is long enough."""
 
 
 def count_of(scene: Scene, config: EvaluationConfig) -> int:
@@ -88,8 +92,23 @@ def draw_episodes(digest: str, space: FreeSpace, rooms: Rooms, count: int, confi
     grid = PathGrid(space.clearance_m >= CONNECTED_M, np.ones(space.clearance_m.shape))
     ends = zip(space.cells(places[a])[:, ::-1], space.cells(places[b])[:, ::-1], strict=True)
     ways = [grid.path(tuple(start), tuple(goal)) for start, goal in ends]
-    shortest = np.array([np.linalg.norm(np.diff(way, axis=0), axis=1).sum() for way in ways]) * space.resolution_m
-    return DrivenEpisodes(np.arange(count), places[a], yaws, places[b], room[a], room[b], shortest)
+    along = [np.cumsum([0, *np.linalg.norm(np.diff(way, axis=0), axis=1)]) * space.resolution_m for way in ways]
+    shortest = np.array([metres[-1] for metres in along])
+    narrow = []
+    for way, metres in zip(ways, along, strict=True):
+        inner = np.minimum(metres, metres[-1] - metres)
+        rows, columns = way[inner >= min(APART_M, inner.max())].T
+        least = space.clearance_m[rows, columns].argmin()
+        narrow.append((columns[least], rows[least]))
+    narrow_xy = (np.array(narrow) + 0.5) * space.resolution_m + space.origin_w
+    return DrivenEpisodes(np.arange(count), places[a], yaws, places[b], room[a], room[b], shortest, narrow_xy)
+
+
+def blocking(starts: EpisodeStart, episodes: DrivenEpisodes, radii_m: Sequence[float]) -> EpisodeStart:
+    """Return starts whose widest small object stands where the shortest path is narrowest."""
+    widest = int(np.argmax(radii_m))
+    xy_w = starts.small_xy_w.at[:, widest].set(jnp.asarray(episodes.narrow_xy_w, jnp.float32))
+    return starts.replace(small_xy_w=xy_w, small_placed=starts.small_placed.at[:, widest].set(True))
 
 
 TRACK_S = 0.5
@@ -202,6 +221,8 @@ class Contender(HostPolicy):
         starts = episode_starts(*begin, len(env.world.small_objects))
         if self.config.objects:
             starts = self._strew(keys, starts)
+        if self.config.blocked:
+            starts = blocking(starts, episodes, [one.radius_m for one in env.world.small_objects])
         n, self._episodes = len(episodes), episodes
         self._played = Played(track_w=[[] for _ in range(n)], **fresh(Played, n))
         self._runs, self._last_w = np.zeros((3, n), int), np.zeros((n, 2), np.float32)

@@ -18,7 +18,7 @@ from topological_nav.__main__ import main
 from topological_nav.config import PolicyConfig
 from topological_nav.drives import imitation
 from topological_nav.drives.dataset import drive_images
-from topological_nav.drives.driving import Forward, Policy, embed_drives, load_policy
+from topological_nav.drives.driving import Forward, Frames, Policy, embed_drives, load_policy
 from topological_nav.learn.learning import Learner
 
 WORDS = (
@@ -154,6 +154,20 @@ def test_the_command_draws_and_its_grid_is_a_table(made, driven, tmp_path, capsy
     assert len(list(out.glob("alpha-*-lambda-*/curves.png"))) == 9
     assert main([*words]) == 0  # all there: nothing is learned again
     assert "policy: epoch" not in capsys.readouterr().out
+
+
+def test_drives_of_two_folders_are_learned_from_together(frames):
+    both, count = Frames.joined([frames, frames]), len(frames.drives.command)
+    assert Frames.joined([frames]) is frames and both.mirrored
+    assert both.drives.scene.tolist() == [0] * len(frames.drives) + [1] * len(frames.drives)
+    assert both.drives.first.tolist() == [*frames.drives.first, *(frames.drives.first[1:] + count)]
+    values = imitation.class_values(CONFIG, 0.5, 0.5)
+    of_one, of_both = (imitation._split(part.drives, CONFIG, values)[0] for part in (frames, both))
+    assert len(of_both) == 2 * len(of_one)
+    for k, part in enumerate((of_one, imitation.mirrored(of_one, count, CONFIG))):
+        mine = of_both.rows + k * 2 * count
+        for half in np.split(mine, 2):
+            assert (both.features[half] == frames.features[part.rows]).all()
 
 
 def test_drives_seen_through_another_camera_are_refused(made, driven, tmp_path):

@@ -25,7 +25,7 @@ from topological_nav.__main__ import main
 from topological_nav.config import EvaluationConfig
 from topological_nav.evaluate import contest as contests
 from topological_nav.evaluate.contest import Contest, ContestScene, _stem, contest_scenes, play_contest
-from topological_nav.evaluate.evaluation import Contender, DrivenEpisodes, count_of, draw_episodes, learned
+from topological_nav.evaluate.evaluation import Contender, DrivenEpisodes, blocking, count_of, draw_episodes, learned
 from topological_nav.navigate.navigator import Events
 from topological_nav.scenes.rendering import Snapshot, episode_starts
 from topological_nav.scenes.space import RECORDED, find_rooms
@@ -84,7 +84,7 @@ def line_journeys(goals) -> DrivenEpisodes:
     n = len(goals)
     goal = np.stack([np.array(goals, float), np.zeros(n)], -1)
     zero = np.zeros(n)
-    return DrivenEpisodes(np.arange(n), np.zeros((n, 2)), zero, goal, zero, zero + 1, np.array(goals, float))
+    return DrivenEpisodes(np.arange(n), np.zeros((n, 2)), zero, goal, zero, zero + 1, np.array(goals, float), goal)
 
 
 def test_an_episode_is_won_where_a_run_ends_near_the_goal():
@@ -143,6 +143,24 @@ def test_episodes_lead_from_room_to_room_and_are_fixed(rooms):
     assert (fewer.start_xy_w == found.start_xy_w[:5]).all() and (fewer.yaw_rad == found.yaw_rad[:5]).all()
     assert (draw_episodes("ab" * 32, space, labels, 5, EvaluationConfig.of(seed=4)).yaw_rad != fewer.yaw_rad).any()
     assert (draw_episodes("cd" * 32, space, labels, 5, config).yaw_rad != fewer.yaw_rad).any()
+
+
+def test_the_narrowest_place_of_a_path_is_the_doorway_and_the_widest_object_stands_there(rooms):
+    space, labels = rooms
+    found = draw_episodes("ab" * 32, space, labels, 12, EvaluationConfig())
+    # The doorway is at x = 0, y from 1 to 2; paths through it keep 0.25 m from the corner at y = 1.
+    far = np.minimum(*(np.linalg.norm(found.narrow_xy_w - end, axis=1) for end in (found.start_xy_w, found.goal_xy_w)))
+    assert (space.at(found.narrow_xy_w) >= 0.25).all() and far.max() > 1.0
+    beside = np.abs(found.start_xy_w[:, 0]) + np.abs(found.goal_xy_w[:, 0]) > 4.0  # both ends are far from the doorway
+    assert (
+        beside.any() and (np.abs(found.narrow_xy_w[beside, 0]) < 0.4).all() and (found.narrow_xy_w[beside, 1] > 1).all()
+    )
+    starts = episode_starts(found.start_xy_w, found.yaw_rad, found.goal_xy_w, 3)
+    blocked = blocking(starts, found, [0.1, 0.3, 0.2])
+    assert blocked.small_placed.tolist() == [[False, True, False]] * 12
+    assert np.asarray(blocked.small_xy_w[:, 1]) == pytest.approx(found.narrow_xy_w, abs=1e-6)
+    with pytest.raises(ConfigError, match="blocked=true needs a small object to block the way with; set objects=1"):
+        Contest((Path(APARTMENT),), ("expert",), Path("out"), EvaluationConfig.of(blocked=True))
 
 
 def test_the_shortest_way_is_as_long_as_over_eight_neighbours_or_shorter(rooms):

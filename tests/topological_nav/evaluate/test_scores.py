@@ -22,6 +22,7 @@ def journeys(shortest) -> DrivenEpisodes:
         zero.astype(int),
         zero.astype(int) + 1,
         np.array(shortest),
+        np.ones((n, 2)),
     )
 
 
