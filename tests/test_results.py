@@ -158,9 +158,10 @@ def test_the_further_topological_tables_are_those_of_their_rows(name):
         assert " | ".join(text(line.scores[score]) for score in ("success", "spl", "rc")) in told, line
 
 
-def test_the_topological_results_name_no_folder_of_a_machine():
+def test_the_topological_results_name_their_preset_and_no_folder_of_a_machine():
     for path in (ROOT / "results" / "topological").rglob("*"):
         if path.suffix == ".parquet":
+            assert set(read_rows([path])["preset"].unique().to_pylist()) <= {"default", "report"}, path
             columns = read_rows([path]).select(["policy", "device", "commit"]).to_pydict()
             assert not [value for values in columns.values() for value in set(values) if value.startswith("/")], path
         elif path.is_file():

@@ -83,7 +83,7 @@ def _contest(arguments: Any, scenes: Sequence[str], contenders: Sequence[str], o
         contenders=tuple(contenders),
         out=out,
         config=configured(configs.EvaluationConfig(), arguments.settings, "evaluate"),
-        preset=preset_of(arguments.settings),
+        preset=preset_of(arguments.settings) or "default",
         truth=arguments.truth,
         policy=arguments.policy or PASSAGE_POLICY,
         ppo=getattr(arguments, "ppo", None),

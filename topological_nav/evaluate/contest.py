@@ -91,7 +91,7 @@ class Contest:
     robot: str = "ttbot"
     domain: str = "clean"
     """The camera that the navigator sees by, goals included: a name of `domains.PRESETS`."""
-    preset: str = ""
+    preset: str = "default"
     """Preset that the settings were laid over; rows name it."""
 
     def __post_init__(self) -> None:
