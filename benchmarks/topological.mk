@@ -139,7 +139,7 @@ $(D)/policy: $(D)/policy-grid
 	@touch $@
 else
 all: networks maps $(D)/policy evaluation transfer $(D)/export
-networks: $(D)/rooms $(D)/rooms-selfsup $(D)/rooms-more $(D)/passages $(D)/alexnet
+networks: $(D)/rooms $(D)/rooms-more $(D)/passages $(D)/alexnet
 evaluation: $(D)/evaluation $(D)/evaluation-policy $(D)/evaluation-ahead1
 $(D)/policy-grid: $(D)/policy
 $(D)/policy: $(D)/rooms $(D)/passages $(D)/drives
@@ -170,8 +170,6 @@ $(D)/drives:
 
 $(D)/rooms: $(D)/data
 	$(call run,$(NAV) train rooms --data $(RUNS)/data -o $(RUNS)/rooms $(ROOMS))
-$(D)/rooms-selfsup: $(D)/data
-	$(call run,$(NAV) train rooms --data $(RUNS)/data -o $(RUNS)/rooms-selfsup init=selfsup $(ROOMS))
 $(D)/rooms-more: $(D)/data-more
 	$(call run,$(NAV) train rooms --data $(RUNS)/data-more -o $(RUNS)/rooms-more $(ROOMS_MORE))
 $(D)/rooms-up $(D)/rooms-down: $(D)/rooms-%: $(D)/data

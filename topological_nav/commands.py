@@ -25,7 +25,7 @@ from topological_nav.data.domains import AdaptConfig
 from topological_nav.data.folders import folder_bytes
 from topological_nav.drives.dagger import simulate_driven
 from topological_nav.drives.dataset import draw_drives, simulate_drives, summary
-from topological_nav.drives.driving import Frames, embed_drives, load_policy
+from topological_nav.drives.driving import embed_drives, load_policy
 from topological_nav.drives.imitation import grid_table, train_grid, train_policy
 from topological_nav.evaluate import scores
 from topological_nav.evaluate.contest import Contest, contest_scenes, play_contest, tracks_of
@@ -295,10 +295,9 @@ def run_train(arguments: Any) -> None:
     config = configured(configs.TASKS[arguments.task], arguments.settings, arguments.task)
     if config.network == "alexnet":
         refuse_unused(arguments, "first_stage" + " hidden" * (arguments.task == "passages"), "with network=alexnet")
-    if config.init != "selfsup":
-        refuse_unused(arguments, "selfsup_epochs selfsup_batch selfsup_learning_rate", f"with init={config.init}")
     out = arguments.out or RUNS / arguments.task
-    if len(folders := arguments.data or (DATASET,)) > 1:
+    folders = arguments.data or (DATASET,)
+    if len(folders) > 1:
         raise ConfigError(f"--data names {len(folders)} folders, expected one in 'train {arguments.task}'")
     with terminal() as host:
         results = train(arguments.task, folders[0], out, config, host)
@@ -319,8 +318,7 @@ def _policy(arguments: Any) -> None:
     out = arguments.out or RUNS / ("policy-grid" if arguments.grid else "policy")
     with terminal() as host:
         runs = arguments.localiser or RUNS / "rooms", arguments.detector or RUNS / "passages"
-        folders = arguments.data or (DRIVES,)
-        frames = Frames.joined([embed_drives(folder, *runs, config.mirror, host) for folder in folders])
+        frames = embed_drives(arguments.data or (DRIVES,), *runs, config.mirror, host)
         results = (train_grid if arguments.grid else train_policy)(frames, out, config, host)
     rows = results if isinstance(results, list) else [results]
     for row in rows:

@@ -119,7 +119,7 @@ class NetworkTrainConfig(Settings):
     first_stage: Annotated[int, Bounds(1, 3)] = 2
     """Stage of ResNet-18 whose map joins the fourth's in the embedding. The report's is 1, with width=64: 64 + 512."""
     init: str = "scratch"
-    """Where the backbone starts: scratch, selfsup (first learns without labels), or a run folder to take it from."""
+    """Where the backbone starts: scratch, or a run folder to take it from."""
     pitch: Literal["all", "up", "level", "down"] = "all"
     """Room images to learn from."""
     test_headings: Literal["thirds", "random"] = "thirds"
@@ -136,12 +136,6 @@ class NetworkTrainConfig(Settings):
     """Share of a room label's weight that is spread over all rooms."""
     augment: bool = True
     """Vary brightness, contrast and colour, and shift images by up to a sixteenth, anew in every epoch."""
-    selfsup_epochs: Count = 30
-    """Passes without labels, where init is selfsup."""
-    selfsup_batch: Annotated[int, Bounds(2, 10**6)] = 128
-    """Pairs of images an update of them."""
-    selfsup_learning_rate: Annotated[float, Bounds(1e-9, 10.0)] = 1e-3
-    """Adam's, of them."""
 
 
 TASKS = {"rooms": NetworkTrainConfig(), "passages": NetworkTrainConfig(batch=32, epochs=20, hidden=0)}

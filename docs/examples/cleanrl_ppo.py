@@ -31,7 +31,7 @@ def train(envs: TorchVectorEnv, iterations: int, steps: int = 32, gamma: float =
                     scores.append(info["episode"]["success"].clone())
                 log = policy.log_prob(action).sum(-1)
                 rows.append((obs.clone(), action, log, value, reward.clone(), terminated | truncated))
-                obs = new  # what is kept is a clone: MJX-Warp is slow where results come to new addresses
+                obs = new
             advantage, next_value, returns = torch.zeros_like(reward), critic(obs)[:, 0], []
             for _, _, _, value, reward, done in reversed(rows):
                 advantage = reward + ~done * gamma * (next_value + lam * advantage) - value

@@ -117,7 +117,6 @@ def test_mistakes_are_one_line(words, told, capsys):
         (["evaluate", "S", "--contenders", "dense", "thinned=0.3"], "thinned"),
         (["train", "rooms", "--localiser", "R"], "--localiser"),
         (["train", "rooms", "--grid"], "--grid"),
-        (["train", "rooms", "selfsup_epochs=3"], "selfsup_epochs"),
         (["train", "passages", "--detector", "R"], "--detector"),
         (["train", "passages", "pitch=up"], "pitch"),
         (["train", "policy", "--grid", "alpha=3"], "alpha"),

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -193,13 +193,11 @@ def need_camera(folder: Path, header: Mapping[str, Any], networks: Networks) -> 
             )
 
 
-def embed_drives(folder: Path, localiser_run: Path, detector_run: Path, mirror: bool, host: Host = ALONE) -> Frames:
-    """Embed the images of all kept drives."""
-    header, config = read_drives_header(folder)
-    drives, networks = load_drives(folder), load_networks(localiser_run, detector_run, classifies=True, same=SAME)
-    need_camera(folder, header, networks)
-    count, total, done = len(drives.command), int(drives.steps[drives.kept].sum()), 0
-    features: np.ndarray | None = None
+def embed_drives(
+    folders: Sequence[Path], localiser_run: Path, detector_run: Path, mirror: bool, host: Host = ALONE
+) -> Frames:
+    """Embed the images of all kept drives of one or more folders."""
+    networks = load_networks(localiser_run, detector_run, classifies=True, same=SAME)
 
     @jax.jit
     def sides(weights: Any, images: jax.Array) -> jax.Array:
@@ -208,6 +206,15 @@ def embed_drives(folder: Path, localiser_run: Path, detector_run: Path, mirror: 
         return jnp.stack([embedded(networks, weights, side) for side in shown], 1).astype(jnp.float16)
 
     embed = functools.partial(sides, [network.variables for network in networks])
+    return Frames.joined([_folder_frames(folder, networks, embed, host) for folder in folders])
+
+
+def _folder_frames(folder: Path, networks: Networks, embed: Callable[[Any], Any], host: Host) -> Frames:
+    header, config = read_drives_header(folder)
+    drives = load_drives(folder)
+    need_camera(folder, header, networks)
+    count, total, done = len(drives.command), int(drives.steps[drives.kept].sum()), 0
+    features: np.ndarray | None = None
     for i, (rows, images) in enumerate(drive_images(folder)):
         at, part = drives.rows(rows), in_batches(embed, images)
         if features is None:
@@ -216,7 +223,7 @@ def embed_drives(folder: Path, localiser_run: Path, detector_run: Path, mirror: 
             features[at + side * count] = part[:, side]
         done += len(images)
         if i % _REPORT_EVERY == 0 or done == total:
-            host.show(f"embedded {done:,} of {total:,} images")
+            host.show(f"embedded {done:,} of {total:,} images of {folder}")
         if stop := host.signal():
             raise Stopped(stop)
     if features is None:

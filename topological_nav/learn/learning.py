@@ -21,13 +21,11 @@ from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import write_json
 from interactive_nav_common.records import Reader
 from interactive_nav_common.runs import weights
-from topological_nav.learn.networks import Contrast, Network, augmented, vicreg_loss
+from topological_nav.learn.networks import Network, augmented
 from topological_nav.scenes.rendering import batched
 
 EVALUATED, DEVICE_EVALUATED = (8, 64), (16, 64, 256)
 """Images a call where nothing is learned, on a CPU and on an accelerator: each call takes the least that serves."""
-VIEW_STEPS = 2
-"""Two views of a place differ by at most so many headings."""
 
 
 @flax.struct.dataclass
@@ -122,33 +120,6 @@ def labelled_epoch(
         return loss, (new.get("batch_stats", stats), {"accuracy": right.mean()})
 
     return descent_epoch(keyed_batches(batch), loss_of, tx)
-
-
-def paired_epoch(module: Contrast, tx: optax.GradientTransformation, batch: int) -> Epoch:
-    """Build an epoch without labels: two views of each place, up to `VIEW_STEPS` headings apart and lit differently.
-
-    Images are [P, K, H, W, 3] u8, K headings of a place and pitch; every image is the first view once. Labels are
-    not looked at.
-    """
-
-    def loss_of(params, stats, images, labels, step):
-        del labels
-        first, second, key = step
-        flat = images.reshape(-1, *images.shape[2:])
-        x = augmented(key, flat[jnp.concatenate([first, second])], False)
-        z, new = module.apply({"params": params, "batch_stats": stats}, x, train=True, mutable=["batch_stats"])
-        a, b = jnp.split(z, 2)
-        return vicreg_loss(a, b), (new.get("batch_stats", stats), {})
-
-    def steps(images, key):
-        places, around = images.shape[:2]
-        key_order, key_turn, key_steps = jax.random.split(key, 3)
-        order = shuffled(key_order, places * around, batch)
-        turn = jax.random.randint(key_turn, order.shape, -VIEW_STEPS, VIEW_STEPS + 1)
-        other = order // around * around + (order % around + turn) % around
-        return order, other, jax.random.split(key_steps, len(order))
-
-    return descent_epoch(steps, loss_of, tx)
 
 
 def shuffled(key: jax.Array, count: int, batch: int) -> jax.Array:

@@ -102,21 +102,6 @@ class Network(nn.Module):
         return joined(self.body(normalised(images), False))
 
 
-class Contrast(nn.Module):
-    """Join a backbone and the expander of VICReg."""
-
-    backbone: str = "resnet18"
-    width: int = 64
-
-    @nn.compact
-    def __call__(self, images: jax.Array, train: bool = True) -> jax.Array:
-        """Return [N, 8 width]."""
-        body = {"resnet18": ResNet18, "alexnet": AlexNet}[self.backbone](self.width, name="body")
-        _, x = body(normalised(images), train)
-        x = nn.relu(_norm(train)(nn.Dense(8 * self.width)(x.mean((1, 2)))))
-        return nn.Dense(8 * self.width)(x)
-
-
 def falling(x: jax.Array) -> jax.Array:
     """Map [N, L] to logits that fall from each to the next, by softplus of it: what is free to 2 m is free to 1 m."""
     return x[:, :1] - jnp.cumsum(jnp.pad(nn.softplus(x[:, 1:]), ((0, 0), (1, 0))), axis=1)
@@ -131,19 +116,6 @@ def joined(maps: tuple[jax.Array, jax.Array]) -> jax.Array:
 def normalised(images: jax.Array) -> jax.Array:
     """Scale grey levels 0 to 255, u8 or f32, to f32 about 0."""
     return (images.astype(jnp.float32) / 255.0 - 0.5) / 0.25
-
-
-def vicreg_loss(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return the loss of two views' expansions [N, D]: Bardes et al. 2022, equation 6, weights 25, 25 and 1."""
-    n, d = a.shape
-    invariance = jnp.square(a - b).mean()
-    spread, shared = jnp.float32(0.0), jnp.float32(0.0)
-    for z in (a, b):
-        z = z - z.mean(0, keepdims=True)
-        spread += nn.relu(1.0 - jnp.sqrt(z.var(0, ddof=1) + 1e-4)).mean() / 2
-        covariance = z.T @ z / (n - 1)
-        shared += (jnp.square(covariance).sum() - jnp.square(jnp.diag(covariance)).sum()) / d
-    return 25.0 * invariance + 25.0 * spread + shared
 
 
 def augmented(key: jax.Array, images: jax.Array, flip: bool) -> jax.Array:

@@ -24,12 +24,11 @@ from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import FileError, readable
 from interactive_nav_common.files import write_json
 from interactive_nav_common.jobs.progress import ALONE, Host
-from interactive_nav_common.runs.folder import CHECKPOINT, claimed, run_epochs
-from interactive_nav_common.runs.weights import read_state
+from interactive_nav_common.runs.folder import claimed, run_epochs
 from topological_nav.config import PITCHES, DataConfig, NetworkTrainConfig
 from topological_nav.data.dataset import RoomImages, load_passages, load_rooms, logits_at, read_header
 from topological_nav.learn import learning
-from topological_nav.learn.networks import Contrast, Network, Places, localisation_scores
+from topological_nav.learn.networks import Network, Places, localisation_scores
 
 SAME = ("robot", "engine", "width", "height", "fov_deg")
 """What two networks' images must have in common to look through one camera."""
@@ -110,19 +109,7 @@ def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host:
         outputs, tx = len(work.lengths_m or work.rooms.names), optax.adam(config.learning_rate)
         network = Network(task, config.network, config.width, config.hidden, outputs, config.first_stage)
         learner = learning.make_learner(network, (data.height, data.width), tx, config.seed)
-        if config.init == "selfsup":
-            saved = read_state(out / CHECKPOINT)
-            if not saved or saved["phase"] == "pairs":  # that of the later phase holds this one's outcome
-                places = work.rooms.images[~work.rooms.test]
-                places = places.reshape(-1, *places.shape[2:])  # the headings of a place and pitch
-                contrast, pairs_tx = Contrast(config.network, config.width), optax.adam(config.selfsup_learning_rate)
-                epoch = learning.paired_epoch(contrast, pairs_tx, config.selfsup_batch)
-                one = learning.over(epoch, places, np.zeros(0, np.int32))
-                paired = learning.make_learner(contrast, places.shape[2:4], pairs_tx, config.seed)
-                key, epochs = learning.phase_key(config.seed, 1), config.selfsup_epochs
-                paired = run_epochs(out, "pairs", paired, one, epochs, key, host)
-                learner = learning.with_backbone(learner, paired.variables)
-        elif config.init != "scratch":
+        if config.init != "scratch":
             donor = load_trained(Path(config.init))
             about = f"it is {donor.about['backbone']} of width {donor.about['width']}"
             learner = learning.with_backbone(learner, donor.variables, f"init: {config.init} does not fit", about)

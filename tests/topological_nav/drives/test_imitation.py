@@ -30,7 +30,7 @@ CONFIG = overridden(PolicyConfig(), WORDS)
 
 @pytest.fixture(scope="module")
 def frames(made, driven):
-    return embed_drives(driven, made.rooms, made.passages, True)
+    return embed_drives([driven], made.rooms, made.passages, True)
 
 
 @pytest.fixture(scope="module")
@@ -179,4 +179,4 @@ def test_drives_seen_through_another_camera_are_refused(made, driven, tmp_path):
     with pytest.raises(
         FileError, match="images have width = 48, the networks learned from 32; drive again with width=32"
     ):
-        embed_drives(copy, made.rooms, made.passages, False)
+        embed_drives([copy], made.rooms, made.passages, False)

@@ -18,7 +18,6 @@ from topological_nav.learn.learning import compiled_epoch, in_batches, padded_si
 
 WORDS = ("network=alexnet", "width=4", "hidden=16", "epochs=2", "batch=32", "learning_rate=1e-3")
 """AlexNet compiles in a third of ResNet-18's time."""
-SELFSUP = ("init=selfsup", "selfsup_epochs=2", "selfsup_batch=32")
 
 
 def weights(run) -> dict:
@@ -83,35 +82,25 @@ def test_a_detector_that_does_not_say_its_lengths_is_refused(made, tmp_path):
 
 @pytest.fixture(scope="module")
 def whole(made, tmp_path_factory):
-    """An uninterrupted run of both phases."""
+    """An uninterrupted run."""
     out = tmp_path_factory.mktemp("runs") / "whole"
-    config = overridden(NetworkTrainConfig(), [*WORDS, *SELFSUP])
+    config = overridden(NetworkTrainConfig(), WORDS)
     assert training.train("rooms", made.data, out, config) is not None
     return out, config
 
 
 @pytest.mark.heavy
-def test_the_phase_without_labels_comes_first_and_learns(whole):
-    lines = read_metrics(whole[0] / "metrics.jsonl")
-    assert [(line["phase"], line["epoch"]) for line in lines] == [
-        *(("pairs", 1), ("pairs", 2), ("labels", 1), ("labels", 2)),
-    ]
-    assert lines[1]["loss"] < lines[0]["loss"]
-
-
-@pytest.mark.heavy
 def test_a_stopped_run_ends_where_an_uninterrupted_one_does(made, whole, tmp_path):
-    """Stopped in either phase, after one epoch and after three; the third call ends it."""
+    """Stopped after the first epoch; the second call ends it."""
     out, config = tmp_path / "run", whole[1]
     told = []
-    for stop_after in (1, 3):
-        with pytest.raises(Stopped):
-            training.train("rooms", made.data, out, config, Host(told.append, lambda n=stop_after: len(told) >= n))
-        assert len(told) == stop_after
+    with pytest.raises(Stopped):
+        training.train("rooms", made.data, out, config, Host(told.append, lambda: len(told) >= 1))
+    assert len(told) == 1
     with pytest.raises(FileError, match="holds no trained network; finish it"):
         training.load_trained(out)
     assert training.train("rooms", made.data, out, config, Host(told.append)) is not None
-    assert len(told) == 4
+    assert len(told) == 2
     assert same(weights(out), weights(whole[0]))
     lines = [read_metrics(run / "metrics.jsonl") for run in (out, whole[0])]
     strip = [[{k: v for k, v in line.items() if k != "seconds"} for line in run] for run in lines]
