@@ -42,7 +42,7 @@ CLUTTER = {
     "evaluation-expert": "the expert",
 }
 """Here it is from the first row."""
-HEADER = ("Navigator", "Success in 600 s", "in 175 s", "SPL", "RC", "AD (s)", "Difference in success")
+HEADER = ("Navigator", "Homes", "Success in 600 s", "in 175 s", "SPL", "RC", "AD (s)", "Difference in success")
 EXACT = 2**16
 
 
@@ -94,9 +94,11 @@ def table(rows: pa.Table, variants: dict[str, str]) -> str:
         ]
         change = ""
         if before is not None:
-            change = estimate((mine[home]["600"] - before[home]["600"]).mean() for home in mine).with_ends(2)
+            change = estimate(
+                (mine[home]["600"] - before[home]["600"]).mean() for home in mine if home in before
+            ).with_ends(2)
         texts = [cell.with_ends(0 if place == 4 else 2) for place, cell in enumerate(cells)]
-        lines.append([title, *texts, change])
+        lines.append([title, str(len(mine)), *texts, change])
         before = mine if variants is LADDER or before is None else before
     return markdown(HEADER, lines)
 
