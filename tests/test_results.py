@@ -13,10 +13,11 @@ import pyarrow.parquet
 import pytest
 from rich.console import Console
 
+from docs.studies.homes import navigator
 from interactive_nav.config import WINDOW
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.records import PACKED_METRICS, read_metrics
-from interactive_nav_common.rows import read_rows
+from interactive_nav_common.rows import read_rows, where
 from topological_nav.evaluate.scores import differences, markdown, summary, text
 from train.figures import tables
 from train.runs.run import config_to_play
@@ -156,6 +157,15 @@ def test_the_further_topological_tables_are_those_of_their_rows(name):
     scenes = [line for line in found if line.group not in ("seen", "unseen", "all")]
     for line in scenes if len(scenes) == 2 else found[-1:]:
         assert " | ".join(text(line.scores[score]) for score in ("success", "spl", "rc")) in told, line
+
+
+def test_the_table_of_navigators_in_furnished_homes_is_that_of_its_rows():
+    rows = read_rows([ROOT / "results" / "topological" / "homes" / "rows.parquet"])
+    page = (ROOT / "docs" / "topological-homes.md").read_text()
+    assert navigator.table(rows, navigator.CLUTTER) in page
+    # By hand: of 347 episodes that the learned policy played in nine homes, two ended without success.
+    ours = where(rows, variant="evaluation-policy")
+    assert (len(ours), len(ours) - int(sum(ours["success"].to_pylist()))) == (347, 2)
 
 
 def test_the_topological_results_name_their_preset_and_no_folder_of_a_machine():
