@@ -63,11 +63,13 @@ class _Driving(_Networks):
 
 @dataclasses.dataclass(kw_only=True)
 class Data(_Listed):
-    """Render room and passage images of scenes, or drives of the expert."""
+    """Render room and passage images of scenes, or drives of the expert, or import photographs."""
 
     LISTED = {"": configs.DataConfig(), " of drives": configs.DriveConfig()}
-    scenes: Annotated[tuple[str, ...], *word("SCENE")]
-    """Scene folders or sets of them."""
+    scenes: Annotated[tuple[str, ...], *word("SCENE")] = ()
+    """Scene folders or sets of them; with photographs, the one that they were taken in, if any."""
+    photographs: Annotated[Path | None, option(metavar="PATH")] = None
+    """Folder of photographs, with where they were taken in photographs.csv."""
     drives: Flag = False
     """Drive through the scenes, and render what the robot sees."""
     out: Annotated[Path | None, option("-o", metavar="DIR")] = None
@@ -140,7 +142,7 @@ class Adapt(_Networks):
     what: Annotated[Literal["features", "passages", "map"], *word("WHAT")]
     """The embedding, adversarially; the passage detector, in configurations A to D; or a map of the domain's images."""
     scene: Annotated[Path | None, *word("SCENE")] = None
-    """map: scene folder."""
+    """map: scene folder; may be left out with photographs."""
     data: Annotated[Path | None, option(metavar="DIR")] = None
     """The source's dataset."""
     target: Annotated[Path | None, option(metavar="DIR")] = None

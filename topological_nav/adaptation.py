@@ -15,6 +15,7 @@ Passages: a detector's four configurations, and maps: of images collected in the
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import flax.linen as nn
@@ -49,7 +50,7 @@ from topological_nav.learn.training import (
 )
 from topological_nav.maps.build import judged_map
 from topological_nav.maps.graph import near_pairs
-from topological_nav.scenes.space import free_space
+from topological_nav.scenes.space import FreeSpace, free_space
 
 ROOMS_STREAM, PASSAGES_STREAM = 1, 2
 """Of chance in target images."""
@@ -255,31 +256,50 @@ def passage_configurations(
         return write_json(out / learning.RESULTS, results)
 
 
-def collected_map(scene_folder: Path, target: Path, localiser_run: Path, detector_run: Path, config: AdaptConfig):
+def collected_map(scene_folder: Path | None, target: Path, localiser: Path, detector: Path, config: AdaptConfig):
     """Build a map of images collected in the target domain: its training positions, no image drawn for the map.
 
+    Of photographs every place is a node, and no scene is needed; a way that was judged by hand is as the hand says.
     An edge is judged by the image of its node nearest to it in angle, 10 degrees off at most for 18 headings. Scores of
     the `build.Built` say how held-out images of the target are localised on it.
     """
-    networks = load_networks(localiser_run, detector_run, same=())
-    scene = load_scene(scene_folder)
+    networks = load_networks(localiser, detector, same=())
     header, data = read_header(target)
-    rooms = target_rooms(target, config)
+    rooms, first = target_rooms(target, config), header["scenes"][0]
+    scene: Any = load_scene(scene_folder) if scene_folder else SimpleNamespace(**first)
     digests = [there["digest"] for there in header["scenes"]]
     if scene.digest not in digests:
         names = ", ".join(there["name"] for there in header["scenes"])
         raise FileError(f"{target}: holds images of {names} as they were, not of '{scene.name}' as it is")
+    if not scene_folder and "by_hand" not in first:
+        raise FileError(f"{target}: is no dataset of photographs; name the scene folder: adapt map SCENE")
     here = rooms.scene == digests.index(scene.digest)
-    nodes, held = here & ~rooms.test, here & rooms.test
+    nodes, held = here & ("by_hand" in first or ~rooms.test), here & rooms.test
     level = rooms.images[:, PITCHES.index("level")]
     shown, xy, label = level[nodes], rooms.xy_w[nodes], rooms.label[nodes]
     room = label - rooms.label[here].min()
-    if not len(near_pairs(xy, config.edge_m)):
+    if not len(pairs := near_pairs(xy, config.edge_m)):
         raise FileError(f"no two positions of '{scene.name}' in {target} are within {config.edge_m} m; collect more")
     about = {"settings": to_dict(config), "data": header["settings"], "domain": to_dict(preset(config.domain))}
-    space = free_space(scene, get_robot(data.robot).height_m)
+    if scene_folder:
+        space = free_space(scene, get_robot(data.robot).height_m)
+    else:  # nothing but floor, a metre about the places
+        cells = np.ceil(np.ptp(xy, axis=0) / 0.1).astype(int) + 20
+        space = FreeSpace(
+            np.pad(np.ones(cells[::-1]), 1), 0.1, (float(xy[:, 0].min()) - 1.0, float(xy[:, 1].min()) - 1.0)
+        )
     built = judged_map(scene, space, xy, room, shown, networks, config.edge_m, config.passable, about)
-    if held.any():
+    for start, end, opened in first.get("by_hand", ()):
+        ends = [first["places"].index(place) if place in first["places"] else -1 for place in (start, end)]
+        ways = (pairs == ends).all(1) | (pairs == ends[::-1]).all(1)
+        if not ways.any() or opened not in ("yes", "no"):
+            expected = f"two places with all headings, at most {config.edge_m} m apart, and yes or no"
+            raise FileError(f"{target}: connectivity.csv has {start},{end},{opened}, expected {expected}")
+        built.map.p[ways] = opened == "yes"
+    if not scene_folder:  # there is no plan to compare with
+        open_ = built.map.p >= config.passable
+        built = dataclasses.replace(built, free=open_, scores={"edges": f"{int(open_.sum())} of {len(open_)} open"})
+    if held.any() and "by_hand" not in first:
         queries = Places(networks.localiser.embed(level[held][:, ::3]), rooms.xy_w[held], rooms.label[held])
         nodes = Places(built.map.embeddings, built.map.xy_w, label)
         built.scores["held-out images localised"] = in_words(localisation_scores(queries, nodes))

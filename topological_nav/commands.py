@@ -2,9 +2,8 @@
 
 import dataclasses
 import sys
-import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from interactive_nav import load_scene
 from interactive_nav_common.config import field_docs, overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import whole_folder, write_text
-from interactive_nav_common.jobs.progress import Host, Progress, SafeConsole, Stopped, progress_bar, say
+from interactive_nav_common.jobs.progress import Host, SafeConsole, bar, say
 from interactive_nav_common.records import read_metrics
 from interactive_nav_common.rows import where
 from interactive_nav_common.signals import stop_signals
@@ -20,9 +19,10 @@ from scenes_mjcf.sets import scene_folders
 from topological_nav import adaptation
 from topological_nav import config as configs
 from topological_nav.config import ADAPTED, DATASET, DRIVES, PASSAGE_POLICY, RUNS, MapConfig
-from topological_nav.data.dataset import load_rooms, make_dataset
+from topological_nav.data.dataset import load_rooms, make_dataset, read_header
 from topological_nav.data.domains import AdaptConfig
 from topological_nav.data.folders import folder_bytes
+from topological_nav.data.photographs import import_photographs
 from topological_nav.drives.dagger import simulate_driven
 from topological_nav.drives.dataset import draw_drives, simulate_drives, summary
 from topological_nav.drives.driving import embed_drives, load_policy
@@ -47,33 +47,6 @@ def terminal() -> Iterator[Host]:
     """Show lines on stdout, at once, and stop at a signal."""
     with stop_signals() as stops:
         yield Host(lambda line: print(line, flush=True), lambda: stops[0] if stops else 0)
-
-
-@contextmanager
-def bar(signals: list[int] | None = None) -> Iterator[Progress]:
-    """Show a bar with the time left on a terminal, a line every tenth elsewhere; raise `Stopped` before the end.
-
-    `signals` are those of a `stop_signals` around it; None: it collects them itself.
-    """
-    console = SafeConsole(stderr=True)
-    collected = stop_signals() if signals is None else nullcontext(signals)
-    with collected as stops, progress_bar(console, "starting") as update:
-        # Neither compiling before the first step nor what an earlier run has done says how fast it goes.
-        tenths, first = 0, None
-
-        def report(what: str, done: int, total: int) -> None:
-            nonlocal tenths, first
-            first = first or (time.perf_counter(), done)
-            update(description=what, completed=done, total=total)
-            if not console.is_terminal and done * 10 // max(total, 1) > tenths:
-                tenths, (began, before), left = done * 10 // total, first, ""
-                if done > before:
-                    left = f", {(time.perf_counter() - began) / (done - before) * (total - done):.0f} s left"
-                console.print(f"{what}: {done:,} of {total:,}{left}", highlight=False, soft_wrap=True)
-            if stops and done < total:
-                raise Stopped(stops[0])
-
-        yield report
 
 
 def _contest(arguments: Any, scenes: Sequence[str], contenders: Sequence[str], out: Path):
@@ -246,6 +219,8 @@ def run_figures(arguments: Any) -> None:
 
 def run_data(arguments: Any) -> None:
     """Render a dataset, or drives of the expert."""
+    if arguments.photographs:
+        return _photographs(arguments)
     if arguments.drives:
         return _drives(arguments)
     config = configured(configs.DataConfig(), arguments.settings, "data")
@@ -261,6 +236,16 @@ def run_data(arguments: Any) -> None:
             f"({s['test_positions']} for testing), {s['passages']} passages ({s['test_passages']})"
         )
     print(_size_line(out, images, config))
+
+
+def _photographs(arguments: Any) -> None:
+    refuse_unused(arguments, "--drives", "with --photographs")
+    folder, out, scenes = arguments.photographs, arguments.out or DATASET, arguments.scenes
+    if len(scenes) > 1:
+        raise ConfigError(f"--photographs are of one building, got scenes {', '.join(scenes)}; name one or none")
+    config = configured(configs.DataConfig(), arguments.settings, "data")
+    print(import_photographs(folder, out, config, Path(scenes[0]) if scenes else None))
+    save(dataset_figure(out), out / "preview.png")
 
 
 def _size_line(out: Path, images: int, config: configs.CameraConfig) -> str:
@@ -334,11 +319,13 @@ def _policy(arguments: Any) -> None:
 def run_adapt(arguments: Any) -> None:
     """Take networks, and a map, to another domain."""
     config = configured(AdaptConfig(), arguments.settings, "adapt")
-    if (arguments.what == "map") != bool(arguments.scene):
-        raise ConfigError("adapt map takes a scene folder, adapt features and adapt passages none")
+    if arguments.what != "map" and arguments.scene:
+        raise ConfigError(f"adapt {arguments.what} takes no scene folder; leave out {arguments.scene}")
     _refuse_unused_to_adapt(arguments)
     arguments.data = arguments.data or DATASET
     arguments.target = arguments.target or arguments.data
+    if config.domain != "clean" and "by_hand" in read_header(arguments.target)[0]["scenes"][0]:
+        raise ConfigError(f"{arguments.target}: is of photographs, which no camera is laid over; say domain=clean")
     needs = _NEEDS[arguments.what]
     chosen = choose(arguments.localiser, arguments.detector, needs=needs)
     arguments.localiser, arguments.detector = chosen.localiser, chosen.detector
@@ -392,8 +379,9 @@ def _adapt_passages(arguments: Any, config: AdaptConfig, host: Host) -> None:
 
 def _adapt_map(arguments: Any, config: AdaptConfig, host: Host) -> None:
     del host
-    out, scene = arguments.out or ADAPTED / f"{arguments.scene.resolve().name}.npz", arguments.scene
-    keep_map(adaptation.collected_map(scene, arguments.target, arguments.localiser, arguments.detector, config), out)
+    runs = arguments.localiser, arguments.detector
+    built = adaptation.collected_map(arguments.scene, arguments.target, *runs, config)
+    keep_map(built, arguments.out or ADAPTED / f"{built.map.scene}.npz")
 
 
 _NEEDS = {"features": ("rooms",), "passages": ("passages",), "map": ("rooms", "passages")}

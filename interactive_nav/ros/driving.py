@@ -11,6 +11,7 @@ from rclpy.node import Node
 
 from interactive_nav.ros import messages as ros
 from interactive_nav.ros.nodes import PATIENCE_S, RosError, Say, Stop
+from interactive_nav.sensing.base import seen_through
 from interactive_nav_common.errors import UserError
 from scenes_mjcf.look import Lens
 
@@ -110,7 +111,7 @@ class DrivingNode:
 
     def _seen(self, image: str, pixels: np.ndarray, lens: Lens) -> np.ndarray:
         """Return what a lens would show of an image, whose camera_info has come."""
-        return ros.seen_through(pixels, self._lenses[image].fov_deg, lens)
+        return seen_through(pixels, self._lenses[image].fov_deg, lens)
 
     def _join(self) -> None:
         """Publish once every sensor has a publisher; refuse to be one of two that drive."""

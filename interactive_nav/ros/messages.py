@@ -24,7 +24,6 @@ from geometry_msgs.msg import (
     Vector3,
 )
 from nav_msgs.msg import Odometry, Path
-from PIL import Image as Pillow
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, Imu, Joy, LaserScan
@@ -183,27 +182,6 @@ def info_lens(message: CameraInfo) -> Lens:
     if any(abs(d) > 1e-9 for d in message.d):
         raise MessageError("camera_info has a distortion; subscribe to a rectified image (image_proc: image_rect)")
     return Lens(message.width, message.height, math.degrees(2 * math.atan(message.height / 2 / fy)))
-
-
-def seen_through(image: np.ndarray, fov_deg: float, lens: Lens) -> np.ndarray:
-    """Return the view [h, w, ...] of a narrower or coarser pinhole lens on the same axis, from a picture [H, W, ...].
-
-    Colours are averaged over each pixel; other images take the nearest pixel.
-    """
-    height, width, *channels = image.shape
-    have = Lens(width, height, fov_deg)
-    # In pixels of the picture: what the wanted lens covers.
-    rows = 2 * lens.half_height / have.pixel
-    columns = rows * lens.width / lens.height
-    if rows > height * 1.001 or columns > width * 1.001:
-        raise MessageError(
-            f"the camera's picture of {width} x {height} spans {fov_deg:.1f} degrees in height, the networks learned "
-            f"from {lens.width} x {lens.height} that span {lens.fov_deg:.1f}: use a wider lens, or train with fov_deg"
-        )
-    rows, columns = min(rows, height), min(columns, width)
-    box = ((width - columns) / 2, (height - rows) / 2, (width + columns) / 2, (height + rows) / 2)
-    how = Pillow.Resampling.BOX if channels else Pillow.Resampling.NEAREST
-    return np.asarray(Pillow.fromarray(image).resize((lens.width, lens.height), how, box=box))
 
 
 def scan_message(

@@ -14,9 +14,11 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from PIL import Image
 
 from interactive_nav.physics.base import one_of_batch
 from interactive_nav.sensing.boxes import BoxTables, apply_axes, box_poses, slab
+from interactive_nav_common.errors import UserError
 from scenes_mjcf.categories import SEGMENTATIONS, MaskClasses
 from scenes_mjcf.look import SKY_COLOUR, CameraPose, Lens
 
@@ -189,3 +191,24 @@ def lit_images(
     base = jnp.clip(base * jnp.take_along_axis(look.tint, flat, 1).reshape(base.shape), 0.0, 1.0)
     rgb = lit(base, normal_w, forward, shaded, jnp, look.sun_w[:, None, None])
     return {"normals": normals, "rgb": jnp.clip(rgb * look.brightness[:, None, None, None], 0.0, 1.0)}
+
+
+def seen_through(image: np.ndarray, fov_deg: float, lens: Lens) -> np.ndarray:
+    """Return what a narrower or coarser pinhole lens on the same axis would show of a picture [H, W, ...].
+
+    It is [h, w, ...], the middle of the picture: colours averaged over each wanted pixel, else the nearest pixel's.
+    """
+    height, width, *channels = image.shape
+    have = Lens(width, height, fov_deg)
+    # In pixels of the picture: what the wanted lens covers.
+    rows = 2 * lens.half_height / have.pixel
+    columns = rows * lens.width / lens.height
+    if rows > height * 1.001 or columns > width * 1.001:
+        raise UserError(
+            f"the camera's picture of {width} x {height} spans {fov_deg:.1f} degrees in height, the networks learned "
+            f"from {lens.width} x {lens.height} that span {lens.fov_deg:.1f}: use a wider lens, or train with fov_deg"
+        )
+    rows, columns = min(rows, height), min(columns, width)
+    box = ((width - columns) / 2, (height - rows) / 2, (width + columns) / 2, (height + rows) / 2)
+    how = Image.Resampling.BOX if channels else Image.Resampling.NEAREST
+    return np.asarray(Image.fromarray(image).resize((lens.width, lens.height), how, box=box))

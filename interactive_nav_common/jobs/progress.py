@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import sys
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -13,7 +14,7 @@ from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsed
 from rich.text import Text
 
 from interactive_nav_common.errors import printable
-from interactive_nav_common.signals import raise_stop
+from interactive_nav_common.signals import raise_stop, stop_signals
 
 
 class SafeConsole(Console):
@@ -98,3 +99,31 @@ ALONE = Host()
 def say(line: str) -> None:
     """Print a line to stderr, at once."""
     print(line, file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def bar(signals: list[int] | None = None) -> Iterator[Progress]:
+    """Show a bar with the time left on a terminal, a line every tenth elsewhere; raise `Stopped` before the end.
+
+    `signals` are those of a `stop_signals` around it; None: it collects them itself.
+    """
+    console = SafeConsole(stderr=True)
+    collected = stop_signals() if signals is None else contextlib.nullcontext(signals)
+    with collected as stops, progress_bar(console, "starting") as update:
+        tenths = 0
+        # Neither compiling before the first step nor what an earlier run has done says how fast it goes.
+        first: tuple[float, int] | None = None
+
+        def report(what: str, done: int, total: int) -> None:
+            nonlocal tenths, first
+            first = first or (time.perf_counter(), done)
+            update(description=what, completed=done, total=total)
+            if not console.is_terminal and done * 10 // max(total, 1) > tenths:
+                tenths, (began, before), left = done * 10 // total, first, ""
+                if done > before:
+                    left = f", {(time.perf_counter() - began) / (done - before) * (total - done):.0f} s left"
+                console.print(f"{what}: {done:,} of {total:,}{left}", highlight=False, soft_wrap=True)
+            if stops and done < total:
+                raise Stopped(stops[0])
+
+        yield report

@@ -8,7 +8,7 @@ from PIL import Image
 
 from docs.studies import rooms as rooms_study
 from interactive_nav.scenes.scene import load_scene
-from topological_nav import commands
+from interactive_nav_common.jobs import progress
 from topological_nav.__main__ import main
 from topological_nav.learn.networks import squares_between
 from topological_nav.maps import build
@@ -161,8 +161,8 @@ def test_rooms_of_a_scene_are_compared_in_a_figure(made, tmp_path, capsys, monke
 
 def test_time_left_is_told_by_what_this_run_has_done_so_far(monkeypatch, capsys):
     clock = iter((400.0, 420.0, 500.0))  # after five minutes of compiling
-    monkeypatch.setattr(commands.time, "perf_counter", lambda: next(clock))
-    with commands.bar() as tell:
+    monkeypatch.setattr(progress.time, "perf_counter", lambda: next(clock))
+    with progress.bar() as tell:
         for done in (20, 25, 30, 31, 100):
             tell("cedar", done, 100)
     # 20 were there before; then 10 in 20 s, so 140 s for the other 70.

@@ -143,21 +143,25 @@ def make_dataset(
     scenes = load_scenes(scene_folders, config.engine)
     robot = get_robot(config.robot)
     plans = [plan_scene(scene, free_space(scene, robot.height_m), config) for scene in scenes]
-    header = DATASET.describe(config, [_about(scene, plan) for scene, plan in zip(scenes, plans, strict=True)])
+    header = DATASET.describe(config, [about_scene(scene, plan) for scene, plan in zip(scenes, plans, strict=True)])
     with DATASET.claimed(out, header):
         drawn = []
         for scene, plan in zip(scenes, plans, strict=True):
-            (out / scene.name).mkdir(exist_ok=True)
-            passages = {f"passage_{f.name}": getattr(plan.passages, f.name) for f in dataclasses.fields(Passages)}
-            arrays = {name: getattr(plan, name) for name in ("xy_w", "room", "test")} | passages
-            arrays |= {"cluster_xy_w": plan.rooms.points_w, "cluster_label": plan.rooms.labels}
-            how = np.asarray([plan.rooms.method, plan.rooms.chosen_by])
-            write_arrays(out / scene.name / "plan.npz", **arrays, how=how)
+            write_plan(out / scene.name, plan)
             files = _shards(out / scene.name, plan, robot, config)
             drawn.append((scene.name, lambda scene=scene: scene, files))
         total = sum(len(p.xy_w) * 3 * config.headings + len(p.passages) for p in plans)
         draw_missing(drawn, total, config, progress)
         return header
+
+
+def write_plan(folder: Path, plan: ScenePlan) -> None:
+    """Write where a scene's images are taken, as `load_plan` reads it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    passages = {f"passage_{f.name}": getattr(plan.passages, f.name) for f in dataclasses.fields(Passages)}
+    arrays = {name: getattr(plan, name) for name in ("xy_w", "room", "test")} | passages
+    arrays |= {"cluster_xy_w": plan.rooms.points_w, "cluster_label": plan.rooms.labels}
+    write_arrays(folder / "plan.npz", **arrays, how=np.asarray([plan.rooms.method, plan.rooms.chosen_by]))
 
 
 def _shards(folder: Path, plan: ScenePlan, robot: RobotSpec, config: DataConfig):
@@ -210,7 +214,8 @@ def load_plan(folder: Path, scene: str) -> ScenePlan:
         return ScenePlan(rooms, arrays["xy_w"], arrays["room"], arrays["test"], passages)
 
 
-def _about(scene: Scene, plan: ScenePlan) -> dict[str, Any]:
+def about_scene(scene: Any, plan: ScenePlan) -> dict[str, Any]:
+    """Return what the description of a dataset says of a scene, of which it needs name, digest and split."""
     recorded = recorded_rooms(scene.digest)
     return {
         "name": scene.name,

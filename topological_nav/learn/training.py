@@ -170,8 +170,12 @@ def _work(task: str, dataset: Path, config: NetworkTrainConfig) -> _Work:
                 )
             test = np.isin(passages.scene, [scenes.index(name) for name in config.test_scenes])
         groups = {"all": np.arange(int(test.sum()))}
+        if test.all():
+            raise FileError(f"{dataset}: has no passages to learn from; label free_m, or make it with passage_sources")
         sides = passages.images[~test], free[~test], passages.images[test], free[test]
         return _Work(rooms, *sides, groups, passages.lengths_m, passages.scored)
+    if len(rooms.names) < 2:
+        raise FileError(f"{dataset}: has one room, expected two to tell apart; label more, or take other networks")
     names = PITCHES if config.pitch == "all" else (config.pitch,)
     learned = rooms.images[~rooms.test][:, [PITCHES.index(name) for name in names]]
     held_out = rooms.images[rooms.test]

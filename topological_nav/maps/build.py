@@ -241,7 +241,7 @@ def judged_by(detector: Trained) -> tuple[float, int]:
 
 
 def judged_map(
-    scene: Scene,
+    scene: Any,
     space: FreeSpace,
     xy_w: np.ndarray,
     room: np.ndarray,
@@ -254,7 +254,8 @@ def judged_map(
 ) -> Built:
     """Build the map of nodes with images [N, K, H, W, 3] u8 around each, and compare its edges with the plan.
 
-    `look` takes edges [E, 2] and headings [E] to the images that edges are judged by; None: the node's nearest.
+    Of the scene only name and digest count. `look` takes edges [E, 2] and headings [E] to the images that edges are
+    judged by; None: the node's nearest.
     """
     margin_m, points = judged_by(networks.detector)
 

@@ -8,6 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from interactive_nav.ros import messages
+from interactive_nav.sensing.base import seen_through
+from interactive_nav_common.errors import UserError
 from scenes_mjcf.look import Lens
 
 HEAD = messages.header(0.3, "base_link")
@@ -72,17 +74,17 @@ def test_a_narrower_lens_sees_the_middle():
     rgb = np.zeros((8, 8, 3), np.uint8)
     rgb[2:6, 2:4], rgb[2:6, 4:6] = 200, 100
     narrow = Lens(2, 2, math.degrees(2 * math.atan(0.5)))
-    assert messages.seen_through(rgb, 90.0, narrow)[..., 0].tolist() == [[200, 100], [200, 100]]
+    assert seen_through(rgb, 90.0, narrow)[..., 0].tolist() == [[200, 100], [200, 100]]
     # The same lens leaves it as it is; coarser pixels are means.
-    assert (messages.seen_through(rgb, 90.0, Lens(8, 8, 90.0)) == rgb).all()
-    assert messages.seen_through(rgb, 90.0, Lens(2, 2, 90.0))[..., 0].tolist() == [[50, 25], [50, 25]]
+    assert (seen_through(rgb, 90.0, Lens(8, 8, 90.0)) == rgb).all()
+    assert seen_through(rgb, 90.0, Lens(2, 2, 90.0))[..., 0].tolist() == [[50, 25], [50, 25]]
 
 
 def test_a_wider_lens_than_the_cameras_is_refused():
-    with pytest.raises(messages.MessageError, match="spans 60.0 degrees in height, the networks learned from 64 x 48"):
-        messages.seen_through(np.zeros((48, 64, 3), np.uint8), 60.0, Lens(64, 48, 90.0))
-    with pytest.raises(messages.MessageError, match="use a wider lens"):
-        messages.seen_through(np.zeros((48, 48, 3), np.uint8), 90.0, Lens(64, 48, 90.0))
+    with pytest.raises(UserError, match="spans 60.0 degrees in height, the networks learned from 64 x 48"):
+        seen_through(np.zeros((48, 64, 3), np.uint8), 60.0, Lens(64, 48, 90.0))
+    with pytest.raises(UserError, match="use a wider lens"):
+        seen_through(np.zeros((48, 48, 3), np.uint8), 90.0, Lens(64, 48, 90.0))
 
 
 def test_a_scan_begins_at_the_right_and_infinity_means_nothing_met():

@@ -314,5 +314,5 @@ def test_what_does_not_fit_is_refused(made, adapted, painted, tmp_path, capsys):
     there = adapted[0]
     with pytest.raises(FileError, match="the run there has domain = 'light', this one 'blur'"):
         adaptation.adapt_features(made.rooms, made.data, made.data, there, AdaptConfig(domain="blur"))
-    assert main(["adapt", "map"]) == 2
-    assert "adapt map takes a scene folder" in capsys.readouterr().err
+    assert main(["adapt", "features", str(made.scene)]) == 2
+    assert "adapt features takes no scene folder; leave out" in capsys.readouterr().err
