@@ -69,7 +69,7 @@ class Data(_Listed):
     scenes: Annotated[tuple[str, ...], *word("SCENE")] = ()
     """Scene folders or sets of them; with photographs, the one that they were taken in, if any."""
     photographs: Annotated[Path | None, option(metavar="PATH")] = None
-    """Folder of photographs, with where they were taken in photographs.csv."""
+    """Folder of photographs, with where they were taken in photographs.csv; or a ROS 2 bag, which becomes one."""
     drives: Flag = False
     """Drive through the scenes, and render what the robot sees."""
     out: Annotated[Path | None, option("-o", metavar="DIR")] = None

@@ -273,6 +273,9 @@ def collected_map(scene_folder: Path | None, target: Path, localiser: Path, dete
         raise FileError(f"{target}: holds images of {names} as they were, not of '{scene.name}' as it is")
     if not scene_folder and "by_hand" not in first:
         raise FileError(f"{target}: is no dataset of photographs; name the scene folder: adapt map SCENE")
+    if "by_hand" in first and header["fov_deg"] != networks.camera.fov_deg:
+        remedy = f"import them with fov_deg={networks.camera.fov_deg:g}, or train networks on this dataset"
+        raise FileError(f"{target}: photographs are stored with fov_deg={header['fov_deg']:g}; {remedy}")
     here = rooms.scene == digests.index(scene.digest)
     nodes, held = here & ("by_hand" in first or ~rooms.test), here & rooms.test
     level = rooms.images[:, PITCHES.index("level")]

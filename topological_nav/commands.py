@@ -22,7 +22,7 @@ from topological_nav.config import ADAPTED, DATASET, DRIVES, PASSAGE_POLICY, RUN
 from topological_nav.data.dataset import load_rooms, make_dataset, read_header
 from topological_nav.data.domains import AdaptConfig
 from topological_nav.data.folders import folder_bytes
-from topological_nav.data.photographs import import_photographs
+from topological_nav.data.photographs import import_photographs, unpack_bag
 from topological_nav.drives.dagger import simulate_driven
 from topological_nav.drives.dataset import draw_drives, simulate_drives, summary
 from topological_nav.drives.driving import embed_drives, load_policy
@@ -243,6 +243,8 @@ def _photographs(arguments: Any) -> None:
     folder, out, scenes = arguments.photographs, arguments.out or DATASET, arguments.scenes
     if len(scenes) > 1:
         raise ConfigError(f"--photographs are of one building, got scenes {', '.join(scenes)}; name one or none")
+    if (folder / "metadata.yaml").is_file() or folder.suffix in (".mcap", ".db3"):
+        return print(unpack_bag(folder, out))
     config = configured(configs.DataConfig(), arguments.settings, "data")
     print(import_photographs(folder, out, config, Path(scenes[0]) if scenes else None))
     save(dataset_figure(out), out / "preview.png")

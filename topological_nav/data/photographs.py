@@ -17,7 +17,8 @@ from PIL import Image
 
 from interactive_nav import get_robot, load_scene
 from interactive_nav.sensing.base import seen_through
-from interactive_nav_common.errors import FileError, readable
+from interactive_nav_common.errors import FileError, missing, optional, readable
+from interactive_nav_common.files import whole_file, write_text
 from interactive_nav_common.rows import digest_of
 from scenes_mjcf.look import Lens
 from topological_nav.config import PITCHES, DataConfig
@@ -26,8 +27,9 @@ from topological_nav.data.folders import lens_of, numbered, write_shard
 from topological_nav.scenes.space import Rooms
 
 TABLE, NUMBERS = "photographs.csv", ("x_m", "y_m", "heading_deg", "free_m", "fov_deg")
-PLACE_M = 0.25
-"""Photographs are of one place, where the table names none, if they are no farther from its first than this."""
+PLACE_M, TURN_RAD = 0.25, math.radians(5.0)
+"""Photographs are of one place, where the table names none, if they are no farther from its first than this. A picture
+of a bag is kept where the robot has gone, or turned, so far since the last."""
 
 
 def read_table(path: Path, needed: str) -> list[dict[str, Any]]:
@@ -112,3 +114,41 @@ def _picture(folder: Path, row: dict[str, Any], lens: Lens) -> np.ndarray:
     with readable(path, FileError, "take it again, or remove its row"), Image.open(path) as image:
         pixels = np.asarray(image.convert("RGB"))
     return seen_through(pixels, fov_deg, lens)
+
+
+def unpack_bag(bag: Path, out: Path) -> str:
+    """Write a ROS 2 bag's photographs and their table to a folder, from the first topic of each kind; say how many."""
+    need = missing("data --photographs BAG", "rosbags", "ros2")
+    highlevel, typesys = (optional(f"rosbags.{part}", need) for part in ("highlevel", "typesys"))
+    from interactive_nav.ros import messages as ros
+
+    rows, last = [], np.full(3, np.inf)
+    with readable(bag, FileError, "record it again, or restore it with 'ros2 bag reindex'", " as a ROS 2 bag"):
+        store = typesys.get_typestore(typesys.Stores.ROS2_KILTED)
+        with highlevel.AnyReader([bag], default_typestore=store) as reader:
+
+            def read(*kinds: str):
+                topics = [c for c in reader.connections if c.msgtype in kinds][:1]
+                for connection, _, raw in reader.messages(topics) if topics else ():
+                    message: Any = reader.deserialize(raw, connection.msgtype)
+                    yield ros.seconds(message.header.stamp), message
+
+            placed = list(read("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"))
+            poses = [getattr(message.pose, "pose", message.pose) for _, message in placed]
+            if not poses:
+                raise FileError(f"{bag}: has no odometry and no poses, so no headings of its images; record /odom too")
+            yaw = np.unwrap([ros.quat_yaw(pose.orientation) for pose in poses])
+            xy = np.array([(pose.position.x, pose.position.y) for pose in poses])
+            fov_deg = next((ros.info_lens(info).fov_deg for _, info in read("sensor_msgs/msg/CameraInfo")), "")
+            for time_s, message in read("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"):
+                now = np.array([np.interp(time_s, [t for t, _ in placed], column) for column in (*xy.T, yaw)])
+                if abs(now - last)[2] < TURN_RAD and math.dist(now[:2], last[:2]) < PLACE_M:
+                    continue
+                last, file, raw = now, f"{len(rows):05d}.png", hasattr(message, "encoding")
+                image = Image.fromarray(ros.image_array(message)) if raw else Image.open(io.BytesIO(message.data))
+                with whole_file(out / file) as partial:
+                    image.save(partial, "PNG")
+                rows.append([file, *np.round([*now[:2], np.degrees(now[2]) % 360], 4), fov_deg, "", ""])
+    lines = [["file", *NUMBERS[:3], "fov_deg", "room", "free_m"], *rows]
+    write_text(out / TABLE, "".join(f"{','.join(map(str, line))}\n" for line in lines))
+    return f"{out}: {len(rows)} photographs; label them in {TABLE}, then import them: data --photographs {out}"

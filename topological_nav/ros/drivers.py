@@ -11,7 +11,6 @@ from PIL import Image
 
 from interactive_nav import get_robot
 from interactive_nav.sensing.base import seen_through
-from interactive_nav_common.config import overlay
 from interactive_nav_common.errors import ConfigError, UserError
 from scenes_mjcf.look import Lens
 from topological_nav.config import NavigatorConfig
@@ -73,9 +72,7 @@ def topological_driver(
 ) -> PilotDriver:
     """Return the navigator with its goal; the first picture of it looks along `goal_heading_rad` in the map's frame."""
     networks, built = load_networks(choice.localiser, choice.detector), load_map(map_file)
-    of_map = {k: v for k, v in built.about.get("data", {}).items() if k == "fov_deg"}
-    camera = overlay(networks.camera, of_map, "map")
-    lens = lens_of(camera, get_robot(camera.robot))
+    lens = lens_of(networks.camera, get_robot(networks.camera.robot))
     sight = NetworkSight(built, networks, config.match)
     policy = local_policy(choice.policy, sight, config, networks)
     if not goals:

@@ -11,7 +11,7 @@ from interactive_nav.scenes.scene import load_scene
 from topological_nav.__main__ import main
 from topological_nav.config import DataConfig
 from topological_nav.data.dataset import load_passages, load_plan, load_rooms
-from topological_nav.data.photographs import import_photographs, read_photographs
+from topological_nav.data.photographs import import_photographs, read_photographs, unpack_bag
 from topological_nav.maps.graph import load_map
 
 SMALL = DataConfig(width=32, height=32, headings=6, quality=100, passage_length_m=1.0, passage_lengths_m=(0.5, 1.0))
@@ -144,5 +144,47 @@ def test_a_map_of_photographs_obeys_the_hand(made, tmp_path, capsys):
     assert by_hand.scene == "flat" and by_hand.p == pytest.approx(expected, abs=1e-6)
     hand.write_text("from,to,open\n0,cellar,yes\n")
     assert "connectivity.csv has 0,cellar,yes, expected two" in refused(capsys, *mapped("wrong"), "domain=clean")
+    size.append("fov_deg=90")
+    assert "photographs are stored with fov_deg=90; import them with fov_deg=120" in refused(
+        capsys, *mapped("narrow"), "domain=clean"
+    )
     words[3] = made.data
     assert "is no dataset of photographs; name the scene folder" in refused(capsys, *words, "domain=clean")
+
+
+def record(path, poses=True):
+    """Record a robot that turns at (1, 2) by 4 degrees a picture, and then goes on by 0.2 m a picture."""
+    rosbag2, typesys = pytest.importorskip("rosbags.rosbag2"), pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS2_KILTED)
+    kinds = {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
+    steps = [(1.0, 2.0, 4.0 * k) for k in range(11)] + [(1.0 + 0.2 * k, 2.0, 40.0) for k in range(1, 4)]
+    names = ["sensor_msgs/msg/Image", "geometry_msgs/msg/PoseStamped"][: 1 + poses]
+    with rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+        topics = [writer.add_connection(f"/{k}", name, typestore=store) for k, name in enumerate(names)]
+        for k, (x, y, degrees) in enumerate(steps):
+            header = kinds["Header"](stamp=kinds["Time"](sec=k, nanosec=0), frame_id="map")
+            half, data = math.radians(degrees) / 2, np.full(48, k, np.uint8)
+            turn = kinds["Quaternion"](x=0.0, y=0.0, z=math.sin(half), w=math.cos(half))
+            pose = kinds["Pose"](position=kinds["Point"](x=x, y=y, z=0.0), orientation=turn)
+            image = kinds["Image"](header, 4, 4, "rgb8", 0, 12, data)
+            for topic, name, message in zip(topics, names, (image, kinds["PoseStamped"](header, pose)), strict=False):
+                writer.write(topic, k, store.serialize_cdr(message, name))
+    return path
+
+
+def test_a_bag_becomes_photographs_where_the_robot_has_turned_or_gone_on(tmp_path):
+    assert "7 photographs" in unpack_bag(record(tmp_path / "bag"), tmp_path / "out")
+    rows = read_photographs(tmp_path / "out")
+    # Every second picture of the turn, then the one 0.4 m on; 0.2 m more is not far enough.
+    expected = [*((1.0, 2.0, 8.0 * k) for k in range(6)), (1.4, 2.0, 40.0)]
+    assert [(row["x_m"], row["y_m"], row["heading_deg"]) for row in rows] == [pytest.approx(one) for one in expected]
+    assert np.asarray(Image.open(tmp_path / "out" / "00001.png"))[0, 0].tolist() == [2, 2, 2]
+
+
+def test_bags_that_are_cut_short_or_lack_poses_are_refused(tmp_path, capsys):
+    [file] = record(tmp_path / "bag").glob("*.mcap")
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    line = refused(capsys, "data", "--photographs", tmp_path / "bag", "-o", tmp_path / "out")
+    assert "not readable as a ROS 2 bag" in line and "ros2 bag reindex" in line
+    blind = record(tmp_path / "blind", poses=False)
+    assert "has no odometry and no poses" in refused(capsys, "data", "--photographs", blind, "-o", tmp_path / "out")
