@@ -118,7 +118,7 @@ MAPS = $(ALL:%=$(D)/map-%)
 .PHONY: ladder hard all networks maps evaluation transfer transfer-policy renderer renderer-policy scan batch tables figures
 ifeq ($(SIZE),homes)
 all: ladder hard $(D)/export
-networks: $(D)/rooms $(D)/passages $(D)/passages-2m
+networks: $(D)/rooms $(D)/passages
 evaluation: $(D)/evaluation $(D)/evaluation-policy
 # Each home by itself, many at a time; the command for all of them finds the images and numbers the rooms.
 $(SEEN:%=$(D)/data.%): $(D)/data.%:
@@ -189,7 +189,8 @@ $(D)/ppo:
 	  run.num_timesteps=$(PPO_STEPS) run.out_dir=$(RUNS) run.name=ppo)
 
 # Scenes are played side by side (evaluation.alder, ...); the command for all of them then finds their rows, and adds up.
-played = $(NAV) evaluate $(1) --maps $(RUNS)/maps $(WITH) $(EVALUATION) -o $(RUNS)/$(basename $(notdir $@))
+MAPS_OF = maps
+played = $(NAV) evaluate $(1) --maps $(RUNS)/$(MAPS_OF) $(WITH) $(EVALUATION) -o $(RUNS)/$(basename $(notdir $@))
 baseline = $(call played,$(1)) --policy passage $(BASELINE) $(if $(PPO),--ppo $(PPO))
 learned = $(call played,$(1)) --contenders $(LEARNED) --policy $(DRIVEN_BY)
 ahead1 = $(call played,$(1)) --contenders dense --policy passage ahead_m=1
@@ -207,26 +208,21 @@ $(D)/evaluation-policy: $(call each,evaluation-policy)
 $(D)/evaluation-ahead1: $(call each,evaluation-ahead1)
 	$(call run,$(call ahead1,$(call folders,$(ALL))))
 
-# From the report's navigator (0) to ours (8), a setting at a time: images, matching, glances, watching, metres, retries, slack,
-# and passages by length. The same images teach a detector that answers for 2 m alone, and build the maps of the others.
-$(D)/passages-2m: $(D)/data
-	@mkdir -p $(RUNS)/data-2m; cp -r $(foreach name,$(SEEN),$(RUNS)/data/$(name)) $(RUNS)/data-2m
-	$(call run,$(NAV) data $(call folders,$(SEEN)) -o $(RUNS)/data-2m $(DATA) passage_lengths_m=[2.0] && \
-	  $(NAV) train passages --data $(RUNS)/data-2m -o $(RUNS)/passages-2m $(PASSAGES))
-TWO = --localiser $(RUNS)/rooms --detector $(RUNS)/passages-2m
-$(ALL:%=$(D)/map-2m-%): $(D)/map-2m-%: $(D)/rooms $(D)/passages-2m
-	$(call run,$(NAV) map $(SCENES)/$* $(TWO) -o $(RUNS)/maps-2m/$*.npz $(MAP))
+# From the report's navigator (0) to ours (evaluation-policy), a setting at a time: images, matching, glances, watching, metres,
+# retries, passages by length (up to 6, maps and navigator ask the detector for 2 m whatever an edge's length is), and slack.
+$(ALL:%=$(D)/map-2m-%): $(D)/map-2m-%: $(D)/rooms $(D)/passages
+	$(call run,$(NAV) map $(SCENES)/$* $(WITH) -o $(RUNS)/maps-2m/$*.npz $(MAP) asked_m=2)
 images = $(if $(filter 0,$(1)),images=1 goal_images=1)
 match = $(if $(filter 0 1,$(1)),match=nearest)
 glance = $(if $(filter 0 1 2,$(1)),glance=false,$(if $(filter 3,$(1)),watch_s=0))
 metres = $(if $(filter 0 1 2 3 4,$(1)),metre_cost=0)
 retries = $(if $(filter 0 1 2 3 4 5,$(1)),retry_cost=0)
-slack = $(if $(filter 0 1 2 3 4 5 6,$(1)),slack_m=0)
-rung = $(foreach one,images match glance metres retries slack,$(call $(one),$(1)))
+lengths = $(if $(filter 7,$(1)),slack_m=0,asked_m=2)
+rung = $(foreach one,images match glance metres retries lengths,$(call $(one),$(1)))
 STEPS = 0 1 2 3 4 5 6 7
 define of_rung
-$(ALL:%=$(D)/ladder-$(1).%): $(D)/ladder-$(1).%: $(D)/map-2m-% $(D)/policy
-	$$(call run,$(NAV) evaluate $(SCENES)/$$* --maps $(RUNS)/maps-2m $(TWO) $(EVALUATION) --contenders dense --policy $(DRIVEN_BY) \
+$(ALL:%=$(D)/ladder-$(1).%): $(D)/ladder-$(1).%: $(D)/map-$(if $(filter 7,$(1)),,2m-)% $(D)/policy
+	$$(call run,$(NAV) evaluate $(SCENES)/$$* --maps $(RUNS)/maps$(if $(filter 7,$(1)),,-2m) $(WITH) $(EVALUATION) --contenders dense --policy $(DRIVEN_BY) \
 	  -o $(RUNS)/ladder-$(1) $(call rung,$(1)))
 endef
 $(foreach step,$(STEPS),$(eval $(call of_rung,$(step))))
@@ -235,13 +231,14 @@ ladder: $(foreach step,$(STEPS),$(ALL:%=$(D)/ladder-$(step).%)) $(call each,eval
 # Small objects, and one of them in the narrowest place of the way: without metres, and where the robot pushes on (passable=0).
 objects-10 = objects=10
 objects-30 = objects=30
-metres-0 = metre_cost=0 slack_m=0
+metres-0 = metre_cost=0 asked_m=2
+$(call each,metres-0) $(call each,hard-metres-0): MAPS_OF = maps-2m
 hard = objects=1 blocked=true
 hard-metres-0 = $(hard) $(metres-0)
 hard-push = $(hard) passable=0
 VARIANTS = objects-10 objects-30 metres-0 hard hard-metres-0 hard-push
 define of_variant
-$(call each,$(1)): $(D)/$(1).%: $(D)/map-% $(D)/policy
+$(call each,$(1)): $(D)/$(1).%: $(D)/map-$(if $(findstring metres,$(1)),2m-)% $(D)/policy
 	$$(call run,$$(call learned,$(SCENES)/$$*) $$($(1)))
 endef
 $(foreach variant,$(VARIANTS),$(eval $(call of_variant,$(variant))))

@@ -162,6 +162,8 @@ class MapConfig(Settings):
     """The image that an edge is judged by: drawn along it, or the nearest of the node's images."""
     connect: bool = True
     """Add nodes until every free place that one can drive to is joined by free edges."""
+    asked_m: Annotated[float | None, Bounds(0.05, 100.0)] = None
+    """Length for which the detector judges an edge; auto: the edge's own."""
     passable: Share = 0.5
     """Edges with at least this probability count as open where connectedness is reported."""
     supersample: Annotated[int | None, Bounds(1, 16)] = None
@@ -181,6 +183,8 @@ class NavigatorConfig(Settings):
     match: Literal["aligned", "nearest"] = "aligned"
     """An image is compared with the nodes' images of the same heading, and all are summed (aligned); or with all of
     them, and the nearest of all decides (nearest)."""
+    asked_m: Annotated[float | None, Bounds(0.05, 100.0)] = None
+    """Length for which the detector is always asked; auto: an edge's own, as `ahead_m`, `slack_m` and `clear_m` say."""
     passable: Share = 0.5
     """The passage detector agrees from this probability on."""
     swing_deg: Annotated[float, Bounds(1.0, 180.0)] = 15.0

@@ -64,7 +64,7 @@ EXPERT_WEIGHT = 1.0
 """Of path against effort: objects are pushed only where no way is free."""
 UNDECIDING = ("batch", "episodes", "supersample")
 """Settings that decide no row, or that enter the digest in another way."""
-LATER = ("goal_images", "blocked", *(f.name for f in dataclasses.fields(GapConfig)))
+LATER = ("goal_images", "blocked", "asked_m", *(f.name for f in dataclasses.fields(GapConfig)))
 """Settings that older rows do not have; those count where the setting is at its default."""
 
 
@@ -264,7 +264,9 @@ def _learned(run: Path, scene: Scene, config: EvaluationConfig) -> tuple[Player,
 def contest_scenes(contest: Contest) -> list[ContestScene]:
     """Return the scenes, with the networks where somebody looks through them."""
     navigates = not contest.truth and {"dense", "sparse"} & set(contest.contenders)
-    networks = load_networks(contest.localiser, contest.detector) if navigates else None
+    networks = None
+    if navigates:
+        networks = load_networks(contest.localiser, contest.detector).asking(contest.config.asked_m)
     return [ContestScene(folder, contest, networks) for folder in contest.scenes]
 
 

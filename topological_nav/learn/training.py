@@ -44,6 +44,8 @@ class Trained:
     """Content of network.json."""
     run: Path = Path()
     """Where it was read."""
+    asked_m: float | None = None
+    """Length for which `passage` answers, whichever is asked for; None: that which is asked for."""
 
     @property
     def stored(self) -> str:
@@ -57,6 +59,7 @@ class Trained:
     def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
         """Return the probability that the path is free so far, of images [N, H, W, 3] u8; see `logits_at`."""
         logits = self.logits(images).astype(float)
+        ahead_m = ahead_m if self.asked_m is None else np.full(np.shape(ahead_m), self.asked_m)
         return 1.0 / (1.0 + np.exp(-logits_at(logits, self.about["lengths_m"], ahead_m)))
 
     def embed(self, images: np.ndarray) -> np.ndarray:
@@ -281,6 +284,10 @@ class Networks(NamedTuple):
     def camera(self) -> DataConfig:
         """Return the settings of the camera that both networks learned from."""
         return overlay(DataConfig(), camera_settings(self.localiser), "network.json")
+
+    def asking(self, asked_m: float | None) -> "Networks":
+        """Return the same networks with a detector that always answers for this length; None: as it is asked."""
+        return self._replace(detector=dataclasses.replace(self.detector, asked_m=asked_m))
 
     @property
     def digests(self) -> dict[str, str]:

@@ -203,7 +203,7 @@ def build_map(
 
     Drawn images are kept in the folder `parts`, if any, so that a map that was stopped goes on.
     """
-    networks = load_networks(localiser_run, detector_run)
+    networks = load_networks(localiser_run, detector_run).asking(config.asked_m)
     data = drawn_for(networks.camera, config.supersample)
     scene, robot = load_scene(scene_folder), get_robot(data.robot)
     space = free_space(scene, robot.height_m)

@@ -25,8 +25,8 @@ LADDER = {
     "ladder-4": "a look for the edge's end in each run",
     "ladder-5": "0.3 for each metre of an edge",
     "ladder-6": "1 for each failed try of an edge",
-    "ladder-7": "0.3 m less asked of the detector",
-    "evaluation-policy": "a detector for five lengths: ours",
+    "ladder-7": "the detector asked for each edge's length",
+    "evaluation-policy": "for 0.3 m less: ours",
 }
 """Rows of a ladder: a difference is from the row above."""
 CLUTTER = {

@@ -7,6 +7,7 @@ import pytest
 
 from topological_nav.learn.learning import initial, variable_shapes
 from topological_nav.learn.networks import Network, augmented, falling, joined
+from topological_nav.learn.training import Networks, Trained
 
 
 def sizes(network: Network, height: int = 224, width: int = 224) -> dict:
@@ -99,3 +100,17 @@ def test_mirroring_is_done_where_asked():
 
     assert rising(False).all()
     assert 10 < rising(True).sum() < 54
+
+
+def test_a_detector_answers_for_one_length_where_that_is_set():
+    class Fixed(Trained):
+        def logits(self, images):
+            return np.array([[2.0, 1.0, -1.0]])
+
+    detector = Fixed(None, {}, {"lengths_m": [1.0, 2.0, 3.0]})  # type: ignore[arg-type]
+    image, asked = np.zeros((1, 4, 4, 3), np.uint8), np.array([[1.0, 2.5]])
+    chances = [1 / (1 + np.exp(-logit)) for logit in (2.0, 0.0, 1.0)]
+    assert detector.passage(image, asked)[0] == pytest.approx(chances[:2])
+    always = Networks(detector, detector).asking(2.0).detector
+    assert always.passage(image, asked)[0] == pytest.approx([chances[2]] * 2)
+    assert always.passage(image, 3.0) == pytest.approx([chances[2]])
