@@ -326,10 +326,10 @@ def run_adapt(arguments: Any) -> None:
     _refuse_unused_to_adapt(arguments)
     arguments.data = arguments.data or DATASET
     arguments.target = arguments.target or arguments.data
-    if config.domain != "clean" and "by_hand" in read_header(arguments.target)[0]["scenes"][0]:
-        raise ConfigError(f"{arguments.target}: is of photographs, which no camera is laid over; say domain=clean")
     needs = _NEEDS[arguments.what]
     chosen = choose(arguments.localiser, arguments.detector, needs=needs)
+    if config.domain != "clean" and "by_hand" in read_header(arguments.target)[0]["scenes"][0]:
+        raise ConfigError(f"{arguments.target}: is of photographs, which no camera is laid over; say domain=clean")
     arguments.localiser, arguments.detector = chosen.localiser, chosen.detector
     chosen.report(policy=False)
     with terminal() as host:
