@@ -105,6 +105,16 @@ class Map(_Networks):
 
 
 @dataclasses.dataclass(kw_only=True)
+class Explore(_Driving):
+    """Build a scene's map while the robot drives about in it without one, and draw it."""
+
+    scene: Annotated[str, *word("SCENE")]
+    """Scene folder."""
+    out: Annotated[Path, option("-o", metavar="DIR")] = RUNS / "maps-explored"
+    """Folder of the map, for `--maps`; with --truth it has no images, and nothing navigates by it."""
+
+
+@dataclasses.dataclass(kw_only=True)
 class Navigate(_Driving):
     """Drive one episode of a scene and draw it."""
 
@@ -194,7 +204,7 @@ class Figures(_Driving):
     """The pictures (default: RUNS/figures)."""
 
 
-KINDS = (Data, Train, Map, Navigate, Evaluate, Adapt, Export, Tables, Figures)
+KINDS = (Data, Train, Map, Explore, Navigate, Evaluate, Adapt, Export, Tables, Figures)
 COMMANDS = {kind.__name__.lower(): kind for kind in KINDS}
 
 
@@ -204,9 +214,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parse(COMMANDS, "python -m topological_nav", argv)
     try:
         # Imported once the command is clear: it is heavy.
-        getattr(importlib.import_module("topological_nav.commands"), f"run_{type(arguments).__name__.lower()}")(
-            arguments
-        )
+        module = "exploration" if isinstance(arguments, Explore) else "commands"
+        run = f"run_{type(arguments).__name__.lower()}"
+        getattr(importlib.import_module(f"topological_nav.{module}"), run)(arguments)
     except (Stopped, KeyboardInterrupt) as stopped:  # the latter: before the work began, or at a second Ctrl-C
         print("topological_nav: stopped; the same command goes on", file=sys.stderr)
         return 128 + (stopped.args[0] if isinstance(stopped, Stopped) else signal.SIGINT)

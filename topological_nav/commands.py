@@ -49,7 +49,7 @@ def terminal() -> Iterator[Host]:
         yield Host(lambda line: print(line, flush=True), lambda: stops[0] if stops else 0)
 
 
-def _contest(arguments: Any, scenes: Sequence[str], contenders: Sequence[str], out: Path):
+def contest_of(arguments: Any, scenes: Sequence[str], contenders: Sequence[str], out: Path):
     """Return the contest that is requested; choose networks and maps that are not named, and build missing maps."""
     contest = Contest(
         scenes=tuple(Path(scene) for scene in scene_folders(scenes)),
@@ -104,7 +104,7 @@ def run_navigate(arguments: Any) -> None:
     if arguments.video and arguments.video.suffix != ".mp4":
         raise ConfigError(f"--video {arguments.video}: expected a name that ends in .mp4")
     refuse_unused(arguments, "batch", "in 'navigate', which drives one episode")
-    contest = _contest(arguments, [arguments.scene], ["sparse" if arguments.sparse else "dense"], RUNS)
+    contest = contest_of(arguments, [arguments.scene], ["sparse" if arguments.sparse else "dense"], RUNS)
     name = Path(arguments.scene).resolve().name
     out = arguments.out or RUNS / "navigate" / f"{name}-{arguments.episode}.png"
     (venue,) = contest_scenes(contest)
@@ -124,7 +124,7 @@ def run_evaluate(arguments: Any) -> None:
     names = arguments.contenders.split(",") if arguments.contenders else names
     if "ppo" not in names:
         refuse_unused(arguments, "--ppo", f"without contender ppo (--contenders {arguments.contenders})")
-    contest = _contest(arguments, arguments.scenes, names, arguments.out)
+    contest = contest_of(arguments, arguments.scenes, names, arguments.out)
     with bar() as report:
         venues = contest_scenes(contest)
         rows = play_contest(contest, venues, report)
@@ -212,7 +212,7 @@ def run_tables(arguments: Any) -> None:
 def run_figures(arguments: Any) -> None:
     """Draw the report's figures."""
     refuse_unused(arguments, "--truth batch", "in 'figures', which draws what networks see in one episode at a time")
-    contest = _contest(arguments, [arguments.scene], ["dense", "sparse"], arguments.out or arguments.runs / "figures")
+    contest = contest_of(arguments, [arguments.scene], ["dense", "sparse"], arguments.out or arguments.runs / "figures")
     with bar() as report:
         draw_report(contest, arguments.runs, report)
 

@@ -256,7 +256,7 @@ class Navigator:
         s.localised[done] = True
         there = done[s.node[done] == s.goal[done]]
         s.phase[there], s.arrived[there] = ARRIVED, True
-        self._plan(s, done[s.node[done] != s.goal[done]], heading)
+        self.plan(s, done[s.node[done] != s.goal[done]], heading)
 
     def _located(self, s: State, rows: np.ndarray, node: np.ndarray) -> None:
         """Note where the robots are; an edge that was driven and did not lead nearer to its head costs more."""
@@ -267,7 +267,7 @@ class Navigator:
         s.penalty[rows[failed], edge[failed]] += self.config.retry_cost
         s.driven[rows] = -1
 
-    def _plan(self, s: State, rows: np.ndarray, heading: np.ndarray) -> None:
+    def plan(self, s: State, rows: np.ndarray, heading: np.ndarray) -> None:
         for i in rows:
             edge = self.map.next_edge(int(s.node[i]), int(s.goal[i]), s.penalty[i])
             s.edge[i] = edge
@@ -308,7 +308,7 @@ class Navigator:
             if old >= 0 and s.penalty[i, old] < PENALTY:
                 s.penalty[i, old] += PENALTY
                 if self.map.next_edge(int(s.node[i]), int(s.goal[i]), s.penalty[i]) != old:
-                    self._plan(s, np.array([i]), heading)
+                    self.plan(s, np.array([i]), heading)
         # Without another way it goes on swinging, all round.
         tried = rows[(s.phase[rows] == SWING) & (s.swing[rows] > max(2 * self.config.swings, self._all_round))]
         s.phase[tried], s.target_rad[tried] = LEAN, s.best_rad[tried]
@@ -344,7 +344,7 @@ class Navigator:
                 self._begin_localise(s, ended[there])
                 # Where the map has no way, on along the heading that was chosen.
                 on = ~new & (s.edge[ended] < 0)
-                self._plan(s, ended[~there & ~on], heading)
+                self.plan(s, ended[~there & ~on], heading)
                 ended = ended[on]
             self._begin_run(s, ended, time)
         acting = np.flatnonzero((s.phase == DRIVE) & (s.acts % self._period == 0))
