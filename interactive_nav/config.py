@@ -20,7 +20,7 @@ IMAGES = ("depth", "segmentation", "rgb", "normals")
 """Parts that are images."""
 VARIANTS = read_packaged(Path(__file__).with_name("variants.yaml"), dict[str, dict[str, Any]])
 ORIGINAL_CODE: dict[str, Any] = VARIANTS["code"]
-"""What the original's code did where it differs from its paper (reference benchmark, section 11)."""
+"""Settings by which the original's code differs from its paper (reference benchmark, section 11)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,49 +206,47 @@ def _only_with(settings: str, *parts: str) -> tuple[str, str, Callable[[Any], bo
 
 @dataclasses.dataclass(frozen=True)
 class SensorConfig(CameraNoise):
-    """What the robot perceives, and with how much noise."""
+    """Set what the robot perceives, and how noisily."""
 
     observations: tuple[str, ...] = OBSERVATIONS
     """Parts of the observation; the vector keeps the original's order: waypoints, goal, velocity, then localisation,
     odometry, collision, joints, lidar, trail. With images (depth, segmentation, rgb, normals) it is a dict."""
     renderer: Literal["auto", "warp", "rays"] = "auto"
-    """Who draws: warp (MJX-Warp's), rays (plain JAX), or auto: warp beside physics on warp, rays elsewhere."""
+    """Renderer: warp (MJX-Warp's), rays (plain JAX), or auto: warp beside physics on warp, rays elsewhere."""
     image_geometry: Literal["boxes", "meshes"] = "boxes"
-    """What images show: the boxes that collide, or the visual meshes with their textures (drawn by Warp, on GPU and
-    CPU, beside any physics)."""
+    """Images show collision boxes, or visual meshes with textures (rendered by Warp, with any physics)."""
     cameras: Sequence[Mapping[str, Any]] = ()
-    """Cameras in place of the robot's one, each a mapping of settings of `CameraView`."""
+    """Cameras that replace the robot's, each a mapping of settings of `CameraView`."""
     robot_visible: bool = False
-    """Images show the robot's body but for the housing of its camera."""
+    """Show the robot's body in images, except for the housing of its camera."""
     random_colours: NotNegative = 0.0
-    """Each episode, each class of things has its colours multiplied by a factor for red, green and blue: the standard
-    deviation of their logarithm."""
+    """Standard deviation of the logarithm of the red, green and blue factors of each object class in each episode."""
     random_light: NotNegative = 0.0
-    """Each episode has its sun and brightness: standard deviation, of the latter in stops."""
+    """Standard deviation of the sun's direction (before normalisation) and of the brightness, in stops, by episode."""
     image_size: ImageSide = 68
     """Side of the square images, pixels."""
     image_fov_deg: FovDeg = None
     """Field of view; none: the robot's camera's (120 degrees)."""
     image_dtype: Literal["float32", "float16", "uint8"] = "float32"
-    """Of images: float32 or float16 in [0, 1], or uint8, 255 times that; normals are in [-1, 1] and never uint8."""
+    """Type of images: float32 or float16 in [0, 1], or uint8, 255 times that; normals are in [-1, 1], never uint8."""
     depth_range_m: Positive = 5.0
-    """Depth is cut off here and divided by it."""
+    """Depth is clipped at this value and divided by it."""
     segmentation_classes: MaskClasses = 4
     """Furniture classes: 4 as in the original's code (desk and table are one), the paper's 5, or all categories."""
     depth_dropout: Share = 0.0
-    """Share of depth pixels that read 0, drawn anew each step."""
+    """Share of depth pixels that read 0, drawn in each step."""
     depth_noise: NotNegative = 0.0
     """Standard deviation of depth, as a share of it."""
     lidar_rays: AtLeastOne = 228
     """Beams of the planar scan, evenly over `lidar_fov_deg` from the right; by default the TurtleBot's Hokuyo."""
     lidar_fov_deg: Annotated[Positive, Bounds(0, 360)] = 240.0
-    """Angle that the scan covers, ahead in its middle."""
+    """Angle of the scan, centred straight ahead."""
     lidar_range_m: Positive = 5.6
-    """Distances are divided by it; 1 where nothing is nearer."""
+    """Distances are divided by it; 1 if nothing is nearer."""
     lidar_pos_m: tuple[float, float, float] = (0.0, 0.0, 0.37)
     """Scanner in the robot's base frame."""
     lidar_dropout: Share = 0.0
-    """Share of beams that read 1, drawn anew each step."""
+    """Share of beams that read 1, drawn in each step."""
     lidar_noise: NotNegative = 0.0
     """Standard deviation of a beam's distance, as a share of it."""
     odometry_noise: NotNegative = 0.0

@@ -1,6 +1,6 @@
-"""Run `python -m topological_nav COMMAND`: words in, files and pictures out.
+"""Run `python -m topological_nav COMMAND`.
 
-Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when stopped: the same command goes on.
+Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when stopped: the same command resumes.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ from topological_nav.data.domains import AdaptConfig
 
 @dataclasses.dataclass(kw_only=True)
 class _Listed(Command):
-    """Base of all commands, which have settings."""
+    """Base of the commands, with settings."""
 
     LISTED: ClassVar[dict[str, Any]]
     """Name of a group of settings -> their defaults."""
@@ -56,9 +56,9 @@ class _Driving(_Networks):
     policy: Annotated[str | None, option(metavar="RUN")] = None
     """Local policy (default: the networks', if none is named); passage: ahead while the detector agrees, else turn."""
     domain: Annotated[str, option(metavar="NAME")] = "clean"
-    """Its camera, goals included: clean, lens, light, noise, blur or camera; maps of its images: `adapt map`."""
+    """Camera, goals included: clean, lens, light, noise, blur or camera; `adapt map` builds maps of its images."""
     truth: Flag = False
-    """Take maps from the plan, and the truth instead of both networks."""
+    """Build maps from the plan, and replace both networks by the truth."""
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -106,12 +106,12 @@ class Map(_Networks):
 
 @dataclasses.dataclass(kw_only=True)
 class Explore(_Driving):
-    """Build a scene's map while the robot drives about in it without one, and draw it."""
+    """Build a scene's map while the robot explores it, and draw it."""
 
     scene: Annotated[str, *word("SCENE")]
     """Scene folder."""
     out: Annotated[Path, option("-o", metavar="DIR")] = RUNS / "maps-explored"
-    """Folder of the map, for `--maps`; with --truth it has no images, and nothing navigates by it."""
+    """Folder of the map, for `--maps`; with --truth the map has no images and serves no navigation."""
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -121,9 +121,9 @@ class Navigate(_Driving):
     scene: Annotated[str, *word("SCENE")]
     """Scene folder."""
     episode: Annotated[int, option(metavar="N")] = 0
-    """Of the scene's."""
+    """Number of the scene's episode."""
     sparse: Flag = False
-    """Use the map thinned out."""
+    """Use the thinned map."""
     out: Annotated[Path | None, option("-o", metavar="PATH")] = None
     """The picture."""
     video: Annotated[Path | None, option(metavar="PATH")] = None
@@ -137,7 +137,7 @@ class Evaluate(_Driving):
     scenes: Annotated[tuple[str, ...], *word("SCENE")]
     """Scene folders or sets of them."""
     contenders: Annotated[str | None, option(metavar="NAME,...")] = None
-    """dense, sparse (the navigator, on its map and on the map thinned out), expert, ppo (default: all that can)."""
+    """dense, sparse (the navigator on its map and on the thinned map), expert, ppo (default: all that can)."""
     ppo: Annotated[Path | None, option(metavar="RUN")] = None
     """Run folder of `python -m train`, whose policy knows where the goal is."""
     out: Annotated[Path, option("-o", metavar="DIR")] = RUNS / "evaluation"
@@ -146,7 +146,7 @@ class Evaluate(_Driving):
 
 @dataclasses.dataclass(kw_only=True)
 class Adapt(_Networks):
-    """Take networks and maps to another domain."""
+    """Adapt networks and maps to another domain."""
 
     LISTED = {"": AdaptConfig()}
     what: Annotated[Literal["features", "passages", "map"], *word("WHAT")]
@@ -177,7 +177,7 @@ class Export(_Listed):
     maps: Annotated[Path | None, option(metavar="DIR")] = None
     """Folder of SCENE.npz, all of which are exported."""
     images: Annotated[Path, option(metavar="PATH")] = DATASET
-    """To compare by: a dataset, or a scene."""
+    """Dataset or scene whose images compare the networks."""
     out: Annotated[Path, option("-o", metavar="DIR")] = RUNS / "export"
     """The folder."""
     picture: Annotated[Path | None, option(metavar="PATH")] = None

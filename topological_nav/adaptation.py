@@ -1,15 +1,15 @@
-"""Take networks and maps to another domain.
+"""Adapt networks and maps to another domain.
 
-Features: Tzeng et al. 2017 (ADDA). A critic learns to separate the embeddings of source images from those of target
-images, which a second extractor computes that starts as the source's; in turn that one learns to be taken for the
-source's, which stays as it is. No label and no position of a target image is used.
+Features: ADDA (Tzeng et al. 2017). A critic learns to separate embeddings of source images from those of target images
+by a second extractor, which starts as the source's and learns to deceive the critic. The source's extractor is frozen;
+labels and positions of target images are not used.
 
-Passages: a detector's four configurations, and maps: of images collected in the target domain.
+Passages: four configurations of a detector. Maps: built from images collected in the target domain.
 
 | | not fine-tuned | fine-tuned on target images |
 |---|---|---|
 | fresh weights | A | B |
-| learned from the source | C | D |
+| trained on the source | C | D |
 """
 
 import dataclasses
@@ -53,11 +53,11 @@ from topological_nav.maps.graph import near_pairs
 from topological_nav.scenes.space import FreeSpace, free_space
 
 ROOMS_STREAM, PASSAGES_STREAM = 1, 2
-"""Of chance in target images."""
+"""Random streams of target images."""
 
 
 class Critic(nn.Module):
-    """Judge embeddings by two layers with leaky ReLU; one output, positive for the source."""
+    """Classify embeddings by two layers with leaky ReLU; the output is positive for the source."""
 
     hidden: int
 
@@ -72,10 +72,10 @@ class Critic(nn.Module):
 
 @flax.struct.dataclass
 class Adapting:
-    """Hold what an epoch changes."""
+    """Hold the state that an epoch changes."""
 
     params: Any
-    """Of the target's network; its heads stay the source's."""
+    """Of the target's network; its heads remain the source's."""
     batch_stats: Any
     opt_state: Any
     critic: Any
@@ -83,7 +83,7 @@ class Adapting:
 
 
 def embed_training(network: Network, variables: Any, images: jax.Array) -> tuple[jax.Array, Any]:
-    """Return embeddings [N, D] by the batch's statistics, and the running ones updated."""
+    """Return embeddings [N, D] by batch statistics, and updated running statistics."""
     embeddings, new = network.apply(
         variables, images, method=lambda module, x: joined(module.body(normalised(x), True)), mutable=["batch_stats"]
     )
@@ -93,7 +93,7 @@ def embed_training(network: Network, variables: Any, images: jax.Array) -> tuple
 def make_adapting(
     network: Network, variables: dict[str, Any], size: int, config: AdaptConfig
 ) -> tuple[Adapting, Critic]:
-    """Return the target's extractor as the source's, and a fresh critic."""
+    """Return a target extractor equal to the source's, and a fresh critic."""
     critic = Critic(config.hidden)
     shapes = jax.eval_shape(critic.init, jax.random.PRNGKey(0), jax.ShapeDtypeStruct((1, size), jnp.float32))
     weights = learning.initial(shapes, config.seed)["params"]
@@ -104,10 +104,10 @@ def make_adapting(
 
 
 def adversarial_epoch(network: Network, critic: Critic, config: AdaptConfig):
-    """Build an epoch: for each batch of target images one update of the critic, then one of the extractor.
+    """Build an epoch that updates the critic, then the extractor, for each batch of target images.
 
-    Called with the source's embeddings [S, D] in place of labels. Its means: `loss` of the extractor, `critic_loss`,
-    and `critic_accuracy`, before its update, where 0.5 means that the domains look alike.
+    The source's embeddings [S, D] replace labels. Means are the extractor's `loss`, `critic_loss` and `critic_accuracy`
+    before the update (0.5: the domains look alike).
     """
     tx, critic_tx = _optimisers(config)
 
@@ -140,10 +140,7 @@ def adversarial_epoch(network: Network, critic: Critic, config: AdaptConfig):
 
 
 def target_statistics(trained: Trained, images: np.ndarray, batch: int, passes: int = 3) -> Trained:
-    """Return the network with batch normalisation's running statistics of other images, its weights as they were.
-
-    Li et al. 2016 (AdaBN): the least that can be done, and a baseline for more. Images [N, H, W, 3] u8.
-    """
+    """Return the network with batch statistics of other images [N, H, W, 3] u8 (AdaBN, Li et al. 2016), a baseline."""
     step = jax.jit(lambda stats, x: embed_training(trained.network, {**trained.variables, "batch_stats": stats}, x)[1])
     stats, size = trained.variables["batch_stats"], min(batch, len(images))
     order = np.random.default_rng(0).permutation(len(images))
@@ -156,10 +153,7 @@ def target_statistics(trained: Trained, images: np.ndarray, batch: int, passes: 
 def adapt_features(
     run: Path, source: Path, target: Path, out: Path, config: AdaptConfig, host: Host = ALONE
 ) -> dict[str, Any]:
-    """Adapt a run's embedding to another domain, or continue the adaptation at `out`.
-
-    Return the content of results.json: localisation before, with the target's statistics alone, and after.
-    """
+    """Adapt a run's embedding to another domain, or resume; return results: localisation before, with AdaBN, after."""
     trained = load_trained(run)
     near, far = load_rooms(source), target_rooms(target, config)
     headers = [read_header(folder)[0] for folder in (source, target)]
@@ -187,7 +181,7 @@ def adapt_features(
 
 
 def adapted_about(trained: Trained, config: AdaptConfig) -> dict[str, Any]:
-    """Return what network.json says of a network that was adapted from a trained one."""
+    """Return the network.json of a network adapted from a trained one."""
     return {**trained.about, "adapted_from": trained.about["digest"], "domain": to_dict(preset(config.domain))}
 
 
@@ -200,7 +194,7 @@ def target_rooms(folder: Path, config: AdaptConfig) -> RoomImages:
 def localisation_between(
     node_network: Trained, node_rooms: RoomImages, query_network: Trained, query_rooms: RoomImages
 ) -> dict[str, Any]:
-    """Score queries of one domain on nodes of another, see `training.localisation`; return their number too."""
+    """Score queries of one domain on nodes of another, and count them; see `training.localisation`."""
     rows = localisation(node_network, node_rooms, query_network, query_rooms)
     if not rows:
         raise FileError("source and target have no scene in common with positions for training and for testing")
@@ -216,16 +210,13 @@ def _optimisers(config: AdaptConfig):
 
 
 CONFIGURATIONS = {"A": (False, False), "B": (False, True), "C": (True, False), "D": (True, True)}
-"""Name -> whether the weights are the source's, and whether they are fine-tuned."""
+"""Name -> whether weights are the source's, and whether they are fine-tuned."""
 
 
 def passage_configurations(
     run: Path, target: Path, out: Path, config: AdaptConfig, host: Host = ALONE
 ) -> dict[str, Any]:
-    """Score a passage detector in another domain, learned from the source or not, fine-tuned or not.
-
-    Return the content of results.json.
-    """
+    """Score a passage detector in another domain, with each of `CONFIGURATIONS`; return results.json."""
     trained = load_trained(run)
     need_task(trained.about, "passages", f"{run}:")
     learned, tested = labelled(target, trained.about["lengths_m"], config)
@@ -257,11 +248,11 @@ def passage_configurations(
 
 
 def collected_map(scene_folder: Path | None, target: Path, localiser: Path, detector: Path, config: AdaptConfig):
-    """Build a map of images collected in the target domain: its training positions, no image drawn for the map.
+    """Build a map of images at a target dataset's training positions, without rendering any for the map.
 
-    Of photographs every place is a node, and no scene is needed; a way that was judged by hand is as the hand says.
-    An edge is judged by the image of its node nearest to it in angle, 10 degrees off at most for 18 headings. Scores of
-    the `build.Built` say how held-out images of the target are localised on it.
+    Photographs need no scene; all their places are nodes, and paths judged by hand keep that judgement. An edge is
+    judged by its node's image nearest in angle, at most 10 degrees off for 18 headings. Scores of the `build.Built`
+    include localisation of held-out target images.
     """
     networks = load_networks(localiser, detector, same=())
     header, data = read_header(target)
@@ -310,7 +301,7 @@ def collected_map(scene_folder: Path | None, target: Path, localiser: Path, dete
 
 
 def labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> tuple[PassageImages, PassageImages]:
-    """Return target images to learn from and to test, no source in both: so many free, or as many as blocked."""
+    """Return target images for training and testing, with disjoint sources and as many free as set, or half."""
     passages = load_passages(target)
     if list(passages.lengths_m) != list(lengths_m):
         lengths = ",".join(f"{length:g}" for length in lengths_m)

@@ -44,7 +44,7 @@ from topological_nav.weights.onnx_files import onnx_models
 
 @contextmanager
 def terminal() -> Iterator[Host]:
-    """Show lines on stdout, at once, and stop at a signal."""
+    """Print lines on stdout without buffering, and stop at a signal."""
     with stop_signals() as stops:
         yield Host(lambda line: print(line, flush=True), lambda: stops[0] if stops else 0)
 
@@ -82,7 +82,7 @@ def contest_of(arguments: Any, scenes: Sequence[str], contenders: Sequence[str],
 
 
 def _refuse_unused(arguments: Any, contest: Contest) -> None:
-    """Refuse settings that change nothing for these contenders."""
+    """Refuse settings that do not affect these contenders."""
     names = set(contest.contenders)
     who = f"without a contender that needs it (contenders: {', '.join(contest.contenders)})"
     if not names & {"dense", "sparse"}:
@@ -319,7 +319,7 @@ def _policy(arguments: Any) -> None:
 
 
 def run_adapt(arguments: Any) -> None:
-    """Take networks, and a map, to another domain."""
+    """Adapt networks, and a map, to another domain."""
     config = configured(AdaptConfig(), arguments.settings, "adapt")
     if arguments.what != "map" and arguments.scene:
         raise ConfigError(f"adapt {arguments.what} takes no scene folder; leave out {arguments.scene}")
@@ -337,7 +337,7 @@ def run_adapt(arguments: Any) -> None:
 
 
 def _refuse_unused_to_adapt(arguments: Any) -> None:
-    """Refuse settings of other adaptations; the settings' docstrings say whose they are."""
+    """Refuse settings of other adaptations, by the settings' docstrings."""
     what = arguments.what
     why = f"in 'adapt {what}'"
     docs = field_docs(AdaptConfig)

@@ -1,8 +1,8 @@
-"""Build a topological map while the robot drives about a home that it does not know.
+"""Build a topological map while the robot drives about an unknown home.
 
-At each stop the robot looks about. The embeddings of what it sees decide whether it stands at a known node or at a new
-one, and the passage detector which headings are open. It drives a run along one that is unexplored, at the nearest node
-that has any, until none is left. Odometry's positions give edges their lengths and decide nothing else.
+At each stop the robot looks around. The embeddings of its images decide whether it is at a known node or a new one, and
+the passage detector which headings are open. It drives a run along an unexplored heading of the nearest node that has
+any, until none is left. Odometry is used only for the lengths of edges.
 """
 
 import dataclasses
@@ -31,21 +31,21 @@ OPEN_M, CLEAR_M, COVERED_M = 1.5, 0.5, 1.5
 """A heading is open that is free for this length; the baseline policy drives on while the way is free for the second;
 floor as near to a node as the third is covered."""
 SAME, SAME_M = 0.5, 0.9
-"""Below this mean distance of embeddings, or with the truth of places (m), the robot stands at a known node."""
+"""Largest mean distance of embeddings, or with the truth of places (m), at which a node counts as known."""
 APART_RAD = np.deg2rad(20.0) + 1e-6
 """Headings this near to one that was driven along are explored; a run ends where the robot has turned away so far."""
 LEG_S = 120.0
-"""Longest time to reach a node, to look about, or to turn and drive a run."""
+"""Longest time to reach a node, to look around, or to turn and drive a run."""
 UNUSED = "--maps episodes min_goal_m success_m thinned batch objects goal_images match images runs glance clear_m"
 
 
 class Explorer(HostPolicy):
-    """Drive one robot about, and remember nodes, edges and which headings are still to be explored."""
+    """Drive one robot, and remember nodes, edges and unexplored headings."""
 
     observes = False
 
     def __init__(self, venue: ContestScene):
-        """Take the scene, with what judges its images; its map becomes the one that is explored."""
+        """Store the scene with its judge of images; the explored map replaces its map."""
         self._venue, self._networks, self._config = venue, venue.networks, venue.contest.config
         data = self._networks.camera if self._networks else DataConfig()
         self._around = headings(data)
@@ -64,7 +64,7 @@ class Explorer(HostPolicy):
         self._policy = local_policy(venue.contest.policy, venue.sight(venue.map), self._how, self._networks or ())
 
     def graph(self, ahead: bool = False) -> TopologicalMap:
-        """Return the map so far; `ahead` adds an unknown node, `OPEN_M` along the heading to be explored."""
+        """Return the current map; `ahead` adds an unknown node, `OPEN_M` along the heading to explore."""
         xy, embeddings, edges = [n[0] for n in self._nodes], [n[2] for n in self._nodes], dict(self._edges)
         if ahead:
             node, angle = self._left or (-1, 0.0)
@@ -107,7 +107,7 @@ class Explorer(HostPolicy):
         return np.asarray(actions, np.float32), np.array([over or time_s >= self._config.limit_s])
 
     def _go(self, here: int = -1, heading: Any = None, goal: int = -1) -> None:
-        """Begin a leg from a node: to a known one, or along the heading to be explored; without one, look about."""
+        """Start a leg from a node: to a known one, along a heading to explore, or, without either, looking around."""
         how = self._how if goal >= 0 else dataclasses.replace(self._how, runs=1, glance=False, swings=1)
         graph = self.graph(ahead=goal < 0)
         self._navigator = Navigator(graph, self._venue.sight(graph), self._policy, how)
@@ -117,7 +117,7 @@ class Explorer(HostPolicy):
             self._navigator.plan(self._mind, np.array([0]), heading)
 
     def _stand(self, xy_w: np.ndarray, away: np.ndarray, heading: np.ndarray) -> bool:
-        """Decide by the distances of known nodes which one this is; return whether nothing is left to explore."""
+        """Match the place to a known node by distances, or add a node; return whether nothing is left to explore."""
         images, sight = np.stack([self._seen[k] for k in sorted(self._seen)]), self._venue.sight(self.graph(ahead=True))
         here = int(away.argmin()) if len(away) and away.min() < (SAME if self._networks else SAME_M) else len(away)
         if here == len(away):
@@ -139,7 +139,7 @@ class Explorer(HostPolicy):
         return self._choose(here, heading)
 
     def _choose(self, here: int, heading: np.ndarray) -> bool:
-        """Go to the nearest node with a heading to explore; return whether there is none."""
+        """Choose the nearest node with a heading to explore; return whether there is none."""
         cost = np.where([p.any() for p in self._unexplored], self.graph().left[:, here], np.inf)
         goal = int(cost.argmin())
         if np.isfinite(cost[goal]):
@@ -149,7 +149,7 @@ class Explorer(HostPolicy):
         return not np.isfinite(cost[goal])
 
     def play(self, progress: Progress = lambda *_: None) -> None:
-        """Explore from a place that the seed draws; `progress` may raise to stop."""
+        """Explore from a random place; `progress` may raise to stop."""
         env, rng, total = self._venue.player.env, np.random.default_rng([self._config.seed, 23]), self._config.limit_s
         start_w = self._venue.space.sample(rng, 1, self._config.clearance_m)
         starts = episode_starts(start_w, rng.uniform(-np.pi, np.pi, 1), start_w, 0)
@@ -161,7 +161,7 @@ class Explorer(HostPolicy):
         self._venue.player.rollout(self, episode_keys(self._config.seed, 1), starts, fewest=1, on_progress=report)
 
     def built(self) -> Built:
-        """Return the map so far and its scores against the plan."""
+        """Return the current map and its scores against the plan."""
         if not self._nodes:
             raise ConfigError(f"limit_s is {self._config.limit_s:g}, expected time to look about; raise it")
         space, graph, data = self._venue.space, self.graph(), DataConfig()

@@ -1,4 +1,4 @@
-"""Put between a navigator and its simulated robots what a real robot has: slip, delays and a compass that drifts."""
+"""Simulate slip, delays and a drifting compass of real robots between a navigator and simulated robots."""
 
 import dataclasses
 from typing import Annotated
@@ -29,23 +29,23 @@ class GapConfig(Settings):
 
 
 class Gap:
-    """Hold the commands under way to a batch of robots; chance depends on seed, episode and control step alone."""
+    """Hold the pending commands to a batch of robots; noise depends on seed, episode and control step alone."""
 
     def __init__(self, config: GapConfig, seed: int, episode: np.ndarray, half_width_m: float):
-        """Take the numbers of the episodes [B], and half the distance between the robot's wheels."""
+        """Store the numbers of the episodes [B], and half the distance between the robot's wheels."""
         self._config, self._seed, self._episode, self._half_m = config, seed, episode, half_width_m
         self._waiting = np.zeros((config.delay_steps, len(episode), 2))
 
     def keep(self, rows: np.ndarray) -> None:
-        """Continue with these rows of the batch only."""
+        """Keep only these rows of the batch."""
         self._episode, self._waiting = self._episode[rows], self._waiting[:, rows]
 
     def heading(self, yaw_rad: np.ndarray, time_s: float) -> np.ndarray:
-        """Return the headings [B] (rad) that a compass gives at a time of the episode."""
+        """Return the compass headings [B] (rad) at a time of the episode."""
         return yaw_rad + np.radians(self._config.compass_deg + self._config.compass_drift_deg * time_s / 60.0)
 
     def executed(self, linear: np.ndarray, angular: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the velocities [B] (m/s, rad/s) that robots execute in a step in which these are commanded."""
+        """Return the velocities [B] (m/s, rad/s) that robots execute in the step of a command."""
         queue = np.concatenate([self._waiting, np.stack([linear, angular], -1)[None]])
         self._waiting, config = queue[1:], self._config
         linear, angular = (queue[0] * [config.linear_gain, config.angular_gain]).T

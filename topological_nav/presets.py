@@ -1,4 +1,4 @@
-"""Lay named settings, such as the report's, over the defaults of the commands."""
+"""Apply named settings, such as the report's, over the defaults of the commands."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,12 +14,12 @@ Config = TypeVar("Config")
 
 
 def preset_of(words: Sequence[str]) -> str:
-    """Return the preset that settings name, or nothing."""
+    """Return the preset that settings name, or an empty string."""
     return next((word.partition("=")[2] for word in words if word.startswith("preset=")), "")
 
 
 def configured(base: Config, words: Sequence[str], part: str) -> Config:
-    """Return the settings of a part with those of `preset=NAME` laid over them, then the other words."""
+    """Return the settings of a part with `preset=NAME`, then the other words, applied."""
     if name := preset_of(words):
         if part not in PRESETS.get(name, {}):
             of_part = ", ".join(known for known, parts in PRESETS.items() if part in parts)

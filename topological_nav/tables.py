@@ -1,4 +1,4 @@
-"""Write the topological report's tables in its columns, with those of a folder of runs beside them."""
+"""Write the topological report's tables beside those of a folder of runs."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -32,7 +32,7 @@ def tables(runs: Path) -> str:
 
 
 def beside(theirs: Sequence[Row], ours: Sequence[Row], keys: int) -> list[list[str]]:
-    """Return cells of the report's rows, each value with ours of the same first `keys` cells to its right."""
+    """Return cells of the report's rows, each value followed by ours with the same first `keys` cells."""
     left, right = ({tuple(row[:keys]): row[keys:] for row in rows} for rows in (theirs, ours))
     blank, lines = [np.nan] * (len(theirs[0]) - keys), []
     for key in dict.fromkeys([*left, *right]):
@@ -48,7 +48,7 @@ def _cell(value: float) -> str:
 
 
 def passage_scores(confusion: Sequence[Sequence[int]]) -> list[float]:
-    """Return accuracy, F1 of free passages, tn, fp, fn and tp; `confusion` has rows of blocked and of free images."""
+    """Return accuracy, F1 of free passages, tn, fp, fn and tp; `confusion` has rows of blocked and free images."""
     (tn, fp), (fn, tp) = confusion
     return [(tn + tp) / (tn + fp + fn + tp), 2 * tp / max(2 * tp + fp + fn, 1), tn, fp, fn, tp]
 

@@ -155,7 +155,7 @@ class SACConfig(OffPolicyConfig):
     tau: Share = 0.005
     """Share of the critics in their targets at each gradient step."""
     initial_alpha: Positive = 0.01
-    """Temperature to begin with; 1 in the original, but rewards are a few centimetres of progress a step here."""
+    """Initial temperature; 1 in the original, but rewards are a few centimetres of progress a step here."""
     target_entropy_per_action: Annotated[float, Bounds(-1e6, 1e6)] = -1.0
     """Entropy that the temperature aims at, times the number of actions: -1 in the original, -0.5 in Brax."""
 
@@ -192,9 +192,9 @@ class CloneConfig(Settings):
     """Behavioural cloning: PPO's policy network learns recorded actions by maximum likelihood."""
 
     demonstrations: str = ""
-    """Parquet file that `python -m train.evaluate --demonstrations` wrote."""
+    """Parquet file of `python -m train.evaluate --demonstrations`."""
     episodes: Literal["successful", "all"] = "successful"
-    """Which episodes of it are learned from."""
+    """Episodes to learn from."""
     num_envs: AtLeastOne | None = None
     """Environments stepped together, to score the policy on the way."""
     unroll_length: AtLeastOne | None = None
@@ -222,9 +222,9 @@ class RunConfig(Settings):
     name: str = ""
     """Folder of this run inside out_dir; empty: <config name>-seed<seed>."""
     seed: Seed = 0
-    """The one seed of networks, environments and sampling."""
+    """Seed of networks, environments and sampling."""
     devices: AtLeastOne = 1
-    """Devices that share the environments and the minibatches, each GPU in a process of its own; ppo only."""
+    """Devices that share environments and minibatches, with a process per GPU; ppo only."""
     num_timesteps: AtLeastOne = 20_000_000
     """Environment steps to train for, rounded up to whole updates."""
     log_every_steps: AtLeastOne = 100_000
@@ -236,7 +236,7 @@ class RunConfig(Settings):
     best_metric: str = "ins_0.5"
     """Episode score whose mean over a checkpoint interval makes the best checkpoint."""
     env_state_limit_mb: NotNegative = 256.0
-    """Checkpoints hold the environments' state up to this size; beyond it, resuming begins new episodes."""
+    """Checkpoints include the environments' state up to this size; beyond it, resuming starts new episodes."""
     tensorboard: bool = True
     """Write TensorBoard events beside metrics.jsonl."""
     wandb: bool = False

@@ -100,9 +100,9 @@ def _push(model: mujoco.MjModel, data: mujoco.MjData, free: dict[int, int], most
 def push_apart(
     parts: SceneParts, most_m: float = MAX_PUSH_M, hold: Collection[int] = ()
 ) -> tuple[SceneParts, dict[int, str]]:
-    """Slide free objects horizontally, without dynamics, until neither hulls nor boxes overlap walls or each other.
+    """Slide free objects by up to `most_m`, without dynamics, so that hulls and boxes overlap neither walls nor others.
 
-    Return also the objects that could not be freed: number -> what it overlaps.
+    Return also the objects among `hold` that still overlap, which are no longer pushed: number -> what it overlaps.
     """
     model = collide_with(build_spec(parts), "both")
     data = mujoco.MjData(model)

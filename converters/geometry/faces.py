@@ -344,9 +344,8 @@ def simplify_open(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> t
 def simplify_parts(parts: tuple[tuple[np.ndarray, np.ndarray], ...], max_faces: int) -> tuple[np.ndarray, np.ndarray]:
     """Return all parts as one mesh of about this many faces, shared out by the square roots of their areas.
 
-    Faces that simple parts do not need go to the others. Parts are simplified within `MOST_M` and `LEAST_AREA`, and
-    further only if the total is too large. A level plane is kept by itself, as it would lose its outline. A small
-    object of many loose pieces becomes its convex hull.
+    Faces that simple parts do not need go to the others. Parts beyond their share are simplified within `MOST_M` and
+    `LEAST_AREA`, and further only if the total is too large. A small part of many loose pieces becomes its convex hull.
     """
     done = [merge_vertices(*part)[:2] for part in parts]
     weight = np.sqrt([face_areas(*part).sum() for part in done])

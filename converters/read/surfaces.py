@@ -294,8 +294,8 @@ def _extent(values: np.ndarray, area: np.ndarray) -> tuple[float, float]:
 def find_up(vertices: np.ndarray, faces: np.ndarray, where: str) -> np.ndarray:
     """Return the unit vector (3,) that points up in a room's scan of any unit, whose faces' front is to the room.
 
-    Nearly all area lies along three orthogonal directions, and the storey's height is the shortest extent. Up is the
-    side that furniture tops and an uncovered floor face.
+    The height is the shortest extent along three orthogonal directions that most area faces. The floor is the end with
+    far more area facing inwards, else the one that furniture tops face away from. Up is the floor's mean normal.
     """
     normal, area = unit_normals(vertices, faces), face_areas(vertices, faces)
     if not area.sum() > 0:

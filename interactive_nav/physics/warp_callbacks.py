@@ -37,7 +37,7 @@ def held(x: jax.Array, owner: object) -> jax.Array:
 
 
 class _Suspended:
-    """Keeps the collector off while anybody is inside, and leaves it as it was at first: devices have threads."""
+    """Suspend the collector while any thread is inside, and restore its state afterwards."""
 
     def __init__(self) -> None:
         self._lock, self._inside, self._collects = threading.Lock(), 0, False
@@ -60,7 +60,7 @@ _SUSPENDED = _Suspended()
 
 
 def quieten() -> None:
-    """Replace Warp's line for each of its hundreds of kernels by one where none is compiled yet. Once is enough."""
+    """Replace Warp's lines, one per kernel, by a single line if none is compiled yet; once is enough."""
     import warp
 
     if warp.config.log_level != warp.LOG_INFO:  # somebody chose, or it was done
@@ -84,7 +84,7 @@ def keep_collector_out() -> None:
 
 
 def without_collector(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the function, not interrupted by the collector, which stays as it was."""
+    """Return the function with the collector suspended in its calls."""
 
     @functools.wraps(function)
     def quiet(*args: Any, **kwargs: Any) -> Any:

@@ -26,13 +26,13 @@ NEAR_M = 0.01
 FAR_M = 100.0
 """Near and far plane of the original's renderer (reference benchmark, section 1.3); what is farther is empty."""
 _FLOOR_HALF_M = (1e4, 1e4, 1.0)
-"""The floor as one more box, whose top is z = 0."""
+"""Half sizes of the floor's box, whose top is z = 0."""
 _LIGHT_W = np.array([0.35, 0.25, 0.9], np.float32) / np.linalg.norm([0.35, 0.25, 0.9])
 
 
 @flax.struct.dataclass
 class Look:
-    """How an episode looks; leading axes as the caller has them."""
+    """Hold an episode's colours and light, with any leading axes."""
 
     tint: jax.Array
     """[..., classes, 3] factors of the colours of each class of the masks; structure and sky are 0."""

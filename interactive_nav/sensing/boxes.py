@@ -28,7 +28,7 @@ PALETTES = {
 """The setting `segmentation_classes` -> colours by class id, then the floor's and the background's."""
 _TINY = np.float32(1e-12)
 HOUSING_M = 0.01
-"""What is as near to the robot's camera is its housing."""
+"""A box this near to the robot's camera counts as its housing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,7 +140,7 @@ class BoxTables:
     colour: jax.Array | None
     """[S, B + 1, 3] f32 in [0, 1], the floor's last; None: no images in colour."""
     classes: MaskClasses = flax.struct.field(pytree_node=False, default=4)
-    """How `class_id` tells categories apart: the setting `segmentation_classes`."""
+    """Categories that `class_id` distinguishes: the setting `segmentation_classes`."""
     robot: Links | None = flax.struct.field(pytree_node=False, default=None)
     """None: it is invisible."""
 

@@ -31,7 +31,7 @@ PARTS = {
 }
 """Part of an observation -> its unit, its frame (base: x forward, y left, z up) and its numbers."""
 COMPARED = ("shape", "dtype", "unit", "scale", "frame")
-"""What of an input, and the rate apart, an environment must have as the file says."""
+"""Properties of an input that must agree with the file, besides the rate."""
 
 
 def inputs_of(env: Any, observations: Any) -> dict[str, Any]:

@@ -94,7 +94,7 @@ TRAIL_STEPS = 10
 TRAIL = (1, 2, 4, 8, 16, 32, 64)
 """Points of it that are observed: 1 to 64 s ago with a control period of 0.1 s, and up to 0.9 s more."""
 LIDAR_NEAR_M = 0.05
-"""Beams begin this far from the scanner (iGibson)."""
+"""Distance of the beams' start from the scanner (iGibson)."""
 
 
 def stream(rng: jax.Array, name: str, step_count: jax.Array) -> jax.Array:

@@ -1,12 +1,12 @@
-"""Make dataset folders of scenes, and read them: room images around positions, and labelled passage images.
+"""Make and read datasets of scenes: room images around positions, and labelled passage images.
 
     DATASET/dataset.json           settings, scenes with digests and counts, versions
-            <scene>/plan.npz       rooms, positions and passages with labels: all that is decided before drawing
+            <scene>/plan.npz       rooms, positions and passages with labels, determined by scene and settings alone
             <scene>/rooms-000.npz  images of some positions: pitch by pitch, heading by heading
             <scene>/passages-000.npz
-            preview.png            where the images were taken, and some of them
+            preview.png            positions of the images, and some of them
 
-What is decided depends on scene and settings only. Drawing goes file by file and skips those that exist.
+Rendering skips files that exist.
 """
 
 import dataclasses
@@ -41,7 +41,7 @@ read_header = DATASET.read
 
 @dataclasses.dataclass(frozen=True)
 class Passages(Rows):
-    """Hold n looks along straight ways, grouped by source."""
+    """Hold n views along straight paths, grouped by source."""
 
     xy_w: np.ndarray
     """[n, 2] m, sources."""
@@ -59,7 +59,7 @@ class Passages(Rows):
 
 @dataclasses.dataclass(frozen=True)
 class ScenePlan:
-    """Say where a scene's images are taken, with labels."""
+    """Hold the positions of a scene's images, with labels."""
 
     rooms: Rooms
     xy_w: np.ndarray
@@ -80,7 +80,7 @@ class RoomImages:
     label: np.ndarray
     """[P] i32 room among all scenes' rooms."""
     names: tuple[str, ...]
-    """Of the labels: scene/room."""
+    """Names of the labels: scene/room."""
     scene: np.ndarray
     """[P] i32."""
     xy_w: np.ndarray
@@ -104,19 +104,16 @@ class PassageImages:
     lengths_m: tuple[float, ...]
     """[L] ascending."""
     scored: int
-    """Which of them passages are balanced on and detectors scored by."""
+    """Index of the length that balances passages and scores detectors."""
 
 
 def headings(config: DataConfig) -> np.ndarray:
-    """Return K headings (rad), evenly about a position, from the world's x axis on."""
+    """Return K evenly spaced headings (rad), starting at the world's x axis."""
     return 2 * np.pi * np.arange(config.headings) / config.headings
 
 
 def plan_scene(scene: Scene, space: FreeSpace, config: DataConfig) -> ScenePlan:
-    """Decide where a scene's images are taken.
-
-    Positions are drawn uniformly; of a room that has more than its share, those farthest from each other stay.
-    """
+    """Choose uniform positions for a scene's images; a room with more than its share keeps the most distant ones."""
     rng = np.random.default_rng([config.seed, 2, int(scene.digest[:8], 16)])
     rooms = scene_rooms(scene, space, config)
     try:
@@ -139,7 +136,7 @@ def plan_scene(scene: Scene, space: FreeSpace, config: DataConfig) -> ScenePlan:
 def make_dataset(
     scene_folders: Sequence[Path], out: Path, config: DataConfig, progress: Progress = lambda *_: None
 ) -> dict[str, Any]:
-    """Make a dataset in the folder `out`, or what is missing of it; return the content of dataset.json."""
+    """Make a dataset in the folder `out`, or its missing part; return the content of dataset.json."""
     scenes = load_scenes(scene_folders, config.engine)
     robot = get_robot(config.robot)
     plans = [plan_scene(scene, free_space(scene, robot.height_m), config) for scene in scenes]
@@ -156,7 +153,7 @@ def make_dataset(
 
 
 def write_plan(folder: Path, plan: ScenePlan) -> None:
-    """Write where a scene's images are taken, as `load_plan` reads it."""
+    """Write the positions of a scene's images for `load_plan`."""
     folder.mkdir(parents=True, exist_ok=True)
     passages = {f"passage_{f.name}": getattr(plan.passages, f.name) for f in dataclasses.fields(Passages)}
     arrays = {name: getattr(plan, name) for name in ("xy_w", "room", "test")} | passages
@@ -165,7 +162,7 @@ def write_plan(folder: Path, plan: ScenePlan) -> None:
 
 
 def _shards(folder: Path, plan: ScenePlan, robot: RobotSpec, config: DataConfig):
-    """Yield each file of a scene and the camera poses of its sheets."""
+    """Yield each file of a scene with the camera poses of its sheets."""
     pitch, heading = (a.ravel() for a in np.meshgrid(config.pitches_rad, headings(config), indexing="ij"))
     passages, each, level = plan.passages, len(pitch), np.zeros(len(pitch))
     rows = [np.arange(first, min(first + each, len(passages))) for first in range(0, len(passages), each)]
@@ -205,7 +202,7 @@ def load_passages(folder: Path) -> PassageImages:
 
 
 def load_plan(folder: Path, scene: str) -> ScenePlan:
-    """Read where a scene's images were taken."""
+    """Read the positions of a scene's images."""
     path = Path(folder) / scene / "plan.npz"
     arrays = read_arrays(path)
     with readable(path, FileError, "run 'data' again"):
@@ -242,11 +239,10 @@ def _read_all(folder: Path, kind: str, count: int, config: DataConfig) -> np.nda
 
 
 def draw_passages(space: FreeSpace, rooms: Rooms, config: DataConfig, rng: np.random.Generator) -> Passages:
-    """Draw sources of every room, targets on a circle about each, and labels from the map.
+    """Draw sources in every room, targets on a circle about each, and labels from the map.
 
-    As many are free as blocked for `passage_length_m`. A room with fewer eligible places than sources gives them all.
-    Surplus passages of the commoner label are left out at random, apart for training and testing, so that guessing
-    scores one half in both.
+    Free and blocked are balanced for `passage_length_m`, separately for training and testing, by dropping surplus
+    passages at random. A room with fewer eligible places than sources uses them all.
     """
     places = space.centres(config.passage_clearance_m)
     labels = rooms.of(places)
@@ -271,10 +267,10 @@ def draw_passages(space: FreeSpace, rooms: Rooms, config: DataConfig, rng: np.ra
 
 
 def free_lengths(space: FreeSpace, xy_w: np.ndarray, heading_rad: np.ndarray, config: DataConfig) -> np.ndarray:
-    """Return whether the ways from places [n, 2] along headings [n] are free for `passage_lengths_m`: [n, L] bool.
+    """Return whether paths from places [n, 2] along headings [n] are free for `passage_lengths_m`: [n, L] bool.
 
-    Each length is looked up at points of another spacing, and one may hit a corner that the others miss. So
-    `passage_length_m` decides: what is free for it is free for less, what is not is not for more, and so on outwards.
+    Because lengths are checked at different points, `passage_length_m` decides: if it is free, so are shorter ones; if
+    it is blocked, so are longer ones; and so on outwards.
     """
     step = np.stack([np.cos(heading_rad), np.sin(heading_rad)], -1)
     points, margin_m, scored = config.passage_points, config.passage_margin_m, config.passage_column
@@ -286,10 +282,7 @@ def free_lengths(space: FreeSpace, xy_w: np.ndarray, heading_rad: np.ndarray, co
 
 
 def logits_at(logits: np.ndarray, lengths_m: Sequence[float], ahead_m: np.ndarray | float) -> np.ndarray:
-    """Interpolate a detector's logits [n, L] of ascending lengths [L] at others: [n], [n, M], or a number for all.
-
-    Return [n] or [n, M]. Beyond the detector's lengths the nearest counts.
-    """
+    """Interpolate logits [n, L] of lengths [L] at others (clipped): [n] or [n, M], or one for all, which gives [n]."""
     given = np.asarray(lengths_m, float)
     ahead = np.asarray(ahead_m, float)
     ahead = np.broadcast_to(ahead, (len(logits), *ahead.shape[1:]))
@@ -303,13 +296,13 @@ def logits_at(logits: np.ndarray, lengths_m: Sequence[float], ahead_m: np.ndarra
 
 
 def balanced(rows: np.ndarray, labels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return as many of the rows with a true label as with a false one, the surplus left out at random."""
+    """Return equally many rows with true and false labels; surplus ones are dropped at random."""
     yes, no = rows[labels[rows]], rows[~labels[rows]]
     count = min(len(yes), len(no))
     return np.sort(np.concatenate([rng.permutation(part)[:count] for part in (yes, no)]))
 
 
 def held_out(count: int, share: float, rng: np.random.Generator) -> np.ndarray:
-    """Draw which are for testing, [count] bool: the share rounded, of two or more at least one and never all."""
+    """Draw which are for testing, [count] bool: the rounded share; of two or more, at least one and not all."""
     tests = 0 if count < 2 else int(np.clip(round(count * share), 1, count - 1))
     return np.isin(np.arange(count), rng.permutation(count)[:tests])

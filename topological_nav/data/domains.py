@@ -1,8 +1,7 @@
-"""Turn rendered images into those that another camera would have taken: a stand-in for the real world.
+"""Convert rendered images to those of another camera, as a stand-in for the real world.
 
-In the order of a real camera: lens (narrower, distorted, darker corners), motion blur, exposure and white balance in
-linear light, sensor noise, the camera's tone curve. Pure functions of images and a seed; where images come from
-(rendered again through another lens or engine, or a scanned room) is a dataset's business, see `config.DataConfig`.
+Steps follow a real camera: lens (narrower, distorted, vignetted), motion blur, exposure and white balance in linear
+light, sensor noise, tone curve. All are pure functions of images and a seed.
 """
 
 import dataclasses
@@ -18,7 +17,7 @@ from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.records import read_packaged
 
 _GAMMA = 2.2
-"""Between grey levels and light, for rendered images."""
+"""Between grey levels and linear light of rendered images."""
 _CHUNK = 256
 
 
@@ -107,10 +106,7 @@ class AdaptConfig(Settings):
 
 
 def as_seen(images: np.ndarray, config: DomainConfig, stream: int = 0) -> np.ndarray:
-    """Return images [..., H, W, 3] u8 as the camera would have taken them.
-
-    An image depends on the seed, the stream, its place in the set and itself alone.
-    """
+    """Return images [..., H, W, 3] u8 of the camera; each depends only on seed, stream, its index and itself."""
     if _changes_nothing(config):
         return images
     flat = images.reshape(-1, *images.shape[-3:])
@@ -123,10 +119,7 @@ def as_seen(images: np.ndarray, config: DomainConfig, stream: int = 0) -> np.nda
 
 
 def as_seen_from(images: np.ndarray, config: DomainConfig, xy_w: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
-    """Return images [N, H, W, 3] u8 as the camera would have taken them, whatever set they are in.
-
-    Chance depends on the seed, and on the place [N, 2] (m) and heading [N] of an image to 1 mm and 1 mrad.
-    """
+    """Return images [N, H, W, 3] u8 of the camera; noise depends on seed, place (to 1 mm) and heading (to 1 mrad)."""
     if _changes_nothing(config) or not len(images):
         return images
     places = np.rint(1000.0 * np.concatenate([xy_w, np.asarray(heading_rad)[:, None]], -1)).astype(np.int64) % 2**32
@@ -143,7 +136,7 @@ def _changes_nothing(config: DomainConfig) -> bool:
 def _chance(
     rng: np.random.Generator, config: DomainConfig, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw for images of a shape: ways [N] (px), exposures [N] and noise, standard normal."""
+    """Draw blur lengths [N] (px), exposures [N] and standard normal noise for images of a shape."""
     ways, stops = rng.uniform(0.0, config.blur_px, shape[0]), rng.standard_normal(shape[0])
     noisy = config.shot_noise or config.read_noise
     return ways, stops, rng.standard_normal(shape) if noisy else np.zeros((shape[0], 1, 1, 1))
@@ -171,10 +164,7 @@ def _taken(
 
 
 def smeared(light: np.ndarray, way_px: float) -> np.ndarray:
-    """Blur an image [H, W, 3] as if its points moved evenly by so many pixels along the rows during the exposure.
-
-    Take the mean over a window of 1 + `way_px` pixels, the outermost ones counted in part; borders are repeated.
-    """
+    """Blur an image [H, W, 3] along its rows: a mean over 1 + `way_px` pixels, outer ones in part, borders repeated."""
     half = way_px / 2
     whole = math.floor(half)
     weights = np.ones(2 * whole + 3)
@@ -183,7 +173,7 @@ def smeared(light: np.ndarray, way_px: float) -> np.ndarray:
 
 
 def _through_lens(light: np.ndarray, zoom: float, barrel: float) -> np.ndarray:
-    """Resample images [N, H, W, 3] bilinearly, so that nothing outside of them is needed."""
+    """Resample images [N, H, W, 3] bilinearly without reading outside of them."""
     height, width = light.shape[1:3]
     factor = (1.0 + barrel * _radius(height, width) ** 2) / (1.0 + barrel) / zoom
     y, x = np.meshgrid(np.arange(height) - (height - 1) / 2, np.arange(width) - (width - 1) / 2, indexing="ij")
@@ -194,6 +184,6 @@ def _through_lens(light: np.ndarray, zoom: float, barrel: float) -> np.ndarray:
 
 
 def _radius(height: int, width: int) -> np.ndarray:
-    """Return distances from the middle [H, W]; 1 in the corners' pixels."""
+    """Return distances [H, W] from the centre; 1 at the corner pixels."""
     y, x = np.meshgrid(np.arange(height) - (height - 1) / 2, np.arange(width) - (width - 1) / 2, indexing="ij")
     return np.hypot(x, y) / max(np.hypot((height - 1) / 2, (width - 1) / 2), 1e-9)

@@ -1,4 +1,4 @@
-"""Describe folders of images of scenes, claim and fill them; store images as sheets of WebP, some sheets a file."""
+"""Describe folders of images of scenes, claim and fill them; store images as sheets of WebP, several per file."""
 
 import contextlib
 import dataclasses
@@ -37,18 +37,18 @@ class Folder(Generic[Config]):
     """Describe a kind of folder."""
 
     file: str
-    """Of its description."""
+    """Name of its description."""
     version: int
-    """Of the folder; raised whenever older ones would be read wrongly."""
+    """Version of the folder; raised when older ones would be misread."""
     base: Config
-    """Settings where the description lacks one."""
+    """Settings that the description may lack."""
     none: str
-    """What to say of a folder that is none."""
+    """Error if a folder is not of this kind."""
     again: str
-    """What to do about one that cannot be used."""
+    """Remedy for a folder that cannot be used."""
 
     def read(self, folder: Path) -> tuple[dict[str, Any], Config]:
-        """Return the description of a folder, and the settings in it."""
+        """Return a folder's description and its settings."""
         path = Path(folder) / self.file
         if not path.is_file():
             raise FileError(f"{folder}: {self.none}")
@@ -61,7 +61,7 @@ class Folder(Generic[Config]):
         return header, overlay(self.base, settings, str(path))
 
     def describe(self, config: Config, scenes: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        """Return the description of a folder with these settings and of these scenes."""
+        """Return the description of a folder with these settings and scenes."""
         robot = get_robot(config.robot)
         return {
             "format": self.version,
@@ -73,7 +73,7 @@ class Folder(Generic[Config]):
 
     @contextlib.contextmanager
     def claimed(self, out: Path, header: dict[str, Any]) -> Iterator[None]:
-        """Describe a new folder, or check that the one there is the same; nobody else works there for the block."""
+        """Describe a new folder, or check that an existing one agrees, and lock it for the block."""
         with alone_in(out):
             path = out / self.file
             if path.is_file():
@@ -91,7 +91,7 @@ class Folder(Generic[Config]):
 
 
 def load_scenes(folders: Sequence[Path], engine: str) -> list[Scene]:
-    """Load the scenes to draw."""
+    """Load the scenes to render."""
     scenes = [load_scene(folder) for folder in folders]
     need_engine(engine)
     names = [scene.name for scene in scenes]
@@ -111,7 +111,7 @@ def draw_missing(
     config: CameraConfig,
     progress: Progress,
 ) -> None:
-    """Draw the files of images that are not there yet."""
+    """Render the files of images that do not exist yet."""
     lens = lens_of(config, get_robot(config.robot))
 
     def missing() -> Iterator[Callable[[], tuple[str, int]]]:
@@ -143,14 +143,14 @@ def folder_bytes(folder: Path) -> int:
 
 
 COLUMNS = 18
-"""Images a row of a sheet."""
+"""Images per row of a sheet."""
 Result = TypeVar("Result")
 THREADS = min(usable_cores(), 16)
-"""That encode and decode: WebP's library runs outside of Python's lock."""
+"""Threads that encode and decode; WebP's library releases Python's lock."""
 
 
 def encode(images: np.ndarray, quality: int) -> bytes:
-    """Encode images [N, H, W, 3] u8 as one WebP picture, row by row; quality 100 is without loss."""
+    """Encode images [N, H, W, 3] u8 as one WebP image, row by row; quality 100 is lossless."""
     n, height, width, _ = images.shape
     columns = min(COLUMNS, n)
     rows = math.ceil(n / columns)
@@ -162,7 +162,7 @@ def encode(images: np.ndarray, quality: int) -> bytes:
 
 
 def decode(data: bytes, count: int, height: int, width: int) -> np.ndarray:
-    """Decode the `count` images [N, H, W, 3] u8 of a picture by `encode`."""
+    """Decode `count` images [N, H, W, 3] u8 written by `encode`."""
     sheet = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
     rows, columns = sheet.shape[0] // height, sheet.shape[1] // width
     tiles = sheet.reshape(rows, height, columns, width, 3).swapaxes(1, 2)
@@ -170,7 +170,7 @@ def decode(data: bytes, count: int, height: int, width: int) -> np.ndarray:
 
 
 def write_shard(path: Path, sheets: list[np.ndarray], quality: int) -> int:
-    """Write groups of images [n_i, H, W, 3] as sheets into one npz file, whole or not at all; return its bytes."""
+    """Write groups of images [n_i, H, W, 3] atomically as sheets of one npz file; return its bytes."""
     coded = [np.frombuffer(encode(images, quality), np.uint8) for images in sheets]
     arrays = {
         "data": np.concatenate(coded),
@@ -192,14 +192,14 @@ def read_arrays(path: Path, command: str = "data") -> dict[str, np.ndarray]:
 
 
 def need_files(paths: Iterable[Path], command: str = "data") -> None:
-    """Raise FileError where one is missing."""
+    """Raise `FileError` if one is missing."""
     missing = next((path for path in paths if not path.is_file()), None)
     if missing:
         raise FileError(f"{missing} is missing; the same '{command}' command goes on where it stopped")
 
 
 def read_shard(path: Path) -> np.ndarray:
-    """Read all images [N, H, W, 3] u8 of a file, in the order they were written."""
+    """Read all images [N, H, W, 3] u8 of a file in order."""
     stored = read_arrays(path)
     with readable(path, FileError, "delete it and run 'data' again"):
         height, width = (int(v) for v in stored["size"])
@@ -209,10 +209,9 @@ def read_shard(path: Path) -> np.ndarray:
 
 
 def in_order(tasks: Iterable[Callable[[], Result]], ahead: int) -> Generator[Result, None, None]:
-    """Yield the results of tasks that threads run, in the tasks' order.
+    """Yield the results of tasks in order, computed by threads.
 
-    Tasks are taken one by one, in the caller's thread. Where one or the caller raises, those that have started are
-    finished and the others left out.
+    Tasks are taken in the caller's thread. If one or the caller raises, started tasks finish and others are skipped.
     """
     waiting: deque[Future[Result]] = deque()
     with ThreadPoolExecutor(THREADS) as pool:
@@ -228,12 +227,12 @@ def in_order(tasks: Iterable[Callable[[], Result]], ahead: int) -> Generator[Res
 
 
 def read_shards(paths: Sequence[Path], command: str = "data") -> Iterator[np.ndarray]:
-    """Return `read_shard` of each file that a command wrote, in order, some files ahead in threads."""
+    """Return `read_shard` of each file of a command, in order; threads read some files ahead."""
     need_files(paths, command)
     return in_order((functools.partial(read_shard, path) for path in paths), THREADS)
 
 
 def numbered(folder: Path, kind: str, items: Sequence[Any] | np.ndarray, each: int) -> list[tuple[Path, Any]]:
-    """Return the files that hold so many items each, and the items of each file."""
+    """Return the files with `each` items, and the items of each file."""
     firsts = range(0, len(items), each)
     return [(folder / f"{kind}-{i:03d}.npz", items[first : first + each]) for i, first in enumerate(firsts)]

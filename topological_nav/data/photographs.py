@@ -1,8 +1,8 @@
 """Make a dataset of photographs of a building, taken level at known places along known headings.
 
-FOLDER/photographs.csv   a row a photograph: file, x_m, y_m, heading_deg (leftwards from the x axis); where known
-                         place, room, fov_deg (vertical), and free_m, the length of the way ahead that is free
-       connectivity.csv  where a person knows better than the detector: from, to (places), open (yes or no)
+FOLDER/photographs.csv   one row per photograph: file, x_m, y_m, heading_deg (leftwards from the x axis); if known
+                         place, room, fov_deg (vertical), and free_m, the length of the free path ahead
+       connectivity.csv  corrections of the detector by hand: from, to (places), open (yes or no)
 """
 
 import csv
@@ -44,7 +44,7 @@ def read_table(path: Path, needed: str) -> list[dict[str, Any]]:
 
 
 def read_photographs(folder: Path) -> list[dict[str, Any]]:
-    """Return the rows of a folder's table, each with a place and a room; numbers that are not known are NaN."""
+    """Return the rows of a folder's table, each with a place and a room; unknown numbers are NaN."""
     rows, stood = read_table(folder / TABLE, "file,x_m,y_m,heading_deg"), []
     for row in rows:
         with readable(folder / TABLE, FileError, f"write {', '.join(NUMBERS)} of {row['file']} as numbers"):
@@ -59,10 +59,7 @@ def read_photographs(folder: Path) -> list[dict[str, Any]]:
 
 
 def import_photographs(folder: Path, out: Path, config: DataConfig, scene: Path | None = None) -> str:
-    """Make the dataset `out` of a folder of photographs; return what it has, in words.
-
-    The map of a `scene` that was photographed fits it. A place that lacks headings is left out.
-    """
+    """Make the dataset `out` of places with all headings, named as a `scene` whose map fits it; return a summary."""
     rows, around, lens = read_photographs(folder), config.headings, lens_of(config, get_robot(config.robot))
     names = list(dict.fromkeys(row["place"] for row in rows))
     place = np.array([names.index(row["place"]) for row in rows], np.int32)
@@ -117,7 +114,7 @@ def _picture(folder: Path, row: dict[str, Any], lens: Lens) -> np.ndarray:
 
 
 def unpack_bag(bag: Path, out: Path) -> str:
-    """Write a ROS 2 bag's photographs and their table to a folder, from the first topic of each kind; say how many."""
+    """Write a ROS 2 bag's photographs, of the first topic of each kind, and their table; return a summary."""
     need = missing("data --photographs BAG", "rosbags", "ros2")
     highlevel, typesys = (optional(f"rosbags.{part}", need) for part in ("highlevel", "typesys"))
     from interactive_nav.ros import messages as ros

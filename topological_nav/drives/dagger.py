@@ -1,7 +1,7 @@
-"""Let a trained policy drive while the expert says what it would command there: DAgger (Ross, Gordon and Bagnell 2011).
+"""Let a trained policy drive while the expert labels its states: DAgger (Ross, Gordon and Bagnell 2011).
 
-A policy that learns from the expert's drives alone never sees where its own mistakes lead. Here the robot goes where
-the policy drives it, and the labels are the expert's; `train policy` then learns from these drives beside the others.
+A policy trained on the expert's drives alone never sees the consequences of its mistakes. `train policy` can add these
+drives to the expert's.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from topological_nav.drives.expert import CONTROL_S, Expert
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose
 
 RUN_STEPS = round(NavigatorConfig().run_s / CONTROL_S)
-"""Control steps after which the policy's memory is fresh, as in the navigator."""
+"""Control steps after which the policy's memory is reset, as in the navigator."""
 
 
 @jax.jit
@@ -33,14 +33,13 @@ def _taught(expert: Expert, memory: Any, state: Any) -> Any:
 
 
 class Pupil(HostPolicy):
-    """Drive by a local policy, and in a share of the steps by the expert, until something is touched.
+    """Drive by a local policy, and in a share of the steps by the expert, until contact.
 
-    The expert's memory says where the robot was, and what the expert would have commanded there next: its dynamic
-    window is about what it commanded before, whoever drove.
+    The expert's memory holds the pose and the command that the expert would have given, whoever drove.
     """
 
     def __init__(self, expert: Expert, numbers: np.ndarray, driver: LocalPolicy, renderers: Sequence[SceneRenderer]):
-        """Take the drives' numbers [B], which decide on the expert's steps, and a renderer for each scene."""
+        """Store the drives' numbers [B], which select the expert's steps, and a renderer for each scene."""
         self.remembers: Expert = expert
         self._numbers, self._driver, self._renderers = numbers, driver, renderers
 
@@ -69,10 +68,7 @@ class Pupil(HostPolicy):
 def simulate_driven(
     scene_folders: Sequence[Path], out: Path, config: DriveConfig, progress: Progress = lambda *_: None
 ) -> Drives:
-    """Simulate all drives, or those that are missing, with the policy of the run `driver` at the wheel.
-
-    The folder's settings name the digest of the policy's weights in the place of the run.
-    """
+    """Simulate missing drives with the run `driver` at the wheel; the folder's settings hold its weights' digest."""
     driver = load_policy(config.driver)
     need_camera(out, DRIVES.describe(config, []), driver.networks)
     config = dataclasses.replace(config, driver=driver.about["digest"])

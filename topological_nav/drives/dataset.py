@@ -1,14 +1,13 @@
-"""Simulate the expert's drives into a folder, and read them: poses, commands, contacts, and what the robot saw.
+"""Simulate the expert's drives into a folder, and read them: poses, commands, contacts, and images.
 
     DRIVES/drives.json             settings, scenes with digests, counts, versions of the format
-           plan.npz                all drives that were decided on: routes, starts, split
-           batch-000.npz           what became of some of them, in the order of the plan
+           plan.npz                all planned drives: routes, starts, split
+           batch-000.npz           results of some of them, in the order of the plan
            <scene>/images-000.npz  images of some of a scene's kept drives, one for each control step
            preview.png             the drives on the floor plans, and images of some
 
-Kept are drives that reached their last node and touched nothing: then the furniture still stands at rest, as it is
-drawn. A drive of a policy ends where it touches something, and is kept. What is decided depends on scenes and settings
-only. Simulating and drawing skip files that exist.
+A drive is kept if it reached its last node without contact, so that furniture is at rest as rendered. A policy's drive
+ends at its first contact and is kept. Plans depend on scenes and settings alone. Existing files are skipped.
 """
 
 import dataclasses
@@ -46,14 +45,14 @@ DRIVES = Folder(
 read_drives_header = DRIVES.read
 AGAIN = "data --drives"
 LIMIT_M = 8.0
-"""Fields of the way left reach so far; beyond they rise with the distance."""
+"""Range of fields of distance to go; beyond it they increase with the distance."""
 CANDIDATES = 32
-"""Starts tried about a node; the best is taken if none is clear."""
+"""Starts to try around a node; the best is used if none is clear."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Drives:
-    """Hold what the expert did: n drives, F control steps in all, drive after drive."""
+    """Hold the results of n drives: F control steps in all, drive after drive."""
 
     scene: np.ndarray
     """[n] i32."""
@@ -62,13 +61,13 @@ class Drives:
     first: np.ndarray
     """[n + 1] where each drive's steps begin."""
     pose_w: np.ndarray
-    """[F, 3] f32 x, y (m) and heading at the beginning of each step."""
+    """[F, 3] f32 x, y (m) and heading at the start of each step."""
     command: np.ndarray
     """[F, 2] f32 m/s and rad/s."""
     touching: np.ndarray
     """[F, 2] bool: furniture, a wall was touched in the step."""
     gap_m: np.ndarray
-    """[F] f32 that the expert expected to keep."""
+    """[F] f32 that the expert predicted."""
     reached: np.ndarray
     """[n] bool."""
     broken: np.ndarray
@@ -76,13 +75,13 @@ class Drives:
     goal_w: np.ndarray
     """[n, 2] m, the last node."""
     labelled: np.ndarray
-    """[n] bool: a policy drove until it touched something, and the commands are what the expert would have done."""
+    """[n] bool: a policy drove until contact; commands are the expert's labels."""
 
     def __len__(self) -> int:
         return len(self.scene)
 
     def rows(self, which: np.ndarray | int) -> np.ndarray:
-        """Return the indices [f] of the control steps of a drive, or of several, drive after drive."""
+        """Return the indices [f] of the control steps of one or more drives, drive after drive."""
         return np.concatenate([np.arange(int(self.first[k]), int(self.first[k + 1])) for k in np.atleast_1d(which)])
 
     @property
@@ -92,18 +91,18 @@ class Drives:
 
     @property
     def touched(self) -> np.ndarray:
-        """Return whether anything was touched on the way, [n] bool."""
+        """Return which drives had a contact, [n] bool."""
         sums = np.concatenate([[0], np.cumsum(self.touching.any(1))])
         return sums[self.first[1:]] > sums[self.first[:-1]]
 
     @property
     def kept(self) -> np.ndarray:
-        """Return which are drawn and learned from, [n] bool: of the expert's those that arrived and touched nothing."""
+        """Return which drives are rendered and used, [n] bool; the expert's must reach the goal without contact."""
         return ~self.broken & (self.labelled | (self.reached & ~self.touched))
 
     @classmethod
     def joined(cls, parts: Sequence["Drives"]) -> "Drives":
-        """Return the drives of several folders, one after the other, with their scenes numbered on."""
+        """Concatenate the drives of several folders, and renumber their scenes."""
         columns = {f.name: [getattr(part, f.name) for part in parts] for f in dataclasses.fields(cls)}
         scenes = np.cumsum([0, *(part.scene.max(initial=-1) + 1 for part in parts)])
         columns["scene"] = [scene + int(before) for scene, before in zip(columns["scene"], scenes, strict=False)]
@@ -116,7 +115,7 @@ class Routes:
     """Hold n drives of one scene."""
 
     nodes: np.ndarray
-    """[n, legs + 1] i32 nodes one after the other; the last repeated where a drive is shorter."""
+    """[n, legs + 1] i32 nodes in order; the last is repeated if a drive is shorter."""
     legs: np.ndarray
     """[n] i32 edges driven."""
     start_xy_w: np.ndarray
@@ -128,10 +127,7 @@ class Routes:
 
 
 def drivable(space: FreeSpace, nodes_w: np.ndarray, to_go_m: np.ndarray, config: DriveConfig) -> np.ndarray:
-    """Return the ordered pairs [E, 2] of nodes [N, 2] nearer than `edge_m` whose planned way is no long detour.
-
-    `to_go_m` [N, rows, columns] is of `expert.way_field`, a field for each node.
-    """
+    """Return pairs [E, 2] of nodes [N, 2] nearer than `edge_m` without a long detour by `to_go_m` of `way_field`."""
     edges = near_pairs(nodes_w, config.edge_m)
     column, row = space.inner_cells(nodes_w).T
     way = to_go_m[edges[:, 1], row[edges[:, 0]], column[edges[:, 0]]]
@@ -142,11 +138,10 @@ def drivable(space: FreeSpace, nodes_w: np.ndarray, to_go_m: np.ndarray, config:
 def draw_routes(
     space: FreeSpace, nodes_w: np.ndarray, edges: np.ndarray, config: DriveConfig, rng: np.random.Generator
 ) -> Routes:
-    """Draw the drives of a scene along edges [E, 2] of `drivable` between nodes [N, 2].
+    """Draw a scene's drives along edges [E, 2] of `drivable` between nodes [N, 2].
 
-    The first edge is uniform over all that are long enough; from its end a drive goes on by an edge that turns less
-    than `turn_deg`, if there is one, uniform over those. A share of the nodes is held out: drives that begin there are
-    for testing.
+    The first edge is uniform over the long enough ones, the next over those that turn less than `turn_deg`, if any. A
+    share of the nodes is held out; drives that start there are for testing.
     """
     if not len(edges):
         raise ConfigError(f"no two of {len(nodes_w)} nodes are joined by a way to drive; use a larger edge_m or detour")
@@ -181,7 +176,7 @@ def draw_routes(
 
 
 def _start(space: FreeSpace, node_w: np.ndarray, config: DriveConfig, rng: np.random.Generator) -> np.ndarray:
-    """Draw a place [2] near a node: the first of some that is clear, else the clearest."""
+    """Draw a clear place [2] near a node, or the clearest of the candidates."""
     angle, share = rng.uniform(0, 2 * np.pi, CANDIDATES), np.sqrt(rng.uniform(0, 1, CANDIDATES))
     offset = config.start_off_m * share[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
     tried = np.concatenate([node_w + offset, node_w[None]])
@@ -191,7 +186,7 @@ def _start(space: FreeSpace, node_w: np.ndarray, config: DriveConfig, rng: np.ra
 
 
 def plan_drives(scenes: Sequence[Scene], config: DriveConfig) -> tuple[Tasks, np.ndarray, Terrain]:
-    """Return n drives, scene by scene, which of them are for testing [n], and what the expert has of the scenes."""
+    """Return n drives, scene by scene, which of them are for testing [n], and the expert's terrain."""
     robot = get_robot(config.robot)
     spaces, fields, parts, tests = [], [], [], []
     for index, scene in enumerate(scenes):
@@ -237,7 +232,7 @@ def simulate_drives(
     progress: Progress = lambda *_: None,
     pupil: Callable[[Expert, np.ndarray], HostPolicy] | None = None,
 ) -> Drives:
-    """Simulate all drives, or those that are missing; a pupil drives beside an expert, by the drives' numbers."""
+    """Simulate drives that are missing; `pupil` maps the expert and drive numbers to the policy that drives."""
     scenes = load_scenes(scene_folders, config.engine)
     header = DRIVES.describe(config, [{"name": s.name, "digest": s.digest, "split": s.split} for s in scenes])
     with DRIVES.claimed(out, header):
@@ -269,7 +264,7 @@ def simulate_drives(
 
 
 def draw_drives(scene_folders: Sequence[Path], out: Path, progress: Progress = lambda *_: None) -> None:
-    """Draw what the robot saw on the kept drives, or what is missing of it."""
+    """Render missing images of the kept drives."""
     with alone_in(out):
         header, config = read_drives_header(out)
         drives, robot = load_drives(out), get_robot(config.robot)
@@ -294,12 +289,12 @@ def draw_drives(scene_folders: Sequence[Path], out: Path, progress: Progress = l
 
 
 def _image_files(out: Path, name: str, index: int, drives: Drives, config: DriveConfig) -> list[tuple[Path, Any]]:
-    """Return each file of a scene's images and the drives [k] in it."""
+    """Return each file of a scene's images and its drives [k]."""
     return numbered(out / name, "images", np.flatnonzero(drives.kept & (drives.scene == index)), config.shard)
 
 
 def drive_images(folder: Path, most: int | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield indices [k] of kept drives and images [F, H, W, 3] u8 of their steps, file by file, at most so many."""
+    """Yield indices [k] of kept drives and images [F, H, W, 3] u8 of their steps by file, at most `most` drives."""
     header, config = read_drives_header(folder)
     drives = load_drives(folder)
     files = [
@@ -316,7 +311,7 @@ def drive_images(folder: Path, most: int | None = None) -> Iterator[tuple[np.nda
 
 
 def load_drives(folder: Path) -> Drives:
-    """Read all drives of a folder, kept or not."""
+    """Read all drives of a folder."""
     folder = Path(folder)
     header, config = read_drives_header(folder)
     batches = numbered(folder, "batch", range(len(header["scenes"]) * config.drives), config.batch)
@@ -331,8 +326,9 @@ def load_drives(folder: Path) -> Drives:
 def summary(drives: Drives) -> dict[str, float]:
     """Return counts, success and contacts.
 
-    `reached`, `touched` and `kept` are shares of the `drives`; `contact_s`: seconds in contact a drive; `seconds`: mean
-    duration of those that reached; `m_s`: mean speed; `turning`: share of steps that turn by 0.125 rad/s or more.
+    `reached`, `touched` and `kept` are shares of `drives`; `contact_s` is seconds of contact per drive; `seconds` the
+    mean duration of those that reached; `m_s` mean speed; `turning` the share of steps that turn by 0.125 rad/s or
+    more.
     """
     going = np.repeat(drives.kept, drives.steps)
     return {

@@ -1,4 +1,4 @@
-"""Drive along an edge of the map, images in, velocities out, ten times a second: two memories and a forward model."""
+"""Map images to velocities along an edge, ten times a second, by two memories; and define the forward model."""
 
 import dataclasses
 import functools
@@ -21,14 +21,14 @@ from topological_nav.learn.training import SAME, Networks, Trained, camera_setti
 from topological_nav.maps.build import PassagePolicy, Sight
 
 Memory = tuple[jax.Array, jax.Array]
-"""Hidden states [B, H] of the cell for linear and of the one for angular velocity."""
+"""Hidden states [B, H] of the cells for linear and angular velocity."""
 
 
 class SummedCell(nn.Module):
-    """Define a GRU cell (Cho et al. 2014, reset gate after the product) whose gates read a sum of memories.
+    """Define a GRU cell (Cho et al. 2014, reset gate after the product) whose gates read a sum s of memories.
 
-    With the input x, the sum s and its memory h: r, z = sigmoid(W x + U s + b) and n = tanh(V x + c + r (Q s + d))
-    make the new memory (1 - z) n + z h. It keeps only its memory, which stays within (-1, 1).
+    Input x and memory h give r, z = sigmoid(W x + U s + b) and n = tanh(V x + c + r (Q s + d)); the new memory is (1 -
+    z) n + z h, within (-1, 1).
     """
 
     hidden: int
@@ -44,7 +44,7 @@ class SummedCell(nn.Module):
 
 
 class Policy(nn.Module):
-    """Choose velocities by one cell for each; both read the sum of both memories."""
+    """Choose velocities by one cell each; both read the sum of both memories."""
 
     hidden: int = 500
     projection: int = 0
@@ -52,7 +52,7 @@ class Policy(nn.Module):
     angular_classes: int = 5
 
     def setup(self) -> None:
-        """Build the parts; flax calls it."""
+        """Build the submodules; flax calls it."""
         self.project = nn.Dense(self.projection) if self.projection else None
         self.cells = [SummedCell(self.hidden), SummedCell(self.hidden)]
         self.heads = [nn.Dense(self.linear_classes), nn.Dense(self.angular_classes)]
@@ -66,21 +66,21 @@ class Policy(nn.Module):
         return new, tuple(head(h) for head, h in zip(self.heads, new, strict=True))  # type: ignore[return-value]
 
     def fresh(self, batch: int) -> Memory:
-        """Return the memory at the start of a run."""
+        """Return the initial memory of a run."""
         return jnp.zeros((batch, self.hidden)), jnp.zeros((batch, self.hidden))
 
 
 class Forward(nn.Module):
-    """Predict the next embedding after an action by two layers, which give its `change` or, if not, itself."""
+    """Predict the next embedding after an action by two layers, either its `change` or itself."""
 
     hidden: int = 512
     change: bool = True
 
     @nn.compact
     def __call__(self, u: jax.Array, x: jax.Array, action: jax.Array, deviation: jax.Array) -> jax.Array:
-        """Map embeddings u [..., D], the same standardised as x, and actions [..., L + A] to the next embeddings.
+        """Map embeddings u [..., D], standardised ones x and actions [..., L + A] to the next embeddings.
 
-        Actions are one-hot classes, or probabilities of them, linear then angular; `deviation` [D] is a change's unit.
+        Actions are one-hot classes or probabilities, linear then angular; `deviation` [D] is the unit of change.
         """
         y = jnp.concatenate([x, action], -1)
         for _ in range(2):
@@ -90,13 +90,13 @@ class Forward(nn.Module):
 
 
 def standardised(u: jax.Array, scale: dict[str, jax.Array]) -> jax.Array:
-    """Return embeddings [..., D] about their `mean` [D], in units of their `deviation` [D]."""
+    """Return embeddings [..., D] minus `mean` [D], divided by `deviation` [D]."""
     mean, deviation = (jnp.broadcast_to(scale[name], u.shape) for name in ("mean", "deviation"))
     return (u - mean) / deviation
 
 
 def unrolled(policy: Policy, params: Any, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return logits [B, T, L] and [B, T, A] of runs of standardised embeddings [B, T, D], each from a fresh memory."""
+    """Return logits [B, T, L] and [B, T, A] of runs of standardised embeddings [B, T, D] from initial memories."""
 
     def step(memory, now):
         return policy.apply({"params": params}, memory, now)
@@ -106,7 +106,7 @@ def unrolled(policy: Policy, params: Any, x: jax.Array) -> tuple[jax.Array, jax.
 
 
 def mean_over(values: jax.Array, mask: jax.Array) -> jax.Array:
-    """Return the mean of values where the mask is true, 0 where it nowhere is."""
+    """Return the mean of values where the mask is true; 0 if it is false everywhere."""
     return jnp.where(mask, values, 0.0).sum() / jnp.maximum(mask.sum(), 1)
 
 
@@ -136,7 +136,7 @@ def policy_loss(
 
 
 def fresh_params(policy: Policy, forward: Forward, width: int, seed: int) -> dict[str, Any]:
-    """Return first weights of policy and forward model for embeddings of a `width`; the latter predicts no change."""
+    """Return initial weights of policy and forward model for embeddings of a `width`; the latter predicts no change."""
     key, u = jax.random.PRNGKey(0), jax.ShapeDtypeStruct((1, width), jnp.float32)
     action = jax.ShapeDtypeStruct((1, policy.linear_classes + policy.angular_classes), jnp.float32)
     shapes = {
@@ -150,7 +150,7 @@ def fresh_params(policy: Policy, forward: Forward, width: int, seed: int) -> dic
 
 
 _REPORT_EVERY = 10
-"""Files of images between two lines about embedding."""
+"""Files of images per progress report."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,17 +161,17 @@ class Frames:
     config: DriveConfig
     header: dict[str, Any]
     features: np.ndarray
-    """[F or 2 F, D] f16 of all control steps, 0 where nothing was drawn; then the same of mirrored images."""
+    """[F or 2 F, D] f16 of all control steps, 0 without an image; then those of mirrored images."""
     networks: Networks
 
     @property
     def mirrored(self) -> bool:
-        """Return whether there are mirrored ones."""
+        """Return whether mirrored images are included."""
         return len(self.features) > len(self.drives.command)
 
     @classmethod
     def joined(cls, parts: Sequence["Frames"]) -> "Frames":
-        """Return the frames of several folders, which the same networks embed; the first has the settings."""
+        """Concatenate the frames of several folders embedded by the same networks, with the first one's settings."""
         if len(parts) == 1:
             return parts[0]
         counts = [len(part.drives.command) for part in parts]
@@ -183,7 +183,7 @@ class Frames:
 
 
 def need_camera(folder: Path, header: Mapping[str, Any], networks: Networks) -> None:
-    """Refuse a folder of drives, by its description, of another camera than that which the networks learned from."""
+    """Raise if a folder of drives, by its description, has another camera than the networks were trained with."""
     mine, theirs = {**header["settings"], "fov_deg": header["fov_deg"]}, camera_settings(networks.localiser)
     for name in SAME:
         if mine[name] != theirs[name]:
@@ -201,7 +201,7 @@ def embed_drives(
 
     @jax.jit
     def sides(weights: Any, images: jax.Array) -> jax.Array:
-        """Map images [N, H, W, 3] to [N, 1 or 2, D] f16: all networks' embeddings, then those of the mirrored."""
+        """Map images [N, H, W, 3] to f16 [N, 1 or 2, D]: concatenated embeddings, then those of mirrored images."""
         shown = (images, images[:, :, ::-1]) if mirror else (images,)
         return jnp.stack([embedded(networks, weights, side) for side in shown], 1).astype(jnp.float16)
 
@@ -232,16 +232,16 @@ def _folder_frames(folder: Path, networks: Networks, embed: Callable[[Any], Any]
 
 
 def embedded(networks: Sequence[Trained], weights: Any, images: jax.Array) -> jax.Array:
-    """Embed images [N, H, W, 3] by all networks, one after the other: [N, D]."""
+    """Return the concatenated embeddings [N, D] of images [N, H, W, 3] by all networks."""
     pairs = zip(networks, weights, strict=True)
     return jnp.concatenate([network.network.apply(w, images, method="embed") for network, w in pairs], -1)  # type: ignore[arg-type]
 
 
 class LocalPolicy(Protocol):
-    """Drive by images alone; what is remembered travels in a state that belongs to the caller."""
+    """Drive by images alone; the caller keeps the policy's state."""
 
     def start(self, batch: int) -> Any:
-        """Return the hidden state of `batch` fresh runs."""
+        """Return the state of `batch` new runs."""
 
     def act(self, state: Any, images: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
         """Map level images [B, H, W, 3] u8 straight ahead to the new state, linear [B] m/s and angular [B] rad/s."""
@@ -249,10 +249,10 @@ class LocalPolicy(Protocol):
 
 
 class TrainedPolicy:
-    """Drive by a `LocalPolicy` that was learned: at each step the likeliest class of either velocity."""
+    """Drive by a trained `LocalPolicy`: the most likely class of either velocity at each step."""
 
     def __init__(self, policy: Policy, variables: dict[str, Any], about: dict[str, Any], networks: Any):
-        """Take what `load_policy` read; compile at the first step of each batch size."""
+        """Store the content that `load_policy` read; compile at the first step of each batch size."""
         self.about: dict[str, Any] = about
         """Content of network.json."""
         self.networks: Networks = networks
@@ -275,7 +275,7 @@ class TrainedPolicy:
         return state, np.asarray(self.about["linear_m_s"])[linear], np.asarray(self.about["angular_rad_s"])[angular]
 
     def probabilities(self, images: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return those of linear [T, L] and angular [T, A] classes in a run that sees images [T, H, W, 3] u8."""
+        """Return probabilities of linear [T, L] and angular [T, A] classes in a run of images [T, H, W, 3] u8."""
         embeddings = np.concatenate([network.embed(images) for network in self.networks], -1)
         weights = self._weights["policy"]
         x = standardised(jnp.asarray(embeddings), weights["scale"])
@@ -283,7 +283,7 @@ class TrainedPolicy:
         return tuple(np.asarray(nn.softmax(one[0])) for one in logits)
 
     def step(self, state: Any, embedding: jax.Array, weights: Any = None) -> tuple[Any, tuple[jax.Array, ...]]:
-        """Return the new state, and the likeliest classes [B] of linear and of angular velocity, by embeddings."""
+        """Return the new state, and the most likely classes [B] of linear and angular velocity, by embeddings."""
         weights = weights or self._weights["policy"]
         x = standardised(embedding, weights["scale"])
         state, logits = self._policy.apply({"params": weights["params"]}, state, x)  # type: ignore[misc]
@@ -296,11 +296,7 @@ class TrainedPolicy:
 def load_policy(
     run_folder: Path | str, localiser: Path | str | None = None, detector: Path | str | None = None
 ) -> TrainedPolicy:
-    """Return the policy of a finished run.
-
-    `localiser` and `detector` are run folders of the networks that embed its images; None: where they were when it
-    learned, relative to the run folder.
-    """
+    """Load a finished run's policy; its networks are `localiser` and `detector`, or those named relative to the run."""
     run = Path(run_folder)
     about = read_description(run, "policy", "policy")
     need_task(about, "policy", f"{run}:")
@@ -320,7 +316,7 @@ def load_policy(
 
 
 def local_policy(name: str, sight: Sight, config: NavigatorConfig, networks: Sequence[Trained] = ()) -> LocalPolicy:
-    """Return what drives along edges; a trained policy sees through those of the networks that are adapted."""
+    """Return the named local policy; a trained one uses those of the networks that are adapted."""
     if name == PASSAGE_POLICY:
         return PassagePolicy(sight, config.passable, config.clear_m)
     return load_policy(name, *(n.run if "adapted_from" in n.about else None for n in networks))

@@ -1,11 +1,10 @@
-"""Command velocities by maps, a scan and where to go: the expert that the local policy learns from.
+"""Command velocities by maps, a scan and a goal: the expert that the local policy learns from.
 
-Pure functions of one robot, for `jax.vmap`. A global path and a local planner in one, after the global dynamic window
-approach (Brock and Khatib 1999): each node of the graph has a field of the way that is left to it round walls and
-furniture, and of the velocities that the robot can reach within a control period (dynamic window: Fox, Burgard and
-Thrun 1997) that one wins which leads it down the field, turns it along the field and keeps its footprint away from
-what the lidar sees and the map holds. The map adds what a planar scan misses, such as table tops; before what only the
-scan sees, in the middle of its way, the robot stops, because no way round is planned.
+Pure functions of one robot, for `jax.vmap`, follow the global dynamic window approach (Brock and Khatib 1999): each
+node has a field of the distance to go around walls and furniture. Among velocities that are reachable in a control
+period (Fox, Burgard and Thrun 1997), the expert chooses by progress down the field, heading along it, and the
+footprint's gap to what the lidar and the map contain. The map adds what a planar scan misses, such as table tops. The
+robot stops at obstacles in its path that only the scan contains, because paths are not replanned.
 """
 
 import functools
@@ -37,16 +36,16 @@ CONTROL_S = 0.1
 LIDAR_B = {name: facts.lidar_b for name, facts in ROBOTS.items() if facts.lidar_b is not None}
 """Scanners by robot, m in the base's frame."""
 REFUSED = 100.0
-"""Cost of a gap of 0 where `margin_m` is wanted; the least bad velocity wins where none keeps it."""
+"""Cost of a gap of 0 instead of `margin_m`; if no velocity keeps the margin, the least bad wins."""
 _SLOPE_M = 0.1
-"""A field's direction is read from points this far apart on each side."""
+"""Distance on each side of the points that give a field's direction."""
 _SLOW = 0.02
-"""Weight of the forward velocity as such: decides between equals."""
+"""Weight of the forward velocity, to break ties."""
 
 
 @flax.struct.dataclass
 class Terrain:
-    """Hold what the expert has of S scenes and G nodes, padded alike."""
+    """Hold the expert's maps of S scenes and G nodes, padded alike."""
 
     clearance_m: jax.Array
     """[S, rows, columns] f32 distance to the nearest obstacle; 0 where blocked."""
@@ -55,16 +54,15 @@ class Terrain:
     resolution_m: jax.Array
     """[S] f32."""
     to_go_m: jax.Array
-    """[G, rows, columns] f32 way left to each node, finite everywhere."""
+    """[G, rows, columns] f32 distance to go to each node, finite everywhere."""
 
 
 def way_field(space: FreeSpace, goals_w: np.ndarray, config: ExpertConfig, limit_m: float) -> np.ndarray:
-    """Return the way left (m) to goals [G, 2] from everywhere, [G, rows, columns] f32, finite everywhere.
+    """Return the distance to go (m) to goals [G, 2], [G, rows, columns] f32, finite everywhere.
 
-    It is by Dijkstra's algorithm over the 32 moves of the environment's geodesic, from the cell with room that is
-    nearest to a goal; one without any room around it has a field of distances to it. A metre along obstacles counts for
-    up to 1 + `near_cost`. Cells that the robot's middle cannot be in take the value of the nearest cell that it can be
-    in and four times the distance there; so does what is farther than the limit.
+    It is by Dijkstra's algorithm over the 32 moves of the environment's geodesic from the cell with room nearest to a
+    goal; without any free cell, the Euclidean distance. A metre beside obstacles counts up to 1 + `near_cost`. Blocked
+    cells and those beyond the limit have the value of the nearest other cell plus four times the distance there.
     """
     room = np.maximum(space.clearance_m - config.radius_m, 0.0)
     free = space.clearance_m >= config.radius_m
@@ -87,7 +85,7 @@ def way_field(space: FreeSpace, goals_w: np.ndarray, config: ExpertConfig, limit
 
 
 def sample(grid: jax.Array, origin_w: jax.Array, resolution_m: jax.Array, xy_w: jax.Array) -> jax.Array:
-    """Interpolate [...] a grid [rows, columns] of cell centres at points [..., 2], outside of its rim."""
+    """Interpolate a grid [rows, columns] of cell centres at points [..., 2], clipped at the border."""
     rows, columns = grid.shape
     origin, last = (jnp.broadcast_to(x, xy_w.shape) for x in (origin_w, jnp.asarray([columns - 1.001, rows - 1.001])))
     u = jnp.clip((xy_w - origin) / resolution_m - 0.5, 0.0, last)
@@ -99,11 +97,7 @@ def sample(grid: jax.Array, origin_w: jax.Array, resolution_m: jax.Array, xy_w: 
 
 
 def window(velocity: jax.Array, config: ExpertConfig) -> tuple[jax.Array, jax.Array]:
-    """Return the velocities that can be reached within a control period: linear [C] and angular [C], all pairs.
-
-    Velocities of the lattice that are out of reach are clipped to the nearest that is in reach. `velocity` [2] is the
-    last command (m/s, rad/s).
-    """
+    """Return pairs of velocities, [C] and [C], reachable within a control period of the last command `velocity` [2]."""
     most = config.angular_rad_s
     v = jnp.linspace(0.0, config.linear_m_s, config.linear_samples)
     w = jnp.linspace(-most, most, config.angular_samples)
@@ -114,7 +108,7 @@ def window(velocity: jax.Array, config: ExpertConfig) -> tuple[jax.Array, jax.Ar
 
 
 def arcs(linear: jax.Array, angular: jax.Array, times_s: jax.Array) -> jax.Array:
-    """Return poses [C, K, 3] in the frame where constant velocities [C] start, after times [K]."""
+    """Return poses [C, K, 3] after times [K] at constant velocities [C], in the frame of the start."""
     turn = angular[:, None] * times_s[None]
     chord = linear[:, None] * times_s[None] * jnp.sinc(turn / (2 * jnp.pi))
     return jnp.stack([chord * jnp.cos(turn / 2), chord * jnp.sin(turn / 2), turn], -1)
@@ -133,13 +127,13 @@ def scan_gap(poses_b: jax.Array, points_b: jax.Array, half_m: jax.Array) -> jax.
 
 
 def outline(half_m: jax.Array) -> jax.Array:
-    """Return the corners and the middles of the sides [8, 2] of a rectangle about the origin."""
+    """Return the corners and midpoints of the sides [8, 2] of a rectangle about the origin."""
     signs = jnp.asarray([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y], jnp.float32)
     return signs * half_m[None]
 
 
 def moved(pose: jax.Array, by: jax.Array) -> jax.Array:
-    """Move poses [..., 3], or points [..., 2], from the frame of a pose [..., 3] to the frame of the pose."""
+    """Transform poses [..., 3] or points [..., 2] from the frame of a pose [..., 3] to the pose's parent frame."""
     cos, sin = jnp.cos(pose[..., 2]), jnp.sin(pose[..., 2])
     x, y = by[..., 0], by[..., 1]
     xy = [pose[..., 0] + cos * x - sin * y, pose[..., 1] + sin * x + cos * y]
@@ -156,10 +150,10 @@ def command(
     half_m: jax.Array,
     config: ExpertConfig,
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the velocities [2] (m/s, rad/s) to command now, and the gap [] (m) that they keep until the horizon.
+    """Return the velocities [2] (m/s, rad/s) to command now, and their gap [] (m) until the horizon.
 
-    `velocity` [2] was commanded last; beams end at `points_b` [R, 2], infinite where they meet nothing; `half_m` [2] is
-    half the footprint's length and width.
+    `velocity` [2] is the last command; `points_b` [R, 2] are ends of beams, infinite if they hit nothing; `half_m` [2]
+    is half the footprint's length and width.
     """
     linear, angular = window(velocity, config)
     times = config.horizon_s * (jnp.arange(config.horizon_steps) + 1.0) / config.horizon_steps
@@ -188,9 +182,9 @@ def command(
 def _left(
     to_go: Callable[..., jax.Array], ways_w: jax.Array, linear: jax.Array, config: ExpertConfig
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the way left [C] at the ends of ways [C, K, 3], and the poses [C, 3] where it is read.
+    """Return the distance to go [C] at the ends of paths [C, K, 3], and the poses [C, 3] where it is read.
 
-    A way past the goal ends there, and what it drives on counts as if it led farther: nobody stops at a node.
+    A path that passes the goal ends there, and the rest counts as progress, so that the robot does not stop at a node.
     """
     values = to_go(xy_w=ways_w[..., :2])
     steps = values.shape[1]
@@ -202,17 +196,14 @@ def _left(
 
 
 def _fall(to_go: Callable[..., jax.Array], xy_w: jax.Array) -> jax.Array:
-    """Return the headings [C] in which a field falls at points [C, 2]."""
+    """Return the headings [C] of a field's descent at points [C, 2]."""
     offsets = _SLOPE_M * jnp.asarray([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     values = to_go(xy_w=xy_w[:, None] + offsets[None])
     return jnp.arctan2(values[:, 3] - values[:, 2], values[:, 1] - values[:, 0])
 
 
 def scan_points(ranges_m: jax.Array, config: ExpertConfig, lidar_xy_b: tuple[float, float]) -> jax.Array:
-    """Return the ends [R, 2] of beams in the robot's frame, infinite for those that reach `lidar_range_m`.
-
-    Ranges [R] go from the right to the left, from a scanner at `lidar_xy_b` (m).
-    """
+    """Return beams' ends [R, 2] in the robot's frame, infinite at `lidar_range_m`; ranges [R] go from right to left."""
     step = config.lidar_fov_deg / config.lidar_rays
     angle = jnp.radians(-0.5 * config.lidar_fov_deg + jnp.arange(config.lidar_rays) * step)
     ends = jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1) * ranges_m[:, None] + jnp.asarray(lidar_xy_b)[None]
@@ -226,9 +217,9 @@ class Tasks(Rows):
     scene: np.ndarray
     """[B] i32."""
     goals: np.ndarray
-    """[B, legs] i32 fields of the terrain, one a leg."""
+    """[B, legs] i32 fields of the terrain, one per leg."""
     goals_w: np.ndarray
-    """[B, legs, 2] m, the nodes they lead to."""
+    """[B, legs, 2] m, the nodes of these fields."""
     legs: np.ndarray
     """[B] i32."""
     start_xy_w: np.ndarray
@@ -238,7 +229,7 @@ class Tasks(Rows):
 
 
 def drive_env(scenes: Sequence[Path], config: DriveConfig) -> InteractiveNav:
-    """Build the environment of the drives: furniture at rest, no small objects."""
+    """Build the environment of the drives, with furniture at rest and no small objects."""
     if config.robot not in LIDAR_B:
         raise UserError(f"robot is '{config.robot}', expected one with a scanner: {', '.join(LIDAR_B)}")
     lidar = {name: getattr(config, name) for name in ("lidar_rays", "lidar_fov_deg", "lidar_range_m")}
@@ -251,7 +242,7 @@ def drive_env(scenes: Sequence[Path], config: DriveConfig) -> InteractiveNav:
 
 @flax.struct.dataclass
 class Expert:
-    """Drive each task's legs, until its last node is reached or time runs out: a `rollout.MemoryPolicy`."""
+    """Drive each task's legs until its last node or the time limit: a `rollout.MemoryPolicy`."""
 
     terrain: Terrain
     tasks: Tasks
@@ -259,14 +250,14 @@ class Expert:
     config: DriveConfig = flax.struct.field(pytree_node=False)
 
     def start(self, state: Any, episode: jax.Array) -> dict[str, Any]:
-        """Return the task with nothing of it done."""
+        """Return the initial memory of the task."""
         zero, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
         fresh = {"leg": zero, "leg_steps": zero, "reached": no, "broken": no, "gap_m": jnp.zeros(())}
         fresh |= {"command": jnp.zeros(2), "pose_w": jnp.zeros(3)}
         return {"task": jax.tree.map(lambda x: x[episode], self.tasks), **fresh}
 
     def act(self, memory: dict[str, Any], state: Any, key: jax.Array) -> tuple[jax.Array, dict[str, Any], jax.Array]:
-        """Return the wheels' action; the memory says where the robot was and what it was commanded."""
+        """Return the wheels' action; the memory holds the robot's pose and the command."""
         config, task, nav, size_m = self.config, memory["task"], state.info["nav"], self.env.robot.size_m
         assert size_m is not None
         begun, xy_w = nav.step_count > 0, nav.robot_pos_w[:2]
@@ -295,10 +286,10 @@ RECORDERS |= {"touching": Recorder(lambda state, action: state.info["nav"].memor
 def drive(
     player: Player, tasks: Tasks, policy: Expert | HostPolicy, on_progress: Callable[[int], None]
 ) -> dict[str, np.ndarray]:
-    """Drive a batch of tasks to their ends, with a player that has `RECORDERS`, by the expert or beside it.
+    """Drive tasks to their ends with a player that has `RECORDERS`, by the expert or a policy beside it.
 
-    Return fields of `dataset.Drives`: those of control steps [B, T, ...], where rows after a drive's `steps` [B] mean
-    nothing; and `reached` and `broken` [B].
+    Return fields of `dataset.Drives` by control step [B, T, ...], invalid after a drive's `steps` [B], and `reached`
+    and `broken` [B].
     """
     starts = episode_starts(tasks.start_xy_w, tasks.start_yaw_rad, tasks.goals_w[:, 0], 0, tasks.scene)
     keys = jnp.zeros((len(tasks), 2), jnp.uint32)

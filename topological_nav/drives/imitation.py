@@ -1,9 +1,9 @@
-"""Train a local policy on drives as two networks see them, into a run folder; or one for every alpha and lambda.
+"""Train a local policy on drives as two networks see them, into a run folder; or one per alpha and lambda.
 
-RUN/config.yaml      settings; a run that is started again with the same ones goes on
+RUN/config.yaml      settings; the same settings resume the run
     versions.json, metrics.jsonl, checkpoint.msgpack, results.json, curves.png   as in `training`
-    weights.safetensors  the policy and the scale of its input; the forward model is not kept
-    network.json     how to build it, and which runs embed its images
+    weights.safetensors  the policy and the scale of its input, without the forward model
+    network.json     how to build it, and the runs that embed its images
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ GRIDS = {
     "nine": [(alpha, lam) for alpha in (0.1, 10.0, 50.0) for lam in (0.1, 0.5, 1.0)],
     "report": [(0.1, 0.5), (10.0, 0.1), (50.0, 1.0)],
 }
-"""Pairs of alpha and lambda: those of the report's table II, and all that its alphas and lambdas give."""
+"""Pairs of alpha and lambda: those of the report's table II, and all combinations of its values."""
 LEAST_SPREAD = 0.3
 """Features are scaled by their standard deviation, at least this share of the mean one."""
 
@@ -47,11 +47,11 @@ class Sequences(Rows):
     """Hold W windows of T control steps."""
 
     rows: np.ndarray
-    """[W, T + 1] i32 indices of the steps' frames; behind a drive's end its last one."""
+    """[W, T + 1] i32 indices of the steps' frames; after a drive's end, its last one."""
     valid: np.ndarray
-    """[W, T] bool: the step is of the drive."""
+    """[W, T] bool: the step belongs to the drive."""
     followed: np.ndarray
-    """[W, T] bool: the frame after it is of the drive too."""
+    """[W, T] bool: the next frame belongs to the drive too."""
     linear: np.ndarray
     """[W, T] i32 class of the commanded velocity."""
     angular: np.ndarray
@@ -59,7 +59,7 @@ class Sequences(Rows):
 
 
 def class_values(config: PolicyConfig, linear_m_s: float, angular_rad_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the velocity that each class stands for: linear [L] m/s and angular [A] rad/s, in rising order."""
+    """Return the classes' velocities, ascending: linear [L] m/s and angular [A] rad/s."""
     return (
         np.linspace(0.0, linear_m_s, config.linear_classes),
         np.linspace(-angular_rad_s, angular_rad_s, config.angular_classes),
@@ -67,16 +67,12 @@ def class_values(config: PolicyConfig, linear_m_s: float, angular_rad_s: float) 
 
 
 def classes(values: np.ndarray, of: np.ndarray) -> np.ndarray:
-    """Return the index (i32) of the nearest of rising values [C]; half way between two, the lower."""
+    """Return the index (i32) of the nearest of ascending values [C]; of two equally near, the lower."""
     return np.searchsorted((of[1:] + of[:-1]) / 2, values - 1e-6).astype(np.int32)
 
 
 def window_starts(steps: int, window: int, overlap: int) -> np.ndarray:
-    """Return where windows start in a drive: from its first step, each sharing at most `overlap` steps with the next.
-
-    A drive that is shorter than a window has one, which its end cuts short; at the end of a longer one, what is left
-    over is left out.
-    """
+    """Return the starts of a drive's windows, which share at most `overlap` steps; a drive's remainder is dropped."""
     stride = max(window - overlap, 1)
     return np.arange(0, max(steps - window, 0) + 1, stride)
 
@@ -84,7 +80,7 @@ def window_starts(steps: int, window: int, overlap: int) -> np.ndarray:
 def make_sequences(
     drives: Drives, which: np.ndarray, config: PolicyConfig, values: tuple[np.ndarray, np.ndarray], overlap_s: float
 ) -> Sequences:
-    """Return all windows of some drives, by their indices [k]."""
+    """Return all windows of the drives with indices [k]."""
     window, overlap = config.steps, int(np.floor(overlap_s / CONTROL_S + 1e-9))
     rows, ends = [], []
     for k in which:
@@ -100,20 +96,20 @@ def make_sequences(
 
 
 def turning_share(sequences: Sequences, config: PolicyConfig) -> np.ndarray:
-    """Return the share [W] of a window's steps whose angular class is not straight ahead."""
+    """Return each window's share [W] of steps whose angular class is not straight ahead."""
     turns = (sequences.angular != config.angular_classes // 2) & sequences.valid
     return turns.sum(1) / np.maximum(sequences.valid.sum(1), 1)
 
 
 def thinned(sequences: Sequences, config: PolicyConfig) -> Sequences:
-    """Return the windows without some of the nearly straight ones, which stay with probability `straight_kept`."""
+    """Return the windows, keeping nearly straight ones with probability `straight_kept`."""
     straight = turning_share(sequences, config) < config.straight_share
     rng = np.random.default_rng([config.seed, 7])
     return sequences.take(np.flatnonzero(~straight | (rng.random(len(sequences)) < config.straight_kept)))
 
 
 def mirrored(sequences: Sequences, frames: int, config: PolicyConfig) -> Sequences:
-    """Return the same windows in a mirror: its frames follow `frames` others, and left is right."""
+    """Return the windows mirrored: frames are offset by `frames`, and left and right are exchanged."""
     return dataclasses.replace(
         sequences, rows=sequences.rows + frames, angular=config.angular_classes - 1 - sequences.angular
     )
@@ -175,7 +171,7 @@ def train_policy(frames: Frames, out: Path, config: PolicyConfig, host: Host = A
 
 
 def _split(drives: Drives, config: PolicyConfig, values: tuple[np.ndarray, np.ndarray]):
-    """Return the sequences of drives to learn from, the same thinned and mirrored where set, and held-out ones."""
+    """Return training sequences, thinned and mirrored if set, and held-out ones."""
     every = make_sequences(drives, np.flatnonzero(drives.kept & ~drives.test), config, values, config.overlap_s)
     held_out = make_sequences(drives, np.flatnonzero(drives.kept & drives.test), config, values, 0.0)
     learned = thinned(every, config)
@@ -187,7 +183,7 @@ def _split(drives: Drives, config: PolicyConfig, values: tuple[np.ndarray, np.nd
 
 
 def _applied(policy: Policy, forward: Forward, params: Any, scale: Any, u: jax.Array):
-    """Return logits of runs of embeddings [B, T + 1, D], and a function of actions [B, T, classes] to the next ones."""
+    """Return logits of embeddings [B, T + 1, D], and a function from actions [B, T, classes] to next embeddings."""
     x = standardised(u, scale)
 
     def next_after(action: list[jax.Array]) -> Any:
@@ -203,10 +199,10 @@ def _one_hot(policy: Policy, linear: jax.Array, angular: jax.Array) -> list[jax.
 
 @functools.cache
 def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: int, count: int) -> Epoch:
-    """Build an epoch over `count` sequences; the last, incomplete batch is left out. See `learning.compiled_epoch`.
+    """Build an epoch over `count` sequences without the last, partial batch; see `learning.compiled_epoch`.
 
-    Labels: the fields of `Sequences`, and the numbers `alpha`, `lam`, `jointly` and `consistent` of `policy_loss`: one
-    program serves a whole grid. The policy is frozen while `jointly` is 0.
+    Labels are the fields of `Sequences` and the numbers `alpha`, `lam`, `jointly` and `consistent` of `policy_loss`, so
+    that one program serves a whole grid. The policy is frozen while `jointly` is 0.
     """
 
     def loss_of(params, scale, features, labels, step):
@@ -235,7 +231,7 @@ def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _judged(policy: Policy, forward: Forward, params: Any, scale: Any, u: jax.Array, linear: Any, angular: Any):
-    """Return the policy's classes, and squared errors of the forward model and of no change."""
+    """Return the policy's classes, and squared errors of the forward model and of predicting no change."""
     logits, next_after = _applied(policy, forward, params, scale, u)
     guesses = next_after(_one_hot(policy, linear, angular)), u[:, :-1]
     errors = [jnp.square(u[:, 1:] - guess).sum(-1) for guess in guesses]
@@ -245,7 +241,7 @@ def _judged(policy: Policy, forward: Forward, params: Any, scale: Any, u: jax.Ar
 def _scores(
     features: np.ndarray, learner: Learner, policy: Policy, forward: Forward, held_out: Sequences, config: PolicyConfig
 ) -> dict[str, Any]:
-    """Compare the policy's commands on held-out drives with the expert's, and the forward model with no change."""
+    """Compare the policy with the expert on held-out drives, and the forward model with predicting no change."""
 
     def judged(rows: np.ndarray, *commands: np.ndarray) -> Any:
         u = jnp.asarray(features[rows], jnp.float32)
@@ -270,10 +266,7 @@ def _scores(
 
 
 def train_grid(frames: Frames, out: Path, config: PolicyConfig, host: Host = ALONE) -> list[dict[str, Any]]:
-    """Train a policy for every pair of alpha and lambda, each in a separate folder under `out`.
-
-    Return the results, also written to grid.json and, as a table, to grid.md.
-    """
+    """Train a policy in a folder under `out` for each pair of alpha and lambda; write and return the results."""
     rows = []
     grid = GRIDS[config.pairs]
     for alpha, lam in grid:
@@ -286,7 +279,7 @@ def train_grid(frames: Frames, out: Path, config: PolicyConfig, host: Host = ALO
 
 
 def grid_table(rows: list[dict[str, Any]]) -> str:
-    """Return a Markdown table with a row for every alpha and lambda, of scores on held-out drives, if there are any."""
+    """Return a Markdown table of scores on held-out drives, if any, with a row per alpha and lambda."""
     names = [(kind, key) for kind in ("linear", "angular") for key in ("accuracy", "macro_f1")]
     lines = [
         [f"{row[name]:g}" for name in ("alpha", "lambda")]

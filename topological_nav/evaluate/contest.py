@@ -1,11 +1,11 @@
-"""Play the contenders of a contest in its scenes into a folder of rows; a contest that was stopped goes on.
+"""Play contenders in the scenes of a contest into a folder of rows; a stopped contest resumes.
 
-OUT/rows/<scene>-<contender>-<digest>-<first episode>.parquet   one row an episode (`evaluation.columns`)
-    tracks/<the same>.npz                                       where the robots went
+OUT/rows/<scene>-<contender>-<digest>-<first episode>.parquet   one row per episode (`evaluation.columns`)
+    tracks/<the same>.npz                                       paths of the robots
     <scene>.png, summary.md                                     written at the end
 
-The digest is of everything that decides the rows: scene, episodes, settings, map, networks, policy. Another question
-adds files; the same one reads its files and plays what is missing.
+The digest covers everything that determines the rows: scene, episodes, settings, map, networks, policy. A contest with
+the same digest reads its files and plays only missing episodes.
 """
 
 import dataclasses
@@ -59,29 +59,29 @@ from train.runs.run_folder import RunFolder
 from train.scoring.policies import Planner
 
 CONTENDERS = ("dense", "sparse", "expert", "ppo")
-"""The navigator on its map, and on the same thinned out; an expert with the plan; a policy that observes the goal."""
+"""The navigator on its map and on a thinned one; an expert with the plan; a policy that observes the goal."""
 EXPERT_WEIGHT = 1.0
-"""Of path against effort: objects are pushed only where no way is free."""
+"""Weight of path against effort: objects are pushed only where no path is free."""
 UNDECIDING = ("batch", "episodes", "supersample")
-"""Settings that decide no row, or that enter the digest in another way."""
+"""Settings that do not affect rows, or enter the digest in another form."""
 LATER = ("goal_images", "blocked", "asked_m", *(f.name for f in dataclasses.fields(GapConfig)))
-"""Settings that older rows do not have; those count where the setting is at its default."""
+"""Settings that older rows lack; those rows count where the setting has its default."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Contest:
-    """Set who plays what."""
+    """Set the players and the scenes."""
 
     scenes: tuple[Path, ...]
     contenders: tuple[str, ...]
     out: Path
     config: EvaluationConfig
     truth: bool = False
-    """Maps built from the plan, and the truth in the place of localiser and passage detector."""
+    """Use maps built from the plan, and the truth instead of localiser and passage detector."""
     maps: Path = Path()
     """Folder of the scenes' maps, unless `truth`."""
     map_files: Mapping[str, Path] = dataclasses.field(default_factory=dict)
-    """Name of a scene -> its map, where that lies elsewhere."""
+    """Name of a scene -> its map, if it lies elsewhere."""
     localiser: Path = Path()
     detector: Path = Path()
     policy: str = PASSAGE_POLICY
@@ -90,9 +90,9 @@ class Contest:
     """Run folder of `python -m train`."""
     robot: str = "ttbot"
     domain: str = "clean"
-    """The camera that the navigator sees by, goals included: a name of `domains.PRESETS`."""
+    """Camera of the navigator, goals included: a name of `domains.PRESETS`."""
     preset: str = "default"
-    """Preset that the settings were laid over; rows name it."""
+    """Preset under the settings; rows name it."""
 
     def __post_init__(self) -> None:
         for name in self.contenders:
@@ -112,7 +112,7 @@ class Contest:
 
 
 class ContestScene:
-    """Hold one scene of a contest; what is costly is built when it is first needed."""
+    """Hold one scene of a contest; costly parts are built at their first use."""
 
     def __init__(self, folder: Path, contest: Contest, networks: Networks | None):
         self.contest, self.networks = contest, networks
@@ -126,7 +126,7 @@ class ContestScene:
 
     @functools.cached_property
     def rooms(self):
-        """Cluster by the default way of clustering, so that episodes do not depend on networks."""
+        """Cluster by the default settings, so that episodes do not depend on networks."""
         return scene_rooms(self.scene, self.space, DataConfig())
 
     @functools.cached_property
@@ -137,7 +137,7 @@ class ContestScene:
 
     @functools.cached_property
     def player(self) -> Player:
-        """Return what plays episodes with the navigator."""
+        """Return a player of episodes with the navigator."""
         return self._player(get_robot(self.contest.robot, CONTROL))
 
     def _player(self, robot: RobotSpec) -> Player:
@@ -154,7 +154,7 @@ class ContestScene:
 
     @functools.cached_property
     def camera(self) -> Camera:
-        """Return the camera that the navigator's sight understands."""
+        """Return the camera for the navigator's sight."""
         if self.networks is None:
             return pose_camera
         world = self.player.env.world
@@ -164,7 +164,7 @@ class ContestScene:
 
     @property
     def drawn(self) -> DataConfig:
-        """Return how the navigator's images are drawn: as the networks learned, by the map's engine and lens."""
+        """Return the navigator's image settings: as in training, with the map's engine and lens."""
         assert self.networks is not None
         of_map = {k: v for k, v in self.map.about.get("data", {}).items() if k in ("engine", "fov_deg")}
         drawn = overlay(self.networks.camera, of_map, "map")
@@ -172,13 +172,13 @@ class ContestScene:
         return drawn_for(drawn, self.contest.config.supersample)
 
     def map_of(self, contender: str) -> TopologicalMap:
-        """Return the map that a navigator goes by."""
+        """Return a navigator's map."""
         if contender != "sparse":
             return self.map
         return self.map.thinned(self.contest.config.thinned, self.contest.config.seed)
 
     def sight(self, graph: TopologicalMap) -> Sight:
-        """Return networks, or the truth."""
+        """Return the networks, or the truth."""
         if self.networks is None:
             return TrueSight(graph, self.space)
         return NetworkSight(graph, self.networks, self.contest.config.match)
@@ -193,7 +193,7 @@ class ContestScene:
         return Navigator(graph, sight, local_policy(name, sight, config, self.networks or ()), config)
 
     def contender(self, name: str) -> Contender:
-        """Return the contender of a name, with what plays its episodes."""
+        """Return the contender of a name, ready to play."""
         config = self.contest.config
         if name == "expert":
             # It plans for half of the robot's width: doorways are narrower than its diagonal, and ways that join
@@ -208,7 +208,7 @@ class ContestScene:
         return NavigatorPlayer(self.player, config, self.navigator(name), self.camera)
 
     def request(self, contender: str) -> dict[str, Any]:
-        """Return everything that decides the rows of a contender."""
+        """Return everything that determines a contender's rows."""
         default, config = to_dict(EvaluationConfig()), to_dict(self.contest.config)
         left_out = {*UNDECIDING, *(name for name in LATER if config[name] == default[name])}
         config = {k: v for k, v in config.items() if k not in left_out}
@@ -262,7 +262,7 @@ def _learned(run: Path, scene: Scene, config: EvaluationConfig) -> tuple[Player,
 
 
 def contest_scenes(contest: Contest) -> list[ContestScene]:
-    """Return the scenes, with the networks where somebody looks through them."""
+    """Return the scenes, with networks if a contender uses them."""
     navigates = not contest.truth and {"dense", "sparse"} & set(contest.contenders)
     networks = None
     if navigates:
@@ -271,11 +271,11 @@ def contest_scenes(contest: Contest) -> list[ContestScene]:
 
 
 CPU_BATCH = 8
-"""Episodes played at a time on a CPU by default."""
+"""Default number of episodes to play at a time on a CPU."""
 
 
 def play_contest(contest: Contest, scenes: Sequence[ContestScene], on_progress: Progress = lambda *_: None) -> pa.Table:
-    """Play what is missing, and return all rows."""
+    """Play missing episodes and return all rows."""
     # Everything that can be refused is refused before the first episode.
     plan = [(scene, name, _stem(scene, name)) for scene in scenes for name in contest.contenders]
     missing = [_missing(contest.out, stem, len(scene.episodes)) for scene, _, stem in plan]
@@ -314,16 +314,13 @@ def _stem(scene: ContestScene, contender: str) -> str:
 
 
 def _missing(out: Path, stem: str, count: int) -> np.ndarray:
-    """Return the numbers of the episodes that no file has."""
+    """Return the numbers of the episodes that are in no file."""
     some = any((out / "rows").glob(f"{stem}-*.parquet"))
     return np.setdiff1d(np.arange(count), _rows(out, stem, count)["episode"].to_numpy() if some else [])
 
 
 def _rows(out: Path, stem: str, count: int) -> pa.Table:
-    """Return rows of the first `count` episodes: the files may have more, of a time when more were requested.
-
-    An episode that two commands played at the same time counts as the first of the files has it.
-    """
+    """Return the rows of the first `count` episodes, for duplicates the first in the files."""
     rows = read_rows(list((out / "rows").glob(f"{stem}-*.parquet")), COLUMNS.check)
     number, first = np.unique(rows["episode"].to_numpy(), return_index=True)
     return rows.take(first[number < count])
@@ -360,7 +357,7 @@ def _write(
 
 
 def tracks_of(contest: Contest, scene: ContestScene, contender: str) -> dict[int, np.ndarray]:
-    """Return episode number -> [t, 2] m, of what has been played."""
+    """Return episode number -> path [t, 2] m, of the episodes played so far."""
     tracks: dict[int, np.ndarray] = {}
     for path in sorted((contest.out / "tracks").glob(f"{_stem(scene, contender)}-*.npz")):
         with read_npz(path, FileError, "delete it and evaluate again") as stored:

@@ -1,9 +1,8 @@
 """Draw the fixed episodes of a scene, and let a contender play them: success, SPL, contacts and duration.
 
-Contenders: the navigator on a map, dense or thinned, with trained networks or with the truth in their place; an expert
-that has the map and the poses of all objects; a learned policy that observes the goal's position. All play the
-same episodes under the same rule: an episode is won when a run of 5 s ends within 1.5 m of the goal, or when the
-navigator localises at the goal's node; it is lost after `limit_s` of simulated time.
+Contenders are the navigator on a dense or thinned map, an expert that knows all poses, and a learned policy that
+observes the goal. An episode succeeds if a run of 5 s ends within 1.5 m of the goal or the navigator localises at the
+goal's node; it fails after `limit_s`.
 """
 
 import dataclasses
@@ -29,9 +28,9 @@ from topological_nav.scenes.rendering import Camera, Snapshot, episode_starts
 from topological_nav.scenes.space import FreeSpace, Rooms
 
 CONNECTED_M = 0.25
-"""Start and goal are joined by a way with this clearance: half of TTbot's width and the grid's rounding."""
+"""Clearance of a path that joins start and goal: half of TTbot's width and the grid's rounding."""
 LEAST, MOST, PER_M2 = 25, 60, 0.5
-"""Episodes a scene."""
+"""Bounds and density of the number of episodes in a scene."""
 APART_M = 1.0
 
 
@@ -54,18 +53,18 @@ class DrivenEpisodes(Rows):
     """[n] length of the shortest way round walls and furniture, for half of the robot's width, over a grid of 16
     directions: at most 2.7 % too long."""
     narrow_xy_w: np.ndarray
-    """[n, 2] m: where that way is narrowest, at least `APART_M` from both ends where it is long enough."""
+    """[n, 2] m: narrowest place of the shortest path, at least `APART_M` from both ends if possible."""
 
 
 def count_of(scene: Scene, config: EvaluationConfig) -> int:
-    """Return the number of episodes of a scene: as set, or by its floor's area."""
+    """Return a scene's number of episodes, as set or by its floor's area."""
     return config.episodes or int(np.clip(round(PER_M2 * scene.manifest.floor_area_m2), LEAST, MOST))
 
 
 def draw_episodes(digest: str, space: FreeSpace, rooms: Rooms, count: int, config: EvaluationConfig) -> DrivenEpisodes:
-    """Draw episodes: number i depends on seed and scene alone, however many there are.
+    """Draw episodes; number i depends on seed and scene alone.
 
-    Start and goal are uniform over free places, in different rooms, farther apart than `min_goal_m`, joined by a way.
+    Start and goal are uniform over free places in different rooms, more than `min_goal_m` apart, and joined by a path.
     """
     parts, _ = label(space.clearance_m >= CONNECTED_M)
     places = space.centres(config.clearance_m)
@@ -105,14 +104,14 @@ def draw_episodes(digest: str, space: FreeSpace, rooms: Rooms, count: int, confi
 
 
 def blocking(starts: EpisodeStart, episodes: DrivenEpisodes, radii_m: Sequence[float]) -> EpisodeStart:
-    """Return starts whose widest small object stands where the shortest path is narrowest."""
+    """Return starts with the widest small object at the narrowest place of the shortest path."""
     widest = int(np.argmax(radii_m))
     xy_w = starts.small_xy_w.at[:, widest].set(jnp.asarray(episodes.narrow_xy_w, jnp.float32))
     return starts.replace(small_xy_w=xy_w, small_placed=starts.small_placed.at[:, widest].set(True))
 
 
 TRACK_S = 0.5
-"""Between two points of a recorded path."""
+"""Time between two points of a recorded path."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -130,17 +129,17 @@ class Played:
     duration_s: np.ndarray = column(0.0)
     """[n]."""
     runs: np.ndarray = column(0, int)
-    """[n] int, runs driven; one that the end of its episode cuts short counts as the whole run."""
+    """[n] int, runs driven; the end of an episode cuts short a run, which counts as whole."""
     contact_runs: np.ndarray = column(0, int)
-    """[n] int, of them with a contact."""
+    """[n] int, runs with a contact."""
     contact_s: np.ndarray = column(0.0)
     """[n] seconds of control steps with a contact, turning included."""
     wall_s: np.ndarray = column(0.0)
-    """[n] of them with a wall."""
+    """[n] of these seconds, with a wall."""
     localisations: np.ndarray = column(0, int)
     blocked: np.ndarray = column(0, int)
     lost: np.ndarray = column(0, int)
-    """[n] int, such events of the navigator; 0 for others."""
+    """[n] int, number of such events of the navigator; 0 for others."""
     broken: np.ndarray = column(False, bool)
     """[n] bool: the physics gave up, which ends an episode as failed."""
     track_w: list[Any]
@@ -148,7 +147,7 @@ class Played:
 
 
 class Contender(HostPolicy):
-    """Play a batch of episodes, by the rule for all, and keep what their scores need of every step."""
+    """Play a batch of episodes by the common rule, and record what their scores need."""
 
     observes = False
 
@@ -160,14 +159,14 @@ class Contender(HostPolicy):
         """Start a batch of episodes."""
 
     def keep(self, rows: np.ndarray) -> None:
-        """Continue with these rows of the batch only."""
+        """Keep only these rows of the batch."""
 
     def step(self, state: Any, now: Snapshot, running: np.ndarray, step: int) -> tuple[Any, Events]:
-        """Return the actions [B, A] of one control step, and what happened before it."""
+        """Return the actions [B, A] of one control step, and the events before it."""
         raise NotImplementedError
 
     def look(self, state: Any) -> Snapshot:
-        """Return where the robots are."""
+        """Return the robots' state."""
         return Snapshot.of(state)
 
     def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> tuple[Any, np.ndarray]:
@@ -187,7 +186,7 @@ class Contender(HostPolicy):
         return actions, self._note(number, now, events, running, step)
 
     def _note(self, number: np.ndarray, now: Snapshot, events: Events, running: np.ndarray, step: int) -> np.ndarray:
-        """Add the moment before a step to the outcomes of the running episodes; return which it ends, [B] bool."""
+        """Add the moment before a step to the outcomes of running episodes; return which episodes end, [B] bool."""
         dt_s, played, rows = self.player.env.dt, self._played, number[running]
         goal_m = np.linalg.norm(now.xy_w - self._episodes.goal_xy_w[number], axis=-1)
         near = events.run_ended & (goal_m < self.config.success_m)
@@ -212,9 +211,9 @@ class Contender(HostPolicy):
         return near | events.arrived | now.broken | events.timed_out
 
     def play(self, episodes: DrivenEpisodes, on_progress: Callable[[int, float], None] = lambda *_: None) -> Played:
-        """Play episodes to their ends, in one batch; noise and small objects depend on their numbers and the seed.
+        """Play episodes to their ends in one batch; noise and small objects depend on episode numbers and the seed.
 
-        `on_progress` is called with the numbers of finished episodes and of simulated seconds; it may raise to stop.
+        `on_progress` gets the numbers of finished episodes and of simulated seconds; it may raise to stop.
         """
         env, keys = self.player.env, episode_keys(self.config.seed, episodes.number)
         begin = episodes.start_xy_w, episodes.yaw_rad, episodes.goal_xy_w
@@ -238,7 +237,7 @@ class Contender(HostPolicy):
 
 
 class NavigatorPlayer(Contender):
-    """Play with the navigator, which looks through a camera."""
+    """Play with the navigator through a camera."""
 
     def __init__(
         self,
@@ -248,13 +247,13 @@ class NavigatorPlayer(Contender):
         camera: Camera,
         watch: Callable[[float, Snapshot, State], None] = lambda *_: None,
     ):
-        """Take its parts; `watch` is called with time, poses and new state of every step."""
+        """Store the parts; `watch` is called with time, poses and new state of every step."""
         super().__init__(player, config)
         self._navigator, self._camera, self._watch = navigator, camera, watch
         self.state: State | None = None
 
     def begin(self, episodes: DrivenEpisodes) -> None:
-        """Take the goals' images, of the scene at rest; see `NavigatorConfig.goal_images`."""
+        """Render the goals' images of the scene at rest; see `NavigatorConfig.goal_images`."""
         config, n = self._navigator.config, len(episodes)
         count = config.goal_images or config.images
         around = np.tile(2 * np.pi * np.arange(count) / count, (n, 1))
@@ -293,11 +292,11 @@ class NavigatorPlayer(Contender):
 
 
 Act = Callable[[Any, np.ndarray, np.ndarray, int], Any]
-"""State, episode numbers [B], which of them run [B] and control steps done to actions [B, A]."""
+"""(state, episode numbers [B], running [B], control steps done) -> actions [B, A]."""
 
 
 class ActionPlayer(Contender):
-    """Play with a policy that acts on the environment's state: its runs follow each other without a break."""
+    """Play with a policy that acts on the environment's state, with runs one after the other."""
 
     def __init__(self, player: Player, config: EvaluationConfig, make_act: Callable[[], Act], observes: bool = False):
         super().__init__(player, config)
@@ -318,7 +317,7 @@ class ActionPlayer(Contender):
 
 
 def learned(player: Player, config: EvaluationConfig, policy: Any) -> ActionPlayer:
-    """Return a policy of `train`, which observes the goal's position."""
+    """Return a player for a policy of `train`, which observes the goal's position."""
 
     @jax.jit
     def chosen(obs: Any, episode: jax.Array, step: jax.Array) -> jax.Array:
@@ -332,7 +331,7 @@ def learned(player: Player, config: EvaluationConfig, policy: Any) -> ActionPlay
 
 
 def columns(episodes: DrivenEpisodes, played: Played, config: EvaluationConfig) -> dict[str, np.ndarray]:
-    """Return the numbers of each row, an array each; SPL, RC and AADC are means of them (see `scores`)."""
+    """Return the numbers of the rows, an array per column; SPL, RC and AADC are means of them (see `scores`)."""
 
     kept = ("contact_s", "wall_s", "duration_s", "path_m", "goal_m", "runs", "contact_runs", "localisations", "blocked")
     ends = {"start": episodes.start_xy_w, "goal": episodes.goal_xy_w}

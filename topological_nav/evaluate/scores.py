@@ -1,9 +1,8 @@
-"""Compute success rate, SPL, RC, AADC and duration of rows of episodes, with 95 % intervals, as tables.
+"""Compute success rate, SPL, RC, AADC and duration of episodes' rows, with 95 % intervals, as tables.
 
-RC is the share of successes with a contact, AADC the seconds in contact of a success, where a run with a contact
-counts as a whole (5 s); both, and the duration, are over successes, as a failure's contacts grow with the time limit.
-AD is the mean duration of all episodes, in simulated seconds.
-A scene's intervals are over its episodes (Wilson's for shares, bootstrap for means); those over scenes are Student's.
+RC is the share of successes with a contact; AADC is the seconds in contact of a success, where a run with a contact
+counts fully (5 s); `duration` is over successes too, AD over all episodes (simulated). Intervals in a scene are
+Wilson's for shares and bootstrap for means; those over scenes are Student's.
 """
 
 import dataclasses
@@ -26,10 +25,10 @@ SCORES = {
     "ad_s": "AD (s)",
     "within": "within 1.5 m",
 }
-"""Name -> heading; `within` is the share of episodes that ended near the goal, whatever the navigator believed."""
+"""Name -> heading; `within` is the share of episodes that ended near the goal, whether or not the navigator knew."""
 HEADER = ("contender", "scene", "episodes", *SCORES.values())
 COLUMN = {"rc": "contact", "ad_s": "duration_s"}
-"""Name of a score -> the column it is of, where that has another name."""
+"""Score -> its column, if the names differ."""
 OF_SUCCESSES = ("rc", "aadc_s", "duration_s")
 NOTHING = Estimate(np.nan, np.nan, np.nan, 0)
 
@@ -43,7 +42,7 @@ def score(rows: pa.Table, name: str) -> Estimate:
 
 
 def by_scene(rows: pa.Table, name: str) -> dict[str, float]:
-    """Return each scene's score; scenes without any (RC where nothing succeeded) are left out."""
+    """Return each scene's score, without scenes that have none (RC without a success)."""
     means = {scene: score(where(rows, scene=scene), name).mean for scene in rows["scene"].unique().to_pylist()}
     return {scene: mean for scene, mean in means.items() if not np.isnan(mean)}
 
@@ -54,13 +53,13 @@ class Line:
 
     contender: str
     group: str
-    """A scene, or over scenes: seen, unseen, all."""
+    """A scene, or a group of scenes: seen, unseen, all."""
     episodes: int
     scores: dict[str, Estimate]
 
 
 def summary(rows: pa.Table) -> list[Line]:
-    """Return for each contender each scene, then the means over seen (train), unseen (test) and all scenes."""
+    """Return each contender's scenes, then the means over seen (train), unseen (test) and all scenes."""
     lines = []
     for contender in rows["contender"].unique().to_pylist():
         played = where(rows, contender=contender)
@@ -76,7 +75,7 @@ def summary(rows: pa.Table) -> list[Line]:
 
 
 def differences(rows: pa.Table) -> list[tuple[str, str, Estimate | Contrast]]:
-    """Compare the same episodes on dense and sparse map, scene by scene; unseen and seen scenes by Welch's test."""
+    """Compare the same episodes on dense and sparse maps by scene, and unseen with seen scenes by Welch's test."""
     results = []
     contenders = rows["contender"].unique().to_pylist()
     for name in ("success", "spl"):
@@ -94,13 +93,13 @@ def differences(rows: pa.Table) -> list[tuple[str, str, Estimate | Contrast]]:
 
 
 def console_table(lines: Sequence[Line]) -> Table:
-    """Return the summary for a terminal."""
+    """Format the summary for a terminal."""
     caption = "mean [95 % interval]; RC, AADC and duration of successes"
     return tables.console_table(HEADER, map(_cells, lines), left=3, caption=caption)
 
 
 def markdown(lines: Sequence[Line], compared: Sequence[tuple[str, str, Estimate | Contrast]]) -> str:
-    """Return the summary and the comparisons for a file."""
+    """Format the summary and the comparisons as Markdown."""
     summed = tables.markdown(HEADER, map(_cells, lines))
     header = ("Compared", "Score", "Difference [95 % interval]")
     lines_compared = [(what, SCORES[name], text(result)) for what, name, result in compared]
@@ -112,7 +111,7 @@ def _cells(line: Line) -> list[str]:
 
 
 def text(value: Estimate | Contrast) -> str:
-    """Return a score or a comparison for tables; `-` where there is nothing to average."""
+    """Format a score or a comparison for tables; `-` if there is nothing to average."""
     if isinstance(value, Contrast):
         return str(value)
     return value.with_ends(2 if abs(value.mean) < 10 else 0) if value.runs else "-"

@@ -1,4 +1,4 @@
-"""Draw what networks and policies learn from and how: drives, learning curves, scores, domains, exports."""
+"""Draw training data and training: drives, learning curves, scores, domains, exports."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,9 +18,9 @@ from topological_nav.scenes.space import free_space
 from topological_nav.weights.export import PRECISION, Compared
 
 SHOWN = 4
-"""Drives whose images are shown."""
+"""Drives with images."""
 FRAMES = 8
-"""Images of each."""
+"""Images per drive."""
 TURNS = LinearSegmentedColormap.from_list("turns", (BLUE, "0.6", VERMILION))
 
 
@@ -73,7 +73,7 @@ def drives_figure(scene_folders: Sequence[Path], folder: Path) -> Figure:
 
 
 def _some(folder: Path, count: int) -> list[tuple[int, np.ndarray]]:
-    """Return a few drives with their images, each of another file."""
+    """Return a few drives with their images, each from a different file."""
     drives, out = load_drives(folder), []
     for rows, images in drive_images(folder, count):
         k, end = int(rows[len(rows) // 2]), int(drives.steps[rows[: len(rows) // 2 + 1]].sum())
@@ -94,7 +94,7 @@ def _shares(axes: Any, drives: Any) -> None:
 
 
 def policy_figure(lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]) -> Figure:
-    """Draw the curves of a policy's run, and how its commands on held-out drives compare with the expert's."""
+    """Draw the curves of a policy's run, and compare its commands on held-out drives with the expert's."""
     figure, (axes,) = panels((15, 3.6), 1, 4)
     curves(axes[0], lines, {"forward": "forward", "consistency": "consistency"})
     axes[0].set_yscale("log")
@@ -117,7 +117,7 @@ def policy_figure(lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
 
 
 def curves_figure(lines: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw loss and accuracy over epochs, from lines of a run's metrics.jsonl, a column a phase."""
+    """Draw loss and accuracy over epochs from lines of metrics.jsonl, a column per phase."""
     names = {"pairs": "without labels (VICReg)", "labels": "with labels"}
     phases = list(dict.fromkeys(line["phase"] for line in lines))
     figure, grid = panels((4.6 * len(phases), 3.2), 1, len(phases))
@@ -139,7 +139,7 @@ _STAGES = {"before": "0.6", "statistics": ORANGE, "after": BLUE}
 def features_figure(
     source: np.ndarray, target: np.ndarray, lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
 ) -> Figure:
-    """Draw images [n, H, W, 3] u8 of both domains, the game's course, and localisation before and after."""
+    """Draw images [n, H, W, 3] u8 of both domains, the adversarial losses, and localisation before and after."""
     figure, (above, below) = parts((8, 5.6), [1.0, 1.15])
     grid, (course, scores) = above.subplots(2, PAIRS), below.subplots(1, 2)
     for line, images, name in zip(grid, (source, target), ("as rendered", "target"), strict=True):

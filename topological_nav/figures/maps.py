@@ -1,4 +1,4 @@
-"""Draw plans, rooms, maps and paths; drive one episode and keep it for a picture, a log and a film."""
+"""Draw plans, rooms, maps and paths; record an episode as a picture, a log and a film."""
 
 import dataclasses
 import functools
@@ -31,13 +31,13 @@ from topological_nav.scenes.space import FreeSpace
 
 WON, LOST = BLUE, VERMILION
 FEW = 100
-"""Episodes of which each start and goal is drawn; of more, only those of the lost."""
+"""Up to so many episodes, every start and goal is drawn; beyond, only those of failures."""
 INK = 40.0
-"""Paths drawn so many times over each other make a solid colour, however many there are."""
+"""Number of overlapping paths that make a solid colour."""
 
 
 def map_lines(axis: Axes, graph: TopologicalMap, passable: float) -> None:
-    """Draw a map in the background: its nodes, and the edges that count as open."""
+    """Draw a map's nodes and open edges in the background."""
     open_ = graph.p >= passable
     ways = np.stack([graph.xy_w[graph.edges[open_, 0]], graph.xy_w[graph.edges[open_, 1]]], 1)
     axis.add_collection(LineCollection(list(ways), colors="0.6", linewidths=0.5, zorder=1))
@@ -50,7 +50,7 @@ def journeys_figure(
     panels: Mapping[str, tuple[TopologicalMap | None, Mapping[int, np.ndarray], Mapping[int, Mapping[str, Any]]]],
     passable: float,
 ) -> Figure:
-    """Draw where contenders went in a scene, a panel each."""
+    """Draw the contenders' paths in a scene, a panel each."""
     extent = np.ptp(space.centres(0.0), axis=0) + 0.8
     columns = len(panels) if extent[1] >= extent[0] or len(panels) == 1 else min(2, len(panels))
     lines = -(-len(panels) // columns)
@@ -134,7 +134,7 @@ def room_points(axis: Axes, points_w: np.ndarray, labels: np.ndarray, **style: A
 
 
 def dataset_figure(folder: Path) -> Figure:
-    """Draw where a dataset's images were taken, a panel a scene, and level images of some positions below."""
+    """Draw a dataset's positions, a panel per scene, and level images of some positions below."""
     header, config = read_header(folder)
     scenes = [(s["name"], load_plan(folder, s["name"])) for s in header["scenes"]]
     rooms = load_rooms(folder)
@@ -197,19 +197,19 @@ def map_figure(space: FreeSpace, graphs: Sequence[TopologicalMap], route: Route 
 
 FILM_EVERY_S = 0.5
 FILM_RATE = 20.0
-"""Frames a second of film: ten times as fast as it was."""
+"""Frames per second of film, ten times as fast as real time."""
 FILM_HEIGHT = 480
 PATH_RGB, GOAL_RGB, ROBOT_RGB = (31, 119, 180), (44, 160, 44), (214, 39, 40)
 
 
 @dataclasses.dataclass(frozen=True)
 class Driven:
-    """Hold an episode."""
+    """Hold a recorded episode."""
 
     venue: ContestScene
     map: TopologicalMap
     journey: DrivenEpisodes
-    """The one alone."""
+    """The episode."""
     played: Played
     goal_node: int
     time_s: np.ndarray
@@ -221,15 +221,15 @@ class Driven:
     phase: np.ndarray
     """[t] i8."""
     views: dict[int, np.ndarray]
-    """Control step -> image, where it was filmed."""
+    """Control step -> image, if filmed."""
     goal_images: np.ndarray
     """[K, ...]."""
     log: list[str]
-    """Events, a line each."""
+    """Events, one per line."""
 
     @property
     def outcome(self) -> str:
-        """Return the outcome in words."""
+        """Return a description of the outcome."""
         played = self.played
         what = "reached the goal" if played.success[0] else "did not reach the goal"
         return (
@@ -247,7 +247,7 @@ class Driven:
         return figure
 
     def draw(self, axis: Axes, width: int = 90) -> None:
-        """Draw the path over plan and map, with labels for a legend, below a title of lines so many letters wide."""
+        """Draw the labelled path over plan and map, with a title in lines of at most `width` letters."""
         title = f"{self.venue.scene.name}, episode {self.journey.number[0]}: {self.outcome}"
         axis.set_title(textwrap.fill(title, width), fontsize=9)
         floor_plan(axis, self.venue.space)
@@ -339,7 +339,7 @@ def _log_lines(graph: TopologicalMap, state: State) -> Iterator[str]:
 
 
 def _film_every(venue: ContestScene) -> int:
-    """Return the control steps from one frame to the next."""
+    """Return the control steps per frame."""
     return max(1, round(FILM_EVERY_S / venue.player.env.dt))
 
 

@@ -1,7 +1,7 @@
-"""Train variables on images and labels: on an accelerator a whole epoch is one compiled program.
+"""Train variables on images and labels; on an accelerator a whole epoch is one compiled program.
 
-The images stay on the device as u8. An epoch's order and augmentation follow from the seed and its number alone, so a
-run that goes on from a checkpoint ends where an uninterrupted one does.
+Images stay on the device as u8. An epoch's order and augmentation depend only on the seed and the epoch's number, so
+that a resumed run gives the same result as an uninterrupted one.
 """
 
 import dataclasses
@@ -25,12 +25,12 @@ from topological_nav.learn.networks import Network, augmented
 from topological_nav.scenes.rendering import batched
 
 EVALUATED, DEVICE_EVALUATED = (8, 64), (16, 64, 256)
-"""Images a call where nothing is learned, on a CPU and on an accelerator: each call takes the least that serves."""
+"""Batch sizes for inference, on a CPU and on an accelerator; each call uses the smallest that suffices."""
 
 
 @flax.struct.dataclass
 class Learner:
-    """Hold what an epoch changes."""
+    """Hold the state that an epoch changes."""
 
     params: Any
     batch_stats: Any
@@ -38,12 +38,12 @@ class Learner:
 
     @classmethod
     def start(cls, variables: dict[str, Any], tx: optax.GradientTransformation) -> Self:
-        """Return these weights before the first update."""
+        """Return the state before the first update of these weights."""
         return cls(variables["params"], variables["batch_stats"], tx.init(variables["params"]))  # type: ignore[call-arg]
 
     @property
     def variables(self) -> dict[str, Any]:
-        """Return what `flax.linen.Module.apply` takes."""
+        """Return the argument of `flax.linen.Module.apply`."""
         return {"params": self.params, "batch_stats": self.batch_stats}
 
 
@@ -54,21 +54,21 @@ Epoch = Callable[[Learner, jax.Array, Any, jax.Array], tuple[Learner, dict[str, 
 def make_learner(
     module: nn.Module, image_shape: tuple[int, int], tx: optax.GradientTransformation, seed: int
 ) -> Learner:
-    """Draw fresh weights."""
+    """Initialise a learner."""
     return Learner.start(initial(variable_shapes(module, image_shape), seed), tx)
 
 
 def variable_shapes(module: nn.Module, image_shape: tuple[int, int]) -> dict[str, Any]:
-    """Return `params` and `batch_stats` of a module as shapes; nothing is computed."""
+    """Return the shapes of a module's `params` and `batch_stats` without computing them."""
     key, image = jax.random.PRNGKey(0), jax.ShapeDtypeStruct((1, *image_shape, 3), jnp.uint8)
     return {"batch_stats": {}, **jax.eval_shape(lambda k, x: module.init(k, x, train=False), key, image)}
 
 
 def initial(shapes: dict[str, Any], seed: int) -> dict[str, Any]:
-    """Return first values of variables: the same on every device, and without a program to compile.
+    """Return initial values of variables, the same on every device, without compiling a program.
 
-    Convolutions as in He et al. 2015 by outputs (sd root of 2 over fan out), dense layers by inputs (1 over root of
-    fan in), scales and variances 1, everything else 0.
+    Convolutions follow He et al. 2015 (sd = sqrt(2 / fan out)), dense layers have sd = 1 / sqrt(fan in); scales and
+    variances are 1, everything else is 0.
     """
     rng = np.random.default_rng(seed)
 
@@ -85,7 +85,7 @@ def initial(shapes: dict[str, Any], seed: int) -> dict[str, Any]:
 
 
 def with_backbone(learner: Learner, donor: dict[str, Any], fault: str = "", about: str = "") -> Learner:
-    """Return the learner with the backbone of other variables (`params`, `batch_stats`); raise if it differs."""
+    """Return the learner with the backbone of other variables (`params`, `batch_stats`); raise if shapes differ."""
     mine, theirs = learner.params["body"], donor["params"]["body"]
     shapes = [jax.tree.map(jnp.shape, tree) for tree in (mine, theirs)]
     if shapes[0] != shapes[1]:
@@ -99,10 +99,7 @@ def with_backbone(learner: Learner, donor: dict[str, Any], fault: str = "", abou
 def labelled_epoch(
     network: Network, tx: optax.GradientTransformation, batch: int, smoothing: float, augment: bool, scored: int = 0
 ) -> Epoch:
-    """Build an epoch of classification; images [N, H, W, 3] u8, labels [N] i32, of passages [N, outputs].
-
-    The last, incomplete batch is left out: order changes every epoch, so every image has its turn.
-    """
+    """Build an epoch of classification without the last, partial batch; labels: [N] i32, of passages [N, outputs]."""
 
     def loss_of(params, stats, images, labels, step):
         rows, key = step
@@ -123,24 +120,24 @@ def labelled_epoch(
 
 
 def shuffled(key: jax.Array, count: int, batch: int) -> jax.Array:
-    """Return [U, batch] rows of an epoch's updates: all in random order, but for a last, incomplete batch."""
+    """Return the rows [U, batch] of an epoch's updates in random order, without the last, partial batch."""
     size = min(batch, count)
     return jax.random.permutation(key, count)[: count // size * size].reshape(-1, size)
 
 
 def over(epoch: Epoch, images: Any, labels: Any) -> Callable[[Learner, int, jax.Array], Any]:
-    """Return an epoch over these images and labels, from now on kept on the device, as `run_epochs` takes it."""
+    """Return an epoch for `run_epochs` over these images and labels, which stay on the device."""
     x, y = jnp.asarray(images), jnp.asarray(labels)
     return lambda learner, _, key: epoch(learner, x, y, key)
 
 
 def phase_key(seed: int, phase: int) -> jax.Array:
-    """Return the key of all epochs of a phase of a run."""
+    """Return the random key of a phase of a run."""
     return jax.random.fold_in(jax.random.PRNGKey(seed), phase)
 
 
 def keyed_batches(batch: int) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
-    """Return the steps of an epoch over images in random order: rows of a batch, and a key."""
+    """Return the steps of an epoch over images in random order: the rows of a batch and a key."""
 
     def steps(images, key):
         key_order, key_steps = jax.random.split(key)
@@ -151,10 +148,7 @@ def keyed_batches(batch: int) -> Callable[[jax.Array, jax.Array], tuple[jax.Arra
 
 
 def descent_epoch(steps: Callable[..., Any], loss_of: Callable[..., Any], tx: optax.GradientTransformation) -> Epoch:
-    """Build an epoch of gradient descent; see `compiled_epoch`.
-
-    `loss_of` takes params, batch_stats, images, labels and a step to the loss, new batch_stats and other means.
-    """
+    """Build an epoch of descent; `loss_of(params, stats, images, labels, step)` returns loss, (new stats, means)."""
 
     def update(learner, images, labels, step):
         grad = jax.value_and_grad(loss_of, has_aux=True)
@@ -166,11 +160,11 @@ def descent_epoch(steps: Callable[..., Any], loss_of: Callable[..., Any], tx: op
 
 
 def compiled_epoch(steps: Callable[..., Any], update: Callable[..., Any]) -> Epoch:
-    """Build an epoch of updates: one program on an accelerator, one program an update on a CPU.
+    """Build an epoch of updates: one program on an accelerator, one program per update on a CPU.
 
-    XLA's CPU convolutions are about eight times slower inside a loop of the program (53 against 441 images/s, ResNet-18
-    of width 8 at 64 x 48 on two busy cores). `steps` takes images and a key to a tree of arrays [S, ...], one row an
-    update.
+    XLA's CPU convolutions are about eight times slower inside a loop of the program (53 against 441 images/s for
+    ResNet-18 of width 8 at 64 x 48 on two busy cores). `steps` maps images and a key to a tree of arrays [S, ...], a
+    row per update.
     """
     planned, one = jax.jit(steps), jax.jit(update, donate_argnums=0)
 
@@ -189,7 +183,7 @@ def compiled_epoch(steps: Callable[..., Any], update: Callable[..., Any]) -> Epo
 
 
 def in_batches(function: Callable[[jax.Array], jax.Array], images: np.ndarray) -> np.ndarray:
-    """Return a compiled function's rows of images [N, H, W, 3]; see `rendering.batched`."""
+    """Return a compiled function's rows for images [N, H, W, 3]; see `rendering.batched`."""
     sizes = EVALUATED if jax.default_backend() == "cpu" else DEVICE_EVALUATED
     if not len(images):  # the shape of a row takes a call
         return np.asarray(function(jnp.zeros((sizes[0], *images.shape[1:]), images.dtype)))[:0]
@@ -197,8 +191,7 @@ def in_batches(function: Callable[[jax.Array], jax.Array], images: np.ndarray) -
 
 
 def padded_size(count: int) -> int:
-    """Return a batch size that holds `count`, of few, because each is compiled: powers of two, on accelerators of four,
-    where little is faster than 16."""
+    """Return a power of two of at least `count`; on accelerators a power of four of at least 16, to compile less."""
     if jax.default_backend() == "cpu":
         return 1 << (count - 1).bit_length()
     return max(16, 1 << ((count - 1).bit_length() + 1) // 2 * 2)
@@ -206,11 +199,11 @@ def padded_size(count: int) -> int:
 
 WEIGHTS, DESCRIPTION, RESULTS = "weights.safetensors", "network.json", "results.json"
 PACKED_WEIGHTS = f"{WEIGHTS}.xz"
-"""Of an exported run."""
+"""File of an exported run."""
 
 
 def write_network(out: Path, tensors: Any, about: dict[str, Any], precision: str = "") -> None:
-    """Write weights and their description, which gains their digest; with a precision those of an export, packed."""
+    """Write weights, and their description with their digest; if a precision is given, as a packed export."""
     header = {name: about[name] for name in ("task", "parameters", "commit") if name in about}
     path = out / (PACKED_WEIGHTS if precision else WEIGHTS)
     digest = weights.write_weights(path, weights.flat(jax.device_get(tensors)), header)["digest"]
@@ -219,7 +212,7 @@ def write_network(out: Path, tensors: Any, about: dict[str, Any], precision: str
 
 
 def weights_file(run: Path) -> Path:
-    """Return where the weights of a run are, whether it was exported or not."""
+    """Return the weights file of a run or an export."""
     packed = run / PACKED_WEIGHTS
     return packed if packed.is_file() else run / WEIGHTS
 
@@ -234,7 +227,7 @@ class _Description:
 
 
 def read_description(run: Path, kind: str, task: str) -> dict[str, Any]:
-    """Return the network.json of a finished run."""
+    """Return the content of a finished run's network.json."""
     path = run / DESCRIPTION
     if not path.is_file():
         raise FileError(f"{run}: holds no trained {kind}; finish it: python -m topological_nav train {task} -o {run}")

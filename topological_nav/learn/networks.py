@@ -1,7 +1,7 @@
-"""Map images to room logits, passage logits and localisation embeddings, and score how well these localise.
+"""Map images to room logits, passage logits and localisation embeddings, and score localisation.
 
-Image batches are u8 [N, H, W, 3] of any size from 16 pixels a side. `width` scales every layer of a backbone; 64 is
-the original's. Batch normalisation and the stem's two halvings are the originals'.
+Image batches are u8 [N, H, W, 3] of at least 16 pixels a side. `width` scales every layer of a backbone (the originals
+have 64). Batch normalisation and the stem's two halvings follow the originals.
 """
 
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ class ResNet18(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array, train: bool) -> tuple[jax.Array, jax.Array]:
-        """Return maps after one of the first stages (2: conv3_x) and the last: [N, h, w, 2 width], [.., 8 width]."""
+        """Return feature maps after conv3_x and the last stage: [N, h, w, 2 width] and [N, h', w', 8 width]."""
         x = _conv(self.width, 7, 2)(x)
         x = nn.relu(_norm(train)(x))
         x = nn.max_pool(x, window_shape=(3, 3), strides=(2, 2), padding="SAME")
@@ -49,7 +49,7 @@ class _Block(nn.Module):
 
 
 class AlexNet(nn.Module):
-    """Define the five convolutions of Krizhevsky 2014 (one column), padded so that small images pass."""
+    """Define the five convolutions of Krizhevsky 2014 (one column), padded to accept small images."""
 
     width: int = 64
 
@@ -67,7 +67,7 @@ class AlexNet(nn.Module):
 
 
 class Network(nn.Module):
-    """Join a backbone and the head of a task."""
+    """Join a backbone and a task's head."""
 
     task: str
     """passages: an output a length, never more for a longer one; after AlexNet two layers with dropout."""
@@ -79,7 +79,7 @@ class Network(nn.Module):
     first_stage: int = 2
 
     def setup(self) -> None:
-        """Make the parts; flax calls it."""
+        """Build the submodules; flax calls it."""
         of_resnet = {"first_stage": self.first_stage} if self.backbone == "resnet18" else {}
         self.body = {"resnet18": ResNet18, "alexnet": AlexNet}[self.backbone](self.width, **of_resnet)
         self.drops = self.task == "passages" and self.backbone == "alexnet"
@@ -89,7 +89,7 @@ class Network(nn.Module):
         self.last = nn.Dense(self.outputs)
 
     def __call__(self, images: jax.Array, train: bool = False) -> jax.Array:
-        """Return logits [N, outputs]; of passages they never rise."""
+        """Return logits [N, outputs]; those of passages never increase."""
         _, x = self.body(normalised(images), train)
         x = x.reshape(len(x), -1) if self.backbone == "alexnet" else x.mean((1, 2))
         for layer in self.layers:
@@ -98,23 +98,23 @@ class Network(nn.Module):
         return falling(x) if self.task == "passages" else x
 
     def embed(self, images: jax.Array) -> jax.Array:
-        """Return [N, D] f32: both feature maps max-pooled over space, each scaled to length 1, one after the other."""
+        """Return [N, D] f32: both feature maps max-pooled over space, scaled to unit length and concatenated."""
         return joined(self.body(normalised(images), False))
 
 
 def falling(x: jax.Array) -> jax.Array:
-    """Map [N, L] to logits that fall from each to the next, by softplus of it: what is free to 2 m is free to 1 m."""
+    """Map [N, L] to decreasing logits by softplus of the differences: a path free to 2 m is free to 1 m."""
     return x[:, :1] - jnp.cumsum(jnp.pad(nn.softplus(x[:, 1:]), ((0, 0), (1, 0))), axis=1)
 
 
 def joined(maps: tuple[jax.Array, jax.Array]) -> jax.Array:
-    """Join two feature maps [N, h, w, c] to the localisation embedding [N, c1 + c2]; its length is the root of 2."""
+    """Join feature maps [N, h, w, c1] and [N, h', w', c2] to an embedding [N, c1 + c2] of length sqrt(2)."""
     parts = [m.max((1, 2)) for m in maps]
     return jnp.concatenate([p / jnp.maximum(jnp.linalg.norm(p, axis=-1, keepdims=True), _EPSILON) for p in parts], -1)
 
 
 def normalised(images: jax.Array) -> jax.Array:
-    """Scale grey levels 0 to 255, u8 or f32, to f32 about 0."""
+    """Scale grey levels 0 to 255 (u8 or f32) to f32 about 0."""
     return (images.astype(jnp.float32) / 255.0 - 0.5) / 0.25
 
 
@@ -152,7 +152,7 @@ def squares_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def in_words(scores: Mapping[str, float]) -> str:
-    """Return scores of `localisation_scores`, or means of them, in words."""
+    """Format scores of `localisation_scores`, or means of them."""
     return (
         f"nearest node {scores['node']:.3f}, right room {scores['room']:.3f}, "
         f"median error {scores['error_m']:.2f} m (least possible {scores['least_error_m']:.2f} m)"
@@ -160,7 +160,7 @@ def in_words(scores: Mapping[str, float]) -> str:
 
 
 def nearest_turn(angle_rad: np.ndarray, count: int) -> np.ndarray:
-    """Return [...] int: which of so many headings, evenly from the world's x axis on, is nearest to each angle."""
+    """Return the index [...] of the heading nearest to each angle; headings start at the world's x axis."""
     return np.rint(angle_rad / (2 * np.pi) * count).astype(int) % count
 
 
@@ -173,10 +173,10 @@ class Places(NamedTuple):
 
 
 def localisation_scores(queries: Places, nodes: Places) -> dict[str, float]:
-    """Return how well queries are localised in one scene, by the nearest embedding over all images of all nodes.
+    """Score localisation of queries in one scene by the nearest embedding among all images of all nodes.
 
-    `node` is the share of queries given the node that is nearest in truth; `room`: share given a node of the same
-    room; `error_m`: median distance to the node given; `least_error_m`: the same for the nearest in truth.
+    `node` is the share of queries assigned to the truly nearest node, `room` to a node of the same room. `error_m` is
+    the median distance to the assigned node, `least_error_m` to the truly nearest.
     """
     each = queries.embeddings.shape[1]
     xy_w, room = np.repeat(queries.xy_w, each, 0), np.repeat(queries.room, each)

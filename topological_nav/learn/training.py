@@ -1,11 +1,11 @@
-"""Train a network for rooms or passages on a dataset, its backbone first without labels if configured; load it again.
+"""Train a network for rooms or passages on a dataset, from scratch or from a run's backbone; load networks.
 
-RUN/config.yaml      settings; a run that is started again with the same ones goes on
+RUN/config.yaml      settings; the same settings resume the run
     versions.json    packages, device, commit
-    metrics.jsonl    one line an epoch of both phases
-    checkpoint.msgpack  the last epoch's learner
-    weights.safetensors, network.json   what was learned, and how to build it
-    results.json     scores on what was held out
+    metrics.jsonl    one line per epoch
+    checkpoint.msgpack  learner after the last epoch
+    weights.safetensors, network.json   the trained network and how to build it
+    results.json     scores on held-out data
     curves.png
 """
 
@@ -31,7 +31,7 @@ from topological_nav.learn import learning
 from topological_nav.learn.networks import Network, Places, localisation_scores
 
 SAME = ("robot", "engine", "width", "height", "fov_deg")
-"""What two networks' images must have in common to look through one camera."""
+"""Image settings that two networks must share to use one camera."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,27 +43,27 @@ class Trained:
     about: dict[str, Any]
     """Content of network.json."""
     run: Path = Path()
-    """Where it was read."""
+    """Folder that it was read from."""
     asked_m: float | None = None
-    """Length for which `passage` answers, whichever is asked for; None: that which is asked for."""
+    """Length for which `passage` always answers; None: the requested one."""
 
     @property
     def stored(self) -> str:
-        """Return what names its numbers: the run's digest, and the precision of an exported network."""
+        """Return an identifier of its values: the run's digest, and an export's precision."""
         return self.about["digest"] + (f"-{self.about['export']['precision']}" if "export" in self.about else "")
 
     def logits(self, images: np.ndarray) -> np.ndarray:
-        """Return [..., outputs] of images [..., H, W, 3] u8, of the size that it learned from."""
+        """Return logits [..., outputs] of images [..., H, W, 3] u8, of the size that it was trained on."""
         return self._rows(images, "__call__")
 
     def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
-        """Return the probability that the path is free so far, of images [N, H, W, 3] u8; see `logits_at`."""
+        """Return the probability that the path is free for `ahead_m`, of images [N, H, W, 3]; see `logits_at`."""
         logits = self.logits(images).astype(float)
         ahead_m = ahead_m if self.asked_m is None else np.full(np.shape(ahead_m), self.asked_m)
         return 1.0 / (1.0 + np.exp(-logits_at(logits, self.about["lengths_m"], ahead_m)))
 
     def embed(self, images: np.ndarray) -> np.ndarray:
-        """Return [..., D] localisation embeddings of images [..., H, W, 3] u8; see `Network.embed`."""
+        """Return localisation embeddings [..., D] of images [..., H, W, 3] u8; see `Network.embed`."""
         return self._rows(images, "embed")
 
     def _rows(self, images: np.ndarray, method: str) -> np.ndarray:
@@ -79,13 +79,13 @@ class Trained:
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _applied(network: Network, method: str, variables: Any, images: jax.Array) -> Any:
-    """Return a network's method of images."""
+    """Apply a network's method to images."""
     return network.apply(variables, images, method=method)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Work:
-    """Hold the images that a run learns from and is scored by."""
+    """Hold the images that a run is trained on and scored by."""
 
     rooms: RoomImages
     images: np.ndarray
@@ -101,7 +101,7 @@ class _Work:
     lengths_m: tuple[float, ...] = ()
     """[L] of passages; empty for rooms."""
     scored: int = 0
-    """The index of the length that passages are scored by."""
+    """Index of the length that passages are scored by."""
 
 
 def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host: Host = ALONE) -> dict[str, Any]:
@@ -137,14 +137,14 @@ def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host:
 
 
 def save_trained(out: Path, trained: Trained) -> Trained:
-    """Write a network as `load_trained` reads it; return it with the digest of its weights in `about`."""
+    """Write a network for `load_trained`; return it with the digest of its weights in `about`."""
     about = {name: value for name, value in trained.about.items() if name != "export"}
     learning.write_network(out, trained.variables, about)
     return dataclasses.replace(trained, about=about)
 
 
 def load_trained(run: Path) -> Trained:
-    """Load the network of a finished run, or of an export of one: its weights are f32 in memory either way."""
+    """Load the network of a finished run or of an export, with f32 weights."""
     run = Path(run)
     about = learning.read_description(run, "network", "TASK")
     if about["task"] == "passages" and "lengths_m" not in about:
@@ -199,7 +199,7 @@ def _work(task: str, dataset: Path, config: NetworkTrainConfig) -> _Work:
 
 
 def _scores(trained: Trained, work: _Work) -> dict[str, Any]:
-    """Return accuracy and macro F1 on held-out images, and how well the embedding localises."""
+    """Return accuracy and macro F1 on held-out images, and localisation scores of the embedding."""
     results = {name: trained.about[name] for name in ("task", "parameters")} | {"trained_on": len(work.images)}
     if len(work.held_out):
         logits, truth, is_passages = trained.logits(work.held_out), work.truth, bool(work.lengths_m)
@@ -218,13 +218,13 @@ def _scores(trained: Trained, work: _Work) -> dict[str, Any]:
 
 
 def class_scores(truth: np.ndarray, chosen: np.ndarray, classes: int = 0) -> dict[str, Any]:
-    """Return accuracy and macro F1 of [N] classes; given their number, also the confusion, a row for each true one."""
+    """Return accuracy and macro F1 of classes [N]; given their number, also the confusion, a row per true class."""
     out = {"accuracy": float((chosen == truth).mean()), "macro_f1": float(f1_score(truth, chosen, average="macro"))}
     return out | ({"confusion": confusion_matrix(truth, chosen, labels=range(classes)).tolist()} if classes else {})
 
 
 def length_scores(logits: np.ndarray, free: np.ndarray, lengths_m: Sequence[float]) -> list[dict[str, float]]:
-    """Return for each length the share of images that are free so far, and of right answers; logits, free [N, L]."""
+    """Return each length's share of free images, and accuracy; logits and `free` are [N, L]."""
     return [
         {"ahead_m": length, "free": float(truth.mean()), "accuracy": float(((logit > 0) == truth).mean())}
         for length, logit, truth in zip(lengths_m, logits.T, free.T, strict=True)
@@ -234,10 +234,10 @@ def length_scores(logits: np.ndarray, free: np.ndarray, lengths_m: Sequence[floa
 def localisation(
     trained: Trained, rooms: RoomImages, other: Trained | None = None, other_rooms: RoomImages | None = None
 ) -> dict[str, Any]:
-    """Score an embedding: training positions as nodes, every third level image of test positions as queries.
+    """Score an embedding by scene: training positions are nodes, every third level image of test positions a query.
 
-    Each scene counts alone; `mean` weighs them by queries. See `networks.localisation_scores`. Queries are images of
-    `other_rooms` (default: the same) that `other` embeds (default: the same); scenes are those of both, by name.
+    `mean` weighs scenes by queries; see `networks.localisation_scores`. Queries are images of `other_rooms` embedded by
+    `other` (defaults: the same), in the scenes that both have.
     """
     other, other_rooms = other or trained, other_rooms or rooms
     level, rows, weights, there = PITCHES.index("level"), {}, [], rows_by_scene(other_rooms)
@@ -264,7 +264,7 @@ def rows_by_scene(rooms: RoomImages) -> dict[str, np.ndarray]:
 
 
 def camera_settings(network: Trained) -> dict[str, Any]:
-    """Return the settings of the images that a network learned from, the lens as it was."""
+    """Return the settings of the images that a network was trained on, with the lens as it was."""
     return {**network.about["data"], "fov_deg": network.about["fov_deg"]}
 
 
@@ -275,33 +275,30 @@ def need_task(about: dict[str, Any], task: str, who: str) -> None:
 
 
 class Networks(NamedTuple):
-    """Group what a navigator sees by."""
+    """Group a navigator's networks."""
 
     localiser: Trained
     detector: Trained
 
     @property
     def camera(self) -> DataConfig:
-        """Return the settings of the camera that both networks learned from."""
+        """Return the camera settings that both networks were trained with."""
         return overlay(DataConfig(), camera_settings(self.localiser), "network.json")
 
     def asking(self, asked_m: float | None) -> "Networks":
-        """Return the same networks with a detector that always answers for this length; None: as it is asked."""
+        """Return the networks with a detector that always answers for this length; None: for the requested one."""
         return self._replace(detector=dataclasses.replace(self.detector, asked_m=asked_m))
 
     @property
     def digests(self) -> dict[str, str]:
-        """Return the digests of the weights, as a map names those that it was built with."""
+        """Return the digests of the weights under the names that maps use."""
         return {name: network.about["digest"] for name, network in zip(self._fields, self, strict=True)}
 
 
 def load_networks(
     localiser: Path, detector: Path, classifies: bool = False, same: Sequence[str] = (*SAME, "headings")
 ) -> Networks:
-    """Load the networks of two finished runs that learned from one camera, by the settings that must be the `same`.
-
-    Any embedding localises; where the localiser `classifies` rooms, it must have been trained for that.
-    """
+    """Load two runs' networks that share the settings `same`; if `classifies`, the localiser must classify rooms."""
     networks = Networks(load_trained(localiser), load_trained(detector))
     if classifies:
         need_task(networks.localiser.about, "rooms", f"{localiser}:")

@@ -1,8 +1,8 @@
-"""Build a scene's topological map by two trained networks: place nodes, draw images, judge edges; and judge images for
-a navigator: how far each node of its map is from where they were taken, and what lies ahead.
+"""Build a scene's topological map by two trained networks, and judge images for a navigator.
 
-The navigator itself never looks into an image. `NetworkSight` queries trained networks; `TrueSight` stands in for
-perfect ones in tests and measurements: its "images" are poses.
+Building places nodes, renders images and judges edges. A `Sight` tells the navigator how far each node is from an
+image, and how far the path ahead is free: `NetworkSight` by networks, `TrueSight` by the truth, where images are poses,
+for tests and measurements.
 """
 
 import contextlib
@@ -36,34 +36,28 @@ from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_en
 from topological_nav.scenes.space import FreeSpace, Rooms, free_space, scene_rooms
 
 OUT_OF_SIGHT_M = 100.0
-"""Added to the distance of a node behind a wall, for `TrueSight`."""
+"""`TrueSight` adds this to the distance of a node behind a wall."""
 LINE_POINTS = 50
-"""Looked up on a line of sight."""
+"""Points to check on a line of sight."""
 
 
 class Sight(Protocol):
-    """Judge images, in batches; an image is one row of an array, of any shape that the judge understands."""
+    """Judge images in batches; an image is a row of an array, of any shape that the judge understands."""
 
     summed: bool
-    """Whether distances of several images are summed; else the least counts."""
+    """Whether distances of several images are summed; otherwise the least counts."""
 
     def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
-        """Return how far each node is, [n, N], by images [n, ...] taken along headings [n]."""
+        """Return the distance of each node [n, N] by images [n, ...] along headings [n]."""
         ...
 
     def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
-        """Return the probability that the way ahead is free for lengths [n], or for M lengths of each [n, M].
-
-        A number is a length for all images, and gives [n].
-        """
+        """Return the probability that the path ahead is free for lengths [n] or [n, M] (m), or one for all ([n])."""
         ...
 
 
 def place_distances(sight: Sight, images: np.ndarray, heading_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far each node is from places, by each image [P, K, N] and by all [P, N]; images [P, K, ...].
-
-    Headings are [K], the same at all places, or [P, K].
-    """
+    """Return nodes' distances by image [P, K, N] and by place [P, N]; images [P, K, ...], headings [K] or [P, K]."""
     count, around = images.shape[:2]
     headings_rad = np.broadcast_to(heading_rad, (count, around)).ravel()
     each = sight.distances(images.reshape(count * around, *images.shape[2:]), headings_rad)
@@ -72,10 +66,10 @@ def place_distances(sight: Sight, images: np.ndarray, heading_rad: np.ndarray) -
 
 
 class NetworkSight:
-    """Judge by a map, a network that embeds and one that judges passages."""
+    """Judge by a map, an embedding network and a passage detector."""
 
     def __init__(self, graph: TopologicalMap, networks: Networks, match: str = "aligned"):
-        """Check that the map is of these networks."""
+        """Check that the map was built with these networks."""
         for name, digest in networks.digests.items():
             used = graph.about.get(name, "")
             if used != digest:
@@ -88,7 +82,7 @@ class NetworkSight:
         self._networks, self.summed = networks, match == "aligned"
 
     def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
-        """Return Euclidean distances [n, N] of embeddings: to the node's image of that heading, or to its nearest."""
+        """Return Euclidean distances [n, N] of embeddings to the node's image of that heading, or its nearest."""
         queries = self._networks.localiser.embed(images).astype(float)
         nodes, around = self._nodes, self._nodes.shape[1]
         if self.summed:
@@ -106,25 +100,25 @@ class NetworkSight:
 
 
 class TrueSight:
-    """Judge by the truth in the place of networks: images are poses [n, 3], x and y (m) and yaw (rad), world frame."""
+    """Judge by the truth instead of networks; images are poses [n, 3]: x, y (m) and yaw (rad), world frame."""
 
     summed = True
 
     def __init__(self, graph: TopologicalMap, space: FreeSpace, margin_m: float = 0.225):
-        """Take the plan."""
+        """Store the plan."""
         self._xy, self._space, self._margin_m = graph.xy_w.astype(float), space, margin_m
 
     def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
-        """Return the distances [n, N] (m) to nodes in sight; `OUT_OF_SIGHT_M` more to those that are not."""
+        """Return the distances [n, N] (m) to nodes, plus `OUT_OF_SIGHT_M` for those out of sight."""
         del heading_rad
         here = np.broadcast_to(images[:, None, :2], (len(images), len(self._xy), 2))
         visible = self._space.segment_free(here, np.broadcast_to(self._xy, here.shape), LINE_POINTS, 0.0)
         return np.linalg.norm(here - self._xy, axis=-1) + OUT_OF_SIGHT_M * ~visible
 
     def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
-        """Return 1 where the way ahead is free, else 0; see `Sight.passage`.
+        """Return 1 where the path ahead is free, else 0; see `Sight.passage`.
 
-        Who stands nearer to an obstacle than the margin may leave it: the way may begin as near, but come no nearer.
+        A path that starts nearer to an obstacle than the margin may come no nearer.
         """
         ahead = np.asarray(ahead_m, float)
         ahead = np.broadcast_to(ahead, (len(images), *ahead.shape[1:]))
@@ -143,24 +137,21 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 class PassagePolicy:
-    """Drive by the passage detector alone, as a baseline: straight on while it agrees, else it swings about.
-
-    It turns left by `SWEEP_RAD`, then right by twice as much, and so on wider, until the detector agrees.
-    """
+    """Drive straight while the passage detector agrees, else swing about, left first and ever wider: a baseline."""
 
     period = 3
-    """Control steps between two looks; in between the last command holds."""
+    """Control steps per image; the last command holds in between."""
     CRUISE_M_S = 0.4
     TURN_RAD_S = 0.5
     SWEEP = 4
-    """Looks (of 0.15 rad) that the first turn to the left lasts."""
+    """Images (0.15 rad each) during the first turn to the left."""
 
     def __init__(self, sight: Sight, passable: float = 0.5, ahead_m: float = 1.0):
-        """Take whose judgement to trust."""
+        """Store the judge."""
         self._sight, self._passable, self._ahead_m = sight, passable, ahead_m
 
     def start(self, batch: int) -> Any:
-        """Return the looks since the way was last free, [batch] i32."""
+        """Return the number of images since the path was last free, [batch] i32."""
         return np.zeros(batch, np.int32)
 
     def act(self, state: Any, images: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
@@ -174,21 +165,21 @@ class PassagePolicy:
 
 
 CHUNK = 252
-"""Images drawn between two reports: fourteen calls of the renderer."""
+"""Images rendered between two reports: fourteen calls of the renderer."""
 CPU_SUPERSAMPLE = 2
-"""Beyond it drawing is what a CPU mostly does, and the networks answer nearly the same (docs/topological.md)."""
+"""Limit on a CPU, where rendering dominates; the networks answer nearly the same (docs/topological.md)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Built:
-    """Hold a map, the space it was built in and its scores."""
+    """Hold a map, its free space and its scores."""
 
     map: TopologicalMap
     space: FreeSpace
     free: np.ndarray
-    """[E] bool: whether each edge's way is free on the plan."""
+    """[E] bool: whether each edge is free on the plan."""
     scores: dict[str, Any]
-    """Nodes a room, connectedness, and how the edges compare with the plan."""
+    """Nodes per room, connectedness, and how edges compare with the plan."""
 
 
 def build_map(
@@ -199,10 +190,7 @@ def build_map(
     progress: Progress = lambda *_: None,
     parts: Path | None = None,
 ) -> Built:
-    """Build a scene's map by the run folders of a network whose embedding localises and of a passage detector.
-
-    Drawn images are kept in the folder `parts`, if any, so that a map that was stopped goes on.
-    """
+    """Build a scene's map by the runs of an embedding and a passage detector; `parts` keeps images, to resume."""
     networks = load_networks(localiser_run, detector_run).asking(config.asked_m)
     data = drawn_for(networks.camera, config.supersample)
     scene, robot = load_scene(scene_folder), get_robot(data.robot)
@@ -235,7 +223,7 @@ def build_map(
 
 
 def judged_by(detector: Trained) -> tuple[float, int]:
-    """Return the margin (m) and the number of points of the labels that a passage detector learned from."""
+    """Return the margin (m) and number of points of the labels that a passage detector was trained on."""
     config = overlay(DataConfig(), detector.about["data"], DESCRIPTION)
     return config.passage_margin_m, config.passage_points
 
@@ -252,11 +240,7 @@ def judged_map(
     about: dict[str, Any],
     look: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
 ) -> Built:
-    """Build the map of nodes with images [N, K, H, W, 3] u8 around each, and compare its edges with the plan.
-
-    Of the scene only name and digest count. `look` takes edges [E, 2] and headings [E] to the images that edges are
-    judged by; None: the node's nearest.
-    """
+    """Build a map of nodes with images [N, K, ...]; `look(edges, headings)` returns images (None: the nearest)."""
     margin_m, points = judged_by(networks.detector)
 
     def probability(edges: np.ndarray, angle: np.ndarray) -> np.ndarray:
@@ -273,7 +257,7 @@ def judged_map(
 def localisation_check(
     sight: Sight, graph: TopologicalMap, images: np.ndarray, heading_rad: np.ndarray, xy_w: np.ndarray
 ) -> dict[str, str]:
-    """Say how well a map localises, by all images of a place and by its first alone."""
+    """Describe how well a map localises by all images of a place, and by the first one."""
     each, summed = place_distances(sight, images, heading_rad)
     away, said = np.linalg.norm(xy_w[:, None] - graph.xy_w, axis=-1), {}
     for what, evidence in ((f"{len(heading_rad)} images", summed), ("1 image", each[:, 0])):
@@ -287,10 +271,7 @@ def localisation_check(
 
 
 def true_map(scene: Scene, space: FreeSpace, rooms: Rooms, config: MapConfig, data: DataConfig) -> TopologicalMap:
-    """Build the map that perfect networks would: ways that are free on the plan have p = 1, others 0.
-
-    It has no embeddings: only `TrueSight` can localise on it.
-    """
+    """Build the map of perfect networks for `TrueSight`: free edges have p = 1, others 0; without embeddings."""
     margin_m, points = data.passage_margin_m, data.passage_points
     xy, _ = place_nodes(space, rooms, config, margin_m, points)
 
@@ -303,10 +284,7 @@ def true_map(scene: Scene, space: FreeSpace, rooms: Rooms, config: MapConfig, da
 
 
 def drawn_for(data: DataConfig, supersample: int | None) -> DataConfig:
-    """Return how a navigator's images are drawn: as networks learned, but larger by `supersample` before averaging.
-
-    Without `supersample` as they learned, on a CPU at most `CPU_SUPERSAMPLE`.
-    """
+    """Return a navigator's image settings: as in training, with `supersample` or at most `CPU_SUPERSAMPLE` on a CPU."""
     need_engine(data.engine)
     if supersample is None:
         most = CPU_SUPERSAMPLE if jax.default_backend() == "cpu" else data.supersample
@@ -315,15 +293,15 @@ def drawn_for(data: DataConfig, supersample: int | None) -> DataConfig:
 
 
 def renderer_of(scene: Scene, data: DataConfig, small: Sequence[SmallObject] = ()) -> SceneRenderer:
-    """Return what draws a scene, and small objects in it, as a dataset's images were drawn."""
+    """Return a renderer of a scene, and small objects, with a dataset's settings."""
     return SceneRenderer(scene, lens_of(data, get_robot(data.robot)), data.supersample, data.engine, small)
 
 
 class Pictures:
-    """Draw level images of a scene, a chunk at a time, each kept in a file until they are not needed any more."""
+    """Render level images of a scene in chunks, each kept in a file until it is no longer needed."""
 
     def __init__(self, scene: Scene, data: DataConfig, robot: RobotSpec, progress: Progress, parts: Path | None = None):
-        """Draw nothing yet."""
+        """Store the settings without rendering."""
         self._scene, self._data, self._robot, self._progress, self._parts = scene, data, robot, progress, parts
         self._done, self.total = 0, 0
         self._of = json.dumps([scene.digest, to_dict(data)], sort_keys=True).encode()
@@ -333,13 +311,13 @@ class Pictures:
         return renderer_of(self._scene, self._data)
 
     def draw_around(self, xy: np.ndarray, around: np.ndarray, what: str) -> np.ndarray:
-        """Draw images [N, K, H, W, 3] from places [N, 2], which count to those to draw, along each of K headings."""
+        """Render images [N, K, H, W, 3] of places [N, 2] along each of K headings, and add them to the total."""
         self.total += len(xy) * len(around)
         images = self.draw(np.repeat(xy, len(around), 0), np.tile(around, len(xy)), what)
         return images.reshape(len(xy), len(around), *images.shape[1:])
 
     def draw(self, xy: np.ndarray, heading: np.ndarray, what: str) -> np.ndarray:
-        """Draw images [N, H, W, 3] u8 from places [N, 2] along headings [N]."""
+        """Render images [N, H, W, 3] u8 of places [N, 2] along headings [N]."""
         drawn = []
         for first in range(0, len(xy), CHUNK):
             rows = slice(first, first + CHUNK)
@@ -364,7 +342,7 @@ class Pictures:
 
 
 def forget(parts: Path) -> None:
-    """Remove the images that `build_map` kept, once the map is written."""
+    """Delete the images that `build_map` kept, once the map is written."""
     for path in parts.glob("*.npy"):
         path.unlink(missing_ok=True)  # by another process that built the same map
     with contextlib.suppress(OSError):
@@ -372,7 +350,7 @@ def forget(parts: Path) -> None:
 
 
 def edge_scores(graph: TopologicalMap, free: np.ndarray, passable: float) -> dict[str, Any]:
-    """Say how a map's edges compare with the plan, and what open ones join; see `Built`."""
+    """Compare a map's edges with the plan, and count the parts that open ones join; see `Built`."""
     open_, parts = graph.p >= passable, graph.open_parts(passable)
     return {
         "edges judged open": f"{int(open_.sum())} of {len(open_)}; free on the plan: {int(free.sum())}",

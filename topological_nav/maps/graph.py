@@ -1,9 +1,8 @@
-"""Place the nodes of a topological map, join them by edges, plan on it, write and read it.
+"""Place a topological map's nodes, join them by edges, plan on it, write and read it.
 
-A node is a position with the embeddings of the images around it. An edge leads from a node to each one nearer than
-`edge_m`; its weight is -log p, p the probability that the way is free, so that the shortest way is the one most likely
-to be free as a whole; who plans may add a cost for each metre (`metre_cost`). Edges carry their absolute angle and
-length: nothing else about positions is needed to drive along them.
+A node is a position with embeddings of the images around it. Edges join nodes nearer than `edge_m`; their weight is
+-log p, where p is the probability that the path is free, so that the shortest path is most likely free as a whole; a
+planner may add `metre_cost`. Edges have an absolute angle and a length, so that driving needs no positions.
 """
 
 from __future__ import annotations
@@ -29,14 +28,14 @@ from topological_nav.config import MapConfig
 from topological_nav.scenes.space import FreeSpace, Rooms
 
 FORMAT = 1
-"""Of map files; raised whenever older ones would be read wrongly."""
+"""Version of map files; raised when older ones would be misread."""
 LEAST_P = 1e-6
-"""Probabilities stay this far from 0, so that weights are finite, and from 1, so that every edge costs something."""
+"""Distance of probabilities from 0, so that weights are finite, and from 1, so that every edge costs something."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Route:
-    """Describe a way through a map."""
+    """Describe a path through a map."""
 
     nodes: tuple[int, ...]
     cost: float
@@ -51,7 +50,7 @@ class TopologicalMap:
     digest: str
     """Of the scene's files, as `interactive_nav.scenes.scene.Scene.digest`."""
     xy_w: np.ndarray
-    """[N, 2] f32 m: for drawing, scoring and the edges' lengths; nothing else of it is used to plan or to localise."""
+    """[N, 2] f32 m, for drawing, scoring and edge lengths; planning and localisation do not use it."""
     room: np.ndarray
     """[N] i32."""
     embeddings: np.ndarray
@@ -59,13 +58,13 @@ class TopologicalMap:
     edges: np.ndarray
     """[E, 2] i32 from, to."""
     p: np.ndarray
-    """[E] f32 probability that the way is free."""
+    """[E] f32 probability that the path is free."""
     angle_rad: np.ndarray
     """[E] f32 heading from the first node to the second, world frame."""
     about: dict[str, Any]
     """Settings, and the networks that built it."""
     metre_cost: float = 0.0
-    """Added to the weight of an edge for each of its metres; belongs to who plans, not to the file."""
+    """Added to an edge's weight per metre; set by the planner, not stored in the file."""
 
     @functools.cached_property
     def length_m(self) -> np.ndarray:
@@ -84,14 +83,11 @@ class TopologicalMap:
 
     @functools.cached_property
     def weight(self) -> np.ndarray:
-        """Return the edges' -log p [E], and `metre_cost` for each metre."""
+        """Return the edges' weights [E]: -log p plus `metre_cost` per metre."""
         return np.array([edge_weight(p) for p in self.p.tolist()]) + self.metre_cost * self.length_m
 
     def next_edge(self, start: int, goal: int, penalty: np.ndarray | None = None) -> int:
-        """Return the first edge of the cheapest way between two different nodes; -1 where there is none.
-
-        `penalty` [E] is added to the edges' weights.
-        """
+        """Return the first edge of the cheapest path with weights plus `penalty` [E]; -1 if there is none."""
         changed = penalty is not None and bool(penalty.any())
         weight = self.weight + penalty if changed else self.weight
         left = self._left_to(weight, goal) if changed else self.left[goal]
@@ -101,7 +97,7 @@ class TopologicalMap:
 
     @functools.cached_property
     def left(self) -> np.ndarray:
-        """Return the cost [N, N] of the cheapest way to each goal (first axis) from each node; infinite without any."""
+        """Return the cost [N, N] of the cheapest path to each goal (first axis) from each node; infinite if none."""
         return self._left_to(self.weight, np.arange(len(self.xy_w)))
 
     def _left_to(self, weight: np.ndarray, goals: np.ndarray | int) -> np.ndarray:
@@ -112,11 +108,11 @@ class TopologicalMap:
         return csr_array((weight, tuple(self.edges.T)), shape=(len(self.xy_w),) * 2)
 
     def open_parts(self, passable: float) -> list[list[int]]:
-        """Return nodes that reach each other along edges of at least this probability; the largest part first."""
+        """Return groups of nodes that reach each other by edges of at least this probability, the largest first."""
         return parts_of(self.edges[self.p >= passable], len(self.xy_w), both_ways=True)
 
     def thinned(self, share: float, seed: int) -> TopologicalMap:
-        """Return the map with a share of each room's nodes, drawn by a seed, at least one: it may fall apart."""
+        """Return the map with a random share of each room's nodes, at least one; it may be disconnected."""
         rng = np.random.default_rng([seed, 11])
         kept = []
         for room in np.unique(self.room):
@@ -132,10 +128,7 @@ class TopologicalMap:
 
 
 def parts_of(edges: np.ndarray, count: int, both_ways: bool = False) -> list[list[int]]:
-    """Return the nodes that edges [E, 2] between `count` nodes join, the largest part first.
-
-    With `both_ways` edges are directed, and nodes of a part must reach each other.
-    """
+    """Return groups of `count` nodes that edges [E, 2] join (`both_ways`: that reach each other), the largest first."""
     joined = csr_array((np.ones(len(edges)), tuple(edges.T)), shape=(count, count))
     _, label = connected_components(joined, directed=both_ways, connection="strong")
     parts = [np.flatnonzero(label == k).tolist() for k in np.unique(label)]
@@ -143,7 +136,7 @@ def parts_of(edges: np.ndarray, count: int, both_ways: bool = False) -> list[lis
 
 
 def edge_weight(p: float) -> float:
-    """Return -log p, with p kept `LEAST_P` from 0 and 1."""
+    """Return -log p, with p at least `LEAST_P` from 0 and 1."""
     return -math.log(min(max(p, LEAST_P), 1.0 - LEAST_P))
 
 
@@ -174,10 +167,7 @@ def assemble(
     probability: Callable[[np.ndarray, np.ndarray], np.ndarray],
     about: dict[str, Any],
 ) -> TopologicalMap:
-    """Build the map of given nodes [N, ...]; those nearer than `edge_m` are joined, both ways.
-
-    `probability` takes edges [E, 2] and headings [E] to [E] probabilities; for the others see `TopologicalMap`.
-    """
+    """Build the map of nodes [N, ...]; `probability` maps edges [E, 2] nearer than `edge_m` and headings [E] to [E]."""
     edges = near_pairs(xy_w, edge_m)
     angle = angles(xy_w, edges)
     arrays = {"xy_w": xy_w, "room": room, "embeddings": embeddings}
@@ -192,7 +182,7 @@ _ARRAYS = {"xy_w": _F32, "room": _I32, "embeddings": _F32, "edges": _I32, "p": _
 
 
 def save_map(nav_map: TopologicalMap, path: Path) -> None:
-    """Write a map as one npz file, whole or not at all."""
+    """Write a map atomically as one npz file."""
     header = {"format": FORMAT, "scene": nav_map.scene, "digest": nav_map.digest, "about": nav_map.about}
     arrays = {name: getattr(nav_map, name) for name in _ARRAYS}
     write_arrays(path, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
@@ -216,21 +206,19 @@ def load_map(path: Path, digest: str | None = None) -> TopologicalMap:
 
 
 ROOMY_M = 0.5
-"""Nodes added to join parts of a map keep to the middle of what is narrower than twice this."""
+"""Nodes that join parts of a map keep to the middle of passages narrower than twice this."""
 TIGHT_COST = 4.0
-"""A metre of the way between parts costs up to so many metres more, the nearer to obstacles."""
+"""Most that a metre of the path between parts costs extra, near obstacles."""
 
 
 def place_nodes(
     space: FreeSpace, rooms: Rooms, config: MapConfig, margin_m: float, points: int
 ) -> tuple[np.ndarray, list[str]]:
-    """Return where a map's nodes stand, [N, 2] m, and what could not be had, in words.
+    """Return positions [N, 2] m of a map's nodes, and a description of what was not possible.
 
-    In every room one place after the other becomes a node, each time the one that has most places within `spacing_m`
-    that no node has yet. A room that needs fewer than `min_per_room` is covered again with less spacing. With random
-    `nodes` a room has one for every square of the spacing, anywhere.
-    Then, where `connect` is set, nodes are added along the free way between parts of the map that no free edge joins
-    which is shortest where room to the sides counts as well.
+    In each room, nodes are added greedily where most places within `spacing_m` have no node yet; a room with fewer than
+    `min_per_room` is covered again more densely. With random `nodes`, a room has one per square of the spacing,
+    anywhere. `connect` then adds nodes along free paths between parts that no free edge joins, preferring roomy paths.
     """
     places = space.centres(config.clearance_m)
     label = rooms.of(places)
@@ -261,13 +249,13 @@ def place_nodes(
 
 
 def free_edges(space: FreeSpace, xy_w: np.ndarray, edge_m: float, margin_m: float, points: int) -> np.ndarray:
-    """Return the pairs [E, 2] of `near_pairs` whose way is free."""
+    """Return the pairs [E, 2] of `near_pairs` with a free path."""
     edges = near_pairs(xy_w, edge_m)
     return edges[space.segment_free(xy_w[edges[:, 0]], xy_w[edges[:, 1]], points, margin_m)]
 
 
 def _covering(places: np.ndarray, radius_m: float, step_m: float) -> np.ndarray:
-    """Choose from places [n, 2], at least one within the radius of each: greedily those with most of the rest near."""
+    """Choose places greedily from [n, 2], most uncovered neighbours first, so that one is within the radius of each."""
     # One place in each square of two cells is enough to choose from.
     _, first = np.unique(np.floor(places / (2 * step_m)), axis=0, return_index=True)
     some = places[np.sort(first)]
@@ -285,7 +273,7 @@ def _covering(places: np.ndarray, radius_m: float, step_m: float) -> np.ndarray:
 
 
 def _joined(space: FreeSpace, xy: np.ndarray, edge_m: float, margin_m: float, points: int) -> tuple[np.ndarray, int]:
-    """Add nodes until free edges join all that a free way joins; return them all, and the number of parts left."""
+    """Add nodes until free edges join what free paths join; return all nodes, and the number of parts left."""
     free = space.free(margin_m)
     # Cells that share a side: the straight way between their centres is as free as they are.
     cost = 1.0 + TIGHT_COST * np.clip(1.0 - space.clearance_m / ROOMY_M, 0.0, 1.0)
@@ -315,10 +303,7 @@ def _joined(space: FreeSpace, xy: np.ndarray, edge_m: float, margin_m: float, po
 
 
 def _stations(space: FreeSpace, way: np.ndarray, edge_m: float, margin_m: float, points: int) -> np.ndarray:
-    """Choose places on a way [n, 2], ends left out, each in free reach of the one before.
-
-    Of those in reach, the one with the most room in the farther half; the end as soon as it is in reach.
-    """
+    """Choose places on a path [n, 2] without its ends, each in free reach of the one before: roomy and far along."""
     chosen, at, room_m = [], 0, np.minimum(space.at(way), ROOMY_M)
     while at < len(way) - 1:
         ahead = way[at + 1 :]

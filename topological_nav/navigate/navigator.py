@@ -1,18 +1,18 @@
 """Command velocities by images, heading and time: the navigator, a state machine over a batch of episodes.
 
-    LOCALISE  turn about, looking along `images` headings; the nearest node is where the robot is
-       |      there: ARRIVED; else Dijkstra gives the next edge
+    LOCALISE  turn on the spot and look along `images` headings; the nearest node is the robot's
+       |      the goal: ARRIVED; else Dijkstra gives the next edge
     FACE      turn to the edge's angle by PID, and ask the passage detector
-       |      whether the way is free for as long as the edge is; agrees: DRIVE; else
+       |      whether the path is free for the edge's length; free: DRIVE; else
     SWING     the same at headings left and right of it, wider and wider
-       |      none agrees: the edge costs more from now on; another one: FACE, else all round; still none:
-    LEAN      turn to the most open of the headings tried, and drive all the same
+       |      all blocked: raise the edge's cost; another edge: FACE, else try all round; all blocked:
+    LEAN      turn to the most open heading that was tried, and DRIVE
     DRIVE     the local policy, in runs of 5 s, or until the edge's head is passed; after twelve: LOCALISE. After each
-              a glance at the image ahead decides whether the robot is still at its node or at a neighbour of it. An
-              edge that was driven in vain costs more from now on. Plan anew from there: FACE
+              run, one image ahead decides whether the robot is at its node or at a neighbour. The cost rises of an
+              edge that led no nearer to its head. Replan from there: FACE
 
-`Navigator.step` is a pure function of arrays, a phase for each episode, so that thousands run in one batch. It never
-sees a position, and looks at images only through `maps.build.Sight`.
+`Navigator.step` is a pure function of arrays with a phase for each episode, so that thousands run in one batch. It
+never sees a position, and judges images only by `maps.build.Sight`.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from topological_nav.maps.build import Sight, place_distances
 from topological_nav.maps.graph import TopologicalMap
 
 PENALTY = 3.0
-"""Added to the weight of an edge that proved blocked: as if it were free with a probability 20 times less."""
+"""Added to the weight of an edge that was blocked, as if its probability were 20 times less."""
 GOLDEN_RAD = np.pi * (3.0 - np.sqrt(5.0))
-"""Where the map has no way, headings are tried that are this far apart: never the same twice."""
+"""Angle between the headings to try where the map has no path; they never repeat."""
 SLACK_S = 1e-3
-"""Clocks of simulators are sums of steps."""
+"""Tolerance for clocks of simulators, which are sums of steps."""
 
 
 LOCALISE, FACE, SWING, LEAN, DRIVE, ARRIVED, STOPPED, TIMED_OUT = range(8)
@@ -47,14 +47,14 @@ TURNING, OVER = (LOCALISE, FACE, SWING, LEAN), (ARRIVED, STOPPED, TIMED_OUT)
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Events:
-    """Hold what happened in a step, [B] bool each; a caller may stop an episode whose run ended."""
+    """Report the events of a step, [B] bool each; a caller may stop an episode whose run ended."""
 
     localised: np.ndarray = column(False, bool)
-    """Turned about, and `State.node` is new."""
+    """Turned on the spot and updated `State.node`."""
     glanced: np.ndarray = column(False, bool)
-    """Saw a neighbour of the last node after a run, and `State.node` is new."""
+    """Recognised a neighbour of the last node after a run, and updated `State.node`."""
     lost: np.ndarray = column(False, bool)
-    """The map has no way from there."""
+    """The map has no path from there."""
     blocked: np.ndarray = column(False, bool)
     """No heading near the edge's is open."""
     run_started: np.ndarray = column(False, bool)
@@ -65,7 +65,7 @@ class Events:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class State(Events):
-    """Hold what a batch of B navigators remembers, and its last step; N nodes, E edges. Every leaf has B rows."""
+    """Hold the memory and the last step of a batch of B navigators; N nodes, E edges. Every leaf has B rows."""
 
     phase: np.ndarray = column(LOCALISE, np.int8)
     """i8, one of `PHASES`."""
@@ -74,13 +74,13 @@ class State(Events):
     node: np.ndarray = column(-1, np.int32)
     """i32 node of the last localisation, -1 before the first."""
     edge: np.ndarray = column(-1, np.int32)
-    """i32 edge that is followed; -1 where the map has no way, or none is planned yet."""
+    """i32 edge to follow; -1 where the map has no path, or none is planned yet."""
     began_s: np.ndarray = column(np.nan)
-    """When the episode began; NaN before its first step."""
+    """Start time of the episode; NaN before its first step."""
     looks: np.ndarray = column(0, np.int32)
     """i32 images taken in this localisation."""
     evidence: np.ndarray
-    """[B, N] what they say: sums, or least, of distances."""
+    """[B, N] sums, or least, of the images' distances to nodes."""
     base_rad: np.ndarray = column(0.0)
     """The edge's angle; in a localisation, the first heading."""
     target_rad: np.ndarray = column(np.nan)
@@ -93,20 +93,20 @@ class State(Events):
     penalty: np.ndarray
     """[B, E] added to the edges' weights."""
     driven: np.ndarray = column(-1, np.int32)
-    """i32 edge that was driven since the robot last localised, -1: none."""
+    """i32 edge driven since the robot last localised; -1 if none."""
     times_lost: np.ndarray = column(0, np.int32)
-    """i32 times that the map had no way."""
+    """i32 times that the map had no path."""
     integral: np.ndarray = column(0.0)
     """PID: integral term, rad/s."""
     error_rad: np.ndarray = column(np.nan)
-    """PID: error of the step before; NaN where it starts."""
+    """PID: error of the previous step; NaN at its start."""
     clock_s: np.ndarray = column(np.nan)
-    """Time of the step before."""
+    """Time of the previous step."""
     run: np.ndarray = column(0, np.int32)
-    """i32 runs done since the robot last looked about."""
+    """i32 runs done since the last localisation."""
     run_end_s: np.ndarray = column(0.0)
     watch_s: np.ndarray = column(0.0)
-    """Next time to look, within a run, whether the edge's head is passed."""
+    """Next time in a run to check whether the edge's head is passed."""
     least: np.ndarray = column(np.inf)
     """Least distance to the head in this run, by `Sight.distances`."""
     acts: np.ndarray = column(0, np.int32)
@@ -116,19 +116,19 @@ class State(Events):
     angular: np.ndarray = column(0.0)
     """rad/s."""
     hidden: Any
-    """The local policy's."""
+    """State of the local policy."""
 
     def take(self, rows: np.ndarray) -> State:
-        """Return those rows of the batch."""
+        """Return the given rows of the batch."""
         return jax.tree.map(lambda x: np.asarray(x)[rows], self)
 
     @property
     def over(self) -> np.ndarray:
-        """Return which have arrived, stopped or run out of time, [B] bool."""
+        """Return which episodes have ended, [B] bool."""
         return self.phase >= ARRIVED
 
     def restart_pid(self, rows: np.ndarray) -> None:
-        """Start turning to a new target: errors of before say nothing."""
+        """Reset the PID for a new target."""
         self.integral[rows], self.error_rad[rows] = 0.0, np.nan
 
     def put_hidden(self, rows: np.ndarray, new: Any) -> None:
@@ -141,13 +141,13 @@ jax.tree_util.register_dataclass(State, [f.name for f in dataclasses.fields(Stat
 
 
 class Navigator:
-    """Navigate by a map, eyes and a local policy."""
+    """Navigate by a map, a judge of images and a local policy."""
 
     def __init__(self, nav_map: TopologicalMap, sight: Sight, policy: LocalPolicy, config: NavigatorConfig):
-        """Take a map, whose nodes' positions are not used, what judges images, and what drives along edges.
+        """Store the parts; the positions of the map's nodes are not used.
 
-        A policy with a `period` looks at every `period`-th image only. Raise `ConfigError` if `config.images` does not
-        divide the number of the map's images a node.
+        A policy with a `period` sees only every `period`-th image. Raise `ConfigError` if `config.images` does not
+        divide the map's number of images per node.
         """
         around = nav_map.embeddings.shape[1]
         if config.match == "aligned" and around % config.images:
@@ -164,11 +164,11 @@ class Navigator:
         self._ask_m = np.append(np.minimum(ahead_m, config.ahead_m), config.clear_m)
 
     def goal_nodes(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
-        """Return the nodes [B] nearest to goals, by images [B, K, ...] taken there along headings [K] or [B, K]."""
+        """Return the nodes [B] nearest to goals by images [B, K, ...] of them along headings [K] or [B, K]."""
         return place_distances(self.sight, images, heading_rad)[1].argmin(-1).astype(np.int32)
 
     def start(self, goal: np.ndarray) -> State:
-        """Start B episodes with these goals [B], of `goal_nodes`."""
+        """Start B episodes with these goals [B] of `goal_nodes`."""
         batch = len(goal)
         return State(
             **fresh(State, batch),
@@ -179,12 +179,12 @@ class Navigator:
         )
 
     def stop(self, state: State, rows: np.ndarray) -> State:
-        """Return the state with some episodes [B] bool ended from outside."""
+        """Return the state after stopping some episodes [B] bool."""
         phase = np.where(rows & ~state.over, STOPPED, state.phase).astype(np.int8)
         return dataclasses.replace(state, phase=phase, linear=state.linear * ~rows, angular=state.angular * ~rows)
 
     def looks(self, state: State, heading_rad: np.ndarray, time_s: np.ndarray | float) -> np.ndarray:
-        """Return whose image `step` will look at, given these, [B] bool; the others' need not be taken."""
+        """Return which images `step` will use, given these, [B] bool; the others need not be taken."""
         heading = np.asarray(heading_rad, float)
         turning = _any_of(state.phase, TURNING)
         # A first target is the heading itself, or near it.
@@ -195,11 +195,10 @@ class Navigator:
         return reached | ((state.phase == DRIVE) & acts)
 
     def step(self, state: State, images: np.ndarray, heading_rad: np.ndarray, time_s: np.ndarray | float) -> State:
-        """Take one control step from a state of `start` or `step`.
+        """Return the state after one control step, with velocities to command and events.
 
-        Images [B, ...] that `looks` leaves out may be anything; headings [B] are those of a compass, world frame;
-        times, [B] or one for all, must not go back. Return the new state, with the velocities to command and what
-        happened.
+        Images [B, ...] outside of `looks` may be anything; headings [B] are a compass's, world frame; times, [B] or one
+        for all, must not decrease.
         """
         batch = len(state.phase)
         heading = np.asarray(heading_rad, float)
@@ -223,7 +222,7 @@ class Navigator:
         return s
 
     def _first_heading(self, heading: np.ndarray) -> np.ndarray:
-        """Return the nearest heading along which nodes have images."""
+        """Return the nearest heading of the nodes' images."""
         step = 2 * np.pi / self.map.embeddings.shape[1]
         return wrap_angle(np.rint(heading / step) * step)
 
@@ -231,13 +230,13 @@ class Navigator:
         return np.full((batch, len(self.map.xy_w)), 0.0 if self.sight.summed else np.inf)
 
     def _reached(self, s: State, heading: np.ndarray, *phases: int) -> np.ndarray:
-        """Return the rows in one of the phases whose heading is reached."""
+        """Return the rows in one of the phases that have reached their heading."""
         return np.flatnonzero(
             _any_of(s.phase, phases) & (np.abs(wrap_angle(s.target_rad - heading)) <= self._tolerance)
         )
 
     def _watches(self, s: State, time: np.ndarray) -> np.ndarray:
-        """Return who looks now, within a run, whether the edge's head is passed, [B] bool."""
+        """Return which robots check now, within a run, whether the edge's head is passed, [B] bool."""
         if not self.config.glance or not self.config.watch_s:
             return np.zeros(len(s.phase), bool)
         return (s.phase == DRIVE) & (s.edge >= 0) & (time >= s.watch_s - SLACK_S)
@@ -259,7 +258,7 @@ class Navigator:
         self.plan(s, done[s.node[done] != s.goal[done]], heading)
 
     def _located(self, s: State, rows: np.ndarray, node: np.ndarray) -> None:
-        """Note where the robots are; an edge that was driven and did not lead nearer to its head costs more."""
+        """Set the robots' nodes; raise the cost of a driven edge that did not lead nearer to its head."""
         s.node[rows] = node
         edge = s.driven[rows]
         tail, head = self.map.edges[edge].T if len(self.map.edges) else (node, node)
@@ -359,7 +358,7 @@ class Navigator:
         s.acts[s.phase == DRIVE] += 1
 
     def _passed(self, s: State, images: np.ndarray, heading: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """Return where of all nodes in question the edge's head is nearest, and getting farther, [B] bool."""
+        """Return where the edge's head is the nearest of its node's neighbours and receding, [B] bool."""
         passed = np.zeros(len(s.phase), bool)
         rows = np.flatnonzero(self._watches(s, time))
         if len(rows):
@@ -380,7 +379,7 @@ class Navigator:
         s.restart_pid(rows)
 
     def _turn(self, s: State, heading: np.ndarray, time: np.ndarray) -> None:
-        """Turn by PID to the target heading, as `simple_pid.PID` computes it."""
+        """Turn to the target heading by PID, as `simple_pid.PID` computes it."""
         rows = np.flatnonzero(_any_of(s.phase, TURNING) & ~np.isnan(s.target_rad))
         config, most = self.config, self.config.max_turn_rad_s
         error = wrap_angle(s.target_rad[rows] - heading[rows])
@@ -394,5 +393,5 @@ class Navigator:
 
 
 def _any_of(phase: np.ndarray, phases: tuple[int, ...]) -> np.ndarray:
-    """Return what `np.isin` does, [B] bool, many times as fast for few rows."""
+    """Return [B] bool as `np.isin` does, many times faster for few rows."""
     return np.logical_or.reduce([phase == one for one in phases])

@@ -27,21 +27,21 @@ class Navigator(Command):
     settings: Words = ()
     """Change settings of the navigator, listed below."""
     map: Annotated[Path, option(metavar="PATH")]
-    """Of `python -m topological_nav map`."""
+    """Map file of `python -m topological_nav map`."""
     heading_from: Literal["imu", "odom"] = "imu"
     """Topic of the heading."""
     heading_offset: Annotated[float, option(metavar="RAD")] = 0.0
-    """Of that frame in the map's."""
+    """Yaw of the heading's frame in the map's frame."""
     localiser: Annotated[Path | None, option(metavar="RUN")] = None
     """Network that embeds images (default: a trained one, else the packaged)."""
     detector: Annotated[Path | None, option(metavar="RUN")] = None
     """Network that judges passages (default: as the localiser)."""
     policy: Annotated[str | None, option(metavar="RUN")] = None
-    """Drives along edges; or passage (default: as the networks, if none is named)."""
+    """Run of the local policy, or passage (default: as the networks, if none is named)."""
     goal: Annotated[UseAppendAction[tuple[Path, ...]], option(metavar="PICTURE")] = ()
-    """Taken at the goal."""
+    """Image taken at the goal."""
     goal_heading: Annotated[float, option(metavar="RAD")] = 0.0
-    """Along which the first was."""
+    """Heading of the first image of the goal."""
 
     @classmethod
     def epilog(cls) -> str:

@@ -1,4 +1,4 @@
-"""Define what drives a robot behind the navigator's node: a picture, a heading and a time in, a velocity out."""
+"""Define drivers behind the navigator's node, which map an image, a heading and a time to a velocity."""
 
 import dataclasses
 import math
@@ -25,12 +25,12 @@ from topological_nav.weights.export import Choice
 
 @dataclasses.dataclass(frozen=True)
 class VelocityCommand:
-    """Hold the velocity that a driver commands until its next step."""
+    """Hold the velocity to command until a driver's next step."""
 
     linear_mps: float
     angular_radps: float
     done: bool = False
-    """The episode is over, and the robot stands."""
+    """The episode is over, and the robot stands still."""
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.linear_mps + self.angular_radps):
@@ -40,7 +40,7 @@ class VelocityCommand:
 
 
 class Driver(Protocol):
-    """Drive one episode; its `step` is called once for each picture that arrives."""
+    """Drive one episode; `step` is called for each image."""
 
     @property
     def lens(self) -> Lens | None:
@@ -52,10 +52,10 @@ class Driver(Protocol):
 
 
 class PilotDriver:
-    """Drive one robot by the navigator: done where it arrived, or ran out of time."""
+    """Drive one robot by the navigator until it reaches the goal or runs out of time."""
 
     def __init__(self, navigator: Navigator, state: State, lens: Lens):
-        """Take the navigator and its state, of `Navigator.start`."""
+        """Store the navigator and its state, of `Navigator.start`."""
         self._navigator, self._state, self.lens = navigator, state, lens
 
     def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> VelocityCommand:
@@ -70,7 +70,7 @@ class PilotDriver:
 def topological_driver(
     map_file: Path, choice: Choice, goals: Sequence[Path], goal_heading_rad: float, config: NavigatorConfig
 ) -> PilotDriver:
-    """Return the navigator with its goal; the first picture of it looks along `goal_heading_rad` in the map's frame."""
+    """Return the navigator with its goal; the goal's first image is along `goal_heading_rad` in the map's frame."""
     networks, built = load_networks(choice.localiser, choice.detector), load_map(map_file)
     lens = lens_of(networks.camera, get_robot(networks.camera.robot))
     sight = NetworkSight(built, networks, config.match)

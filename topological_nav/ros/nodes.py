@@ -15,30 +15,30 @@ from interactive_nav.ros.nodes import Say
 from topological_nav.ros.drivers import Driver
 
 SILENCE_S = 1.0
-"""Wall-clock time without a picture or a heading after which the navigator stops the robot."""
+"""Wall-clock time without an image or a heading after which the node stops the robot."""
 _HEADING_LATE_S = 0.2
-"""Wall-clock time to wait for a heading that is not older than a picture."""
+"""Wall-clock time to wait for a heading no older than an image."""
 
 
 class Headings:
-    """Hold the last headings by time; not safe for several threads at once."""
+    """Hold recent headings by time; not thread-safe."""
 
     def __init__(self, kept: int = 256):
         self._pairs: deque[tuple[float, float]] = deque(maxlen=kept)
 
     def add(self, time_s: float, yaw_rad: float) -> None:
-        """Add a heading; one that is older than the newest drops all others (a clock that was set back)."""
+        """Add a heading; one older than the newest drops all others (the clock was set back)."""
         if time_s < self.newest_s:
             self._pairs.clear()
         self._pairs.append((time_s, yaw_rad))
 
     @property
     def newest_s(self) -> float:
-        """Return the time of the last heading; minus infinity before the first."""
+        """Return the time of the last heading; minus infinity without one."""
         return self._pairs[-1][0] if self._pairs else -math.inf
 
     def at(self, time_s: float) -> float:
-        """Return the heading, rad in [-pi, pi]: interpolated between two, else the nearest one."""
+        """Return the heading, rad in [-pi, pi], interpolated between two, or else the nearest one."""
         if not self._pairs:
             raise ValueError("no heading was added yet")
         times, yaws = np.array(self._pairs).T
@@ -46,10 +46,7 @@ class Headings:
 
 
 class NavigatorNode(DrivingNode):
-    """Hand each picture and its heading to a driver, and publish the driver's commands.
-
-    It does not know whether a robot or a simulator is behind the topics: time is that of the pictures.
-    """
+    """Pass images and headings to a driver, for a robot or a simulator, and publish commands; time is the images'."""
 
     def __init__(
         self,
@@ -59,10 +56,7 @@ class NavigatorNode(DrivingNode):
         heading_offset_rad: float = 0.0,
         say: Say = lambda _: None,
     ):
-        """Create its subscriptions on a node of `ros_node`.
-
-        The offset is the yaw of the heading sensor's frame in the map's, added to the heading.
-        """
+        """Subscribe on a node of `ros_node`; the offset is the yaw of the heading's frame in the map's frame."""
         super().__init__(node, "navigator", SILENCE_S, say)
         self._driver, self._offset = driver, heading_offset_rad
         self._headings, self._image, self._said_s = Headings(), np.zeros(0), -math.inf

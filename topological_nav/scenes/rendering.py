@@ -1,11 +1,8 @@
-"""Draw what a robot's camera sees of a scene, in batches of any size, and build the environments that it drives in.
+"""Render a robot camera's images of a scene, in batches of any size, and build environments to drive in.
 
-Furniture begins where it stands at rest. Images show what is pushed where it is, open doors open, and small objects
-where they lie.
-
-`warp` (MJX-Warp's ray tracer, on a CPU or an NVIDIA GPU) and `gl` (MuJoCo's renderer, which needs EGL or OSMesa)
-both draw the visual meshes with their textures. Their light differs, so the images of one do not fit networks that
-learned from the other.
+Images show furniture and doors as they stand, and small objects as they lie; furniture is at rest at first. `warp`
+(MJX-Warp's ray tracer, on a CPU or an NVIDIA GPU) and `gl` (MuJoCo's renderer, needs EGL or OSMesa) draw the textured
+visual meshes. Their lighting differs, so a network trained on images of one does not suit the other.
 """
 
 import dataclasses
@@ -31,9 +28,9 @@ from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.look import CameraPose, GlPainter, Lens, look_along
 
 CPU_IMAGES = (1, 2, 6, 18)
-"""Images a call on a CPU, which takes as long for each; 18 are the headings of one position and pitch."""
+"""Batch sizes on a CPU, where batching saves no time; 18 are the headings of one position and pitch."""
 DEVICE_BATCH, DEVICE_PIXELS = (8, 2048), 256 * 640 * 480
-"""Least and most images a call on an accelerator, and the most pixels drawn for them."""
+"""Least and most images per call on an accelerator, and the most pixels rendered for them."""
 Painter = Callable[..., Any]
 """Positions [n, 3] and axes [n, 3, 3] of cameras, the same of all geoms [n, g, ...], to images [n, H, W, 3] u8, in an
 array of any kind."""
@@ -47,10 +44,7 @@ CONTROL = "twist"
 
 
 def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pitch_rad: np.ndarray) -> CameraPose:
-    """Return the pose of the camera of a robot with its base at [..., 2] m on the floor, turned to headings [...].
-
-    The camera looks by `pitch_rad` [...] further up than its mount's pitch.
-    """
+    """Return a robot camera's pose at [..., 2] m and headings [...]; `pitch_rad` tilts it up from its mount."""
     camera = robot.camera
     if camera.body != robot.base_body:
         raise UserError(
@@ -68,19 +62,19 @@ def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pit
 
 
 def need_engine(engine: str) -> None:
-    """Refuse an engine of pictures or physics that is not installed, before any work is done for it."""
+    """Raise if an engine of images or physics is not installed, before any work is done."""
     if engine == "warp":
         note = "; networks see by the engine that they learned from, what is drawn anew can have engine=gl"
         optional("warp", missing("engine=warp", "warp-lang", "warp", note))
 
 
 class SceneRenderer:
-    """Draws one scene without a robot in it."""
+    """Render one scene without a robot."""
 
     def __init__(
         self, scene: Scene, lens: Lens, supersample: int = 1, engine: str = "warp", small: Sequence[SmallObject] = ()
     ):
-        """Load the scene's meshes; the first picture may compile."""
+        """Load the scene's meshes; the first image may compile."""
         need_engine(engine)
         self._lens, self._by = lens, supersample
         self._large = Lens(lens.width * supersample, lens.height * supersample, lens.fov_deg)
@@ -96,7 +90,7 @@ class SceneRenderer:
         self._painter(self._sizes[0])  # an engine that does not start says so here
 
     def draw(self, pose: CameraPose, bodies: Bodies | None = None) -> np.ndarray:
-        """Draw [N, H, W, 3] u8 images of cameras with leaves [N, ...]."""
+        """Render images [N, H, W, 3] u8 of cameras with leaves [N, ...]."""
         pos, axes = np.asarray(pose.pos_w, np.float32), np.asarray(pose.axes_w, np.float32)
         if not len(pos):
             return np.empty((0, self._lens.height, self._lens.width, 3), np.uint8)
@@ -134,7 +128,7 @@ def _painter(engine: str, model: mujoco.MjModel, data: mujoco.MjData, lens: Lens
 
 
 def batch_sizes(lens: Lens, platform: str) -> tuple[int, ...]:
-    """Return the numbers of images a call of the engine, ascending; each is compiled when it is first needed."""
+    """Return the engine's batch sizes, ascending; each compiles at its first use."""
     if platform == "cpu":
         return CPU_IMAGES
     least, most = DEVICE_BATCH
@@ -143,10 +137,7 @@ def batch_sizes(lens: Lens, platform: str) -> tuple[int, ...]:
 
 
 def calls(count: int, sizes: tuple[int, ...]) -> list[int]:
-    """Return the sizes of the calls that draw `count` images.
-
-    None are in vain where there are calls of one; else calls are as few as can be, the last the least that serves.
-    """
+    """Return batch sizes for `count` images: unpadded if one is 1, else the fewest calls and the smallest last one."""
     out: list[int] = []
     while count > 0:
         if sizes[0] == 1:
@@ -158,10 +149,7 @@ def calls(count: int, sizes: tuple[int, ...]) -> list[int]:
 
 
 def batched(function: Callable[..., Any], arrays: Sequence[np.ndarray], sizes: tuple[int, ...]) -> Any:
-    """Return a function's rows, a tree, of arrays [N, ...], in calls of these sizes only, each of which is compiled.
-
-    The last call is padded by the last row.
-    """
+    """Return a function's rows (a tree) for arrays [N, ...], in calls of these sizes only; the last call is padded."""
     count, first, waiting, out = len(arrays[0]), 0, None, []
     for size in calls(count, sizes):
         rows = np.minimum(np.arange(first, first + size), count - 1)
@@ -173,10 +161,7 @@ def batched(function: Callable[..., Any], arrays: Sequence[np.ndarray], sizes: t
 
 
 def shrink(images: Any, by: int) -> Any:
-    """Shrink [N, by H, by W, 3] u8 to [N, H, W, 3] u8: means over squares of `by` pixels, halves rounded to even.
-
-    In whole numbers, so that NumPy and every device give the same; the result is an array of the images' kind.
-    """
+    """Average squares of `by` pixels: [N, by H, by W, 3] u8 to [N, H, W, 3], equal on all devices; halves to even."""
     if by == 1:
         return images
     xp = jnp if isinstance(images, jax.Array) else np
@@ -191,7 +176,7 @@ def shrink(images: Any, by: int) -> Any:
 
 
 def _visual_model(scene: Scene, lens: Lens, small: Sequence[SmallObject]) -> mujoco.MjModel:
-    """Build the scene's visual meshes and floor; boxes stand for bodies without a mesh."""
+    """Build the scene's visual meshes and floor; bodies without a mesh are boxes."""
     spec = picture_spec(scene, small=small)
     if not any(body.joints for body in spec.bodies):
         # MJX-Warp wants at least one degree of freedom.
@@ -203,14 +188,14 @@ def _visual_model(scene: Scene, lens: Lens, small: Sequence[SmallObject]) -> muj
 
 
 def make_env(scenes: Sequence[Path], robot: str | RobotSpec, backend: str, **settings: Any) -> InteractiveNav:
-    """Build an environment of velocity commands to a robot, by `interactive_nav.make`; its episodes have no end."""
+    """Build an environment of velocity commands to a robot by `interactive_nav.make`, with endless episodes."""
     need_engine(backend)
     fixed = {"control_mode": CONTROL, "episode_steps": 10**8, "num_waypoints": 1}
     return make(robot, scenes, backend=backend, **fixed, **settings)
 
 
 def episode_starts(start_xy_w: Any, yaw_rad: Any, goal_xy_w: Any, objects: int, scene: Any = 0) -> EpisodeStart:
-    """Return the starts of B episodes, in scenes [B] or one of an environment, small objects left out."""
+    """Return the starts of B episodes, in scenes [B] or in one, without small objects."""
     batch = len(start_xy_w)
     return EpisodeStart(
         scene_index=jnp.broadcast_to(jnp.asarray(scene, jnp.int32), batch),
@@ -225,7 +210,7 @@ def episode_starts(start_xy_w: Any, yaw_rad: Any, goal_xy_w: Any, objects: int, 
 
 @dataclasses.dataclass(frozen=True)
 class Snapshot:
-    """Hold where a batch of robots is."""
+    """Hold the state of a batch of robots."""
 
     xy_w: np.ndarray
     """[B, 2] m."""
@@ -234,13 +219,13 @@ class Snapshot:
     path_m: np.ndarray
     """[B] driven so far."""
     movable: np.ndarray
-    """[B] bool: touched something movable in the last control step."""
+    """[B] bool: touched a movable object in the last control step."""
     wall: np.ndarray
-    """[B] bool: touched a wall in it."""
+    """[B] bool: touched a wall in the last control step."""
     qpos: np.ndarray
-    """[B, nq] of the environment: where everything is."""
+    """[B, nq] of the environment."""
     broken: np.ndarray
-    """[B] bool: the physics gave up on it, lost contacts, or had no room for something near or awake (MJX)."""
+    """[B] bool: the physics failed, lost contacts, or had no room for an object near or awake (MJX)."""
 
     @classmethod
     def of(cls, state: Any) -> "Snapshot":
@@ -256,14 +241,14 @@ class Snapshot:
 
 @jax.jit
 def _packed(pos, yaw, path, touching, lost, nonfinite, qpos) -> jax.Array:
-    """Return a `Snapshot` as one array [B, 7 + nq] f32, because every transfer from an accelerator makes it wait."""
+    """Return a `Snapshot` as one array [B, 7 + nq] f32, because each transfer stalls an accelerator."""
     broken = (nonfinite > 0) | (lost > 0)
     flags = jnp.stack([yaw, path, *touching.T[:2], broken], 1)
     return jnp.concatenate([pos[:, :2], flags, qpos], 1).astype(jnp.float32)
 
 
 def scene_camera(renderer: SceneRenderer, robot: RobotSpec, world: World) -> Camera:
-    """Return the level images of a robot's camera, in the world's first scene."""
+    """Return a function that renders level images of a robot's camera in the world's first scene."""
 
     def images(xy: np.ndarray, yaw: np.ndarray, qpos: np.ndarray | None = None) -> np.ndarray:
         bodies = None
@@ -276,5 +261,5 @@ def scene_camera(renderer: SceneRenderer, robot: RobotSpec, world: World) -> Cam
 
 
 def pose_camera(xy_w: np.ndarray, yaw_rad: np.ndarray, _: np.ndarray | None = None) -> np.ndarray:
-    """Return poses [n, 3], the images of `maps.build.TrueSight`."""
+    """Return poses [n, 3], which are the images of `maps.build.TrueSight`."""
     return np.concatenate([np.asarray(xy_w, float), np.asarray(yaw_rad, float)[:, None]], -1)

@@ -1,8 +1,7 @@
-"""Compute the free space of a scene, where a robot may stand and which straight ways are free, and its rooms.
+"""Compute a scene's rooms and free space: where a robot may stand and which straight paths are free.
 
-Obstacles are the walls and everything movable where it stands at rest, up to the robot's height, doors included. Rooms
-are clusters of free positions by their coordinates alone. Where a scene's plan is recorded (plans.json: the generated
-scenes of the package), they are compared with it by the adjusted Rand index.
+Obstacles are walls, doors and movable objects at rest, up to the robot's height. Rooms are clusters of free positions
+by their coordinates alone; the adjusted Rand index compares them with recorded plans (plans.json: generated scenes).
 """
 
 import dataclasses
@@ -24,7 +23,7 @@ from interactive_nav_common.grids import cell_centres, clearance
 from topological_nav.config import DataConfig
 
 _FREE_M = 1e-6
-"""Clearance of a cell that is free at all."""
+"""Least clearance of a free cell."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +49,7 @@ class FreeSpace:
         return np.floor((np.asarray(xy_w, float) - self.origin_w) / self.resolution_m).astype(int)
 
     def inner_cells(self, xy_w: np.ndarray) -> np.ndarray:
-        """Return the same, of the map's cells nearest to them."""
+        """Return the map's cells nearest to points, as `cells` does."""
         rows, columns = self.clearance_m.shape
         return np.clip(self.cells(xy_w), 0, (columns - 1, rows - 1))
 
@@ -61,10 +60,7 @@ class FreeSpace:
         return np.where(inside, self.clearance_m[cell[..., 1], cell[..., 0]], 0.0)
 
     def segment_free(self, start_w: np.ndarray, end_w: np.ndarray, points: int, margin_m: float) -> np.ndarray:
-        """Return whether straight ways between points [..., 2] (m) are free, [...] bool.
-
-        Every looked-up point has the margin as its clearance; 0: its cell is free.
-        """
+        """Return whether straight paths between points [..., 2] keep the margin at `points` places; 0: free cells."""
         share = np.linspace(0.0, 1.0, points)[:, None]
         start_w, end_w = np.asarray(start_w, float), np.asarray(end_w, float)
         along = start_w[..., None, :] + share * (end_w - start_w)[..., None, :]
@@ -72,7 +68,7 @@ class FreeSpace:
         return np.asarray((self.at(along) >= max(margin_m, _FREE_M) - 1e-9).all(-1))
 
     def sample(self, rng: np.random.Generator, count: int, least_m: float) -> np.ndarray:
-        """Draw different cell centres [count, 2] with at least this clearance, uniform over them."""
+        """Draw distinct cell centres [count, 2] with at least this clearance, uniformly."""
         centres = self.centres(least_m)
         if len(centres) < count:
             raise ConfigError(
@@ -97,7 +93,7 @@ def free_space(scene: Scene, height_m: float) -> FreeSpace:
 
 
 def spread(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return the indices of `count` points of [n, 2] (all, where there are fewer): each next one is the farthest."""
+    """Return the indices of up to `count` points of [n, 2]; each next one is the farthest from the others."""
     if count <= 0 or not len(points):
         return np.zeros(0, int)
     picked = [int(rng.integers(len(points)))]
@@ -111,9 +107,9 @@ def spread(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarr
 
 METHODS = ("kmeans", "gmm", "spectral")
 MAX_ROOMS = 15
-"""Most rooms that a choice by BIC or silhouette considers."""
+"""Most rooms considered when BIC or silhouette choose."""
 CLUSTERED = 1000
-"""Free positions that are clustered: enough that a doorway holds several."""
+"""Free positions to cluster: enough that a doorway contains several."""
 _PLANS = json.loads(Path(__file__).with_name("plans.json").read_text(encoding="utf-8"))
 RECORDED: dict[str, tuple[tuple[float, ...], ...]] = {
     plan["digest"]: tuple(map(tuple, plan["rooms"])) for plan in _PLANS.values()
@@ -123,7 +119,7 @@ RECORDED: dict[str, tuple[tuple[float, ...], ...]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Rooms:
-    """Hold the rooms of a scene, given by the nearest of many labelled positions."""
+    """Hold the rooms of a scene; each point belongs to the room of the nearest labelled position."""
 
     points_w: np.ndarray
     """[n, 2] m."""
@@ -131,7 +127,7 @@ class Rooms:
     """[n] i32, 0 to count - 1, in the order of the rooms' means by x, then y."""
     method: str
     chosen_by: str
-    """What decided their number: config, recorded, bic or silhouette."""
+    """What determined their number: config, recorded, bic or silhouette."""
 
     @property
     def count(self) -> int:
@@ -170,11 +166,7 @@ def cluster(points: np.ndarray, method: str, count: int, seed: int) -> np.ndarra
 
 
 def choose_count(points: np.ndarray, method: str, seed: int, most: int = MAX_ROOMS) -> tuple[int, str]:
-    """Choose a number of clusters where none is given; return it and the criterion's name.
-
-    The Gaussian mixture takes the least Bayesian information criterion, the others the greatest silhouette, which
-    needs at least two clusters.
-    """
+    """Return the number of clusters of least BIC (gmm) or greatest silhouette (others, 2 or more) and its criterion."""
     most = min(most, len(points) - 1)
     if method == "gmm":
         with threadpool_limits(1):
@@ -203,25 +195,25 @@ def find_rooms(
 
 
 def scene_rooms(scene: Scene, space: FreeSpace, config: DataConfig) -> Rooms:
-    """Return a scene's rooms as a dataset of these settings has them; see `find_rooms`."""
+    """Return a scene's rooms with a dataset's settings; see `find_rooms`."""
     recorded = recorded_rooms(scene.digest)
     return find_rooms(space, config.room_method, config.num_rooms, recorded, config.seed, config.clearance_m)
 
 
 def recorded_rooms(digest: str) -> np.ndarray | None:
-    """Return x0, y0, x1, y1 (m, world) of a scene's rooms [k, 4], by its digest; None where no plan is recorded."""
+    """Return x0, y0, x1, y1 (m, world) of a scene's rooms [k, 4] by its digest; None without a recorded plan."""
     return np.array(RECORDED[digest]) if digest in RECORDED else None
 
 
 def room_of(recorded: np.ndarray, xy_w: np.ndarray) -> np.ndarray:
-    """Return the recorded room [n] that holds each point [n, 2], or in a doorway the nearest one."""
+    """Return the recorded room [n] that contains each point [n, 2], or the nearest one."""
     low, high = recorded[None, :, :2], recorded[None, :, 2:]
     outside = np.maximum(np.maximum(low - xy_w[:, None], xy_w[:, None] - high), 0.0)
     return np.linalg.norm(outside, axis=-1).argmin(1).astype(np.int32)
 
 
 def agreement(rooms: Rooms, recorded: np.ndarray) -> float:
-    """Return the adjusted Rand index of the rooms with the recorded ones: 1 the same, 0 as good as chance."""
+    """Return the adjusted Rand index of the rooms with the recorded ones: 1 identical, 0 chance."""
     return float(adjusted_rand_score(room_of(recorded, rooms.points_w), rooms.labels))
 
 

@@ -1,14 +1,12 @@
-"""Export finished runs as a small folder, and choose networks, policy and maps where none are named.
+"""Export finished runs as a small folder, and choose networks, policy and maps that are not named.
 
 OUT/rooms/ passages/ policy/   weights.safetensors.xz, network.json, config.yaml, versions.json, results.json
     maps/SCENE.npz             embeddings in half precision
-    export.json                commit, device and digest of every run, sizes, how well the networks agree with the runs'
+    export.json                commit, device and digest of each run, sizes, agreement of the networks with the runs
 
-Everything that reads a run folder reads these. Kernels and matrices are fp16; biases, scales and statistics, one number
-in a hundred, stay f32: a variance may exceed what fp16 holds. `digest` in network.json stays that of the run, so that
-maps and policies of either belong to both: an export whose predictions differ is refused. `export.weights_digest` is
-that of the tensors in `weights.safetensors.xz`. The package carries such a folder in `weights/exported`, whose policy
-and maps may be absent: a scene's map is then built when it is first needed.
+Kernels and matrices are fp16; biases, scales and statistics stay f32, because a variance may overflow fp16. `digest` in
+network.json is that of the run, so that maps and policies fit both. Exports whose predictions differ are refused.
+The package contains such a folder, `weights/exported`; its policy and maps are optional.
 """
 
 import dataclasses
@@ -53,14 +51,14 @@ FORMAT, PRECISION, ABOUT = 1, "fp16", "export.json"
 
 @dataclasses.dataclass(frozen=True)
 class Compared:
-    """Compare what runs and their exports compute from the same images of P places and K headings."""
+    """Compare the outputs of runs and their exports for the same images of P places and K headings."""
 
     embedding: np.ndarray
     """[2, P K] distance between the two embeddings of an image, by the localiser and by the detector."""
     apart: np.ndarray
     """[P K] distance of an image's embedding to the nearest of another place, by the localiser."""
     probability: np.ndarray
-    """[2, P K, L] that the way is free for each of the detector's lengths, by the run and by the export."""
+    """[2, P K, L] probability that the path is free for each of the detector's lengths, by run and by export."""
     scores: dict[str, float]
 
 
@@ -74,10 +72,7 @@ def export(
     config: ExportConfig,
     progress: Progress = lambda *_: None,
 ) -> tuple[dict[str, int], Compared]:
-    """Write an export, whole or not at all, in place of one at `out`; return `sizes_of` it and the comparison.
-
-    `policy` is a run that learned with both networks, `maps` a folder of SCENE.npz that were built with both.
-    """
+    """Write an export atomically, replacing one at `out`; return `sizes_of` it and the comparison."""
     out = Path(os.path.abspath(out))
     if out.exists() and not (out / ABOUT).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise FileError(f"{out}: is something else than an export; choose another folder (-o)")
@@ -132,7 +127,7 @@ def sizes_of(folder: Path) -> dict[str, int]:
 
 
 def size_lines(sizes: dict[str, int], limit_mib: float) -> str:
-    """Return the sizes in words, the largest first."""
+    """Format the sizes, the largest first."""
     total = sum(sizes.values()) / 2**20
     parts = (f"{name} {size / 2**20:.2f}" for name, size in sorted(sizes.items(), key=lambda item: -item[1]))
     remedy = "leave maps out, or train with a smaller width, hidden or projection"
@@ -178,7 +173,7 @@ def compare(
 
 
 def level_images(source: Path, networks: Networks, places: int, progress: Progress = lambda *_: None) -> np.ndarray:
-    """Return level images [P, K, H, W, 3] u8 around places of a dataset, or of a scene, which is drawn."""
+    """Return level images [P, K, H, W, 3] u8 around places of a dataset, or of a scene, which is rendered."""
     if (source / "dataset.json").is_file():
         images = load_rooms(source).images[:, PITCHES.index("level")]
         return images[np.unique(np.linspace(0, len(images) - 1, places).round().astype(int))]
@@ -193,7 +188,7 @@ def level_images(source: Path, networks: Networks, places: int, progress: Progre
 
 
 def _driven(policy: TrainedPolicy, images: np.ndarray) -> np.ndarray:
-    """Return the velocities [K, 2, P] at K steps."""
+    """Return the velocities [K, 2, P] that a policy commands in K steps."""
     state, velocities = policy.start(len(images)), []
     for step in range(images.shape[1]):
         state, *velocity = policy.act(state, images[:, step])
@@ -202,7 +197,7 @@ def _driven(policy: TrainedPolicy, images: np.ndarray) -> np.ndarray:
 
 
 def _export_run(task: str, run: Path, out: Path, config: ExportConfig) -> dict[str, Any]:
-    """Write a run's folder and return where it comes from."""
+    """Write a run's folder and return its commit, device and command."""
     for name in (CONFIG, VERSIONS, RESULTS):
         if not (run / name).is_file():
             raise FileError(f"{run}: has no {name}; finish the run first")
@@ -227,33 +222,33 @@ def _export_run(task: str, run: Path, out: Path, config: ExportConfig) -> dict[s
 
 
 def _without_folder(word: str) -> str:
-    """Return a word of a command line, an absolute path without the folders that it has on one machine alone."""
+    """Return a word of a command line, with an absolute path reduced to its file name."""
     key, sign, value = word.rpartition("=")
     return f"{key}{sign}{PurePath(value).name}" if PurePath(value).is_absolute() else word
 
 
 def packaged_weights() -> Path:
-    """Return where the weights of the package are, if it has any."""
+    """Return the folder of weights in the package."""
     return Path(str(importlib.resources.files("topological_nav"))) / "weights" / "exported"
 
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """Name the runs and maps that are used."""
+    """Name the runs and maps to use."""
 
     localiser: Path
     detector: Path
     policy: str
     """A run folder, or `PASSAGE_POLICY`."""
     maps: tuple[Path, ...]
-    """Folders that may have the scene's map; the first is where a new one is kept."""
+    """Folders that may contain the scene's map; a new one is written to the first."""
     renewed: bool
-    """Whether a map there that does not fit may be built again: nobody but this program wrote it."""
+    """Whether a map that does not fit may be rebuilt, because only this program writes there."""
     source: str
-    """Where the networks come from; empty: they were named."""
+    """Where the networks come from; empty if the caller named them."""
 
     def report(self, policy: bool = True) -> None:
-        """Print where the networks come from, and the local policy, unless the networks were named."""
+        """Print the origin of the networks, and the local policy, unless the caller named the networks."""
         if self.source:
             say(f"{self.source}; local policy: {self.policy}" if policy else self.source)
 
@@ -266,8 +261,8 @@ def choose(
 ) -> Choice:
     """Choose the run folders that are not given.
 
-    Networks that are not given come from one place: `RUNS`, where those needed are finished, else the package. The
-    policy of that place is used if neither network is given, else it is `PASSAGE_POLICY`.
+    Missing networks come from `RUNS` if all are trained there, else from the package. The policy is taken from the same
+    place if neither network is given, else it is `PASSAGE_POLICY`.
     """
     given = {"rooms": localiser, "passages": detector}
     missing = [task for task in needs if given[task] is None]
@@ -298,7 +293,7 @@ def choose(
 
 
 def fitting_map(choice: Choice, scene: str, digest: str) -> Path | None:
-    """Return the first map of a scene that these networks can use, or None where there is none."""
+    """Return the first map of a scene that these networks can use, or None."""
     networks = [read_description(run, "network", "TASK")["digest"] for run in (choice.localiser, choice.detector)]
     for folder in choice.maps:
         path = folder / f"{scene}.npz"

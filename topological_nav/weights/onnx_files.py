@@ -1,4 +1,4 @@
-"""Write the networks of a navigator as ONNX files: pictures in; embeddings, logits and velocities out."""
+"""Write a navigator's networks as ONNX files that map images to embeddings, logits and velocities."""
 
 import math
 from typing import Any
@@ -20,10 +20,7 @@ _STEP = ("embedding", "linear_memory", "angular_memory", "twist", "next_linear_m
 
 
 def onnx_models(networks: Networks, driver: TrainedPolicy | None, images: np.ndarray) -> dict[str, bytes]:
-    """Return ONNX models of both networks and of a policy, by name, each with a description.
-
-    They are compared with JAX over images [P, K, H, W, 3] u8, which a policy sees one after the other at P places.
-    """
+    """Return ONNX models of networks and policy by name, compared with JAX's on image sequences [P, K, H, W, 3] u8."""
     inputs, models = {"image": images.reshape(-1, *images.shape[2:])}, {}
     for task, network in zip(("rooms", "passages"), networks, strict=True):
         bound = network.network.bind(network.variables)
@@ -55,7 +52,7 @@ def onnx_models(networks: Networks, driver: TrainedPolicy | None, images: np.nda
 
 
 def _describe(networks: Networks, network: Any, inputs: Any, outputs: Any, facts: Any) -> dict[str, Any]:
-    """Describe a model as policies are; `facts` are of outputs by name."""
+    """Describe a model in the format of policies; `facts` describe outputs by name."""
     data, rate = networks.camera, {"rate_hz": 1.0 / CONTROL_S}
     robot = get_robot(data.robot, "twist")
     sizes = {"width": data.width, "height": data.height, "vertical_fov_deg": networks.localiser.about["fov_deg"]}

@@ -28,27 +28,27 @@ from converters.generate.models.cad import Models
 from converters.geometry.density import ROBOTS
 
 LOOKS = 8
-"""Best places of a group whose way round is looked at before it is left out."""
+"""Best places of a group to check for free paths before it is left out."""
 REDRAWS = 3
-"""Times that a group is drawn anew, with other models, before it is left out; rows get shorter too."""
+"""Attempts at a group with other models before it is left out; rows get shorter too."""
 FEWEST = 4
-"""Pieces that a row may do without."""
+"""Most pieces to remove from a row."""
 ALIKE, IN_ROWS = 2, ("counter", "door", "radiator")
-"""A model that stands so often is not drawn again, of other categories than these; a group has several alike."""
+"""Most copies of a model, except in these categories; a group contains several alike."""
 BATHS = ("tub", "shower")
 """A home with a bathroom has one of these."""
 MOST_BASES = 3
-"""Times that a plan's rooms are furnished until each has what it needs."""
+"""Attempts to furnish a plan's rooms with what each needs."""
 NEEDS_FROM = 0.2
-"""Share of the floor from which rooms have what they need; less may not suffice."""
+"""Share of the floor from which every room is furnished with what it needs; less may not suffice."""
 PRIVATE = ("bathroom", "bedroom", "office")
-"""Rooms that get their doors first."""
+"""Rooms that get doors first."""
 MOST_ADDED = 500
-"""Times that something is added to meet a share."""
+"""Most attempts to add furniture to reach a share."""
 CLUTTER_SHARE = 0.1
-"""Of what is added: small things that lie about."""
+"""Share of additions that are small objects."""
 WIDE_M = max(disc.radius_m for disc in ROBOTS.values()) + 0.02
-"""Disc that gets past what a room's use demands; past what is added, the disc of the settings does."""
+"""Disc that furniture must let pass at first; afterwards, the disc of the settings."""
 
 
 class Full(GenerationError):
