@@ -30,6 +30,7 @@ def toy(painted, tmp_path_factory):
     return explored(painted, tmp_path_factory.mktemp("toy"))
 
 
+@pytest.mark.heavy
 def test_it_explores_both_rooms_and_ends_when_no_heading_is_left(toy):
     explorer, built, seen = toy
     assert (built.map.xy_w[:, 0] < -0.5).sum() >= 2 and (built.map.xy_w[:, 0] > 0.5).sum() >= 2
@@ -56,6 +57,7 @@ def test_edges_have_the_angle_that_the_robot_left_by(toy):
     assert graph.length_m == pytest.approx(lengths(graph.xy_w, graph.edges))
 
 
+@pytest.mark.heavy
 def test_a_seed_gives_one_map(toy, painted, tmp_path):
     first, again = toy[1].map, explored(painted, tmp_path)[1].map
     for name in ("xy_w", "edges", "p", "angle_rad"):

@@ -106,11 +106,18 @@ def test_random_headings_to_test_are_as_many_and_of_the_same_places(made):
     assert work.groups["level"].tolist() == [i for i in range(len(work.held_out)) if i // 6 % 3 == 1]
 
 
-def test_scenes_to_test_passages_by_give_nothing_to_learn_from(made):
+def test_scenes_to_test_passages_by_give_nothing_to_learn_from(made, monkeypatch):
     passages = dataset.load_passages(made.data)
     config = dataclasses.replace(configs.TASKS["passages"], test_scenes=("painted",))
-    work = training._work("passages", made.data, config)
-    assert (len(work.images), len(work.held_out)) == (0, len(passages.images))
+    with pytest.raises(FileError, match="has no passages to learn from; name fewer test_scenes"):
+        training._work("passages", made.data, config)
+    # As if every second image were of another scene.
+    halves = dataclasses.replace(passages, scene=np.arange(len(passages.images), dtype=np.int32) % 2)
+    with monkeypatch.context() as patched:
+        patched.setattr(training, "load_passages", lambda _: halves)
+        patched.setattr(training, "read_header", lambda _: ({"scenes": [{"name": "painted"}, {"name": "other"}]}, None))
+        work = training._work("passages", made.data, config)
+    assert (work.held_out == passages.images[::2]).all() and (work.images == passages.images[1::2]).all()
     with pytest.raises(FileError, match="has no scene elm, expected among painted"):
         training._work("passages", made.data, dataclasses.replace(config, test_scenes=("elm",)))
 

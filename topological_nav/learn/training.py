@@ -174,7 +174,8 @@ def _work(task: str, dataset: Path, config: NetworkTrainConfig) -> _Work:
             test = np.isin(passages.scene, [scenes.index(name) for name in config.test_scenes])
         groups = {"all": np.arange(int(test.sum()))}
         if test.all():
-            raise FileError(f"{dataset}: has no passages to learn from; label free_m, or make it with passage_sources")
+            remedy = "name fewer test_scenes" if config.test_scenes else "label free_m, or make it with passage_sources"
+            raise FileError(f"{dataset}: has no passages to learn from; {remedy}")
         sides = passages.images[~test], free[~test], passages.images[test], free[test]
         return _Work(rooms, *sides, groups, passages.lengths_m, passages.scored)
     if len(rooms.names) < 2:

@@ -311,7 +311,7 @@ def made_of(folder):
     return [sorted(row["name"] for row in scene["objects"]) for scene in scenes]
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_training_goes_on_where_it_stopped(tmp_path):
     # The home of seed 30 is a sparse one; what is held out is there already, and is kept.
     kept, held_out = tmp_path / f"run/held_out/{HELD_OUT_SEED}.npz", stair()
