@@ -1,11 +1,13 @@
 """A TurtleBot and a TTbot in a bare toy room of 6 x 4 m: pictures, scans, odometry and touches by hand."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import interactive_nav
+from interactive_nav.ros import nodes
 from interactive_nav.ros.__main__ import main
 from interactive_nav.ros.simulator import NEEDED, RosSimulator, compose
 from interactive_nav_common.errors import UserError
@@ -115,3 +117,15 @@ def test_poses_are_composed():
 def test_a_start_that_is_no_pose_is_one_line(capsys):
     assert main(["simulate", "room", "--start", "1,2"]) == 2
     assert "--start is '1,2', expected X,Y,YAW" in capsys.readouterr().err
+
+
+def test_a_moment_that_nobody_answers_is_sent_again(monkeypatch):
+    """As best effort may lose a message; what has no stamp, by which readers know it, is not."""
+    monkeypatch.setattr(nodes, "AGAIN_S", 0.05)
+    simulator = nodes.SimulatorNode(SimpleNamespace(create_subscription=lambda *_: None), None, nodes.Pace())  # type: ignore[arg-type]
+    sent = []
+    simulator._out = {name: SimpleNamespace(publish=sent.append) for name in ("image", "clock")}
+    image = SimpleNamespace(header="now")
+    simulator._send({"clock": "tick", "image": image})
+    assert simulator.answer(0, lambda: len(sent) >= 4) == (0.0, 0.0)
+    assert sent == ["tick", image, image, image]
