@@ -183,5 +183,5 @@ def run_explore(arguments: Any) -> None:
         try:
             explorer.play(report)
         except Stopped:
-            say("stopped: the map has what was seen so far; the same command begins anew")
+            say("stopped: the map has what was seen so far; the same command starts again")
     keep_map(explorer.built(), arguments.out / f"{venue.scene.name}.npz")

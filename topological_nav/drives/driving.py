@@ -171,15 +171,26 @@ class Frames:
 
     @classmethod
     def joined(cls, parts: Sequence["Frames"]) -> "Frames":
-        """Concatenate the frames of several folders embedded by the same networks, with the first one's settings."""
+        """Return the frames of several folders, embedded by the same networks; the first has the settings."""
         if len(parts) == 1:
             return parts[0]
+        for name in ("linear_m_s", "angular_rad_s"):
+            if len(most := {getattr(part.config, name) for part in parts}) > 1:
+                raise FileError(f"folders of drives have {name} = {sorted(most)}, expected one; drive again with one")
         counts = [len(part.drives.command) for part in parts]
         halves = [part.features[:count] for part, count in zip(parts, counts, strict=True)]
         halves += [part.features[count:] for part, count in zip(parts, counts, strict=True)]
-        header = {"folders": [part.header for part in parts]}
+        folders: list[dict[str, Any]] = []  # those that differ only in their scenes are described once
+        for header in (part.header for part in parts):
+            alike = next((one for one in folders if {**one, "scenes": 0} == {**header, "scenes": 0}), None)
+            if alike:
+                alike["scenes"] = [*alike["scenes"], *header["scenes"]]
+            else:
+                folders.append(dict(header))
         drives = Drives.joined([part.drives for part in parts])
-        return dataclasses.replace(parts[0], drives=drives, header=header, features=np.concatenate(halves))
+        return dataclasses.replace(
+            parts[0], drives=drives, header={"folders": folders}, features=np.concatenate(halves)
+        )
 
 
 def need_camera(folder: Path, header: Mapping[str, Any], networks: Networks) -> None:

@@ -160,6 +160,11 @@ def test_drives_of_two_folders_are_learned_from_together(frames):
     both, count = Frames.joined([frames, frames]), len(frames.drives.command)
     assert Frames.joined([frames]) is frames and both.mirrored
     assert both.drives.scene.tolist() == [0] * len(frames.drives) + [1] * len(frames.drives)
+    (header,) = both.header["folders"]  # alike but for their scenes: described once
+    assert header == {**frames.header, "scenes": 2 * frames.header["scenes"]}
+    faster = dataclasses.replace(frames, config=dataclasses.replace(frames.config, linear_m_s=0.8))
+    with pytest.raises(FileError, match=r"have linear_m_s = \[0.5, 0.8\], expected one; drive again with one"):
+        Frames.joined([frames, faster])
     assert both.drives.first.tolist() == [*frames.drives.first, *(frames.drives.first[1:] + count)]
     values = imitation.class_values(CONFIG, 0.5, 0.5)
     of_one, of_both = (imitation._split(part.drives, CONFIG, values)[0] for part in (frames, both))
