@@ -68,11 +68,12 @@ else ifeq ($(SIZE),report)
   ROOMS = preset=report
   PASSAGES = preset=report test_scenes=$(TEST_SCENES)
   ALEXNET = $(PASSAGES)
-  DRIVES = preset=report backend=native drives=311 batch=2488
+  DRIVES = preset=report backend=native drives=311 batch=311
   GRID = preset=report
   MAP = preset=report check=60
   EVALUATION = preset=report backend=native
   ADAPT = preset=report
+  PAIRS = alpha-0.1-lambda-0.5 alpha-10-lambda-0.1 alpha-50-lambda-1
   PPO ?=
   DRIVEN_BY = $(RUNS)/policy-grid/alpha-10-lambda-0.1
   PASSAGES_FROM = data-passages
@@ -99,6 +100,9 @@ endif
 DRIVEN_BY ?= $(RUNS)/policy
 PASSAGES_FROM ?= data
 LEARNED ?= dense
+# Whether homes are drawn and driven in by themselves.
+APART := $(filter report homes,$(SIZE))
+DRIVEN = $(if $(APART),$(SEEN:%=$(RUNS)/drives/%),$(RUNS)/drives)
 
 NAV = $(PY) -m topological_nav
 WITH = --localiser $(RUNS)/rooms --detector $(RUNS)/passages
@@ -120,22 +124,21 @@ ifeq ($(SIZE),homes)
 all: ladder hard $(D)/export
 networks: $(D)/rooms $(D)/passages
 evaluation: $(D)/evaluation $(D)/evaluation-policy
-# Each home by itself, many at a time; the command for all of them finds the images and numbers the rooms.
-$(SEEN:%=$(D)/data.%): $(D)/data.%:
-	$(call run,$(NAV) data $(SCENES)/$* -o $(RUNS)/parts/$* $(DATA))
-$(D)/data: $(SEEN:%=$(D)/data.%)
-	@mkdir -p $(RUNS)/data; mv $(foreach name,$(SEEN),$(RUNS)/parts/$(name)/$(name)) $(RUNS)/data
-	$(call run,$(NAV) data $(call folders,$(SEEN)) -o $(RUNS)/data $(DATA))
-$(SEEN:%=$(D)/drives.%): $(D)/drives.%:
-	$(call run,$(NAV) data --drives $(SCENES)/$* -o $(RUNS)/drives/$* $(DRIVES))
 $(D)/policy: $(D)/rooms $(D)/passages $(SEEN:%=$(D)/drives.%)
-	$(call run,$(NAV) train policy --data $(SEEN:%=$(RUNS)/drives/%) $(WITH) -o $(RUNS)/policy $(POLICY))
+	$(call run,$(NAV) train policy --data $(DRIVEN) $(WITH) -o $(RUNS)/policy $(POLICY))
 else ifeq ($(SIZE),report)
 all: tables
 networks: $(D)/rooms $(D)/rooms-up $(D)/rooms-down $(D)/passages $(D)/alexnet
 evaluation: $(D)/evaluation $(D)/evaluation-policy
-$(D)/policy-grid: $(D)/rooms $(D)/passages $(D)/drives
-$(D)/policy: $(D)/policy-grid
+# An epoch in each home keeps the embeddings of its drives, for the three pairs, which learn side by side; the command for the
+# grid finds them all, and adds up.
+$(SEEN:%=$(D)/embedded.%): $(D)/embedded.%: $(D)/rooms $(D)/passages $(D)/drives.%
+	$(call run,$(NAV) train policy --data $(RUNS)/drives/$* $(WITH) -o $(RUNS)/embedded/$* $(GRID) epochs=1)
+$(PAIRS:%=$(D)/policy-grid.%): $(D)/policy-grid.%: $(SEEN:%=$(D)/embedded.%)
+	$(call run,$(NAV) train policy --data $(DRIVEN) $(WITH) -o $(RUNS)/policy-grid/$* $(GRID) $(of_pair))
+of_pair = alpha=$(word 2,$(subst -, ,$*)) lam=$(word 4,$(subst -, ,$*))
+$(D)/policy-grid: $(PAIRS:%=$(D)/policy-grid.%)
+$(D)/policy: $(D)/policy-grid.$(notdir $(DRIVEN_BY))
 	@touch $@
 else
 all: networks maps $(D)/policy evaluation transfer $(D)/export
@@ -143,12 +146,12 @@ networks: $(D)/rooms $(D)/rooms-more $(D)/passages $(D)/alexnet
 evaluation: $(D)/evaluation $(D)/evaluation-policy $(D)/evaluation-ahead1
 $(D)/policy-grid: $(D)/policy
 $(D)/policy: $(D)/rooms $(D)/passages $(D)/drives
-	$(call run,$(NAV) train policy --data $(RUNS)/drives $(WITH) -o $(RUNS)/policy $(POLICY))
+	$(call run,$(NAV) train policy --data $(DRIVEN) $(WITH) -o $(RUNS)/policy $(POLICY))
 endif
 maps: $(MAPS)
 tables: networks evaluation $(D)/policy-grid $(D)/adapted-passages
 	$(NAV) tables $(RUNS)
-figures: $(D)/drives $(D)/map-alder $(D)/policy $(D)/adapted-passages
+figures: $(D)/drives$(if $(APART),.alder) $(D)/map-alder $(D)/policy $(D)/adapted-passages
 	$(NAV) figures $(RUNS) $(WITH) --policy $(DRIVEN_BY) --maps $(RUNS)/maps $(EVALUATION)
 transfer: $(D)/features $(D)/adapted-passages $(D)/evaluation-unadapted $(D)/evaluation-adapted
 transfer-policy: $(D)/evaluation-unadapted-policy $(D)/evaluation-adapted-policy
@@ -157,16 +160,25 @@ renderer: $(D)/features-gl $(D)/adapted-passages-gl $(D)/evaluation-unadapted-gl
 renderer-policy: $(D)/evaluation-unadapted-gl-policy $(D)/evaluation-adapted-gl-policy
 scan: $(D)/features-scan $(D)/adapted-passages-scan $(D)/unadapted-map-scan $(D)/adapted-map-scan
 
-ifneq ($(SIZE),homes)
+ifneq ($(APART),)
+# Each home by itself, many at a time; the command for all of them finds the images and numbers the rooms.
+$(SEEN:%=$(D)/data.%): $(D)/data.%:
+	$(call run,$(NAV) data $(SCENES)/$* -o $(RUNS)/parts/$* $(DATA))
+$(D)/data: $(SEEN:%=$(D)/data.%)
+	@mkdir -p $(RUNS)/data; mv $(foreach name,$(SEEN),$(RUNS)/parts/$(name)/$(name)) $(RUNS)/data
+	$(call run,$(NAV) data $(call folders,$(SEEN)) -o $(RUNS)/data $(DATA))
+$(SEEN:%=$(D)/drives.%): $(D)/drives.%:
+	$(call run,$(NAV) data --drives $(SCENES)/$* -o $(RUNS)/drives/$* $(DRIVES))
+else
 $(D)/data:
 	$(call run,$(NAV) data $(call folders,$(SEEN)) -o $(RUNS)/data $(DATA))
+$(D)/drives:
+	$(call run,$(NAV) data --drives $(call folders,$(SEEN)) -o $(RUNS)/drives $(DRIVES))
 endif
 $(D)/data-more:
 	$(call run,$(NAV) data $(call folders,$(SEEN)) -o $(RUNS)/data-more $(MORE_POSITIONS))
 $(D)/data-passages:
 	$(call run,$(NAV) data $(call folders,$(ALL)) -o $(RUNS)/data-passages $(PASSAGE_DATA))
-$(D)/drives:
-	$(call run,$(NAV) data --drives $(call folders,$(SEEN)) -o $(RUNS)/drives $(DRIVES))
 
 $(D)/rooms: $(D)/data
 	$(call run,$(NAV) train rooms --data $(RUNS)/data -o $(RUNS)/rooms $(ROOMS))
@@ -182,7 +194,7 @@ $(D)/alexnet: $(D)/$(PASSAGES_FROM)
 $(D)/map-%: $(D)/rooms $(D)/passages
 	$(call run,$(NAV) map $(SCENES)/$* $(WITH) -o $(RUNS)/maps/$*.npz $(MAP))
 $(D)/policy-grid:
-	$(call run,$(NAV) train policy --grid --data $(RUNS)/drives $(WITH) -o $(RUNS)/policy-grid $(GRID))
+	$(call run,$(NAV) train policy --grid --data $(DRIVEN) $(WITH) -o $(RUNS)/policy-grid $(GRID))
 
 $(D)/ppo:
 	$(call run,$(PY) -m train --config turtlebot_ppo env.robot=ttbot "env.scenes=[$(subst $(space),$(comma),$(call folders,$(SEEN)))]" \

@@ -121,8 +121,14 @@ def test_the_report_is_one_graph_that_ends_in_its_tables():
             assert settings.limit_s == 175.0 and settings.images == settings.goal_images == 1
     networks = {"rooms", "rooms-up", "rooms-down", "passages", "alexnet", "policy-grid", "adapted-passages"}
     scenes = {f"maps/{Path(one).name}.npz" for one in done["data-passages"][0].scenes}
-    data = {"data", "data-passages", "data-unseen", "drives"}
-    assert set(done) == networks | scenes | data | {"evaluation", "evaluation-policy"} and len(scenes) == 10
+    homes = [Path(one).name for one in done["data"][0].scenes]
+    data = {"data", "data-passages", "data-unseen"}
+    data |= {f"{folder}/{home}" for folder in ("parts", "drives", "embedded") for home in homes}
+    pairs = {f"policy-grid/alpha-{alpha:g}-lambda-{lam:g}": (alpha, lam) for alpha, lam in GRIDS["report"]}
+    assert set(done) == networks | scenes | data | {*pairs, "evaluation", "evaluation-policy"} and len(scenes) == 10
+    # A pair by itself is what the grid looks for.
+    assert {name: (done[name][1].alpha, done[name][1].lam) for name in pairs} == pairs
+    assert {dataclasses.replace(done[name][1], alpha=10.0, lam=0.1) for name in pairs} == {done["policy-grid"][1]}
     assert [done[name][1].pitch for name in ("rooms-up", "rooms", "rooms-down")] == ["up", "level", "down"]
     passages, policy = done["passages"][1], done["evaluation-policy"][0].policy
     seven = {Path(one).name for one in done["data-passages"][0].scenes} - set(passages.test_scenes)
@@ -131,8 +137,7 @@ def test_the_report_is_one_graph_that_ends_in_its_tables():
     assert done["policy-grid"][0].grid and (float(alpha), float(lam)) in GRIDS[done["policy-grid"][1].pairs]
     assert done["evaluation-policy"][0].contenders == "dense,sparse"
     # As many drives as the report has, but for a few.
-    drives = done["drives"]
-    assert len(drives[0].scenes) * drives[1].drives == 2488
+    assert sum(done[f"drives/{home}"][1].drives for home in homes) == 2488
 
 
 def with_given_networks(*words: str):

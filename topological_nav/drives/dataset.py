@@ -4,6 +4,7 @@
            plan.npz                all planned drives: routes, starts, split
            batch-000.npz           results of some of them, in the order of the plan
            <scene>/images-000.npz  images of some of a scene's kept drives, one for each control step
+           embedded-<digest>.npy   embeddings of all images by two networks, which `train policy` keeps
            preview.png             the drives on the floor plans, and images of some
 
 A drive is kept if it reached its last node without contact, so that furniture is at rest as rendered. A policy's drive

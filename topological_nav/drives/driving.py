@@ -12,8 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from interactive_nav_common.errors import FileError
+from interactive_nav_common.errors import FileError, readable
+from interactive_nav_common.files import whole_file
 from interactive_nav_common.jobs.progress import ALONE, Host, Stopped
+from interactive_nav_common.rows import digest_of
 from topological_nav.config import PASSAGE_POLICY, DriveConfig, NavigatorConfig
 from topological_nav.drives.dataset import Drives, drive_images, load_drives, read_drives_header
 from topological_nav.learn.learning import in_batches, initial, read_description, read_weights
@@ -33,11 +35,13 @@ class SummedCell(nn.Module):
 
     hidden: int
 
-    @nn.compact
-    def __call__(self, hidden: jax.Array, total: jax.Array, x: jax.Array) -> jax.Array:
-        """Map a memory [B, H], a sum [B, H] and an input [B, D] to the new memory [B, H]."""
-        from_x = jnp.split(nn.Dense(3 * self.hidden, name="inputs")(x), 3, -1)
-        from_total = jnp.split(nn.Dense(3 * self.hidden, name="memory")(total), 3, -1)
+    def setup(self) -> None:
+        """Build the submodules; flax calls it."""
+        self.inputs, self.memory = nn.Dense(3 * self.hidden), nn.Dense(3 * self.hidden)
+
+    def __call__(self, hidden: jax.Array, total: jax.Array, product: jax.Array) -> jax.Array:
+        """Map a memory [B, H], a sum [B, H] and the input's product [B, 3 H] by `inputs` to the new memory [B, H]."""
+        from_x, from_total = (jnp.split(one, 3, -1) for one in (product, self.memory(total)))
         reset, keep = (nn.sigmoid(a + b) for a, b in zip(from_x[:2], from_total[:2], strict=True))
         new = nn.tanh(from_x[2] + reset * from_total[2])
         return (1.0 - keep) * new + keep * hidden
@@ -59,11 +63,23 @@ class Policy(nn.Module):
 
     def __call__(self, memory: Memory, x: jax.Array) -> tuple[Memory, tuple[jax.Array, jax.Array]]:
         """Map standardised embeddings [B, D] to the next memory and logits of linear and angular classes."""
+        new = self.advance(memory, self.products(x))
+        return new, self.logits(new)
+
+    def products(self, x: jax.Array) -> tuple[jax.Array, ...]:
+        """Return what either cell reads of embeddings [..., D], [..., 3 H], which no memory enters."""
         if self.project is not None:
             x = nn.relu(self.project(x))
+        return tuple(cell.inputs(x) for cell in self.cells)
+
+    def advance(self, memory: Memory, products: tuple[jax.Array, ...]) -> Memory:
+        """Return the next memory."""
         total = memory[0] + memory[1]
-        new = tuple(cell(hidden, total, x) for cell, hidden in zip(self.cells, memory, strict=True))
-        return new, tuple(head(h) for head, h in zip(self.heads, new, strict=True))  # type: ignore[return-value]
+        return tuple(cell(hidden, total, p) for cell, hidden, p in zip(self.cells, memory, products, strict=True))  # type: ignore[return-value]
+
+    def logits(self, memory: Memory) -> tuple[jax.Array, jax.Array]:
+        """Return logits of linear and angular classes."""
+        return tuple(head(h) for head, h in zip(self.heads, memory, strict=True))  # type: ignore[return-value]
 
     def fresh(self, batch: int) -> Memory:
         """Return the initial memory of a run."""
@@ -98,11 +114,16 @@ def standardised(u: jax.Array, scale: dict[str, jax.Array]) -> jax.Array:
 def unrolled(policy: Policy, params: Any, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return logits [B, T, L] and [B, T, A] of runs of standardised embeddings [B, T, D] from initial memories."""
 
-    def step(memory, now):
-        return policy.apply({"params": params}, memory, now)
+    def apply(method: str, *of: Any) -> Any:
+        return policy.apply({"params": params}, *of, method=method)
 
-    _, logits = jax.lax.scan(step, policy.fresh(len(x)), x.swapaxes(0, 1))
-    return tuple(value.swapaxes(0, 1) for value in logits)  # type: ignore[return-value]
+    def step(memory, now):
+        new = apply("advance", memory, now)
+        return new, new
+
+    # Only what a memory enters is computed step by step.
+    _, memories = jax.lax.scan(step, policy.fresh(len(x)), apply("products", x.swapaxes(0, 1)))
+    return tuple(value.swapaxes(0, 1) for value in apply("logits", memories))  # type: ignore[return-value]
 
 
 def mean_over(values: jax.Array, mask: jax.Array) -> jax.Array:
@@ -207,7 +228,7 @@ def need_camera(folder: Path, header: Mapping[str, Any], networks: Networks) -> 
 def embed_drives(
     folders: Sequence[Path], localiser_run: Path, detector_run: Path, mirror: bool, host: Host = ALONE
 ) -> Frames:
-    """Embed the images of all kept drives of one or more folders."""
+    """Embed the images of all kept drives of one or more folders, each of which keeps the embeddings for the next time."""
     networks = load_networks(localiser_run, detector_run, classifies=True, same=SAME)
 
     @jax.jit
@@ -217,13 +238,17 @@ def embed_drives(
         return jnp.stack([embedded(networks, weights, side) for side in shown], 1).astype(jnp.float16)
 
     embed = functools.partial(sides, [network.variables for network in networks])
-    return Frames.joined([_folder_frames(folder, networks, embed, host) for folder in folders])
+    kept = f"embedded-{digest_of([mirror, *(network.stored for network in networks)])}.npy"
+    return Frames.joined([_folder_frames(Path(folder), kept, networks, embed, host) for folder in folders])
 
 
-def _folder_frames(folder: Path, networks: Networks, embed: Callable[[Any], Any], host: Host) -> Frames:
+def _folder_frames(folder: Path, kept: str, networks: Networks, embed: Callable[[Any], Any], host: Host) -> Frames:
     header, config = read_drives_header(folder)
     drives = load_drives(folder)
     need_camera(folder, header, networks)
+    if (folder / kept).is_file():
+        with readable(folder / kept, FileError, "delete it, and the images are embedded again"):
+            return Frames(drives, config, header, np.load(folder / kept), networks)
     count, total, done = len(drives.command), int(drives.steps[drives.kept].sum()), 0
     features: np.ndarray | None = None
     for i, (rows, images) in enumerate(drive_images(folder)):
@@ -239,6 +264,8 @@ def _folder_frames(folder: Path, networks: Networks, embed: Callable[[Any], Any]
             raise Stopped(stop)
     if features is None:
         raise FileError(f"{folder}: none of {len(drives)} drives was kept; drive more, or in other scenes")
+    with whole_file(folder / kept) as partial, open(partial, "wb") as file:
+        np.save(file, features)
     return Frames(drives, config, header, features, networks)
 
 

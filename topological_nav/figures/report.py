@@ -18,7 +18,7 @@ from interactive_nav_common.jobs.progress import Progress, say
 from interactive_nav_common.records import RUNS
 from topological_nav.adaptation import labelled
 from topological_nav.data.domains import AdaptConfig
-from topological_nav.drives.dataset import drive_images, load_drives, read_drives_header
+from topological_nav.drives.dataset import DRIVES, drive_images, load_drives, read_drives_header
 from topological_nav.drives.driving import TrainedPolicy, load_policy
 from topological_nav.drives.imitation import classes
 from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
@@ -43,6 +43,8 @@ def picture(axis: Axes, image: np.ndarray, title: str, frame: Any = None) -> Non
 
 def strips(folder: Path, policy: str, scene: str) -> Iterator[tuple[str, Figure]]:
     """Yield what the policy sees on the drive that turns left most (8) and on the one that turns least (9)."""
+    if (folder / scene / DRIVES.file).is_file():  # the home's own folder
+        folder = folder / scene
     header, _ = read_drives_header(folder)
     driver, drives, names = load_policy(policy), load_drives(folder), [about["name"] for about in header["scenes"]]
     mine = np.flatnonzero(drives.kept & (np.array(names)[drives.scene] == scene)).tolist()

@@ -185,3 +185,20 @@ def test_drives_seen_through_another_camera_are_refused(made, driven, tmp_path):
         FileError, match="images have width = 48, the networks learned from 32; drive again with width=32"
     ):
         embed_drives([copy], made.rooms, made.passages, False)
+
+
+def test_embeddings_are_kept_for_the_next_training(made, driven, tmp_path):
+    copy = tmp_path / "drives"
+    shutil.copytree(driven, copy, ignore=shutil.ignore_patterns("embedded-*"))
+    first = embed_drives([copy], made.rooms, made.passages, False)
+    for images in copy.rglob("images-*.npz"):
+        images.unlink()
+    again = embed_drives([copy], made.rooms, made.passages, False)
+    assert first.features.any() and (again.features == first.features).all()
+    # Mirrored images were not embedded, and have to be there.
+    with pytest.raises(FileError, match="is missing; the same 'data --drives' command goes on"):
+        embed_drives([copy], made.rooms, made.passages, True)
+    (kept,) = copy.glob("embedded-*.npy")
+    kept.write_bytes(kept.read_bytes()[:200])
+    with pytest.raises(FileError, match="not readable.*; delete it, and the images are embedded again"):
+        embed_drives([copy], made.rooms, made.passages, False)
