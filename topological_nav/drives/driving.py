@@ -111,6 +111,10 @@ def standardised(u: jax.Array, scale: dict[str, jax.Array]) -> jax.Array:
     return (u - mean) / deviation
 
 
+UNROLL = 1
+"""Steps of memories in one turn of the loop."""
+
+
 def unrolled(policy: Policy, params: Any, x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return logits [B, T, L] and [B, T, A] of runs of standardised embeddings [B, T, D] from initial memories."""
 
@@ -122,7 +126,7 @@ def unrolled(policy: Policy, params: Any, x: jax.Array) -> tuple[jax.Array, jax.
         return new, new
 
     # Only what a memory enters is computed step by step.
-    _, memories = jax.lax.scan(step, policy.fresh(len(x)), apply("products", x.swapaxes(0, 1)))
+    _, memories = jax.lax.scan(step, policy.fresh(len(x)), apply("products", x.swapaxes(0, 1)), unroll=UNROLL)
     return tuple(value.swapaxes(0, 1) for value in apply("logits", memories))  # type: ignore[return-value]
 
 
