@@ -232,7 +232,7 @@ def need_camera(folder: Path, header: Mapping[str, Any], networks: Networks) -> 
 def embed_drives(
     folders: Sequence[Path], localiser_run: Path, detector_run: Path, mirror: bool, host: Host = ALONE
 ) -> Frames:
-    """Embed the images of all kept drives of one or more folders, each of which keeps the embeddings for the next time."""
+    """Embed the images of all kept drives of one or more folders, which keep the embeddings for the next time."""
     networks = load_networks(localiser_run, detector_run, classifies=True, same=SAME)
 
     @jax.jit
