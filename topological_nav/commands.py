@@ -239,7 +239,7 @@ def run_data(arguments: Any) -> None:
 
 
 def _photographs(arguments: Any) -> None:
-    refuse_unused(arguments, "--drives", "with --photographs")
+    refuse_unused(arguments, "--drives objects", "with --photographs")
     folder, out, scenes = arguments.photographs, arguments.out or DATASET, arguments.scenes
     if len(scenes) > 1:
         raise ConfigError(f"--photographs are of one building, got scenes {', '.join(scenes)}; name one or none")

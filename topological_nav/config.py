@@ -76,6 +76,8 @@ class DataConfig(CameraConfig):
     """Points of the segment to check on the map, both ends included."""
     passage_margin_m: Annotated[float, Bounds(0.0, 10.0)] = 0.225
     """Least distance of each point from obstacles: half of TTbot's width; 0: it may touch them."""
+    objects: Annotated[int, Bounds(0, 100)] = 0
+    """Small objects that lie on the floor in passage images, at most: each source has a layout of its own."""
     shard: Count = 10
     """Sheets of images per file: the most that an interrupted rendering loses."""
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from interactive_nav import get_robot
 from interactive_nav.robots import RobotSpec
+from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import Scene
 from interactive_nav_common.errors import ConfigError, FileError, readable
 from interactive_nav_common.files import write_arrays
@@ -26,6 +27,7 @@ from interactive_nav_common.jobs.progress import Progress
 from interactive_nav_common.rows import Rows
 from topological_nav.config import DataConfig
 from topological_nav.data.folders import Folder, draw_missing, load_scenes, numbered, read_arrays, read_shards
+from topological_nav.data.objects import bodies, clear_of, fewer_at_furniture, strew
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.space import FreeSpace, Rooms, agreement, free_space, recorded_rooms, scene_rooms, spread
 
@@ -55,6 +57,8 @@ class Passages(Rows):
     """[n] i32 room of the source."""
     test: np.ndarray
     """[n] bool."""
+    small_w: np.ndarray
+    """[n, N, 3] x, y (m) and yaw of the source's small objects; NaN: absent."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,7 +152,7 @@ def make_dataset(
             files = _shards(out / scene.name, plan, robot, config)
             drawn.append((scene.name, lambda scene=scene: scene, files))
         total = sum(len(p.xy_w) * 3 * config.headings + len(p.passages) for p in plans)
-        draw_missing(drawn, total, config, progress)
+        draw_missing(drawn, total, config, progress, pick(config.objects))
         return header
 
 
@@ -156,22 +160,22 @@ def write_plan(folder: Path, plan: ScenePlan) -> None:
     """Write the positions of a scene's images for `load_plan`."""
     folder.mkdir(parents=True, exist_ok=True)
     passages = {f"passage_{f.name}": getattr(plan.passages, f.name) for f in dataclasses.fields(Passages)}
+    passages = {name: of for name, of in passages.items() if of.shape[1:] != (0, 3)}  # no objects: as ever
     arrays = {name: getattr(plan, name) for name in ("xy_w", "room", "test")} | passages
     arrays |= {"cluster_xy_w": plan.rooms.points_w, "cluster_label": plan.rooms.labels}
     write_arrays(folder / "plan.npz", **arrays, how=np.asarray([plan.rooms.method, plan.rooms.chosen_by]))
 
 
 def _shards(folder: Path, plan: ScenePlan, robot: RobotSpec, config: DataConfig):
-    """Yield each file of a scene with the camera poses of its sheets."""
+    """Yield each file of a scene with the camera poses of its sheets, and the poses of its small objects."""
     pitch, heading = (a.ravel() for a in np.meshgrid(config.pitches_rad, headings(config), indexing="ij"))
     passages, each, level = plan.passages, len(pitch), np.zeros(len(pitch))
     rows = [np.arange(first, min(first + each, len(passages))) for first in range(0, len(passages), each)]
-    sheets = {
-        "rooms": [camera_pose(robot, xy, heading, pitch) for xy in plan.xy_w],
-        "passages": [camera_pose(robot, passages.xy_w[r], passages.heading_rad[r], level[: len(r)]) for r in rows],
-    }
-    for kind, poses in sheets.items():
-        yield from numbered(folder, kind, poses, config.shard)
+    for path, places_w in numbered(folder, "rooms", plan.xy_w, config.shard):
+        yield path, [camera_pose(robot, xy, heading, pitch) for xy in places_w], None
+    for path, sheets in numbered(folder, "passages", rows, config.shard):
+        poses = [camera_pose(robot, passages.xy_w[r], passages.heading_rad[r], level[: len(r)]) for r in sheets]
+        yield path, poses, bodies(passages.small_w[np.concatenate(sheets)])
 
 
 def load_rooms(folder: Path) -> RoomImages:
@@ -207,6 +211,7 @@ def load_plan(folder: Path, scene: str) -> ScenePlan:
     arrays = read_arrays(path)
     with readable(path, FileError, "run 'data' again"):
         rooms = Rooms(arrays["cluster_xy_w"], arrays["cluster_label"], *(str(w) for w in arrays["how"]))
+        arrays.setdefault("passage_small_w", np.zeros((len(arrays["passage_free"]), 0, 3)))
         passages = Passages(*(arrays[f"passage_{f.name}"] for f in dataclasses.fields(Passages)))
         return ScenePlan(rooms, arrays["xy_w"], arrays["room"], arrays["test"], passages)
 
@@ -242,7 +247,7 @@ def draw_passages(space: FreeSpace, rooms: Rooms, config: DataConfig, rng: np.ra
     """Draw sources in every room, targets on a circle about each, and labels from the map.
 
     Free and blocked are balanced for `passage_length_m`, separately for training and testing, by dropping surplus
-    passages at random. A room with fewer eligible places than sources uses them all.
+    passages at random. A room with fewer eligible places than sources uses them all. Labels regard small objects, too.
     """
     places = space.centres(config.passage_clearance_m)
     labels = rooms.of(places)
@@ -258,11 +263,15 @@ def draw_passages(space: FreeSpace, rooms: Rooms, config: DataConfig, rng: np.ra
     phase = rng.uniform(0, 2 * np.pi, n)
     heading = (phase[:, None] + 2 * np.pi * np.arange(each) / each).ravel() % (2 * np.pi)
     start = np.repeat(sources, each, 0)
-    free = free_lengths(space, start, heading, config)
-    of_sources = (np.repeat(values, each) for values in (np.arange(n, dtype=np.int32), room, test))
+    bare = free_lengths(space, start, heading, config)
+    small_w = strew(space, sources, config, rng)
+    free = bare & clear_of(small_w, sources, heading.reshape(n, each), config).reshape(bare.shape)
+    of_sources = (np.repeat(values, each, 0) for values in (np.arange(n, dtype=np.int32), room, test, small_w))
     every = Passages(start, heading, free, *of_sources)
-    scored = free[:, config.passage_column]
-    kept = [balanced(np.flatnonzero(every.test == held), scored, rng) for held in (False, True)]
+    scored, rows = free[:, config.passage_column], np.arange(len(free))
+    if config.objects:
+        rows = fewer_at_furniture(bare[:, config.passage_column], scored, rng)
+    kept = [balanced(rows[every.test[rows] == held], scored, rng) for held in (False, True)]
     return every.take(np.sort(np.concatenate(kept)))
 
 

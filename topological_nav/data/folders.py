@@ -17,6 +17,7 @@ from PIL import Image
 
 from interactive_nav import get_robot, load_scene
 from interactive_nav.robots import RobotSpec
+from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.scenes.scene import Scene
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import FileError, readable
@@ -27,7 +28,7 @@ from interactive_nav_common.untrusted.reading import read_npz
 from interactive_nav_common.versions import usable_cores
 from scenes_mjcf.look import CameraPose, Lens
 from topological_nav.config import CameraConfig
-from topological_nav.scenes.rendering import SceneRenderer, need_engine
+from topological_nav.scenes.rendering import Bodies, SceneRenderer, need_engine
 
 Config = TypeVar("Config", bound=CameraConfig)
 
@@ -106,22 +107,23 @@ def lens_of(config: CameraConfig, robot: RobotSpec) -> Lens:
 
 
 def draw_missing(
-    scenes: Iterable[tuple[str, Callable[[], Scene], Iterable[tuple[Path, list[CameraPose]]]]],
+    scenes: Iterable[tuple[str, Callable[[], Scene], Iterable[tuple[Path, list[CameraPose], Bodies | None]]]],
     total: int,
     config: CameraConfig,
     progress: Progress,
+    small: Sequence[SmallObject] = (),
 ) -> None:
-    """Render the files of images that do not exist yet."""
-    lens = lens_of(config, get_robot(config.robot))
+    """Render the files of images that do not exist yet; a file's bodies are where its small objects lie."""
+    how = lens_of(config, get_robot(config.robot)), config.supersample, config.engine, small
 
     def missing() -> Iterator[Callable[[], tuple[str, int]]]:
         for name, load, files in scenes:
-            renderer = functools.cache(lambda load=load: SceneRenderer(load(), lens, config.supersample, config.engine))
-            for path, poses in files:
+            renderer = functools.cache(lambda load=load: SceneRenderer(load(), *how))
+            for path, poses, bodies in files:
                 ends, sheets = np.cumsum([len(pose.pos_w) for pose in poses]), []
                 if not path.is_file():  # drawn together, in full batches
                     every = (np.concatenate([getattr(p, leaf) for p in poses]) for leaf in ("pos_w", "axes_w"))
-                    sheets = np.split(renderer().draw(CameraPose(*every)), ends[:-1])
+                    sheets = np.split(renderer().draw(CameraPose(*every), bodies), ends[:-1])
                 yield functools.partial(_write, path, sheets, config.quality, name, int(ends[-1]))
 
     done = 0

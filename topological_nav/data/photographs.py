@@ -80,7 +80,8 @@ def import_photographs(folder: Path, out: Path, config: DataConfig, scene: Path 
         test[mine] = held_out(len(mine), config.test_share, rng)
     judged = np.flatnonzero(np.isfinite(where[:, 3]))
     free, of = where[judged, 3:4] >= np.asarray(config.passage_lengths_m), place[judged]
-    looks = Passages(where[judged, :2], np.deg2rad(where[judged, 2]), free, of, label[of], test[of])
+    heading, nothing = np.deg2rad(where[judged, 2]), np.zeros((len(of), 0, 3))
+    looks = Passages(where[judged, :2], heading, free, of, label[of], test[of], nothing)
     sides = (np.flatnonzero(test[of] == held) for held in (False, True))
     kept = np.sort(np.concatenate([balanced(side, free[:, config.passage_column], rng) for side in sides]))
     rooms, path = Rooms(xy, label, "photographs", "table"), folder / "connectivity.csv"

@@ -276,11 +276,11 @@ def draw_drives(scene_folders: Sequence[Path], out: Path, progress: Progress = l
                 raise FileError(f"{folder}: is not the scene that was driven in; drive again")
             return there
 
-        def files(index: int, name: str) -> Iterator[tuple[Path, list[CameraPose]]]:
+        def files(index: int, name: str) -> Iterator[tuple[Path, list[CameraPose], None]]:
             (out / name).mkdir(exist_ok=True)
             for path, rows in _image_files(out, name, index, drives, config):
                 poses = [drives.pose_w[drives.rows(k)] for k in rows]
-                yield path, [camera_pose(robot, p[:, :2], p[:, 2], np.zeros(len(p))) for p in poses]
+                yield path, [camera_pose(robot, p[:, :2], p[:, 2], np.zeros(len(p))) for p in poses], None
 
         drawn = [
             (about["name"], functools.partial(scene, folder, about["digest"]), files(index, about["name"]))

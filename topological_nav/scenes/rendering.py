@@ -39,6 +39,8 @@ Bodies = tuple[Sequence[str], np.ndarray, np.ndarray]
 Camera = Callable[..., np.ndarray]
 """Places [n, 2] (m), headings [n] (rad) and the world's `qpos` [n, nq] to images from there [n, ...]; None: a world at
 rest, without small objects."""
+HIDDEN_M = -50.0
+"""Height of small objects that an image does not show."""
 CONTROL = "twist"
 """Control mode whose action is a base velocity."""
 
@@ -81,7 +83,7 @@ class SceneRenderer:
         self._model = _visual_model(scene, self._large, small)
         self._data = mujoco.MjData(self._model)
         for name in body_names(small):
-            self._data.qpos[self._model.joint(f"{name}_joint").qposadr[0] + 2] = -50.0
+            self._data.qpos[self._model.joint(f"{name}_joint").qposadr[0] + 2] = HIDDEN_M
         mujoco.mj_forward(self._model, self._data)
         self._sizes = batch_sizes(self._large, jax.default_backend()) if engine == "warp" else (1,)
         self._painter = functools.cache(
