@@ -37,10 +37,6 @@ BEFORE_M = (0.15, 0.85)
 """From a doorway's middle to a piece that narrows it, along the way through."""
 PASSAGE_M = (0.15, 0.60)
 """Clearance in the middle of what is taken for a passage."""
-
-
-FAR_M = 0.65
-"""Clearance beyond which more makes no difference."""
 DOUBT_M = (-0.02, 0.08)
 """Radii this much smaller and larger are measured: a gap counts as barred where the smaller does not pass and as open
 where the larger does. Maps come out a centimetre or two off, and planners on a grid of 5 cm keep 6 to 8 cm away."""
@@ -66,54 +62,26 @@ class Passages:
 
     def __init__(self, home: Home):
         self.home = home
-        floor = home.floor
-        static = floor.inside & ~floor.fixed
+        static = home.floor.inside & ~home.floor.fixed
         self.ways = {
             robot: [Ways.of(static, CELL_M, disc.radius_m + more) for more in DOUBT_M] for robot, disc in ROBOTS.items()
         }
-        self.room_m = {robot: np.minimum(clearance(floor.free(robot), CELL_M), FAR_M) for robot in self.ways}
-        """Robot -> clearance of the floor as the furniture stands, up to `FAR_M`."""
-        self.shares = {
-            robot: Shares(*(way.must_push_share(self.room_m[robot]) for way in ways))
-            for robot, ways in self.ways.items()
-        }
-        """Robot -> shares of the pairs between which it must push."""
+        self.shares, self.room_m = self.measured()
         self.bars: dict[int, bool] = {}
         """Id of a piece -> whether it bars a passage as the furniture stands; others were not looked at."""
 
-    def nearer(self, standing: list[Standing]) -> tuple[dict[str, Shares], dict[str, np.ndarray]] | None:
-        """Return the current `shares` and `room_m` if they are nearer to the wanted ranges than before, else None."""
-        unknown = dict.fromkeys(self.ways, Shares(math.inf, -math.inf))  # misses nothing
-
-        def with_one(shares: dict[str, Shares], robot: str, bound: str, share: float) -> dict[str, Shares]:
-            return shares | {robot: shares[robot]._replace(**{bound: share})}
-
-        every = [(robot, bound) for robot in self.ways for bound in Shares._fields]
-        every.sort(key=lambda one: -self.miss(with_one(unknown, *one, getattr(self.shares[one[0]], one[1]))))
-        shares, room_m, most = unknown, dict[str, np.ndarray](), self.miss() - LEAST_GAIN
-        for robot, bound in every:
-            if robot not in room_m:
-                room_m[robot] = self.room_after(standing, robot)
-            way = self.ways[robot][Shares._fields.index(bound)]
-            shares = with_one(shares, robot, bound, way.must_push_share(room_m[robot]))
-            if self.miss(shares) >= most:
-                return None
+    def measured(self) -> tuple[dict[str, Shares], dict[str, np.ndarray]]:
+        """Return by robot the shares of pairs between which it must push, and the clearance (m), as things stand."""
+        room_m = {robot: clearance(self.home.floor.free(robot), CELL_M) for robot in self.ways}
+        shares = {
+            robot: Shares(*(way.must_push_share(room_m[robot]) for way in ways)) for robot, ways in self.ways.items()
+        }
         return shares, room_m
 
-    def room_after(self, standing: list[Standing], robot: str) -> np.ndarray:
-        """Return a robot's `room_m` as the furniture stands now, where it stood as listed when that was measured."""
-        floor, reach = self.home.floor, math.ceil(FAR_M / CELL_M)
-        room_m = self.room_m[robot].copy()
-        gone, come = _changed(standing, floor.standing)
-        for piece in gone + come:
-            # What is farther than `FAR_M` from a piece does not feel it, nor what is farther than that from there.
-            near, around = (
-                tuple(slice(max(s.start - k * reach, 0), s.stop + k * reach) for s in piece.window) for k in (1, 2)
-            )
-            inner = tuple(slice(n.start - a.start, n.stop - a.start) for n, a in zip(near, around, strict=True))
-            free = floor.inside[around] & (floor.below[robot][around] == 0)
-            room_m[near] = np.minimum(clearance(free, CELL_M), FAR_M)[inner]
-        return room_m
+    def nearer(self) -> tuple[dict[str, Shares], dict[str, np.ndarray]] | None:
+        """Return what is `measured` now if it is nearer to the wanted ranges than before, else None."""
+        shares, room_m = self.measured()
+        return (shares, room_m) if self.miss(shares) < self.miss() - LEAST_GAIN else None
 
     def miss(self, shares: dict[str, Shares] | None = None) -> float:
         """Return how far shares (those measured last) lie from the wanted ranges, summed."""
@@ -133,7 +101,7 @@ class Passages:
         floor, cfg = self.home.floor, self.home.cfg
         standing = list(floor.standing)
         if change() and floor.share > cfg.furniture_share - SHARE_TOLERANCE:
-            measured = self.nearer(standing)
+            measured = self.nearer()
             if measured is not None:
                 (self.shares, self.room_m), self.bars = measured, {}
                 return True
@@ -250,10 +218,9 @@ def _clear(home: Home, passages: Passages) -> None:
     rooms = [piece.room, *(int(k) for k in rng.permutation(len(home.plan.rooms))[:3])]
 
     def change() -> bool:
-        standing = floor.standing
         floor.remove(piece)
         if id(piece) not in passages.bars:
-            passages.bars[id(piece)] = passages.nearer(standing) is not None
+            passages.bars[id(piece)] = passages.nearer() is not None
         if not passages.bars[id(piece)]:
             return False
         takes = (room for room in rooms if home.takes([model.category], room))
