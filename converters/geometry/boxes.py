@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull, QhullError
 
-from converters.geometry.faces import face_areas, face_vectors
+from converters.geometry.faces import face_areas
 from interactive_nav_common.rotations import yaw_matrix
 
 MIN_THICKNESS_M = 0.01
@@ -63,19 +63,9 @@ class OrientedBox:
 
 
 def hull_of(points: np.ndarray) -> Hull:
-    """Return the convex hull of (n, 3) points: the arrays of `trimesh.convex.convex_hull` in a quarter of its time."""
-    try:
-        hull = ConvexHull(points, qhull_options="QbB Pp Qt")
-    except QhullError:
-        hull = ConvexHull(points, qhull_options="QJ")
-    used = np.sort(hull.vertices)
-    vertices, faces = hull.points[used], np.searchsorted(used, hull.simplices)
-    normals = face_vectors(vertices, faces)
-    some = np.linalg.norm(normals, axis=1) > 1e-14
-    faces, normals = faces[some], normals[some]
-    inwards = ((vertices[faces[:, 0]] - vertices.mean(axis=0)) * normals).sum(axis=1) < 0
-    faces[inwards] = faces[inwards, ::-1]
-    return Hull(vertices, faces.astype(np.int64))
+    """Return the convex hull of (n, 3) points."""
+    mesh = trimesh.convex.convex_hull(points)
+    return Hull(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64))
 
 
 def convex_hull(points: np.ndarray) -> Hull:
