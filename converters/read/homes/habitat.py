@@ -5,11 +5,10 @@ files and URDFs, or are mesh files. A `*semantic_lexicon.json` gives objects the
 """
 
 import collections
-import contextlib
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -20,6 +19,8 @@ from converters.read.obj import TexturedMesh
 from converters.read.urdf import placed, read_urdf, urdf_fronts
 from converters.records.errors import PARTS, SceneRejected, check_count
 from converters.records.raw import RawScene
+from interactive_nav_common.config import Bounds
+from interactive_nav_common.records import Reader
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, matrix_from_quat, transform
 
 SCENE, STAGE, OBJECT, ARTICULATED = (
@@ -38,6 +39,8 @@ KEYS = {
 """The keys that are read, or that change neither place, size nor colour."""
 DEFAULT_MASS_KG = 1.0
 """Habitat's default."""
+Number = Annotated[float, Bounds(-1e6, 1e6)]
+_DATASET = Reader(SceneRejected, "mend the dataset")
 
 
 def scenes_of(root: Path) -> list[Path]:
@@ -84,11 +87,8 @@ class _Reader:
         instances = []
         kinds = {"stage_instance": STAGE, "object_instances": OBJECT, "articulated_object_instances": ARTICULATED}
         for key, kind in kinds.items():
-            value = scene.get(key, [])
-            listed = [value] if kind == STAGE else value
-            if not isinstance(listed, list) or not all(isinstance(i, dict) for i in listed):
-                what = "an object of keys and values" if kind == STAGE else "a list of objects"
-                raise SceneRejected(f"{path}: {key} is {_short(value)}, expected {what}")
+            value = [scene[key]] if kind == STAGE else scene.get(key, [])
+            listed = _DATASET.typed(value, list[dict[str, Any]], f"{path}: {key}")
             instances += [(instance, kind) for instance in listed]
         check_count(path, len(instances), PARTS, "instances")
         self._count(scene, "scene")
@@ -97,7 +97,7 @@ class _Reader:
 
     def _count(self, about: dict[str, Any], kind: str) -> None:
         """Count the keys that are not read."""
-        self.dropped.update(f"{_short(key)[1:-1]} (not read)" for key in about if key not in KEYS[kind].split())
+        self.dropped.update(f"{key:.60} (not read)" for key in about if key not in KEYS[kind].split())
 
     def _parts(self, instance: dict[str, Any], kind: str, local: bool, path: Path) -> Iterator[HomePart]:
         self._count(instance, "instance")
@@ -149,9 +149,7 @@ class _Reader:
         mass = _value(about, "mass", DEFAULT_MASS_KG, config) if kind == OBJECT else None
         friction = _value(about, "friction_coefficient", 0.0, config)
         number = about.get("semantic_id") if kind == OBJECT else None
-        if not isinstance(number, int | None):
-            raise SceneRejected(f"{config}: semantic_id is {_short(number)}, expected a whole number")
-        label = self._classes.get(number, "")
+        label = self._classes.get(_DATASET.typed(number, int | None, f"{config}: semantic_id"), "")
         title = Path(name).name + (f"_{label}" if label else "")
         friction = friction if 0 < friction <= 2 else None
         return [HomePart(title, transform(np.eye(3), origin), render, collision, False, mass, friction)]
@@ -210,43 +208,20 @@ class _Reader:
         return max(paths, key=lambda p: sum(part in p.parts for part in folders), default=None)
 
     def _table(self, path: Path) -> dict[str, Any]:
-        value = read_json(self.source.use(self.source.inside(path), ""))
-        if not isinstance(value, dict):
-            raise SceneRejected(f"{path}: holds {_short(value)}, expected an object of keys and values")
-        return value
+        return _DATASET.typed(read_json(self.source.use(self.source.inside(path), "")), dict[str, Any], str(path))
 
     def _lexicon(self) -> dict[Any, str]:
         """Return class number -> name."""
         names: dict[Any, str] = {}
         for path in (p for same in self._files.values() for p in same if p.name.endswith(LEXICON)):
-            classes = self._table(path).get("classes", [])
-            if not isinstance(classes, list):
-                raise SceneRejected(f"{path}: classes is {_short(classes)}, expected a list")
-            for entry in classes:
+            for entry in _DATASET.typed(self._table(path).get("classes", []), list[Any], f"{path}: classes"):
                 if isinstance(entry, dict) and isinstance(entry.get("id"), int) and isinstance(entry.get("name"), str):
                     names[entry["id"]] = entry["name"]
         return names
 
 
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) < 60 else f"{text[:57]}..."
-
-
 def _value(parent: dict[str, Any], key: str, default: Any, path: Path) -> Any:
     """Return a text, a number, or as many numbers as the default has."""
-    value = parent.get(key, default)
-    if isinstance(default, str):
-        fits, expected = isinstance(value, str), "text"
-    elif isinstance(default, float):
-        fits = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e6
-        value, expected = float(value) if fits else value, "a number below 1e6"
-    else:
-        numbers, expected = np.full(1, np.nan), f"{len(default)} usable numbers"
-        with contextlib.suppress(TypeError, ValueError, OverflowError):
-            numbers = np.array(value, float)
-        fits = numbers.shape == np.shape(default) and (np.abs(numbers) <= 1e6).all()
-        value = numbers if fits else value
-    if not fits:
-        raise SceneRejected(f"{path}: {key} is {_short(value)}, expected {expected}")
-    return value
+    hint = {str: str, float: Number}.get(type(default)) or tuple[(Number,) * len(default)]
+    value = _DATASET.typed(parent.get(key, default), hint, f"{path}: {key}")
+    return np.array(value) if isinstance(default, tuple) else value
