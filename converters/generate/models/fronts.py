@@ -13,7 +13,7 @@ import numpy as np
 
 from converters.generate.models.cad import CadModel, Instance, as_drawn, cad_model
 from converters.generate.models.parts import Part, box
-from converters.geometry.faces import compacted, loose_parts
+from converters.geometry.faces import compacted, loose_parts, stacked
 from converters.records.raw import UP, ScannedHinge, VisualMesh
 from interactive_nav_common.rotations import transformed
 from scenes_mjcf.categories import CATEGORIES
@@ -225,13 +225,9 @@ def _cut(surface: VisualMesh, faces: np.ndarray) -> VisualMesh:
 
 def _with_tray(surface: VisualMesh, tray: tuple[Part, ...]) -> VisualMesh:
     """Return a surface and parts in the colour of its first corner."""
-    vertices, faces = [surface.vertices], [surface.faces]
-    for part in tray:
-        faces.append(part.faces + sum(map(len, vertices)))
-        vertices.append(part.vertices)
-    corners = np.zeros((sum(map(len, faces[1:])), 3), np.int64)
-    uv_faces = np.vstack([surface.uv_faces, corners])
-    return dataclasses.replace(surface, vertices=np.vstack(vertices), faces=np.vstack(faces), uv_faces=uv_faces)
+    vertices, faces = stacked([(surface.vertices, surface.faces), *((part.vertices, part.faces) for part in tray)])
+    corners = np.zeros((len(faces) - len(surface.faces), 3), np.int64)
+    return dataclasses.replace(surface, vertices=vertices, faces=faces, uv_faces=np.vstack([surface.uv_faces, corners]))
 
 
 def carcass(model: CadModel, cut: tuple[Opening, ...]) -> CadModel:

@@ -11,6 +11,7 @@ from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.finishes import Colouring
 from converters.generate.surface.sides import OTHER, Side, Span
 from converters.generate.surface.texture import Chart, piece_charts, plain
+from converters.geometry.faces import face_vectors
 from converters.records.raw import OTHER_PROP
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, yaw_matrix
 
@@ -116,9 +117,8 @@ def _on_worktops(items: Sequence[Instance], rng: np.random.Generator) -> Iterato
         if rng.random() < BARE:
             continue
         solid = item.model.surface or item.model.parts[-1]
-        corners = solid.vertices[solid.faces]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        level, of = np.unique(np.round(corners[:, :, 1].mean(axis=1), 3), return_inverse=True)
+        normal = face_vectors(solid.vertices, solid.faces)
+        level, of = np.unique(np.round(solid.vertices[solid.faces, 1].mean(axis=1), 3), return_inverse=True)
         area = np.bincount(of, np.where(normal[:, 1] > 0.99 * np.linalg.norm(normal, axis=1), normal[:, 1], 0.0))
         foot = item.to_floor(np.array([item.model.center * [1, 0, 1] + [0, level[np.argmax(area)], 0]]))[0]
         turn = yaw_matrix(item.yaw_rad + rng.uniform(-0.3, 0.3)) @ Y_UP_TO_Z_UP

@@ -15,7 +15,7 @@ from converters.generate.homes.building import Plan
 from converters.generate.homes.config import HomeConfig
 from converters.generate.homes.space import GRID_M, cell_centres, free_grid, room_mask
 from converters.generate.models.cad import Instance
-from converters.geometry.faces import compacted, loose_parts, vertex_normals
+from converters.geometry.faces import compacted, face_vectors, loose_parts, vertex_normals
 from converters.records.raw import FLOOR, WALL
 from interactive_nav_common.grids import clearance
 from scenes_mjcf.categories import TABLE
@@ -52,12 +52,11 @@ class Solid:
 
 def solid_from_mesh(vertices: np.ndarray, faces: np.ndarray, label: int, material: str, owner: int) -> Solid:
     """Return a convex mesh as half-spaces, equal planes merged."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    normals = np.cross(b - a, c - a)
+    normals = face_vectors(vertices, faces)
     area = np.linalg.norm(normals, axis=1)
     keep = area > 1e-10
     normals = normals[keep] / area[keep, None]
-    offsets = np.einsum("ij,ij->i", normals, a[keep])
+    offsets = np.einsum("ij,ij->i", normals, vertices[faces[keep, 0]])
     _, first = np.unique(np.round(np.column_stack([normals, offsets]), 4), axis=0, return_index=True)
     return Solid(normals[first], offsets[first], vertices.min(axis=0), vertices.max(axis=0), label, material, owner)
 

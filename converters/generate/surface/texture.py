@@ -5,6 +5,7 @@ in the building and patterns continue across charts. Faces are one-sided, counte
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -238,6 +239,7 @@ class Chart:
     lit_as: np.ndarray | None = None
     """(3,) normal that light falls on instead of the patch's: of thin things at a wall, whose edges are not dark."""
 
+    @functools.cached_property
     def frame(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return its rectangle: corner (3,), unit edges (2, 3) and normal (3,), size (2,) in metres."""
         normal = face_vectors(self.vertices, self.faces).sum(axis=0)
@@ -250,6 +252,18 @@ class Chart:
         flat = (self.vertices - middle) @ axes.T
         low = flat.min(axis=0)
         return middle + low @ axes, axes, normal, flat.max(axis=0) - low
+
+    @property
+    def size_m(self) -> np.ndarray:
+        """Return the (2,) size of its rectangle."""
+        return self.frame[3]
+
+    def grid(self, n: np.ndarray, step_m: np.ndarray, first: float) -> np.ndarray:
+        """Return (n[0] * n[1], 3) places, rows along the second edge, clamped to the patch."""
+        corner, axes, _, size_m = self.frame
+        s, t = (np.clip((np.arange(n[k]) + first) * step_m[k], 0, size_m[k]) for k in range(2))
+        st = np.stack(np.meshgrid(s, t), axis=-1).reshape(-1, 2)
+        return corner + st[:, :1] * axes[0] + st[:, 1:] * axes[1]
 
 
 def plain(colour: Sequence[float] | np.ndarray) -> Colouring:
@@ -275,53 +289,37 @@ def piece_charts(vertices: np.ndarray, faces: np.ndarray, label: int, material: 
     return [Chart(*compacted(vertices, faces[chart == k]), *about) for k in range(n)]
 
 
-@dataclasses.dataclass(frozen=True)
-class _Laid:
-    chart: Chart
-    corner: np.ndarray
-    axes: np.ndarray
-    normal: np.ndarray
-    size_m: np.ndarray
-
-    def grid(self, n: np.ndarray, step_m: np.ndarray, first: float) -> np.ndarray:
-        """Return (n[0] * n[1], 3) places, rows along the second edge, clamped to the patch."""
-        s, t = (np.clip((np.arange(n[k]) + first) * step_m[k], 0, self.size_m[k]) for k in range(2))
-        st = np.stack(np.meshgrid(s, t), axis=-1).reshape(-1, 2)
-        return self.corner + st[:, :1] * self.axes[0] + st[:, 1:] * self.axes[1]
-
-
-def _lit(laid: list[_Laid], light: Light) -> list[np.ndarray]:
+def _lit(charts: list[Chart], light: Light) -> list[np.ndarray]:
     """Compute for each patch (rows, columns, 3) brightness on a coarse grid from corner to corner, all at once."""
-    counts = [np.maximum(np.ceil(q.size_m / LIGHT_M).astype(int), 1) + 1 for q in laid]
-    places = [q.grid(n, q.size_m / (n - 1), 0.0) for q, n in zip(laid, counts, strict=True)]
-    normals = [q.normal if q.chart.lit_as is None else q.chart.lit_as for q in laid]
+    counts = [np.maximum(np.ceil(c.size_m / LIGHT_M).astype(int), 1) + 1 for c in charts]
+    places = [c.grid(n, c.size_m / (n - 1), 0.0) for c, n in zip(charts, counts, strict=True)]
+    normals = [c.frame[2] if c.lit_as is None else c.lit_as for c in charts]
     normals = np.repeat(normals, [len(p) for p in places], axis=0)
     values = light(np.concatenate(places), normals)
     ends = np.cumsum([len(p) for p in places])[:-1]
     return [v.reshape(n[1], n[0], 3) for v, n in zip(np.split(values, ends), counts, strict=True)]
 
 
-def _texels(laid: _Laid, n: np.ndarray, density: np.ndarray, grid: np.ndarray | None) -> np.ndarray:
+def _texels(chart: Chart, n: np.ndarray, density: np.ndarray, grid: np.ndarray | None) -> np.ndarray:
     """Return (rows, columns, 3) colours of one patch with its margin, first row lowest."""
-    chart = laid.chart
     if isinstance(chart.paint, np.ndarray):
         return np.pad(chart.paint[::-1], ((MARGIN, MARGIN), (MARGIN, MARGIN), (0, 0)), mode="edge")
     wide = n + 2 * MARGIN
-    colour = chart.paint(laid.grid(wide, 1 / density, 0.5 - MARGIN)).reshape(wide[1], wide[0], 3)
+    colour = chart.paint(chart.grid(wide, 1 / density, 0.5 - MARGIN)).reshape(wide[1], wide[0], 3)
     if grid is None:
         return colour
-    s, t = ((np.arange(wide[k]) + 0.5 - MARGIN) / density[k] / max(laid.size_m[k], 1e-9) for k in range(2))
+    s, t = ((np.arange(wide[k]) + 0.5 - MARGIN) / density[k] / max(chart.size_m[k], 1e-9) for k in range(2))
     lattice = [np.linspace(0.0, 1.0, n) for n in grid.shape[:2]]
     places = np.meshgrid(np.clip(t, 0, 1), np.clip(s, 0, 1), indexing="ij")
     return colour * RegularGridInterpolator(lattice, grid)(tuple(places))
 
 
-def _packed(laid: list[_Laid]) -> tuple[int, float, list[np.ndarray], np.ndarray]:
+def _packed(charts: list[Chart]) -> tuple[int, float, list[np.ndarray], np.ndarray]:
     """Return side of the sheet, factor on the resolution, texels (columns, rows) and corner of each patch."""
-    finer, paints = 1.0, [q.chart.paint for q in laid]
-    images = [np.array(paint.shape[1::-1]) if isinstance(paint, np.ndarray) else None for paint in paints]
+    finer = 1.0
+    images = [np.array(c.paint.shape[1::-1]) if isinstance(c.paint, np.ndarray) else None for c in charts]
     while True:
-        sizes = [np.ceil(np.round(q.size_m * q.chart.texels_per_m * finer, 6)).astype(int) for q in laid]
+        sizes = [np.ceil(np.round(c.size_m * c.texels_per_m * finer, 6)).astype(int) for c in charts]
         sizes = [np.maximum(n, 1) if image is None else image for n, image in zip(sizes, images, strict=True)]
         wide = np.array(sizes) + 2 * MARGIN
         for side in SHEETS:
@@ -335,27 +333,26 @@ def _packed(laid: list[_Laid]) -> tuple[int, float, list[np.ndarray], np.ndarray
 
 def assemble(charts: list[Chart], light: Light) -> tuple[Scan, Atlas]:
     """Join patches into one mesh, no vertex in two of them, and paint its sheet, whose side is one of `SHEETS`."""
-    laid = [_Laid(c, *c.frame()) for c in charts]
     first: dict[int, int] = {}
     sheet_of = [first.setdefault(id(c.paint) if c.uv is not None else -1 - k, k) for k, c in enumerate(charts)]
     drawn = sorted(set(sheet_of))
-    side, finer, sizes, corners = _packed([laid[k] for k in drawn])
+    side, finer, sizes, corners = _packed([charts[k] for k in drawn])
     shaded = [k for k in drawn if not charts[k].glows and charts[k].uv is None]
-    grids = dict(zip(shaded, _lit([laid[k] for k in shaded], light), strict=True))
+    grids = dict(zip(shaded, _lit([charts[k] for k in shaded], light), strict=True))
     sheet = np.full((side, side, 3), 0.8)
     place = {}
     for k, n, corner in zip(drawn, sizes, corners, strict=True):
         density = np.full(2, charts[k].texels_per_m * finer)
         place[k] = corner + MARGIN, density, n
         x, y = corner
-        sheet[y : y + n[1] + 2 * MARGIN, x : x + n[0] + 2 * MARGIN] = _texels(laid[k], n, density, grids.get(k))
+        sheet[y : y + n[1] + 2 * MARGIN, x : x + n[0] + 2 * MARGIN] = _texels(charts[k], n, density, grids.get(k))
     uv = []
-    for q, k in zip(laid, sheet_of, strict=True):
+    for chart, k in zip(charts, sheet_of, strict=True):
         corner, density, n = place[k]
-        if q.chart.uv is not None:
-            uv.append(corner + q.chart.uv * n)
+        if chart.uv is not None:
+            uv.append(corner + chart.uv * n)
         else:
-            uv.append(corner + (q.chart.vertices - q.corner) @ q.axes.T * density)
+            uv.append(corner + (chart.vertices - chart.frame[0]) @ chart.frame[1].T * density)
     vertices, faces = stacked((c.vertices, c.faces) for c in charts)
     uv, uv_faces = stacked(zip(uv, (c.faces if c.uv_faces is None else c.uv_faces for c in charts), strict=True))
     labels = np.repeat([c.label for c in charts], [len(c.vertices) for c in charts]).astype(np.uint8)
