@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from converters.check.gates import LIMITS, eroded, free_space_values, judge
+from converters.check.gates import LIMITS, free_space_values, judge
 from interactive_nav.scenes.scene import load_scene
-from interactive_nav_common.grids import label
+from interactive_nav_common.grids import clearance, label
 from scenes_mjcf.schema import SceneManifest, load_manifest, load_maps
 from scenes_mjcf.sets import packaged_set
 from topological_nav.scenes.space import recorded_rooms
@@ -98,11 +98,11 @@ def test_gates_pass_and_mujoco_loads_it(name):
 def test_robots_reach_all_rooms_through_the_static_structure(name):
     maps = load_maps(SCENES / name)
     for radius_m in (0.18, 0.30):  # TurtleBot, Fetch
-        pieces, count = label(eroded(maps.traversable, maps.resolution_m, radius_m))
+        pieces, count = label(clearance(maps.traversable, maps.resolution_m) >= radius_m)
         size = np.bincount(pieces.ravel())[1:] * maps.resolution_m**2
         # Slivers between a cupboard and a corner may be cut off; a room may not.
         assert count and size.sum() - size.max() < 0.5
-    pieces, _ = label(eroded(maps.traversable, maps.resolution_m, 0.45))
+    pieces, _ = label(clearance(maps.traversable, maps.resolution_m) >= 0.45)
     assert np.bincount(pieces.ravel())[1:].max() * maps.resolution_m**2 > 5.0  # JackRabbot
 
 

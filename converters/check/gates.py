@@ -109,14 +109,9 @@ def physical_values(model: mujoco.MjModel, named: dict[str, str] | None = None) 
     }
 
 
-def eroded(traversable: np.ndarray, resolution_m: float, radius_m: float) -> np.ndarray:
-    """Return cells whose middle is at least the radius from all that is not traversable, map edge included."""
-    return clearance(traversable, resolution_m) >= radius_m
-
-
 def _largest_piece(maps: SceneMaps) -> tuple[np.ndarray, np.ndarray]:
     """Return connected cells where the disc's middle may be, and every cell's distance to them, m."""
-    piece = largest_component(eroded(maps.traversable, maps.resolution_m, ROBOT_RADIUS_M))
+    piece = largest_component(clearance(maps.traversable, maps.resolution_m) >= ROBOT_RADIUS_M)
     distance = ndimage.distance_transform_edt(~piece, sampling=maps.resolution_m)
     return piece, np.asarray(distance) if piece.any() else np.full(piece.shape, np.inf)
 

@@ -17,7 +17,6 @@ from converters.check.gates import (
     LIMITS,
     check_folder,
     collide_with,
-    eroded,
     evaluate,
     free_space_values,
     free_space_warnings,
@@ -29,6 +28,7 @@ from converters.check.gates import (
 from converters.check.settle import settle
 from converters.records.errors import StageFailed
 from interactive_nav.geodesic import navigation_grid
+from interactive_nav_common.grids import clearance
 from scenes_mjcf.schema import SceneMaps, load_manifest, load_maps, save_maps
 
 
@@ -59,7 +59,7 @@ def test_judge_holds_values_against_the_table(name, value, passed):
 def test_erosion_by_hand():
     free = np.ones((20, 20), bool)
     # A cell's middle in row r is (r + 0.5) * 0.05 m from the map's edge: 0.175 in row 3, 0.225 in row 4.
-    inner = eroded(free, 0.05, 0.18)
+    inner = clearance(free, 0.05) >= 0.18
     assert inner.sum() == 12 * 12 and inner[4, 4] and not inner[3, 10]
 
 
@@ -80,7 +80,7 @@ def test_rooms_that_share_only_a_corner_are_apart_for_the_gate_as_for_the_enviro
     free = np.zeros((130, 130), bool)
     free[5:65, 5:65] = True
     free[65 - overlap : 125 - overlap, 65 - overlap : 125 - overlap] = True
-    fits = eroded(free, 0.05, 0.18)
+    fits = clearance(free, 0.05) >= 0.18
     # With 5 cells the two pieces of the eroded floor touch diagonally: a disc cannot get from one to the other.
     _, touching = ndimage.label(fits, np.ones((3, 3)))  # type: ignore[misc]
     assert touching == (1 if overlap >= 5 else 2)
