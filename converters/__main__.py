@@ -20,34 +20,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from converters.generating import (
-    CORES,
-    Build,
-    Command,
-    Decomposing,
-    Generate,
-    GenerateScenes,
-    Get,
-    ListModels,
-    ListScenes,
-    MakeScenes,
-    Models,
-    ObjectConfig,
-    OnCluster,
-)
+from converters import generating, segmenting
 from converters.records.errors import StageFailed
-from converters.segmenting import (
-    Annotate,
-    MeshFile,
-    Propose,
-    Segment,
-    SegmentScore,
-    SegmentTrain,
-    WithLibrary,
-    label_unlabelled,
-    next_step,
-    propose_unproposed,
-)
 from interactive_nav_common.commands import Flag, Words, option, parse, word
 from interactive_nav_common.config import AtLeastOne, read_words, refuse_unused
 from interactive_nav_common.errors import ConfigError, UserError, printable, readable, reports_errors
@@ -94,7 +68,7 @@ def alignment_table(rows: tuple[dict[str, Any], ...]) -> Table:
 
 
 @dataclasses.dataclass(kw_only=True)
-class Convert(OnCluster, MeshFile, WithLibrary, Decomposing):
+class Convert(generating.OnCluster, segmenting.MeshFile, segmenting.WithLibrary, generating.Decomposing):
     """Turn a raw scan with alignments into a scene folder: SRC OUT; or many: SRC... --into DIR, or @LIST --into DIR."""
 
     places: Annotated[tuple[str, ...], *word("SRC OUT")] = ()
@@ -111,7 +85,7 @@ class Convert(OnCluster, MeshFile, WithLibrary, Decomposing):
     """Of an MJCF or Gazebo home that names files outside of its folder: the folder that may be read."""
     split: Literal["train", "test"] = "train"
     """Recorded in scene.json."""
-    jobs: Annotated[AtLeastOne, option(metavar="N")] = CORES
+    jobs: Annotated[AtLeastOne, option(metavar="N")] = generating.CORES
     """Decompositions side by side; with --into, sources."""
     auto_align: Flag = False
     """Also fit library models to labelled furniture that has no annotation."""
@@ -161,8 +135,8 @@ class Convert(OnCluster, MeshFile, WithLibrary, Decomposing):
             raise ConfigError(f"convert: got {len(places)} folders, expected SRC OUT, or SRC... --into DIR")
         assert self.out is not None
         if self.segment:
-            label_unlabelled(self, console)
-            self.annotations = self.annotations or propose_unproposed(self, console)
+            segmenting.label_unlabelled(self, console)
+            self.annotations = self.annotations or segmenting.propose_unproposed(self, console)
             config = dataclasses.replace(config, auto_align=self.annotations is None)
         warn = warn_once(console)
         with stage_progress(console) as report:
@@ -187,13 +161,13 @@ class Convert(OnCluster, MeshFile, WithLibrary, Decomposing):
                 soft_wrap=True,
             )
         layout, moves = results[0].manifest.source["format"], any(result.manifest.objects for result in results)
-        if not moves and (word := next_step(self, layout)):
+        if not moves and (word := segmenting.next_step(self, layout)):
             console.print(word, soft_wrap=True, highlight=False)
         return 0 if all(g.passed for result in results for g in result.gates) else 1
 
 
 @dataclasses.dataclass(kw_only=True)
-class Object(ObjectConfig):
+class Object(generating.ObjectConfig):
     """Turn one mesh or URDF into a folder with a MuJoCo body."""
 
     source: Annotated[Path, *word("MESH_OR_URDF")]
@@ -220,7 +194,7 @@ class Object(ObjectConfig):
 
 
 @dataclasses.dataclass(kw_only=True)
-class Check(Command):
+class Check(generating.Command):
     """Run the acceptance gates on a scene folder; exit with 1 if one fails."""
 
     scene: Annotated[Path, *word("SCENE_DIR")]
@@ -245,7 +219,7 @@ class Check(Command):
 
 
 @dataclasses.dataclass(kw_only=True)
-class Preview(Command):
+class Preview(generating.Command):
     """Draw a conversion's stages from above."""
 
     scene: Annotated[Path, *word("SCENE_OR_OBJECT_DIR")]
@@ -264,7 +238,7 @@ class Preview(Command):
 
 
 @dataclasses.dataclass(kw_only=True)
-class Export(Command):
+class Export(generating.Command):
     """Draw a scene for Sweet Home 3D, to edit it there and convert it again."""
 
     scene: Annotated[Path, *word("SCENE_DIR")]
@@ -290,24 +264,24 @@ def _lines(place: str) -> list[str]:
 
 COMMANDS: dict[str, Any] = {
     "convert": Convert,
-    "segment": Segment,
-    "segment-train": SegmentTrain,
-    "segment-score": SegmentScore,
-    "propose": Propose,
-    "annotate": Annotate,
+    "segment": segmenting.Segment,
+    "segment-train": segmenting.SegmentTrain,
+    "segment-score": segmenting.SegmentScore,
+    "propose": segmenting.Propose,
+    "annotate": segmenting.Annotate,
     "object": Object,
     "check": Check,
-    "generate": Generate,
-    "generate-scenes": GenerateScenes,
-    "scenes": {"list": ListScenes, "make": MakeScenes},
-    "models": Models,
-    "library": {"get": Get, "build": Build, "list": ListModels},
+    "generate": generating.Generate,
+    "generate-scenes": generating.GenerateScenes,
+    "scenes": {"list": generating.ListScenes, "make": generating.MakeScenes},
+    "models": generating.Models,
+    "library": {"get": generating.Get, "build": generating.Build, "list": generating.ListModels},
     "preview": Preview,
     "export": Export,
 }
 
 
-def _standing(command: Command) -> dict[str, int]:
+def _standing(command: generating.Command) -> dict[str, int]:
     """Return the inode by path where the command writes: it changes once something else is put there."""
     target = glob.escape(str(getattr(command, "out", None) or getattr(command, "output", None) or ""))
     inodes = {}

@@ -19,23 +19,9 @@ from PIL import Image
 from trimesh.visual import ColorVisuals
 
 from converters.geometry.faces import merge_vertices
-from converters.read import obj
+from converters.read import obj, surfaces
 from converters.read.files import SourceFolder, as_number, check_mesh, read_labels
 from converters.read.formats.gltf import read_gltf
-from converters.read.surfaces import (
-    AXES,
-    UNITS_M,
-    check_extent,
-    faces_away,
-    find_unit,
-    find_up,
-    floor_level,
-    label_storeys,
-    labelled,
-    turn_upright,
-    welded,
-    with_split_corners,
-)
 from converters.records.errors import SceneRejected
 from converters.records.raw import RawScene
 from interactive_nav_common.errors import readable
@@ -170,33 +156,34 @@ def read_single_mesh(
 ) -> RawScene:
     """Read a scan that is one mesh file; without labels beside it, structure is recognised by its shape.
 
-    Referenced files must lie in its folder. `up` is a key of `AXES`, `unit` of `UNITS_M`; `auto` detects them.
+    Referenced files must lie in its folder. `up` and `unit` are keys of `surfaces.AXES` and `surfaces.UNITS_M`;
+    `auto` detects them.
     """
     source = SourceFolder(path.parent, strict)
     mesh = read_surface(source, source.inside(path), "give a mesh file")
     mesh = dataclasses.replace(mesh, vertices=mesh.vertices * [-1.0 if mirror else 1.0, 1.0, 1.0])
-    axis = find_up(mesh.vertices, mesh.faces, str(path)) if up == "auto" else AXES[up]
-    vertices = mesh.vertices @ turn_upright(axis).T
-    word = find_unit(vertices, mesh.faces, str(path)) if unit == "auto" else unit
+    axis = surfaces.find_up(mesh.vertices, mesh.faces, str(path)) if up == "auto" else surfaces.AXES[up]
+    vertices = mesh.vertices @ surfaces.turn_upright(axis).T
+    word = surfaces.find_unit(vertices, mesh.faces, str(path)) if unit == "auto" else unit
     tilt = math.degrees(math.acos(float(np.clip(axis[2], -1.0, 1.0))))
     if up == "auto" and tilt > 0.5:
         source.note(f"{path.name}: turned by {tilt:.1f} degrees, so that its floor is level; --up z leaves it")
     if word != "m" and unit == "auto":
         source.note(f"{path.name}: taken to be in {word}; --unit says otherwise")
-    mesh = dataclasses.replace(mesh, vertices=vertices * UNITS_M[word])
-    check_extent(str(path), mesh.vertices)
-    if faces_away(mesh.vertices, mesh.faces):
+    mesh = dataclasses.replace(mesh, vertices=vertices * surfaces.UNITS_M[word])
+    surfaces.check_extent(str(path), mesh.vertices)
+    if surfaces.faces_away(mesh.vertices, mesh.faces):
         raise SceneRejected(
             f"{path}: its floor faces down: the mesh is mirrored or inside out; give --mirror, which mirrors x, or "
             "turn the order of each face's corners if only that is wrong"
         )
-    floor_m = floor_level(mesh.vertices, mesh.faces, str(path))
+    floor_m = surfaces.floor_level(mesh.vertices, mesh.faces, str(path))
     if (beside_it := beside(path, "labels.npz")).is_file():
         given = source.use(source.inside(beside_it), "")
-        mesh, labels = labelled(mesh, read_labels(given), given)
+        mesh, labels = surfaces.labelled(mesh, read_labels(given), given)
     else:
-        mesh = with_split_corners(welded(mesh))
-        labels = label_storeys(mesh.vertices, mesh.faces, (floor_m,))
+        mesh = surfaces.with_split_corners(surfaces.welded(mesh))
+        labels = surfaces.label_storeys(mesh.vertices, mesh.faces, (floor_m,))
         source.note(f"{path.name}: has no labels: floor, walls and ceiling are told by shape, all else is part of them")
     licence = "unknown: a mesh file says none"
     return source.scene("mesh", obj.scan_of(mesh, labels), name=path.stem, floor_height_m=floor_m, licence=licence)

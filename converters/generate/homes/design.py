@@ -8,20 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from converters.generate.homes import furnish
 from converters.generate.homes.arrange import TABLES, Arrangement, GroupMember, anchored, group_of, least_of
 from converters.generate.homes.building import Building
 from converters.generate.homes.config import SHARE_TOLERANCE, GenerationError, HomeConfig, Range
 from converters.generate.homes.floor import CELL_M, Standing
-from converters.generate.homes.furnish import (
-    WIDE_M,
-    Full,
-    Home,
-    clutter_category,
-    furnish_home,
-    kinds,
-    room_set,
-    settle,
-)
 from converters.generate.homes.opening import open_fronts
 from converters.generate.homes.plans import home_plan
 from converters.generate.homes.space import rooms_joined, static_grid
@@ -60,7 +51,7 @@ class Shares(NamedTuple):
 class Passages:
     """Hold a home's floor as robots see it. Mutable, private to one search."""
 
-    def __init__(self, home: Home):
+    def __init__(self, home: furnish.Home):
         self.home = home
         static = home.floor.inside & ~home.floor.fixed
         self.ways = {
@@ -140,7 +131,7 @@ def _changed(before: list[Standing], now: list[Standing]) -> tuple[list[Standing
     return [s for s in before if id(s) not in stands], [s for s in now if id(s) not in was]
 
 
-def adjust(home: Home) -> dict[str, float]:
+def adjust(home: furnish.Home) -> dict[str, float]:
     """Move light pieces until the shares that must be pushed lie in the wanted ranges; return them by robot."""
     rng, passages = home.rng, Passages(home)
     wanted = home.cfg.must_push
@@ -171,16 +162,16 @@ def adjust(home: Home) -> dict[str, float]:
     )
 
 
-def _narrow(home: Home, passages: Passages) -> None:
+def _narrow(home: furnish.Home, passages: Passages) -> None:
     """Try one light piece in a passage."""
     rng, floor = home.rng, home.floor
     place_at = passages.narrowing(rng)
     if place_at is None:
         return
     xy, room = place_at
-    kept = kinds(room_set(home, room)).intersection(TABLES.strewn)
+    kept = furnish.kinds(furnish.room_set(home, room)).intersection(TABLES.strewn)
     alone = [s for s in passages.light() if ":" not in s.group and s.item.model.category in kept]
-    piece, category = None, clutter_category(home, room)
+    piece, category = None, furnish.clutter_category(home, room)
     if alone and (floor.share > home.cfg.furniture_share or rng.random() < 0.7):
         piece = alone[rng.integers(len(alone))]
         model, scale = piece.item.model, piece.item.scale
@@ -205,7 +196,7 @@ def _narrow(home: Home, passages: Passages) -> None:
     passages.trial(change)
 
 
-def _clear(home: Home, passages: Passages) -> None:
+def _clear(home: furnish.Home, passages: Passages) -> None:
     """Try to put one light piece that bars a passage to where its room, or another, has space for it."""
     rng, floor = home.rng, home.floor
     light = [piece for piece in passages.light() if passages.bars.get(id(piece), True)]
@@ -224,7 +215,7 @@ def _clear(home: Home, passages: Passages) -> None:
         if not passages.bars[id(piece)]:
             return False
         takes = (room for room in rooms if home.takes([model.category], room))
-        any(settle(home, model.category, alone, room, home.narrow_m) for room in takes)
+        any(furnish.settle(home, model.category, alone, room, home.narrow_m) for room in takes)
         return True
 
     passages.trial(change)
@@ -244,17 +235,17 @@ def design_home(cfg: HomeConfig, rng: np.random.Generator) -> Building:
     for _ in range(MOST_PLANS):
         plan, uses = home_plan(cfg, rng)
         try:
-            home = furnish_home(plan, uses, cfg, rng)
+            home = furnish.furnish_home(plan, uses, cfg, rng)
             shares = adjust(home)
         except GenerationError as error:
             refused = error
-            full += isinstance(error, Full)
+            full += isinstance(error, furnish.Full)
             if full == (1 if sum(r.area_m2 for r in plan.rooms) > LARGE_M2 else MOST_FULL):
                 break
             continue
         items = [s.item for s in home.floor.standing]
         plan = dataclasses.replace(plan, built_in=tuple(item for item in items if item.model.built_in))
-        if not rooms_joined(static_grid(plan), plan, WIDE_M - 0.02):
+        if not rooms_joined(static_grid(plan), plan, furnish.WIDE_M - 0.02):
             refused = GenerationError("built-in furniture bars a room: ask for more area or fewer rooms")
             continue
         movable = tuple(item for item in items if not item.model.built_in)

@@ -9,17 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.generate.homes.arrange import (
-    PLENTY_M2,
-    TABLES,
-    Arrangement,
-    GroupMember,
-    RoomSet,
-    apart,
-    arrange,
-    on_floor,
-    stand,
-)
+from converters.generate.homes import arrange
 from converters.generate.homes.building import Plan, Rect
 from converters.generate.homes.config import SHARE_TOLERANCE, GenerationError, HomeConfig
 from converters.generate.homes.doors import hang_doors
@@ -74,8 +64,8 @@ class Home:
     def fresh(self) -> Models:
         """Return the models, without those that stand in the home as often as people have the same thing."""
         models = (s.item.model for s in self.floor.standing)
-        stand = Counter(m.name for m in models if m.category not in IN_ROWS)
-        self.models.spent = {name for name, count in stand.items() if count >= ALIKE}
+        often = Counter(m.name for m in models if m.category not in IN_ROWS)
+        self.models.spent = {name for name, count in often.items() if count >= ALIKE}
         return self.models
 
     def count(self, group: str, room: int) -> int:
@@ -84,12 +74,12 @@ class Home:
 
     def takes(self, categories: Sequence[str], room: int) -> bool:
         """Return whether a room may have such pieces, and neither it nor the home would have too many of a kind."""
-        if not {c for c in categories if c in TABLES.strewn} <= kinds(room_set(self, room)):
+        if not {c for c in categories if c in arrange.TABLES.strewn} <= kinds(room_set(self, room)):
             return False
-        larger = max(self.floor.floor_cells * CELL_M**2 / PLENTY_M2, 1.0)
-        for category, more in Counter(c for c in categories if c in TABLES.most).items():
+        larger = max(self.floor.floor_cells * CELL_M**2 / arrange.PLENTY_M2, 1.0)
+        for category, more in Counter(c for c in categories if c in arrange.TABLES.most).items():
             here = [s.room == room for s in self.floor.standing if s.item.model.category == category]
-            in_room, in_home = TABLES.most[category]
+            in_room, in_home = arrange.TABLES.most[category]
             if sum(here) + more > in_room or len(here) + more > in_home * larger:
                 return False
         return True
@@ -98,7 +88,7 @@ class Home:
         """Return the first room without what it needs, or the lack of a bath; empty where all is there."""
         for room, use in enumerate(self.uses):
             have = {s.item.model.category for s in self.floor.standing if s.room == room}
-            without = [c for c in TABLES.rooms[use].needs if self.models.has(c) and c not in have]
+            without = [c for c in arrange.TABLES.rooms[use].needs if self.models.has(c) and c not in have]
             if without:
                 return f"the {use} of {self.plan.rooms[room].area_m2:.1f} m2 has no place for: {', '.join(without)}"
         baths = [c for c in BATHS if self.models.has(c)]
@@ -108,7 +98,7 @@ class Home:
 
 
 def _preference(
-    arrangement: Arrangement, places: Places, floor: Floor, room: int, rng: np.random.Generator
+    arrangement: arrange.Arrangement, places: Places, floor: Floor, room: int, rng: np.random.Generator
 ) -> np.ndarray:
     """Return (n,) how much a group likes each place."""
     liking = rng.uniform(0.0, 0.6, len(places.side))
@@ -129,19 +119,19 @@ def _preference(
 
 def _on_floor(corners: tuple[float, float, float, float], origin: np.ndarray, side: int) -> Rect:
     """Return a rectangle u0, v0, u1, v1 of a group's frame, on the floor."""
-    a, b = (on_floor(origin, side * math.pi / 2, *corner) for corner in (corners[:2], corners[2:]))
+    a, b = (arrange.on_floor(origin, side * math.pi / 2, *corner) for corner in (corners[:2], corners[2:]))
     (x0, y0), (x1, y1) = np.minimum(a, b), np.maximum(a, b)
     return Rect(x0, y0, x1, y1)
 
 
-def settle(home: Home, name: str, arrangement: Arrangement, room: int, radius_m: float) -> bool:
+def settle(home: Home, name: str, arrangement: arrange.Arrangement, room: int, radius_m: float) -> bool:
     """Stand a group in the best place where it fits and the disc still gets round; return whether there is one."""
     floor, rng = home.floor, home.rng
     ranked = []
     # Models are not quite alike on both sides: what just fits under a table may touch it where all is mirrored.
     mirrored = arrangement.mirrored()
-    loose = [stand(p, np.zeros(2), math.pi / 2) for p in mirrored.pieces if not p.model.built_in]
-    both = all(apart(a, b) for a, b in itertools.combinations(loose, 2))
+    loose = [arrange.stand(p, np.zeros(2), math.pi / 2) for p in mirrored.pieces if not p.model.built_in]
+    both = all(arrange.apart(a, b) for a, b in itertools.combinations(loose, 2))
     for way in (arrangement, mirrored) if both else (arrangement,):
         places = floor.places(way, room, rng)
         fits = floor.fitting(way, room, places)
@@ -160,16 +150,16 @@ def settle(home: Home, name: str, arrangement: Arrangement, room: int, radius_m:
             for k, piece in enumerate(way.pieces):
                 if fits[k]:
                     group = name if k == 0 else f"{name}: {piece.model.category}"
-                    floor.add(stand(piece, origin, side * math.pi / 2), room, group)
+                    floor.add(arrange.stand(piece, origin, side * math.pi / 2), room, group)
             if way.front is not None:
                 floor.keep_front(_on_floor(way.front, origin, side))
             return True
     return False
 
 
-def _few(home: Home, arrangement: Arrangement, room: int) -> Arrangement | None:
+def _few(home: Home, arrangement: arrange.Arrangement, room: int) -> arrange.Arrangement | None:
     """Return a group without the pieces that are too many of a kind; None where it needs one of them."""
-    kept: list[GroupMember] = []
+    kept: list[arrange.GroupMember] = []
     for piece in arrangement.pieces:
         if home.takes([p.model.category for p in (*kept, piece)], room):
             kept.append(piece)
@@ -180,12 +170,13 @@ def _few(home: Home, arrangement: Arrangement, room: int) -> Arrangement | None:
 
 def try_group(home: Home, name: str, room: int, radius_m: float) -> bool:
     """Try several models of a group, and shorter rows, in a room; return whether one fits within all limits."""
-    if not home.takes([TABLES.groups[name].anchor if name in TABLES.groups else name], room):
+    group = arrange.TABLES.groups.get(name)
+    if not home.takes([group.anchor if group else name], room):
         return False
-    rows = any(s.relation == "next" for s in TABLES.groups[name].satellites) if name in TABLES.groups else False
+    rows = group is not None and any(s.relation == "next" for s in group.satellites)
     most = home.cfg.furniture_share + SHARE_TOLERANCE / 2
-    for fewer in range(FEWEST + 1 if rows else REDRAWS if name in TABLES.groups else 1):
-        arrangement = arrange(name, home.fresh(), home.rng, fewer if rows else 0)
+    for fewer in range(FEWEST + 1 if rows else REDRAWS if group else 1):
+        arrangement = arrange.arrange(name, home.fresh(), home.rng, fewer if rows else 0)
         arrangement = arrangement and _few(home, arrangement, room)
         if arrangement is None:
             continue
@@ -196,10 +187,10 @@ def try_group(home: Home, name: str, room: int, radius_m: float) -> bool:
     return False
 
 
-def room_set(home: Home, room: int) -> RoomSet:
+def room_set(home: Home, room: int) -> arrange.RoomSet:
     """Return what a room has; the living room has the table where there is no dining room and the kitchen is small."""
     use = home.uses[room]
-    chosen = TABLES.rooms[use]
+    chosen = arrange.TABLES.rooms[use]
     if use == "living" and "dining" not in home.uses:
         return dataclasses.replace(chosen, base=(chosen.base[0], ("dining table", 0.9), *chosen.base[1:]))
     if use == "living" and len(home.uses) <= 2:
@@ -208,9 +199,9 @@ def room_set(home: Home, room: int) -> RoomSet:
 
 
 @functools.cache
-def kinds(has: RoomSet) -> set[str]:
+def kinds(has: arrange.RoomSet) -> set[str]:
     """Return the categories of all furniture that a room may have."""
-    groups = [TABLES.groups[name] for name, _ in (*has.base, *has.more)]
+    groups = [arrange.TABLES.groups[name] for name, _ in (*has.base, *has.more)]
     pieces = {s.category for group in groups for s in group.satellites} | {group.anchor for group in groups}
     return pieces | {category for category, _ in has.clutter}
 
@@ -242,7 +233,7 @@ def stand_clutter(home: Home) -> None:
 
 def clutter_category(home: Home, room: int) -> str | None:
     """Draw a category of what lies about in a room; return None where there are no models of any."""
-    models, table = home.fresh(), TABLES.rooms[home.uses[room]].clutter
+    models, table = home.fresh(), arrange.TABLES.rooms[home.uses[room]].clutter
     odds = [(c, w) for c, w in table if models.has(c) and home.takes([c], room)]
     if not odds:
         return None
@@ -260,15 +251,18 @@ def grow(home: Home) -> None:
     rng, cfg, floor = home.rng, home.cfg, home.floor
     tired: set[tuple[int, str]] = set()
     radius_m = WIDE_M
+
+    def fullness(room: int) -> float:
+        return floor.room_share(room) / arrange.TABLES.rooms[home.uses[room]].appetite
+
     for _ in range(MOST_ADDED):
         if floor.share >= cfg.furniture_share - SHARE_TOLERANCE / 2:
             return
-        hungry = {k: floor.room_share(k) / TABLES.rooms[use].appetite for k, use in enumerate(home.uses)}
-        for room in sorted(hungry, key=lambda k: hungry[k]):
+        for room in sorted(range(len(home.uses)), key=fullness):
             chosen = room_set(home, room)
             every = (*((g, 1.0) for g, _ in chosen.base), *chosen.more)
             every = [(g, w) for g, w in every if (room, g) not in tired]
-            groups = [(g, w) for g, w in every if home.count(g, room) < TABLES.groups[g].most]
+            groups = [(g, w) for g, w in every if home.count(g, room) < arrange.TABLES.groups[g].most]
             more_clutter = (room, "clutter") not in tired
             if not groups and (radius_m == WIDE_M or not more_clutter):
                 continue
@@ -286,11 +280,11 @@ def grow(home: Home) -> None:
                 break
             radius_m, tired = home.narrow_m, set()
     if abs(floor.share - cfg.furniture_share) > SHARE_TOLERANCE:
-        fullest = min(range(len(home.uses)), key=lambda k: floor.room_share(k) / TABLES.rooms[home.uses[k]].appetite)
-        without = ", ".join(sorted(name for room, name in tired if room == fullest)) or "anything"
+        least = min(range(len(home.uses)), key=fullness)
+        without = ", ".join(sorted(name for room, name in tired if room == least)) or "anything"
         raise Full(
             f"furniture_share is {cfg.furniture_share}: nothing more fits at {floor.share:.2f} (the emptiest room, "
-            f"{home.uses[fullest]} of {home.plan.rooms[fullest].area_m2:.1f} m2, at {floor.room_share(fullest):.2f}, "
+            f"{home.uses[least]} of {home.plan.rooms[least].area_m2:.1f} m2, at {floor.room_share(least):.2f}, "
             f"has no place for: {without}); ask for less, or for other rooms"
         )
 
