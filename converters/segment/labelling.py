@@ -24,22 +24,8 @@ from converters.propose.retrieval import annotated_vertices
 from converters.read.surfaces import floor_level, storey_of
 from converters.records.errors import SceneRejected
 from converters.records.raw import UNLABELLED, RawScene
+from converters.segment import voxels
 from converters.segment.samples import TIERS, building_surface
-from converters.segment.voxels import (
-    BELOW_M,
-    FEATURES,
-    LAYERS,
-    NAMES,
-    NYU40,
-    VOXEL_M,
-    Surface,
-    Voxels,
-    at_vertices,
-    classes_of,
-    intersection_over_union,
-    sample_surface,
-    voxelise,
-)
 from interactive_nav_common.errors import readable
 from interactive_nav_common.runs import weights
 from interactive_nav_common.signals import signals_wait
@@ -71,7 +57,7 @@ class VoxelNet(nn.Module):
             width = skip.shape[-1]
             x = jnp.concatenate([_unfold(nn.Dense(8 * width, dtype=self.dtype)(x)), skip], axis=-1)
             x = self._block(x, width)
-        return _unfold(nn.Dense(8 * len(NAMES), dtype=self.dtype)(x)).astype(jnp.float32)
+        return _unfold(nn.Dense(8 * len(voxels.NAMES), dtype=self.dtype)(x)).astype(jnp.float32)
 
     def _block(self, x: jax.Array, width: int) -> jax.Array:
         x = nn.relu(nn.LayerNorm(dtype=self.dtype)(nn.Conv(width, (3, 3, 3), dtype=self.dtype)(x)))
@@ -97,38 +83,40 @@ def dense(index: jax.Array, features: jax.Array, shape: tuple[int, int]) -> jax.
 
     Rows of the index [N, K, 3] with a negative x are padding; features are [N, K, FEATURES] int8.
     """
-    height = (index[..., 2:] + 0.5) * (VOXEL_M / 3) - BELOW_M / 3
+    height = (index[..., 2:] + 0.5) * (voxels.VOXEL_M / 3) - voxels.BELOW_M / 3
     given = jnp.concatenate([jnp.ones_like(height), height, features.astype(jnp.float32) / 127], axis=-1)
     x, y, z = (jnp.where(index[..., :1] < 0, 1 << 20, index)[..., k] for k in range(3))
     tile = jnp.arange(len(index))[:, None]
-    return jnp.zeros((len(index), *shape, LAYERS, FEATURES + 2)).at[tile, x, y, z].set(given, mode="drop")
+    return jnp.zeros((len(index), *shape, voxels.LAYERS, voxels.FEATURES + 2)).at[tile, x, y, z].set(given, mode="drop")
 
 
 Scores = Callable[[jax.Array, jax.Array, tuple[int, int]], jax.Array]
 """Index, features and shape of `dense` -> [N, X, Y, LAYERS, classes]."""
 
 
-def score_voxels(voxels: Voxels, scores: Scores, report: Callable[[float], None] = lambda share: None) -> np.ndarray:
+def score_voxels(
+    occupied: voxels.Voxels, scores: Scores, report: Callable[[float], None] = lambda share: None
+) -> np.ndarray:
     """Return (k, classes) scores of occupied voxels, tile by tile."""
-    out = np.zeros((len(voxels.index), len(NAMES)), np.float32)
-    extent = voxels.index[:, :2].max(axis=0, initial=0) + 1
+    out = np.zeros((len(occupied.index), len(voxels.NAMES)), np.float32)
+    extent = occupied.index[:, :2].max(axis=0, initial=0) + 1
     side = [min(TILE, int(-(-n // 16) * 16)) for n in extent]
     step = [s - 2 * MARGIN if n > s else s for n, s in zip(extent, side, strict=True)]
     starts = [(i, j) for i in range(0, int(extent[0]), step[0]) for j in range(0, int(extent[1]), step[1])]
     tiles = []
     for start in starts:
         low = np.array(start) - [MARGIN if n > s else 0 for n, s in zip(extent, side, strict=True)]
-        at = voxels.index[:, :2] - low
+        at = occupied.index[:, :2] - low
         near = np.flatnonzero(((at >= 0) & (at < side)).all(axis=1))
-        inner = ((voxels.index[near, :2] >= start) & (voxels.index[near, :2] < np.add(start, step))).all(axis=1)
+        inner = ((occupied.index[near, :2] >= start) & (occupied.index[near, :2] < np.add(start, step))).all(axis=1)
         if inner.any():
             tiles.append((low, near, near[inner]))
     most = max((len(near) for _, near, _ in tiles), default=0)
     for k, (low, near, inner) in enumerate(tiles):
-        index, features = np.full((1, most, 3), -1), np.zeros((1, most, FEATURES), np.int8)
-        index[0, : len(near)], features[0, : len(near)] = voxels.index[near] - [*low, 0], voxels.features[near]
+        index, features = np.full((1, most, 3), -1), np.zeros((1, most, voxels.FEATURES), np.int8)
+        index[0, : len(near)], features[0, : len(near)] = occupied.index[near] - [*low, 0], occupied.features[near]
         tile = scores(jnp.asarray(index), jnp.asarray(features), (side[0], side[1]))[0]
-        x, y, z = (voxels.index[inner] - [*low, 0]).T
+        x, y, z = (occupied.index[inner] - [*low, 0]).T
         out[inner] = np.asarray(tile[x, y, z])
         report((k + 1) / len(tiles))
     return out
@@ -138,7 +126,7 @@ def save_network(path: Path, net: VoxelNet, variables: Any) -> None:
     """Write weights of a byte each, with a factor for each output of a layer; vectors in half precision."""
     params = {name: np.asarray(value, np.float32) for name, value in weights.flat(variables["params"]).items()}
     tensors = {name: value if value.ndim > 1 else value.astype(np.float16) for name, value in params.items()}
-    about = {"task": "segment", "widths": list(net.widths), "names": list(NAMES), "voxel_m": VOXEL_M}
+    about = {"task": "segment", "widths": list(net.widths), "names": list(voxels.NAMES), "voxel_m": voxels.VOXEL_M}
     weights.write_weights(path, weights.rounded(tensors, step=0.0, least=0), about)
 
 
@@ -170,15 +158,15 @@ def load_scores(weights: Path | None = None) -> Scores:
     return scores
 
 
-def score_points(surface: Surface, floors_m: tuple[float, ...], scores: Scores, report: Report) -> np.ndarray:
+def score_points(surface: voxels.Surface, floors_m: tuple[float, ...], scores: Scores, report: Report) -> np.ndarray:
     """Return (n, classes) scores of a surface's points, storey by storey; zeros too high above a floor."""
-    out, of = np.zeros((len(surface.points), len(NAMES)), np.float32), storey_of(surface.points[:, 2], floors_m)
+    out, of = np.zeros((len(surface.points), len(voxels.NAMES)), np.float32), storey_of(surface.points[:, 2], floors_m)
     for k, floor_m in enumerate(floors_m):
         mine = np.flatnonzero(of == k)
-        voxels = voxelise(surface.rows(mine), floor_m)
-        scored = score_voxels(voxels, scores, lambda share, k=k: report("segment", (k + share) / len(floors_m)))
-        inside = voxels.of_point >= 0
-        out[mine[inside]] = scored[voxels.of_point[inside]]
+        occupied = voxels.voxelise(surface.rows(mine), floor_m)
+        scored = score_voxels(occupied, scores, lambda share, k=k: report("segment", (k + share) / len(floors_m)))
+        inside = occupied.of_point >= 0
+        out[mine[inside]] = scored[occupied.of_point[inside]]
     return out
 
 
@@ -189,15 +177,15 @@ def label_scan(raw: RawScene, scores: Scores, report: Report = lambda stage, sha
     if not floors:
         given = raw.floor_height_m
         floors = (floor_level(scan.vertices, scan.faces, raw.name) if given is None else given,)
-    surface = sample_surface(scan)
-    scored = at_vertices(score_points(surface, floors, scores, report), surface, scan.faces, len(scan.vertices))
-    return np.where(scored.any(axis=1), NYU40[scored.argmax(axis=1)], UNLABELLED)
+    surface = voxels.sample_surface(scan)
+    scored = voxels.at_vertices(score_points(surface, floors, scores, report), surface, scan.faces, len(scan.vertices))
+    return np.where(scored.any(axis=1), voxels.NYU40[scored.argmax(axis=1)], UNLABELLED)
 
 
 def score_source(raw: RawScene, scores: Scores, report: Report) -> dict[str, Any]:
     """Return IoU by class at the vertices of a labelled source, and how many annotated objects `propose` finds."""
     labels = label_scan(raw, scores, report)
-    iou = intersection_over_union(classes_of(raw.scan.labels), classes_of(labels))
+    iou = voxels.intersection_over_union(voxels.classes_of(raw.scan.labels), voxels.classes_of(labels))
     boxes, matched = [(a.category, bounds(annotated_vertices(a, raw.cads))) for a in raw.annotations], []
     for scan in (dataclasses.replace(raw.scan, labels=labels), raw.scan):
         proposed = [(p.category, bounds(p.points)) for p in propose_instances(scan)]
@@ -220,4 +208,4 @@ def score_homes(seed: int, count: int, scores: Scores, report: Report) -> dict[s
         truth.append(classes[inside])
         predicted.append(guess[inside].argmax(axis=1))
         report("score", len(truth) / count)
-    return intersection_over_union(np.concatenate(truth), np.concatenate(predicted))
+    return voxels.intersection_over_union(np.concatenate(truth), np.concatenate(predicted))
