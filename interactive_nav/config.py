@@ -279,8 +279,36 @@ class SensorConfig(CameraNoise):
         return tuple(overlay(CameraView(), view, "cameras") for view in self.cameras) or (CameraView(),)
 
 
+_Steps = Annotated[int, Bounds(0, 100)]
+
+
 @dataclasses.dataclass(frozen=True)
-class NavConfig(SensorConfig, PhysicsConfig, TaskRules):
+class RandomDynamics(Settings):
+    """Set ranges (low, high) from which each episode draws its dynamics uniformly; the defaults change nothing."""
+
+    random_mass: tuple[Positive, Positive] = (1.0, 1.0)
+    """Factor of the mass of all movable objects, drawn by episode: low,high."""
+    random_friction: tuple[Positive, Positive] = (1.0, 1.0)
+    """Factor of the friction of all movable objects, which holds on the floor, by episode: low,high."""
+    random_motor_gain: tuple[NotNegative, NotNegative] = (1.0, 1.0)
+    """Velocity of the base that the motors execute, as a share of the commanded one, by episode: low,high."""
+    random_wheel_slip: tuple[Share, Share] = (0.0, 0.0)
+    """Share of their speed that the wheels of a side lose, by episode and side: low,high."""
+    random_motor_delay_steps: tuple[_Steps, _Steps] = (0, 0)
+    """Control steps from an action to its execution, by episode: low,high. Until the first, commands are 0."""
+    random_sensor_delay_steps: tuple[_Steps, _Steps] = (0, 0)
+    """Age of observations in control steps, by episode: low,high. Until then they stay the first."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in (field.name for field in dataclasses.fields(RandomDynamics)):
+            low, high = getattr(self, name)
+            if low > high:
+                raise ConfigError(f"{name} is {(low, high)}, expected the smaller number first; write {(high, low)}")
+
+
+@dataclasses.dataclass(frozen=True)
+class NavConfig(SensorConfig, PhysicsConfig, RandomDynamics, TaskRules):
     """Settings of an environment (defaults: reference benchmark, section 11); impossible ones raise `ConfigError`."""
 
 

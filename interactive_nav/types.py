@@ -77,6 +77,16 @@ class GoalField:
 
 
 @flax.struct.dataclass
+class EpisodeDynamics:
+    """What an episode drew: setting -> value, of `random_wheel_slip` left and right. Delays of at most K steps hold
+    (K, A) commands, the newest last, and observations: of the last K + 1 steps in turn, then the episode's first."""
+
+    drawn: dict[str, jax.Array]
+    commands: jax.Array | None
+    seen: Any
+
+
+@flax.struct.dataclass
 class NavInfo:
     """The task's memory of one episode."""
 
@@ -109,6 +119,8 @@ class NavInfo:
     """The memory of each term, by its key (`interactive_nav.task.terms`)."""
     round_field: tuple[GoalField, jax.Array] | None = None
     """With `potential_round`: what the geodesic round heavy furniture needs to know, and [] bool whether it counts."""
+    dynamics: EpisodeDynamics | None = None
+    """With random dynamics."""
 
 
 @flax.struct.dataclass

@@ -68,6 +68,12 @@ def transformed(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
+def scale_sides(linear: Array, angular: Array, left: Array, right: Array, half_width_m: float) -> tuple[Array, Array]:
+    """Return a base's velocity [...], m/s and rad/s, with the speeds of its left and right side scaled."""
+    left, right = left * (linear - half_width_m * angular), right * (linear + half_width_m * angular)
+    return (left + right) / 2, (right - left) / (2 * half_width_m)
+
+
 def wrap_angle(angle_rad: Array, period_rad: float = 2 * math.pi) -> Array:
     """Return the angles wrapped to [-period/2, period/2)."""
     return (angle_rad + period_rad / 2) % period_rad - period_rad / 2

@@ -6,6 +6,7 @@ from typing import Annotated
 import numpy as np
 
 from interactive_nav_common.config import Bounds, Settings
+from interactive_nav_common.rotations import scale_sides
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +53,5 @@ class Gap:
         if not config.slip:
             return linear, angular
         rngs = (np.random.default_rng([self._seed, 15, number, step]) for number in self._episode.tolist())
-        share = 1.0 + config.slip * np.array([rng.standard_normal(2) for rng in rngs]).T
-        left, right = np.stack([linear - self._half_m * angular, linear + self._half_m * angular]) * share
-        return (left + right) / 2, (right - left) / (2 * self._half_m)
+        left, right = 1.0 + config.slip * np.array([rng.standard_normal(2) for rng in rngs]).T
+        return scale_sides(linear, angular, left, right, self._half_m)

@@ -11,10 +11,13 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jax import custom_batching
 
 from interactive_nav.config import TaskRules
+from interactive_nav.scenes.slots import Layout
+from interactive_nav.scenes.world import FLOOR_FRICTION
 
 
 def _broadcast(tree: Any, batched: Any, size: int) -> Any:
@@ -57,6 +60,16 @@ TOUCH_FORCE_N = 1e-4
 
 
 @flax.struct.dataclass
+class ModelChange:
+    """How an environment's model differs from its scene's: [] f32 factors of the mass and friction of all movable
+    objects; for MJX-JAX dotted names of fields -> values, for all rows but those that scenes fill. None: not."""
+
+    mass_scale: Any
+    friction_scale: Any
+    fields: Any = None
+
+
+@flax.struct.dataclass
 class PhysicsState:
     """State of one environment's physics: JAX or NumPy arrays, with leading batch axes as the caller has them."""
 
@@ -68,6 +81,8 @@ class PhysicsState:
     """[nv] f32."""
     control_steps: Any = None
     """[] i32 since the episode began: the environment's clock, which backends leave out."""
+    change: ModelChange | None = None
+    """Of the model, for the next control step, which backends leave out too."""
 
 
 @flax.struct.dataclass
@@ -127,6 +142,39 @@ def uncommitted(tree: Any) -> Any:
     `device_put` compiles nothing, unlike `jnp.asarray`, which compiles a program for each shape.
     """
     return jax.tree.map(lambda x: jax.device_put(np.asarray(x)) if isinstance(x, jax.Array) else x, tree)
+
+
+_MASS = {"body_mass": 1, "body_inertia": 1, "body_subtreemass": 1, "body_invweight0": -1, "dof_invweight0": -1}
+"""Fields -> the power of the mass that they grow with. Contacts are as soft as before, and rest poses the same."""
+SCALED = (*_MASS, "geom_friction", "pair_friction")
+
+
+def make_scaling(model: mujoco.MjModel, layout: Layout) -> Callable[[dict, ModelChange, Any], dict[str, Any]]:
+    """Return (fields, change, numpy or jax.numpy) -> fields of one environment, those in `SCALED` changed."""
+    bodies = np.isin(np.arange(model.nbody), layout.slot_body)
+    bodies |= bodies[model.body_parentid]  # such as its feet
+    geoms = bodies[model.geom_bodyid]
+    pairs = geoms[model.pair_geom1] | geoms[model.pair_geom2]
+    rows = dict.fromkeys(_MASS, bodies) | {"dof_invweight0": bodies[model.dof_bodyid]}
+    rows["geom_friction"], rows["pair_friction"] = (
+        geoms[:, None] * (np.arange(3) < 1),
+        pairs[:, None] * (np.arange(5) < 2),
+    )
+
+    def scaled(fields: dict[str, Any], change: ModelChange, xp: Any) -> dict[str, Any]:
+        out = dict(fields)
+        for name in fields.keys() & set(SCALED):
+            scale = change.mass_scale if name in _MASS else change.friction_scale
+            if scale is not None:
+                value, mine = fields[name], rows[name]
+                # A pair has the larger friction of its two geoms, and the floor's stays.
+                new = xp.maximum(
+                    value * scale ** _MASS.get(name, 1), FLOOR_FRICTION if name == "pair_friction" else 0.0
+                )
+                out[name] = xp.where(mine.reshape(*mine.shape, *[1] * (value.ndim - mine.ndim)), new, value)
+        return out
+
+    return scaled
 
 
 PAPER_FORCE = TaskRules()

@@ -18,7 +18,7 @@ import numpy as np
 from mujoco import mjx
 
 from interactive_nav.config import NavConfig
-from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces, uncommitted
+from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, make_scaling, summarise_forces, uncommitted
 from interactive_nav.physics.nearness import Measured
 from interactive_nav.physics.warp_callbacks import keep_collector_out
 from interactive_nav.physics.window import PhysicsWindow
@@ -49,8 +49,9 @@ class MjxPhysics(Physics):
         self.active_dofs = self.window.model.nv
         """That can be awake at a time."""
         self.contacts_per_env, self.constraints_per_env = config.contacts_per_env, config.constraints_per_env
-        self._host = self._host_model()
-        self._model = uncommitted(mjx.put_model(self._host, impl=self.name, device=jax.local_devices()[0]))
+        self.mj_model = self._host_model()
+        self.mjx_model = uncommitted(mjx.put_model(self.mj_model, impl=self.name, device=jax.local_devices()[0]))
+        self._scaled = make_scaling(self.mj_model, self.window.layout)
         layout = self.window.layout
         self._sensors = layout.force_sensors[:, None] + np.arange(3)
         self._config = config
@@ -84,8 +85,11 @@ class MjxPhysics(Physics):
         window = self.window
         chosen, walls, missed = window.select(measured)
         fields = window.fields(scene, chosen, walls)
-        model = self._model.replace(
-            **{name: value.reshape(getattr(self._model, name).shape) for name, value in fields.items()}
+        if state.change is not None:
+            fields = self._scaled(window.with_given(fields, state.change.fields or {}), state.change, jnp)
+        given = {} if state.change is None else state.change.fields or {}
+        model = self.mjx_model.tree_replace({name: given[name] for name in given.keys() - fields.keys()}).replace(
+            **{name: value.reshape(getattr(self.mjx_model, name).shape) for name, value in fields.items()}
         )
         inner = window.enter(state, chosen)
         data = template.replace(qpos=inner.qpos, qvel=inner.qvel, qacc_warmstart=inner.qacc_warmstart)
@@ -95,7 +99,7 @@ class MjxPhysics(Physics):
         def control(data, k):
             if not self._world.robot.control_every_substep:
                 return data
-            return self._controlled(data, command, time_s + k * self._host.opt.timestep)
+            return self._controlled(data, command, time_s + k * self.mj_model.opt.timestep)
 
         data, (forces, contacts), failures = self._substep_all(model, data, control)
         out = window.leave(state, PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), chosen)
@@ -132,18 +136,18 @@ class WarpPhysics(MjxPhysics):
         super().__init__(world, config, window)
         if self._sleeps:
             self.active_dofs = min(config.active_dofs or self.window.awake_at_rest, self.active_dofs)
-        self._tree_of_slot = self._host.body_treeid[self.window.layout.slot_body]
+        self._tree_of_slot = self.mj_model.body_treeid[self.window.layout.slot_body]
         if not (self.contacts_per_env and self.constraints_per_env):
             measured = measure_buffers(world, self.window, self.active_dofs)
             self.contacts_per_env = self.contacts_per_env or measured[0]
             self.constraints_per_env = self.constraints_per_env or measured[1]
         # Warp prints a line per overflow or unconverged solve: ours are counted instead.
-        self._model = self._model.tree_replace({"opt._impl.warn_overflow": 0})
-        self._contacts = sensor_addresses(self._host) if config.needs_contacts else None
+        self.mjx_model = self.mjx_model.tree_replace({"opt._impl.warn_overflow": 0})
+        self._contacts = sensor_addresses(self.mj_model) if config.needs_contacts else None
 
     def _template(self, n):
         return mjx.make_data(
-            self._host,
+            self.mj_model,
             impl="warp",
             naconmax=n * self.contacts_per_env,
             naccdmax=n * min(self.contacts_per_env, CCD_PER_ENV),
@@ -164,8 +168,8 @@ class WarpPhysics(MjxPhysics):
         if not self._sleeps:
             return data
         impl, trees = data._impl, jnp.asarray(self._tree_of_slot)
-        asleep = jnp.full(self._host.ntree, _AWAKE).at[trees].set(jnp.where(awake, _AWAKE, trees))
-        still = asleep[jnp.asarray(self._host.dof_treeid)] >= 0
+        asleep = jnp.full(self.mj_model.ntree, _AWAKE).at[trees].set(jnp.where(awake, _AWAKE, trees))
+        still = asleep[jnp.asarray(self.mj_model.dof_treeid)] >= 0
         qvel, warm = (jnp.where(still, 0.0, x) for x in (data.qvel, data.qacc_warmstart))
         new: dict[str, Any] = {
             "_impl.tree_asleep": asleep.astype(impl.tree_asleep.dtype),
@@ -201,8 +205,8 @@ class JaxPhysics(MjxPhysics):
     def __init__(self, world: World, config: NavConfig, window: PhysicsWindow | None = None):
         super().__init__(world, config, window)
         layout = self.window.layout
-        self._slot_of_geom = _slot_of_geom(layout, self._host)
-        self._rolls = rolling_geoms(self._host, world.robot, layout.robot_bodies)
+        self._slot_of_geom = _slot_of_geom(layout, self.mj_model)
+        self._rolls = rolling_geoms(self.mj_model, world.robot, layout.robot_bodies)
 
     def _host_model(self):
         spec = self.window.spec.copy()
@@ -211,7 +215,7 @@ class JaxPhysics(MjxPhysics):
         return spec.compile()
 
     def _template(self, n):
-        return mjx.make_data(self._host, impl="jax")
+        return mjx.make_data(self.mj_model, impl="jax")
 
     def _substep_all(self, model, data, control):
         def substep(data, k):

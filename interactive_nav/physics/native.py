@@ -4,6 +4,7 @@ Objects at rest sleep until touched. Sleep is engine state outside `PhysicsState
 dropped for environments whose incoming state is not, to the bit, the one last returned.
 """
 
+import copy
 import dataclasses
 import threading
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from interactive_nav.config import NavConfig
+from interactive_nav.physics import base
 from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces
 from interactive_nav.scenes.contacts import from_sensors, sensor_addresses
 from interactive_nav.scenes.world import World
@@ -59,7 +61,7 @@ class _Pool:
 
     def __init__(self, models: tuple[mujoco.MjModel, ...], size: int, threads: int, sleep: bool):
         self.batch = Batch(models[0], nsim=size, nthread=threads, persistent=sleep)
-        self.scene = np.zeros(size, np.int64)
+        self.scene, self.scale, self.models = np.zeros(size, np.int64), np.ones((size, 2)), [models[0]] * size
         self.qpos = np.full((size, models[0].nq), np.nan, np.float32)
         self.qvel = np.full((size, models[0].nv), np.nan, np.float32)
         self.state_qpos, self.state_qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
@@ -86,6 +88,7 @@ class NativePhysics(Physics):
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
             if self._config.sleep:
                 model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
+        self._scaled = base.make_scaling(self._models[0], world.layout)
         self._pools: dict[int, list[_Pool]] = {}
         self._lock = threading.Lock()
 
@@ -97,21 +100,30 @@ class NativePhysics(Physics):
             return jax.ShapeDtypeStruct(shape, jnp.float32 if name.endswith("force_n") else jnp.int32)
 
         shapes = (
-            PhysicsState(*(jax.ShapeDtypeStruct((n, size), jnp.float32) for size in (self.nq, self.nv, self.nv))),
+            PhysicsState(*[jax.ShapeDtypeStruct((n, size), jnp.float32) for size in (self.nq, self.nv, self.nv)]),  # pyright: ignore[reportArgumentType]
             StepSignals(**{field.name: shape_of(field.name) for field in dataclasses.fields(StepSignals)}),
         )
         # One array: JAX takes 30 us to hand over each argument of a callback.
         columns = (state.qpos, state.qvel, state.qacc_warmstart, command, time_s[:, None], scene[:, None])
+        if state.change is not None:
+            scales = state.change.mass_scale, state.change.friction_scale
+            columns += tuple(jnp.ones((n, 1)) if scale is None else scale[:, None] for scale in scales)
         packed = jnp.concatenate([jnp.asarray(x, jnp.float32) for x in columns], 1)
-        return jax.pure_callback(self._step_host, shapes, packed, vmap_method="sequential")
+        step = self._step_host if state.change is None else self._step_scaled
+        return jax.pure_callback(step, shapes, packed, vmap_method="sequential")
 
-    def _step_host(self, packed):
+    def _step_scaled(self, packed):
+        packed = np.asarray(packed)
+        return self._step_host(packed[:, :-2], packed[:, -2:])
+
+    def _step_host(self, packed, scale: Any = 1.0):
         packed = np.asarray(packed)
         qpos, qvel, warm, rest = np.split(packed, np.cumsum([self.nq, self.nv, self.nv]), 1)
         command, time_s, scene = np.nan_to_num(rest[:, :-2]), rest[:, -2], rest[:, -1].astype(np.int64)
         pool = self._take_pool(qpos)
         try:
-            return self._step_pool(pool, scene, PhysicsState(qpos, qvel, warm), command, time_s)
+            self._set_models(pool, scene, np.broadcast_to(scale, (len(packed), 2)))
+            return self._step_pool(pool, PhysicsState(qpos, qvel, warm), command, time_s)
         finally:
             with self._lock:
                 self._pools[len(packed)].append(pool)
@@ -127,12 +139,22 @@ class NativePhysics(Physics):
                 return free.pop(int(np.argmax(equal)))
         return _Pool(self._models, size, self._config.threads, self._config.sleep)
 
-    def _step_pool(self, pool: _Pool, scene, state: PhysicsState, command, time_s):
+    def _set_models(self, pool: _Pool, scene: np.ndarray, scale: np.ndarray) -> None:
+        """Give each environment its scene's model, or a copy with its `scale` [N, 2] of masses and friction."""
+        changed = np.flatnonzero((pool.scene != scene) | (pool.scale != scale).any(1))
+        for i in changed:
+            pool.models[i] = model = self._models[scene[i]]
+            if (scale[i] != 1.0).any():
+                pool.models[i], fields = copy.copy(model), {name: getattr(model, name) for name in base.SCALED}
+                for name, value in self._scaled(fields, base.ModelChange(*scale[i]), np).items():
+                    getattr(pool.models[i], name)[:] = value
+        if len(changed):
+            pool.batch.set_models(pool.models)
+            pool.qpos[changed] = np.nan
+            pool.scene, pool.scale = scene.copy(), scale.copy()
+
+    def _step_pool(self, pool: _Pool, state: PhysicsState, command, time_s):
         batch, qpos, qvel = pool.batch, state.qpos, state.qvel
-        if len(self._models) > 1 and not np.array_equal(pool.scene, scene):
-            batch.set_models([self._models[s] for s in scene])
-            pool.qpos[np.flatnonzero(pool.scene - scene)] = np.nan
-            pool.scene = scene.copy()
         finite = np.asarray(np.isfinite(qpos).all(1) & np.isfinite(qvel).all(1))
         resumed = np.equal(qpos, pool.qpos).all(1) & np.equal(qvel, pool.qvel).all(1)
         fresh = np.flatnonzero(~resumed)
@@ -158,8 +180,8 @@ class NativePhysics(Physics):
             StepSignals(
                 **forces,
                 overflow=raised[:, _OVERFLOWS].any(1).astype(np.int32),
-                left_out=np.zeros(len(scene), np.int32),
-                crowded=np.zeros(len(scene), np.int32),
+                left_out=np.zeros(len(qpos), np.int32),
+                crowded=np.zeros(len(qpos), np.int32),
                 unconverged=(iterations >= self._iterations).astype(np.int32),
                 nonfinite=nonfinite.astype(np.int32),
             ),

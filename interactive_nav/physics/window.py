@@ -197,6 +197,14 @@ class PhysicsWindow:
             out |= {name: table[index] for name, table in tables.items()}
         return out
 
+    def with_given(self, fields: dict[str, jax.Array], given: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        """Return `fields` with the values of `given` in all rows that neither slots nor walls fill."""
+        for (_, _, step, _), tables in self._tables[:-1]:
+            for name in tables.keys() & given.keys():
+                value, filled = fields[name], (step > 0).reshape(-1, *[1] * (fields[name].ndim - 1))
+                fields = fields | {name: jnp.where(filled, value, given[name].reshape(value.shape))}
+        return fields
+
     def static_poses(self, scene: jax.Array, walls: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return world positions [ngeom, 3] and matrices [ngeom, 3, 3] of the geoms, right where these never move."""
         (of_scene, first, step, at), tables = self._tables[-1]

@@ -34,6 +34,7 @@ from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing.boxes import apply_axes, body_poses
 from interactive_nav.sensing.observation import waypoints_in_body
 from interactive_nav.sensing.sensors import Sensors
+from interactive_nav.task.dynamics import Dynamics
 from interactive_nav.task.terms import TERMS, Moment, Step, Term
 from interactive_nav.types import EpisodeStart, GoalField, NavInfo
 from interactive_nav_common.errors import ConfigError
@@ -70,6 +71,7 @@ class InteractiveNav(Env):
         limit = config.potential_round
         self._round = round_tables(self.world, self.tables, config, limit) if limit else None
         self.physics = make_physics(self.world, config)
+        self.dynamics = Dynamics(config, robot)
         observed = config.observations
         self.terms = (*(t for t in TERMS if t.kind != "observation" or t.name in observed), *terms)
         keys = [t.key for t in self.terms]
@@ -166,7 +168,8 @@ class InteractiveNav(Env):
         zero = jnp.zeros(())
         info = {"nav": self._remember(nav), "rng": rng, "truncation": zero, "time_out": zero}
         names = (*self.metric_names, *self.reward_names)
-        return State(physics, (), zero, zero, {name: zero for name in names}, info)  # pyright: ignore[reportArgumentType]
+        state = State(physics, (), zero, zero, {name: zero for name in names}, info)  # pyright: ignore[reportArgumentType]
+        return self.dynamics.begin(state, self._observation)
 
     def _at_start(self, scene: jax.Array, physics: PhysicsState, geodesic_m: jax.Array) -> dict[str, Any]:
         """Return the fields of `NavInfo` that change within an episode, as they are at its start."""
@@ -196,13 +199,17 @@ class InteractiveNav(Env):
 
     def observe(self, state: State, blank: jax.Array | bool = False) -> State:
         """Return the state with the observation of where it is now; zeros where `blank`, as after a broken step."""
+        state = self.dynamics.show(state, self._observation(state))
+        return state.replace(obs=jax.tree.map(lambda x: jnp.where(blank, jnp.zeros_like(x), x), state.obs))
+
+    def _observation(self, state: State) -> jax.Array | dict[str, jax.Array]:
+        """Return the observation of where the state is now, without delay."""
         nav: NavInfo = state.info["nav"]
         physics: PhysicsState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
         moment = Moment(*self._constants, nav, physics, self._robot_pose(physics)[1])
         parts = [t for t in self.terms if t.kind == "observation"]
         remembered = {t.name: t.evaluate(nav.memory.get(t.key), moment) for t in parts}
-        obs = self.sensors.observe(physics, nav, state.info["rng"], remembered)
-        return state.replace(obs=jax.tree.map(lambda x: jnp.where(blank, jnp.zeros_like(x), x), obs))
+        return self.sensors.observe(physics, nav, state.info["rng"], remembered)
 
     def advance(self, state: State, action: jax.Array) -> State:
         """Do `step` without an observation: `obs` stays what it was until `observe`."""
@@ -214,6 +221,8 @@ class InteractiveNav(Env):
         nav = self._resumed(nav, before, again)
         over = (state.done > 0) & ~again
         time_s = nav.step_count * self.config.control_dt_s
+        nav, command, change = self.dynamics.execute(nav, command, state.info.get("model"))
+        before = before.replace(change=change)  # pyright: ignore[reportAttributeAccessIssue]
         physics, signals = self.physics.step(nav.scene_index, before, command, time_s)
         step = self._measure(nav, physics, signals, state.info["rng"])
         nav = step.nav

@@ -164,7 +164,10 @@ def _trail(trail_w: jax.Array, step: Step) -> jax.Array:
 
 
 def _masses_kg(step: Step) -> jax.Array:
-    return step.tables.mass_kg[step.nav.scene_index].at[0].set(step.score_mass_kg)
+    masses_kg, dynamics = step.tables.mass_kg[step.nav.scene_index], step.nav.dynamics
+    if dynamics is not None and "random_mass" in dynamics.drawn:
+        masses_kg = masses_kg * dynamics.drawn["random_mass"]
+    return masses_kg.at[0].set(step.score_mass_kg)
 
 
 def _path_efficiency(memory: Any, step: Step) -> jax.Array:

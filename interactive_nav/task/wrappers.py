@@ -13,7 +13,8 @@ from the sharded arrays (means, gradients) XLA reduces over the devices by itsel
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import operator
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -21,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env, State, Wrapper
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.tree_util import tree_leaves_with_path
 
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav_common.errors import ConfigError
@@ -76,7 +78,8 @@ def reset_where(env: InteractiveNav, state: Any, keys: jax.Array, mask: jax.Arra
     reward, done, metrics, truncation, time_out = jax.tree.map(lambda x: jnp.where(mask, 0.0, x), of_step)
     info = {**info, "nav": nav, "rng": rng, "truncation": truncation, "time_out": time_out}
     new = state.replace(pipeline_state=physics, reward=reward, done=done, metrics=metrics, info=info)
-    return new.replace(obs=_where(mask, jax.vmap(env.observe)(new).obs, state.obs))
+    new = jax.vmap(env.observe)(new)
+    return new.replace(obs=_where(mask, new.obs, state.obs))
 
 
 def step_all(
@@ -105,10 +108,12 @@ def wrap_for_brax_training(
         env: what `interactive_nav.make` returns, or a wrapper of it: see `AutoResetEnv`.
         episode_length: at least the environment's `episode_steps`, which ends its episodes; None: that.
         action_repeat: control steps that an action is held for.
-        randomization_fn: none: scenes and episodes are drawn by the environment.
+        randomization_fn: (MJX's model) -> (the model with N values of some fields, axes: 0 for these, else None), as
+            learners pass it on; backend `jax` only. Environment i keeps value i. The model is
+            `env.physics.mjx_model`, in which scenes fill the rows of objects and walls; those values are theirs.
 
     Raises:
-        ConfigError: a shorter `episode_length`, a `randomization_fn`, or a wrapper that would be passed over.
+        ConfigError: a shorter `episode_length`, another backend, or a wrapper that would be passed over.
     """
     steps = env.config.episode_steps
     if episode_length is not None and episode_length < steps:
@@ -116,9 +121,24 @@ def wrap_for_brax_training(
             f"episode_length is {episode_length}, expected at least the environment's {steps}: "
             f"make it with episode_steps={episode_length}"
         )
+    wrapped = AutoResetEnv(env, action_repeat)
     if randomization_fn is not None:
-        raise ConfigError("randomization_fn is given, expected None: the environment draws its scenes by itself")
-    return AutoResetEnv(env, action_repeat)
+        wrapped.models = _varied_fields(env.unwrapped, randomization_fn)
+    return wrapped
+
+
+def _varied_fields(env: InteractiveNav, randomization_fn: Callable[[Any], tuple[Any, Any]]) -> dict[str, jax.Array]:
+    """Return dotted name -> [N, ...] of the fields of MJX's model that Playground's `randomization_fn` varies."""
+    if env.backend != "jax":
+        raise ConfigError(
+            f"randomization_fn is given with backend='{env.backend}', expected backend='jax'; or use the settings "
+            "random_mass, random_friction and their like, which every backend takes"
+        )
+    models, axes = randomization_fn(env.physics.mjx_model)  # pyright: ignore[reportAttributeAccessIssue]
+    at = {jax.tree_util.keystr(path, simple=True, separator="."): axis for path, axis in tree_leaves_with_path(axes)}
+    if not at or set(at.values()) != {0}:
+        raise ConfigError(f"randomization_fn varies axes {at}, expected axis 0 of one or more fields, else None")
+    return {name: operator.attrgetter(name)(models) for name in at}
 
 
 def _refuse_passed_over(env: Any) -> None:
@@ -161,6 +181,7 @@ class AutoResetEnv(Wrapper):
         super().__init__(env)
         _refuse_passed_over(env)
         self.action_repeat, self.final_obs = action_repeat, final_obs
+        self.models: dict[str, jax.Array] = {}
 
     def reset(self, rng: jax.Array, slot: jax.Array | None = None) -> State:
         """Return N states for [N, 2] keys; `slot` as in `reset_all`."""
@@ -173,12 +194,20 @@ class AutoResetEnv(Wrapper):
             "running_reward": zero,
             "episode_metrics": {name: zero for name in (*self.env.metric_names, "length", "sum_reward")},
         }
+        for name, value in self.models.items():
+            if slot is None and len(value) != len(rng):
+                raise ConfigError(
+                    f"randomization_fn varies {len(value)} models, expected one per environment: {len(rng)}"
+                )
+            index = jnp.arange(len(rng)) if slot is None else slot % len(value)
+            info["model"] = info.get("model", {}) | {name: jnp.asarray(value)[index]}
         return state.replace(info=info | ({"final_obs": state.obs} if self.final_obs else {}))
 
     def step(self, state: State, action: jax.Array) -> State:
         """Return the states that follow N states and [N, A] actions."""
         # What ended in the last step has begun anew.
-        advance = jax.vmap(self.env.step if self.final_obs else self.env.advance)
+        delayed = self.env.config.random_sensor_delay_steps[1] > 0  # looks at every step
+        advance = jax.vmap(self.env.step if self.final_obs or delayed else self.env.advance)
         stepped = advance(state.replace(done=jnp.zeros_like(state.done)), action)
         for _ in range(self.action_repeat - 1):
             paid = stepped.reward

@@ -104,7 +104,7 @@ def _read_both(physics, world):
             None,
         )
     else:
-        model = world.models[0] if physics.name == "native" else physics._host
+        model = world.models[0] if physics.name == "native" else physics.mj_model
         floors = np.array([model.sensor(f"floor_{i}").adr[0] for i in range(len(physics._sensors))])
         physics._sensors = np.concatenate([physics._sensors, floors[:, None] + np.arange(3)])
     if physics.name != "native":

@@ -141,8 +141,6 @@ def test_wrappers_that_would_be_passed_over_are_refused(env, auto):
         ConfigError, match="episode_length is 5, expected at least the environment's 6: .*episode_steps=5"
     ):
         wrap_for_brax_training(env, episode_length=5)
-    with pytest.raises(ConfigError, match="randomization_fn"):
-        wrap_for_brax_training(env, randomization_fn=lambda system, rng: (system, rng))
 
 
 @pytest.mark.slow
