@@ -13,7 +13,7 @@ from interactive_nav_common.commands import Command as AnyCommand
 from interactive_nav_common.commands import Flag, Words, option, word
 from interactive_nav_common.config import AtLeastOne, Positive, read_words, refuse_unused
 from interactive_nav_common.jobs.progress import stage_progress
-from scenes_mjcf.sets import HERE, PACKAGED, in_cache, is_listed, packaged_set
+from scenes_mjcf import sets
 
 CORES = os.cpu_count() or 1
 
@@ -171,15 +171,17 @@ class ListScenes(Command):
     def run(self, console: Console) -> None:
         """Run the command."""
         listed = {
-            f / scene: (name, m) for name, f in PACKAGED.items() for scene, m in packaged_set(name).scenes.items()
+            f / scene: (name, m)
+            for name, f in sets.PACKAGED.items()
+            for scene, m in sets.packaged_set(name).scenes.items()
         }
         for scene, (name, member) in listed.items():
-            place = next((p for p in (scene, in_cache(scene)) if p.exists()), None)
-            other = place and place == in_cache(scene) and not is_listed(place, member)
+            place = next((p for p in (scene, sets.in_cache(scene)) if p.exists()), None)
+            other = place and place == sets.in_cache(scene) and not sets.is_listed(place, member)
             what = "in the cache is another scene of this name: make it again" if other else place or "not made"
             print(f"{name:<10} {member.split:<6} {scene.name:<15} {what}")
-        for scene in sorted({path.parent for path in HERE.rglob("scene.json")} - set(listed)):
-            print(f"{'-':<10} {'-':<6} {scene.relative_to(HERE).as_posix():<15} {scene}")
+        for scene in sorted({path.parent for path in sets.HERE.rglob("scene.json")} - set(listed)):
+            print(f"{'-':<10} {'-':<6} {scene.relative_to(sets.HERE).as_posix():<15} {scene}")
 
 
 @dataclasses.dataclass(kw_only=True)

@@ -32,19 +32,8 @@ from interactive_nav_common.files import check_name, write_text
 from interactive_nav_common.jobs.processes import LOST, Job, Launcher, LocalLauncher, run_jobs
 from interactive_nav_common.rows import write_parquet
 from interactive_nav_common.signals import interrupts_heard
+from scenes_mjcf import sets
 from scenes_mjcf.schema import SceneError, load_manifest
-from scenes_mjcf.sets import (
-    FILE,
-    PACKAGED,
-    Member,
-    SceneSet,
-    in_cache,
-    is_listed,
-    packaged_set,
-    read_set,
-    scene_digest,
-    write_set,
-)
 
 ROWS = "conversions.parquet"
 SCHEMA = pa.schema(
@@ -204,14 +193,14 @@ def begin_set(out: Path, tier: str, count: int, seed: int = SEEDS) -> None:
     write_text(path, text)
 
 
-def list_set(recipes: Recipes, out: Path, log: Callable[[str], None] = lambda line: None) -> SceneSet:
+def list_set(recipes: Recipes, out: Path, log: Callable[[str], None] = lambda line: None) -> sets.SceneSet:
     """Write `set.json`: the set's scenes and their digests; report and keep a listed digest that differs."""
-    path = out / FILE
-    members = dict(read_set(path).scenes) if path.is_file() else {}
+    path = out / sets.FILE
+    members = dict(sets.read_set(path).scenes) if path.is_file() else {}
     for recipe in recipes.scenes:
-        listed = members.get(recipe.name, Member(recipe.split, recipe.seed))
+        listed = members.get(recipe.name, sets.Member(recipe.split, recipe.seed))
         if (out / recipe.name / "scene.json").is_file():
-            digest = scene_digest(out / recipe.name)
+            digest = sets.scene_digest(out / recipe.name)
             if listed.digest not in ("", digest):
                 log(f"{recipe.name}: not the scene that {path} lists")
             else:
@@ -219,8 +208,8 @@ def list_set(recipes: Recipes, out: Path, log: Callable[[str], None] = lambda li
                 listed = dataclasses.replace(listed, digest=digest, measures=measures)
         members[recipe.name] = listed
     tiers = {recipe.building.tier for recipe in recipes.scenes}
-    scenes = SceneSet(tiers.pop() if len(tiers) == 1 else "mixed", members)
-    write_set(scenes, path)
+    scenes = sets.SceneSet(tiers.pop() if len(tiers) == 1 else "mixed", members)
+    sets.write_set(scenes, path)
     return scenes
 
 
@@ -280,7 +269,7 @@ def generate_scenes(wanted: Any, report: Report, log: Callable[[str], None]) -> 
     else:
         gates = make_scenes(todo, recipes.conversion, wanted.out, wanted.overwrite, wanted.jobs, report, log)
         failed = [name for name, failing in gates.items() if failing]
-    if not wanted.only and (wanted.tier or (wanted.out / FILE).is_file()):
+    if not wanted.only and (wanted.tier or (wanted.out / sets.FILE).is_file()):
         list_set(recipes, wanted.out, log)
     return failed
 
@@ -293,19 +282,19 @@ def make_packaged(
     Cached folders with other scenes than the listed ones are replaced. Return the names of scenes that fail, miss a
     gate, or differ from the set's list.
     """
-    sets = {name: packaged_set(name).scenes for name in PACKAGED}
-    words = [word for name, members in sets.items() for word in (name, f"{name}/train", f"{name}/test", *members)]
+    scenes = {name: sets.packaged_set(name).scenes for name in sets.PACKAGED}
+    words = [word for name, members in scenes.items() for word in (name, f"{name}/train", f"{name}/test", *members)]
     for word in (word for word in names if word not in words):
         raise GenerationError(f"no scene or set {word!r}{nearest(word, words)}; 'scenes list' shows them")
     failed: list[str] = []
-    for name, folder in PACKAGED.items():
-        members = sets[name]
+    for name, folder in sets.PACKAGED.items():
+        members = scenes[name]
         named = [n for n, m in members.items() if {n, name, f"{name}/{m.split}"} & set(names)]
         wanted = {n: members[n] for n in named if not (folder / n / "scene.json").is_file()}
         for scene in (n for n in named if n not in wanted):
             log(f"{scene}: is there, {folder / scene}")
-        out = in_cache(folder)
-        todo = tuple(n for n, m in wanted.items() if not is_listed(out / n, m))
+        out = sets.in_cache(folder)
+        todo = tuple(n for n, m in wanted.items() if not sets.is_listed(out / n, m))
         others = [n for n in todo if (out / n).exists()]
         for scene in (n for n in wanted if n not in todo):
             log(f"{scene}: is there, {out / scene}")
@@ -319,7 +308,7 @@ def make_packaged(
             continue
         rest = wanted_set(out=out, recipes=folder / RECIPES, only=todo, overwrite=bool(others))
         failed += generate_scenes(rest, report, log)
-        for scene in (n for n in todo if n not in failed and not is_listed(out / n, wanted[n])):
+        for scene in (n for n in todo if n not in failed and not sets.is_listed(out / n, wanted[n])):
             command = f"python -m converters generate-scenes FOLDER --recipes {folder / RECIPES} --only {scene}"
             log(f"{scene}: not the scene that the set {name} lists; as a scene of your own: {command}")
             failed.append(scene)

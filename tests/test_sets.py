@@ -207,8 +207,7 @@ def cached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (home / "recipes.yaml").touch()
     monkeypatch.setenv("INTERACTIVE_NAV_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("scenes_mjcf.sets.HERE", tmp_path / "package")
-    for module in ("scenes_mjcf.sets", "converters.many", "converters.generating"):
-        monkeypatch.setattr(f"{module}.PACKAGED", {"furnished": home})
+    monkeypatch.setattr("scenes_mjcf.sets.PACKAGED", {"furnished": home})
     monkeypatch.chdir(tmp_path)
     return tmp_path / "cache" / "package" / "furnished"
 
@@ -258,8 +257,8 @@ def test_scenes_that_are_made_by_name_are_compared(tmp_path: Path, monkeypatch: 
     """The generator is stood in for, and so is the package: it gives alder, and cedar where birch was wanted."""
     monkeypatch.setenv("INTERACTIVE_NAV_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("scenes_mjcf.sets.HERE", tmp_path / "package")
-    monkeypatch.setattr("converters.many.PACKAGED", {"sparse": tmp_path / "package"})
-    monkeypatch.setattr("converters.many.packaged_set", lambda name: read_set(COMMITTED / f"{name}.json"))
+    monkeypatch.setattr("scenes_mjcf.sets.PACKAGED", {"sparse": tmp_path / "package"})
+    monkeypatch.setattr("scenes_mjcf.sets.packaged_set", lambda name: read_set(COMMITTED / f"{name}.json"))
     shutil.copytree(ROOT / "scenes_mjcf" / "elm", tmp_path / "package" / "elm")
     assert main(["scenes", "make", "alder", "elm"]) == 1
     assert "alder: an earlier version of the generator wrote these scenes" in capsys.readouterr().out.replace("\n", " ")
