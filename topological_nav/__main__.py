@@ -21,7 +21,7 @@ from topological_nav.data.domains import AdaptConfig
 
 
 @dataclasses.dataclass(kw_only=True)
-class _Listed(Command):
+class Listed(Command):
     """Base of the commands, with settings."""
 
     LISTED: ClassVar[dict[str, Any]]
@@ -37,7 +37,7 @@ class _Listed(Command):
 
 
 @dataclasses.dataclass(kw_only=True)
-class _Networks(_Listed):
+class UsesNetworks(Listed):
     """Base of the commands that use networks."""
 
     localiser: Annotated[Path | None, option(metavar="RUN")] = None
@@ -47,7 +47,7 @@ class _Networks(_Listed):
 
 
 @dataclasses.dataclass(kw_only=True)
-class _Driving(_Networks):
+class _Driving(UsesNetworks):
     """Base of the commands that drive through scenes."""
 
     LISTED = {"": configs.EvaluationConfig()}
@@ -62,7 +62,7 @@ class _Driving(_Networks):
 
 
 @dataclasses.dataclass(kw_only=True)
-class Data(_Listed):
+class Data(Listed):
     """Render room and passage images of scenes, or drives of the expert, or import photographs."""
 
     LISTED = {"": configs.DataConfig(), " of drives": configs.DriveConfig()}
@@ -77,7 +77,7 @@ class Data(_Listed):
 
 
 @dataclasses.dataclass(kw_only=True)
-class Train(_Networks):
+class Train(UsesNetworks):
     """Train the room classifier, the passage detector or the local policy."""
 
     LISTED = {"": configs.TASKS["rooms"], " of policy": configs.PolicyConfig()}
@@ -92,7 +92,7 @@ class Train(_Networks):
 
 
 @dataclasses.dataclass(kw_only=True)
-class Map(_Networks):
+class Map(UsesNetworks):
     """Build a scene's topological map and draw it."""
 
     LISTED = {"": configs.MapConfig()}
@@ -145,7 +145,7 @@ class Evaluate(_Driving):
 
 
 @dataclasses.dataclass(kw_only=True)
-class Adapt(_Networks):
+class Adapt(UsesNetworks):
     """Adapt networks and maps to another domain."""
 
     LISTED = {"": AdaptConfig()}
@@ -162,7 +162,7 @@ class Adapt(_Networks):
 
 
 @dataclasses.dataclass(kw_only=True)
-class Export(_Listed):
+class Export(Listed):
     """Write finished runs as a small folder of weights in half precision, or as ONNX files."""
 
     LISTED = {"": configs.ExportConfig()}

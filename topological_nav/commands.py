@@ -380,7 +380,6 @@ def _adapt_passages(arguments: Any, config: AdaptConfig, host: Host) -> None:
 
 
 def _adapt_map(arguments: Any, config: AdaptConfig, host: Host) -> None:
-    del host
     runs = arguments.localiser, arguments.detector
     built = adaptation.collected_map(arguments.scene, arguments.target, *runs, config)
     keep_map(built, arguments.out or ADAPTED / f"{built.map.scene}.npz")

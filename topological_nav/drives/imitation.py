@@ -222,8 +222,7 @@ def policy_epoch(policy: Policy, forward: Forward, learning_rate: float, batch: 
         }
         return loss, (scale, {**parts, **right})
 
-    def steps(features, key):
-        del features
+    def steps(_, key):
         return (shuffled(key, count, batch),)
 
     return descent_epoch(steps, loss_of, optax.adam(learning_rate))

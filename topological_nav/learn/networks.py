@@ -56,7 +56,6 @@ class AlexNet(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array, train: bool) -> tuple[jax.Array, jax.Array]:
         """Return feature maps of the third and the fifth convolution: [N, h, w, 6 width] and [N, h', w', 4 width]."""
-        del train
         maps = []
         for i, (factor, kernel, stride) in enumerate(((1, 11, 4), (3, 5, 1), (6, 3, 1), (4, 3, 1), (4, 3, 1))):
             x = nn.relu(nn.Conv(factor * self.width, (kernel, kernel), (stride, stride), padding="SAME")(x))

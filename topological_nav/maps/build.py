@@ -110,7 +110,6 @@ class TrueSight:
 
     def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
         """Return the distances [n, N] (m) to nodes, plus `OUT_OF_SIGHT_M` for those out of sight."""
-        del heading_rad
         here = np.broadcast_to(images[:, None, :2], (len(images), len(self._xy), 2))
         visible = self._space.segment_free(here, np.broadcast_to(self._xy, here.shape), LINE_POINTS, 0.0)
         return np.linalg.norm(here - self._xy, axis=-1) + OUT_OF_SIGHT_M * ~visible

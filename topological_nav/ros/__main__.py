@@ -12,18 +12,20 @@ from typing import Annotated, Literal
 from tyro.conf import UseAppendAction
 
 from interactive_nav.ros.commands import need_ros
-from interactive_nav_common.commands import Command, Words, option, parse
-from interactive_nav_common.config import overridden, settings_help
+from interactive_nav_common.commands import Words, option, parse
+from interactive_nav_common.config import overridden
 from interactive_nav_common.errors import reports_errors
 from interactive_nav_common.jobs.progress import say
 from interactive_nav_common.signals import stop_signals
+from topological_nav.__main__ import UsesNetworks
 from topological_nav.config import NavigatorConfig
 
 
 @dataclasses.dataclass(kw_only=True)
-class Navigator(Command):
+class Navigator(UsesNetworks):
     """Run the navigator as a node of ROS 2, for a robot or a simulator."""
 
+    LISTED = {"": NavigatorConfig()}
     settings: Words = ()
     """Change settings of the navigator, listed below."""
     map: Annotated[Path, option(metavar="PATH")]
@@ -32,21 +34,12 @@ class Navigator(Command):
     """Topic of the heading."""
     heading_offset: Annotated[float, option(metavar="RAD")] = 0.0
     """Yaw of the heading's frame in the map's frame."""
-    localiser: Annotated[Path | None, option(metavar="RUN")] = None
-    """Network that embeds images (default: a trained one, else the packaged)."""
-    detector: Annotated[Path | None, option(metavar="RUN")] = None
-    """Network that judges passages (default: as the localiser)."""
     policy: Annotated[str | None, option(metavar="RUN")] = None
     """Run of the local policy, or passage (default: as the networks, if none is named)."""
     goal: Annotated[UseAppendAction[tuple[Path, ...]], option(metavar="PICTURE")] = ()
     """Image taken at the goal."""
     goal_heading: Annotated[float, option(metavar="RAD")] = 0.0
     """Heading of the first image of the goal."""
-
-    @classmethod
-    def epilog(cls) -> str:
-        """Return the settings."""
-        return f"settings (key=default):\n{settings_help(NavigatorConfig())}"
 
 
 @reports_errors("topological_nav.ros")

@@ -93,9 +93,10 @@ class ActorCritic(abc.ABC):
         return (self.config.num_envs or 0) * (self.config.steps_per_update or 0)
 
     @property
-    @abc.abstractmethod
     def optimizers(self) -> tuple[optax.GradientTransformation, ...]:
         """Return the optimizers of policy, critics, and whatever else the algorithm learns, in this order."""
+        c: Any = self.config
+        return optax.adam(c.actor_learning_rate), optax.adam(c.critic_learning_rate)
 
     @abc.abstractmethod
     def init(self, key_networks: jax.Array, key: jax.Array) -> Any:
@@ -105,13 +106,13 @@ class ActorCritic(abc.ABC):
     def policy(self, learner: Any, deterministic: bool) -> types.Policy:
         """Return (observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
 
-    @abc.abstractmethod
     def init_noise(self) -> Any:
-        """Return the exploration noise of every environment at the start of an episode."""
+        """Return the exploration noise of every environment at the start of an episode; none by default."""
+        return ()
 
-    @abc.abstractmethod
     def explore(self, learner: Any, observation: Any, noise: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-        """Return actions [envs, A] in [-1, 1] to learn from, and the noise after them."""
+        """Return actions [envs, A] in [-1, 1] to learn from, by default drawn from the policy, and the next noise."""
+        return self.policy(learner, deterministic=False)(observation, key)[0], noise
 
     @abc.abstractmethod
     def gradient_step(
@@ -207,8 +208,6 @@ class SACState(ActorCriticState):
 
 @dataclasses.dataclass(frozen=True)
 class SAC(ActorCritic):
-    """Holds all that learning does not change."""
-
     config: SACConfig
 
     @staticmethod
@@ -217,12 +216,9 @@ class SAC(ActorCritic):
 
     @property
     def optimizers(self) -> tuple[optax.GradientTransformation, ...]:
-        """Return the optimizers of policy, critics and temperature."""
-        c = self.config
-        return tuple(map(optax.adam, (c.actor_learning_rate, c.critic_learning_rate, c.alpha_learning_rate)))
+        return *super().optimizers, optax.adam(self.config.alpha_learning_rate)
 
     def init(self, key_networks: jax.Array, key: jax.Array) -> SACState:
-        """Return a new learner."""
         log_alpha = jnp.log(jnp.float32(self.config.initial_alpha))
         return SACState(
             **self.first_fields(key_networks),
@@ -232,19 +228,8 @@ class SAC(ActorCritic):
         )
 
     def policy(self, learner: SACState, deterministic: bool) -> types.Policy:
-        """Return (observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
         params = self.whole_policy(learner.policy_params, learner.q_params)
         return sac_networks.make_inference_fn(self.networks)((learner.normalizer_params, params), deterministic)
-
-    def init_noise(self) -> tuple[()]:
-        """Return nothing: the policy is random itself."""
-        return ()
-
-    def explore(
-        self, learner: SACState, observation: Any, noise: tuple[()], key: jax.Array
-    ) -> tuple[jax.Array, tuple[()]]:
-        """Return actions drawn from the policy."""
-        return self.policy(learner, deterministic=False)(observation, key)[0], noise
 
     def gradient_step(
         self, learner: SACState, transitions: types.Transition, key: jax.Array
@@ -328,27 +313,17 @@ def ddpg_losses(both: sac_networks.SACNetworks, reward_scaling: float, discounti
 
 @dataclasses.dataclass(frozen=True)
 class DDPG(ActorCritic):
-    """Holds all that learning does not change."""
-
     config: DDPGConfig
 
-    @property
-    def optimizers(self) -> tuple[optax.GradientTransformation, ...]:
-        """Return the optimizers of policy and critic."""
-        return optax.adam(self.config.actor_learning_rate), optax.adam(self.config.critic_learning_rate)
-
     def init(self, key_networks: jax.Array, key: jax.Array) -> DDPGState:
-        """Return a new learner."""
         common = self.first_fields(key_networks)
         return DDPGState(**common, target_policy_params=common["policy_params"], key=key)
 
     def policy(self, learner: DDPGState, deterministic: bool = True) -> types.Policy:
         """Return (observation [N, ...], key) -> (action [N, A] in [-1, 1], extras), which is never random."""
-        del deterministic
         params = self.whole_policy(learner.policy_params, learner.q_params)
 
         def act(observation: Any, key: jax.Array) -> tuple[jax.Array, dict[str, Any]]:
-            del key
             return action_of(self.networks, learner.normalizer_params, params, observation), {}
 
         return act
@@ -371,8 +346,7 @@ class DDPG(ActorCritic):
     def gradient_step(
         self, learner: DDPGState, transitions: types.Transition, key: jax.Array
     ) -> tuple[DDPGState, dict[str, jax.Array]]:
-        """Step critic and policy, and the targets when they are due."""
-        del key  # nothing is drawn
+        """Step critic and policy, and the targets when they are due; nothing is drawn with the key."""
         c = self.config
         critic_loss, actor_loss = ddpg_losses(self.networks, c.reward_scaling, c.discounting)
         acting = self.whole_policy(learner.target_policy_params, learner.target_q_params)
