@@ -31,7 +31,6 @@ class Listed(Command):
 
     @classmethod
     def epilog(cls) -> str:
-        """Return the settings."""
         listed = cls.LISTED.items()
         return "\n\n".join(f"settings{of or ' (key=default)'}:\n{settings_help(config)}" for of, config in listed)
 

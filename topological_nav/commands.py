@@ -100,7 +100,6 @@ def _refuse_unused(arguments: Any, contest: Contest) -> None:
 
 
 def run_navigate(arguments: Any) -> None:
-    """Drive one episode and draw it."""
     if arguments.video and arguments.video.suffix != ".mp4":
         raise ConfigError(f"--video {arguments.video}: expected a name that ends in .mp4")
     refuse_unused(arguments, "batch", "in 'navigate', which drives one episode")
@@ -119,7 +118,6 @@ def run_navigate(arguments: Any) -> None:
 
 
 def run_evaluate(arguments: Any) -> None:
-    """Play episodes and score them."""
     names = ("dense", "sparse", "expert", *(["ppo"] if arguments.ppo else []))
     names = arguments.contenders.split(",") if arguments.contenders else names
     if "ppo" not in names:
@@ -145,7 +143,6 @@ def run_evaluate(arguments: Any) -> None:
 
 
 def run_map(arguments: Any) -> None:
-    """Build a map and draw it."""
     config = configured(MapConfig(), arguments.settings, "map")
     chosen = choose(arguments.localiser, arguments.detector, PASSAGE_POLICY)
     chosen.report(policy=False)
@@ -182,7 +179,6 @@ def keep_map(built: Built, out: Path, ends: Sequence[int] | None = None) -> None
 
 
 def run_export(arguments: Any) -> None:
-    """Write finished runs as a small folder, or as ONNX files."""
     config = overridden(configs.ExportConfig(), arguments.settings)
     if arguments.onnx:
         refuse_unused(arguments, "--maps --picture limit_mib tolerance commit", "with --onnx")
@@ -204,13 +200,11 @@ def run_export(arguments: Any) -> None:
 
 
 def run_tables(arguments: Any) -> None:
-    """Write the report's tables with ours."""
     write_text(arguments.runs / "tables.md", tables(arguments.runs))
     print(arguments.runs / "tables.md")
 
 
 def run_figures(arguments: Any) -> None:
-    """Draw the report's figures."""
     refuse_unused(arguments, "--truth batch", "in 'figures', which draws what networks see in one episode at a time")
     contest = contest_of(arguments, [arguments.scene], ["dense", "sparse"], arguments.out or arguments.runs / "figures")
     with bar() as report:
@@ -218,7 +212,6 @@ def run_figures(arguments: Any) -> None:
 
 
 def run_data(arguments: Any) -> None:
-    """Render a dataset, or drives of the expert."""
     if arguments.photographs:
         return _photographs(arguments)
     if arguments.drives:
@@ -273,7 +266,6 @@ def _drives(arguments: Any) -> None:
 
 
 def run_train(arguments: Any) -> None:
-    """Train a network or a local policy."""
     if arguments.task == "policy":
         return _policy(arguments)
     refuse_unused(arguments, "--localiser --detector --grid", f"in 'train {arguments.task}'")
@@ -319,7 +311,6 @@ def _policy(arguments: Any) -> None:
 
 
 def run_adapt(arguments: Any) -> None:
-    """Adapt networks, and a map, to another domain."""
     config = configured(AdaptConfig(), arguments.settings, "adapt")
     if arguments.what != "map" and arguments.scene:
         raise ConfigError(f"adapt {arguments.what} takes no scene folder; leave out {arguments.scene}")

@@ -1,7 +1,6 @@
 """Define all settings of datasets, training and maps, checked on construction; docstrings are the help."""
 
 import dataclasses
-import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -98,12 +97,6 @@ class DataConfig(CameraConfig):
     def passage_column(self) -> int:
         """Return which of `passage_lengths_m` is `passage_length_m`."""
         return self.passage_lengths_m.index(self.passage_length_m)
-
-    @property
-    def pitches_rad(self) -> tuple[float, float, float]:
-        """Return upward angles in the order of `PITCHES`."""
-        up = math.radians(self.pitch_deg)
-        return up, 0.0, -up
 
 
 @dataclasses.dataclass(frozen=True)

@@ -174,7 +174,6 @@ class Explorer(HostPolicy):
 
 
 def run_explore(arguments: Any) -> None:
-    """Explore a scene, write the map and draw it."""
     refuse_unused(arguments, UNUSED, "in 'explore'")
     arguments.maps = None if arguments.truth else Path()  # none is read
     (venue,) = contest_scenes(contest_of(arguments, [arguments.scene], ["dense"], arguments.out))

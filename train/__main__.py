@@ -32,7 +32,6 @@ class Train(Command):
 
     @classmethod
     def epilog(cls) -> str:
-        """Return the presets and every setting."""
         presets = ", ".join(config_io.preset_names())
         return f"presets: {presets}\n\nsettings (key=default):\n{config_io.help_text()}"
 

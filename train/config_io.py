@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from interactive_nav_common.config import flatten, nearest, overlay, read_words, settings_help, to_dict
-from interactive_nav_common.errors import ConfigError, regular
+from interactive_nav_common.errors import ConfigError, readable
 from interactive_nav_common.records import Reader
 from scenes_mjcf.sets import scene_folders
 from train.config import AUTO as AUTO_SIZES
@@ -39,14 +39,15 @@ run was trained; none changes what a policy does."""
 
 def from_yaml(text: str, where: str = "config") -> TrainConfig:
     """Return the config that a run wrote as YAML, as `from_dict`, without settings that are gone."""
-    values = _parsed(text, where)
+    values = parsed(text, where)
     for section, names in GONE.items() if isinstance(values, dict) else ():
         if isinstance(plain := values.get(section), dict):
             values = values | {section: {name: value for name, value in plain.items() if name not in names}}
     return from_dict(values, where=where)
 
 
-def _parsed(text: str, where: str) -> Any:
+def parsed(text: str, where: str) -> Any:
+    """Return the plain values of YAML text."""
     return Reader(ConfigError, "expected settings, see --help", finite=False).decoded(text, "YAML", where)
 
 
@@ -66,11 +67,8 @@ def read_file(name_or_path: str, folder: Path, what: str, prefix: str = "") -> t
                 f"{prefix}no {what} {name_or_path!r}{nearest(name_or_path, names)}; "
                 f"expected one of {', '.join(names)}, or the path of a .yaml file"
             )
-    try:
-        return path, _parsed(regular(path).read_text(encoding="utf-8"), path.name)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise ConfigError(f"{prefix}cannot read {path} ({reason}); expected a YAML file") from None
+    with readable(path, ConfigError, f"{prefix}expected a YAML file"):
+        return path, parsed(path.read_text(encoding="utf-8"), path.name)
 
 
 def load_config(name_or_path: str, overrides: Sequence[str] = ()) -> TrainConfig:

@@ -30,11 +30,11 @@ from train.runs.run import build_env, config_to_play
 from train.runs.run_folder import RunFolder
 from train.scoring import LEARNED, SEED
 from train.scoring.evaluation import load_policy
+from train.scoring.rows import SCORES
 from train.scoring.session import ROWS
 
 OBSERVATIONS, ENVS = 1000, 20
 """Recorded for the comparison with JAX, and the environments that they come from."""
-SCORES = ("success", "path_efficiency", "effort_efficiency", "ins_0.5")
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -105,7 +105,6 @@ def describe_policy(folder: RunFolder, config: TrainConfig, meta: CheckpointMeta
 
 @reports_errors("train.export")
 def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = build_env) -> int:
-    """Export; return 0 when done, 2 on a user's error."""
     arguments, console = parse(Export, "python -m train.export", argv), SafeConsole()
     if arguments.out.suffix != ".onnx":
         raise ConfigError(f"--out is {str(arguments.out)!r}, expected a file that ends in .onnx")

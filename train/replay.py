@@ -100,7 +100,6 @@ class Replay(OfRun):
 
 @reports_errors("train.replay")
 def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any] = build_env) -> int:
-    """Record; return 0 when done, 2 on a user's error."""
     arguments = parse(Replay, "python -m train.replay", argv)
     if not all(number.isdecimal() for number in arguments.episodes.split(",")):
         raise ConfigError(f"--episodes is {arguments.episodes!r}, expected numbers from 0 on, such as 0,1,5")

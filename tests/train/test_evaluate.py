@@ -306,7 +306,7 @@ def test_damaged_files_are_one_line_for_figures(run, evaluated, tmp_path, capsys
 def test_a_run_folder_with_damaged_files(tmp_path):
     folder = RunFolder(tmp_path)
     folder.config.write_bytes(bytes(range(256)))
-    with pytest.raises(FileError, match=r"config.yaml: cannot be read \(not a text file\)"):
+    with pytest.raises(FileError, match=r"config.yaml: not readable as the config of a run \(UnicodeDecodeError"):
         folder.read_config()
     assert folder.origin()["env_steps"] is None
     for name in ("versions.json", "summary.json"):

@@ -162,6 +162,7 @@ def test_learning_curves_meet_at_the_steps_all_seeds_have():
     np.testing.assert_allclose(values, [[0.5, 1.0, 1.0], [0.0, 0.5, 1.0]])
     assert curves.common_curve([[{"env_steps": 1}]], "s")[0].size == 0
     np.testing.assert_allclose(curves.running_mean(np.array([[1.0, 2.0, 6.0, 3.0]]), 3), [[1.5, 3.0, 11 / 3, 4.5]])
+    np.testing.assert_array_equal(curves.running_mean(np.array([[1.0, 2.0, 6.0, 3.0]]), 1), [[1.0, 2.0, 6.0, 3.0]])
 
 
 def test_goals_are_counted_by_the_steps_between_two_lines():

@@ -168,7 +168,8 @@ def write_plan(folder: Path, plan: ScenePlan) -> None:
 
 def _shards(folder: Path, plan: ScenePlan, robot: RobotSpec, config: DataConfig):
     """Yield each file of a scene with the camera poses of its sheets, and the poses of its small objects."""
-    pitch, heading = (a.ravel() for a in np.meshgrid(config.pitches_rad, headings(config), indexing="ij"))
+    up = math.radians(config.pitch_deg)
+    pitch, heading = (a.ravel() for a in np.meshgrid([up, 0.0, -up], headings(config), indexing="ij"))
     passages, each, level = plan.passages, len(pitch), np.zeros(len(pitch))
     rows = [np.arange(first, min(first + each, len(passages))) for first in range(0, len(passages), each)]
     for path, places_w in numbered(folder, "rooms", plan.xy_w, config.shard):

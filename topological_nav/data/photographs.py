@@ -64,6 +64,7 @@ def import_photographs(folder: Path, out: Path, config: DataConfig, scene: Path 
     names = list(dict.fromkeys(row["place"] for row in rows))
     place = np.array([names.index(row["place"]) for row in rows], np.int32)
     where = np.array([[row[name] for name in NUMBERS] for row in rows])
+    fov_deg = np.where(np.isnan(where[:, 4]), lens.fov_deg, where[:, 4])
     turns, taken = where[:, 2] / 360 * around, np.full((len(names), around), -1)
     for k in np.argsort(-np.abs(turns - np.rint(turns))):  # that nearest to a heading stands at last
         taken[place[k], int(np.rint(turns[k])) % around] = k
@@ -98,7 +99,10 @@ def import_photographs(folder: Path, out: Path, config: DataConfig, scene: Path 
         write_plan(out / name, plan)
         for kind, sheets in of_kind.items():
             for path, some in numbered(out / name, kind, sheets, config.shard):
-                images = [np.stack([_picture(folder, rows[k], lens) for k in sheet]) for sheet in some]
+                images = [
+                    np.stack([read_picture(folder / rows[k]["file"], fov_deg[k], lens) for k in sheet])
+                    for sheet in some
+                ]
                 write_shard(path, images, config.quality)
     left_out = ", ".join(names[k] for k in np.flatnonzero(lacking)) or "none"
     return (
@@ -107,9 +111,9 @@ def import_photographs(folder: Path, out: Path, config: DataConfig, scene: Path 
     )
 
 
-def _picture(folder: Path, row: dict[str, Any], lens: Lens) -> np.ndarray:
-    path, fov_deg = folder / row["file"], lens.fov_deg if math.isnan(row["fov_deg"]) else row["fov_deg"]
-    with readable(path, FileError, "take it again, or remove its row"), Image.open(path) as image:
+def read_picture(path: Path, fov_deg: float, lens: Lens) -> np.ndarray:
+    """Return what a lens shows [H, W, 3] u8 of a photograph with a vertical field of view."""
+    with readable(path, FileError, "take it again, or leave it out"), Image.open(path) as image:
         pixels = np.asarray(image.convert("RGB"))
     return seen_through(pixels, fov_deg, lens)
 

@@ -44,7 +44,6 @@ class Pupil(HostPolicy):
         self._numbers, self._driver, self._renderers = numbers, driver, renderers
 
     def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> Any:
-        """See `HostPolicy`."""
         action, memory, over = _taught(self.remembers, state.info["policy"], state)
         over = np.asarray(over) | np.asarray(state.info["nav"].memory["touching"]).any(1)
         robot, config = self.remembers.env.robot, self.remembers.config

@@ -212,20 +212,17 @@ def scan_points(ranges_m: jax.Array, config: ExpertConfig, lidar_xy_b: tuple[flo
 
 @flax.struct.dataclass
 class Tasks(Rows):
-    """Hold a batch of B drives over several scenes."""
+    """Hold a batch of B drives over several scenes, a row each; integers are i32."""
 
     scene: np.ndarray
-    """[B] i32."""
     goals: np.ndarray
-    """[B, legs] i32 fields of the terrain, one per leg."""
+    """[B, legs] fields of the terrain, one per leg."""
     goals_w: np.ndarray
     """[B, legs, 2] m, the nodes of these fields."""
     legs: np.ndarray
-    """[B] i32."""
     start_xy_w: np.ndarray
     """[B, 2] m."""
     start_yaw_rad: np.ndarray
-    """[B]."""
 
 
 def drive_env(scenes: Sequence[Path], config: DriveConfig) -> InteractiveNav:

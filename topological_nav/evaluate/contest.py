@@ -121,7 +121,6 @@ class ContestScene:
 
     @functools.cached_property
     def space(self) -> FreeSpace:
-        """Return the free space for the robot."""
         return free_space(self.scene, self.robot.height_m)
 
     @functools.cached_property
@@ -131,7 +130,6 @@ class ContestScene:
 
     @functools.cached_property
     def episodes(self) -> DrivenEpisodes:
-        """Draw all episodes of the scene."""
         config = self.contest.config
         return draw_episodes(self.scene.digest, self.space, self.rooms, count_of(self.scene, config), config)
 
@@ -146,7 +144,6 @@ class ContestScene:
 
     @functools.cached_property
     def map(self) -> TopologicalMap:
-        """Load or build the dense map."""
         if self.networks is None:
             return true_map(self.scene, self.space, self.rooms, MapConfig(), DataConfig())
         path = self.contest.map_files.get(self.scene.name) or self.contest.maps / f"{self.scene.name}.npz"
@@ -172,7 +169,6 @@ class ContestScene:
         return drawn_for(drawn, self.contest.config.supersample)
 
     def map_of(self, contender: str) -> TopologicalMap:
-        """Return a navigator's map."""
         if contender != "sparse":
             return self.map
         return self.map.thinned(self.contest.config.thinned, self.contest.config.seed)
@@ -184,7 +180,6 @@ class ContestScene:
         return NetworkSight(graph, self.networks, self.contest.config.match)
 
     def navigator(self, contender: str) -> Navigator:
-        """Return the navigator of the dense or the sparse map."""
         graph = self.map_of(contender)
         sight = self.sight(graph)
         name, config = self.contest.policy, self.contest.config

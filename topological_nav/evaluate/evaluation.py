@@ -116,32 +116,29 @@ TRACK_S = 0.5
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Played:
-    """Hold the outcome of n episodes."""
+    """Hold the outcome of n episodes; arrays are [n]."""
 
     success: np.ndarray = column(False, bool)
-    """[n] bool."""
     arrived: np.ndarray = column(False, bool)
-    """[n] bool: ended because the navigator localised at the goal's node."""
+    """The episode ended because the navigator localised at the goal's node."""
     goal_m: np.ndarray = column(0.0)
-    """[n] distance to the goal at the end."""
+    """Distance to the goal at the end."""
     path_m: np.ndarray = column(0.0)
-    """[n]."""
     duration_s: np.ndarray = column(0.0)
-    """[n]."""
     runs: np.ndarray = column(0, int)
-    """[n] int, runs driven; the end of an episode cuts short a run, which counts as whole."""
+    """Runs driven; the end of an episode cuts short a run, which counts as whole."""
     contact_runs: np.ndarray = column(0, int)
-    """[n] int, runs with a contact."""
+    """Runs with a contact."""
     contact_s: np.ndarray = column(0.0)
-    """[n] seconds of control steps with a contact, turning included."""
+    """Seconds of control steps with a contact, turning included."""
     wall_s: np.ndarray = column(0.0)
-    """[n] of these seconds, with a wall."""
+    """Of these seconds, with a wall."""
     localisations: np.ndarray = column(0, int)
     blocked: np.ndarray = column(0, int)
     lost: np.ndarray = column(0, int)
-    """[n] int, number of such events of the navigator; 0 for others."""
+    """Number of such events of the navigator; 0 for others."""
     broken: np.ndarray = column(False, bool)
-    """[n] bool: the physics gave up, which ends an episode as failed."""
+    """The physics gave up, which ends an episode as failed."""
     track_w: list[Any]
     """n paths [t, 2], m, a point every `TRACK_S`."""
 
@@ -166,11 +163,9 @@ class Contender(HostPolicy):
         raise NotImplementedError
 
     def look(self, state: Any) -> Snapshot:
-        """Return the robots' state."""
         return Snapshot.of(state)
 
     def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> tuple[Any, np.ndarray]:
-        """See `HostPolicy`."""
         self._rows = number = np.minimum(episode, len(self._episodes) - 1)  # a batch may be padded
         if step == 0:
             for name, values in fresh(Played, len(number)).items():
@@ -268,14 +263,12 @@ class NavigatorPlayer(Contender):
         self._gap = Gap(self.config, self.config.seed, episodes.number, half_m)
 
     def keep(self, rows: np.ndarray) -> None:
-        """See `Contender`."""
         assert self.state is not None
         self.state, self._images = self.state.take(rows), self._images[rows]
         self._shot = tuple(part[rows] for part in self._shot)
         self._gap.keep(rows)
 
     def step(self, state: Any, now: Snapshot, running: np.ndarray, step: int) -> tuple[Any, Events]:
-        """See `Contender`."""
         assert self.state is not None
         time_s, robot = step * self.player.env.dt, self.player.env.robot
         heading = self._gap.heading(now.yaw_rad, time_s)
@@ -303,11 +296,9 @@ class ActionPlayer(Contender):
         self._make_act, self.observes = make_act, observes
 
     def begin(self, episodes: DrivenEpisodes) -> None:
-        """See `Contender`."""
         self._act = self._make_act()
 
     def step(self, state: Any, now: Snapshot, running: np.ndarray, step: int) -> tuple[Any, Events]:
-        """See `Contender`."""
         config, dt_s = self.config, self.player.env.dt
         edge = running & (step % max(1, round(config.run_s / dt_s)) == 0)
         late = running & (step * dt_s >= config.limit_s - 1e-3)

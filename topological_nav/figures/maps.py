@@ -229,7 +229,6 @@ class Driven:
 
     @property
     def outcome(self) -> str:
-        """Return a description of the outcome."""
         played = self.played
         what = "reached the goal" if played.success[0] else "did not reach the goal"
         return (

@@ -54,7 +54,6 @@ Epoch = Callable[[Learner, jax.Array, Any, jax.Array], tuple[Learner, dict[str, 
 def make_learner(
     module: nn.Module, image_shape: tuple[int, int], tx: optax.GradientTransformation, seed: int
 ) -> Learner:
-    """Initialise a learner."""
     return Learner.start(initial(variable_shapes(module, image_shape), seed), tx)
 
 
@@ -132,7 +131,6 @@ def over(epoch: Epoch, images: Any, labels: Any) -> Callable[[Learner, int, jax.
 
 
 def phase_key(seed: int, phase: int) -> jax.Array:
-    """Return the random key of a phase of a run."""
     return jax.random.fold_in(jax.random.PRNGKey(seed), phase)
 
 

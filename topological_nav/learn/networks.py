@@ -78,7 +78,6 @@ class Network(nn.Module):
     first_stage: int = 2
 
     def setup(self) -> None:
-        """Build the submodules; flax calls it."""
         of_resnet = {"first_stage": self.first_stage} if self.backbone == "resnet18" else {}
         self.body = {"resnet18": ResNet18, "alexnet": AlexNet}[self.backbone](self.width, **of_resnet)
         self.drops = self.task == "passages" and self.backbone == "alexnet"

@@ -95,7 +95,6 @@ class NetworkSight:
         return _apart(queries, nodes.reshape(-1, nodes.shape[-1])).reshape(len(queries), -1, around).min(-1)
 
     def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
-        """Return the detector's probability; see `Sight.passage`."""
         return self._networks.detector.passage(images, ahead_m)
 
 
@@ -105,7 +104,6 @@ class TrueSight:
     summed = True
 
     def __init__(self, graph: TopologicalMap, space: FreeSpace, margin_m: float = 0.225):
-        """Store the plan."""
         self._xy, self._space, self._margin_m = graph.xy_w.astype(float), space, margin_m
 
     def distances(self, images: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
@@ -146,7 +144,6 @@ class PassagePolicy:
     """Images (0.15 rad each) during the first turn to the left."""
 
     def __init__(self, sight: Sight, passable: float = 0.5, ahead_m: float = 1.0):
-        """Store the judge."""
         self._sight, self._passable, self._ahead_m = sight, passable, ahead_m
 
     def start(self, batch: int) -> Any:
@@ -154,7 +151,6 @@ class PassagePolicy:
         return np.zeros(batch, np.int32)
 
     def act(self, state: Any, images: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
-        """See `driving.LocalPolicy`."""
         free = self._sight.passage(images, self._ahead_m) >= self._passable
         # Turns end after 1, 3, 5, ... times SWEEP looks: sides change after SWEEP * k^2.
         side = np.where(np.floor(np.sqrt(state / self.SWEEP)).astype(int) % 2 == 0, 1.0, -1.0)
@@ -300,7 +296,6 @@ class Pictures:
     """Render level images of a scene in chunks, each kept in a file until it is no longer needed."""
 
     def __init__(self, scene: Scene, data: DataConfig, robot: RobotSpec, progress: Progress, parts: Path | None = None):
-        """Store the settings without rendering."""
         self._scene, self._data, self._robot, self._progress, self._parts = scene, data, robot, progress, parts
         self._done, self.total = 0, 0
         self._of = json.dumps([scene.digest, to_dict(data)], sort_keys=True).encode()

@@ -119,7 +119,6 @@ class State(Events):
     """State of the local policy."""
 
     def take(self, rows: np.ndarray) -> State:
-        """Return the given rows of the batch."""
         return jax.tree.map(lambda x: np.asarray(x)[rows], self)
 
     @property
@@ -128,11 +127,9 @@ class State(Events):
         return self.phase >= ARRIVED
 
     def restart_pid(self, rows: np.ndarray) -> None:
-        """Reset the PID for a new target."""
         self.integral[rows], self.error_rad[rows] = 0.0, np.nan
 
     def put_hidden(self, rows: np.ndarray, new: Any) -> None:
-        """Set rows of the local policy's state."""
         for old, value in zip(jax.tree.leaves(self.hidden), jax.tree.leaves(new), strict=True):
             old[rows] = np.asarray(value)
 

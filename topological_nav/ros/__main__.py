@@ -44,7 +44,6 @@ class Navigator(UsesNetworks):
 
 @reports_errors("topological_nav.ros")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the navigator's node."""
     with stop_signals() as stops:
         arguments = parse(Navigator, "python -m topological_nav.ros", argv)
         config = overridden(NavigatorConfig(), arguments.settings)

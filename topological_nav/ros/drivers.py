@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from PIL import Image
 
 from interactive_nav import get_robot
-from interactive_nav.sensing.base import seen_through
 from interactive_nav_common.errors import ConfigError, UserError
 from scenes_mjcf.look import Lens
 from topological_nav.config import NavigatorConfig
 from topological_nav.data.folders import lens_of
+from topological_nav.data.photographs import read_picture
 from topological_nav.drives.driving import local_policy
 from topological_nav.learn.training import load_networks
 from topological_nav.maps.build import NetworkSight
@@ -55,11 +54,9 @@ class PilotDriver:
     """Drive one robot by the navigator until it reaches the goal or runs out of time."""
 
     def __init__(self, navigator: Navigator, state: State, lens: Lens):
-        """Store the navigator and its state, of `Navigator.start`."""
         self._navigator, self._state, self.lens = navigator, state, lens
 
     def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> VelocityCommand:
-        """See `Driver.step`."""
         now = image[None], np.array([heading_rad]), np.array([time_s])
         self._state = state = self._navigator.step(self._state, *now)
         done = bool(state.arrived[0]) or bool(state.timed_out[0])
@@ -77,13 +74,7 @@ def topological_driver(
     policy = local_policy(choice.policy, sight, config, networks)
     if not goals:
         raise ConfigError("the navigator has no goal; name a picture taken there: --goal PICTURE")
-    pictures = []
-    for path in goals:
-        try:
-            with Image.open(path) as image:
-                pictures.append(seen_through(np.asarray(image.convert("RGB")), lens.fov_deg, lens))
-        except OSError as error:
-            raise ConfigError(f"{path}: is no picture that can be read ({error})") from None
+    pictures = [read_picture(path, lens.fov_deg, lens) for path in goals]
     around = goal_heading_rad + 2 * np.pi * np.arange(len(pictures)) / len(pictures)
     navigator = Navigator(built, sight, policy, config)
     return PilotDriver(navigator, navigator.start(navigator.goal_nodes(np.stack(pictures)[None], around)), lens)

@@ -131,7 +131,6 @@ class Rooms:
 
     @property
     def count(self) -> int:
-        """Return the number of rooms."""
         return int(self.labels.max()) + 1
 
     def of(self, xy_w: np.ndarray) -> np.ndarray:

@@ -28,7 +28,6 @@ class Draw(Command):
 
 @reports_errors("train.figures")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Draw; return 0 when done, 2 on a user's error."""
     arguments = parse(Draw, "python -m train.figures", argv)
     from interactive_nav_common.figures import RC, plt, save  # Matplotlib takes a second: --help does without
     from train.figures.results import SWEPT, Results, chosen_split, figures_of

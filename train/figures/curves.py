@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
+from scipy.ndimage import uniform_filter1d
 
 from interactive_nav_common.figures import draw_means, legend, panels
 from interactive_nav_common.statistics import estimate
@@ -64,12 +65,9 @@ def _points(lines: Sequence[Mapping[str, Any]], key: str) -> np.ndarray:
 
 def running_mean(values: np.ndarray, width: int) -> np.ndarray:
     """Return centred means over up to `width` points along the last axis, fewer at the ends."""
-    if width <= 1:
-        return values
-    sums = np.cumsum(np.concatenate([np.zeros((*values.shape[:-1], 1)), values], -1), -1)
-    at = np.arange(values.shape[-1])
-    low, high = np.maximum(at - width // 2, 0), np.minimum(at + width // 2 + 1, values.shape[-1])
-    return (sums[..., high] - sums[..., low]) / (high - low)
+    size = 2 * (width // 2) + 1
+    sums, counts = (uniform_filter1d(x, size, mode="constant") for x in (values, np.ones_like(values)))
+    return sums / counts
 
 
 def cell_curves(cells: Mapping[style.Cell, Sequence[Sequence[Mapping[str, Any]]]]) -> Figure:

@@ -220,7 +220,6 @@ def page(results: Sequence[Path], split: str | None, films: int, console: "Conso
 
 @reports_errors("train.figures.report")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Write the report; return 0 when done, 2 on a user's error."""
     arguments = parse(Report, "python -m train.figures.report", argv)
     from interactive_nav_common.jobs.progress import SafeConsole
 

@@ -39,11 +39,9 @@ class Looks:
         self.seeds = seeds_text({len(runs) for runs in cells.values()})
 
     def algorithm(self, name: str) -> dict[str, Any]:
-        """Return colour and marker."""
         return look(ALGORITHMS, name, self.algorithms)
 
     def robot(self, name: str) -> dict[str, Any]:
-        """Return colour and marker."""
         return look(ROBOTS, name, self.robots)
 
     def fill(self, k_int: float) -> Any:
@@ -56,19 +54,15 @@ class Looks:
         return LINES[self.k_ints.index(k_int) % len(LINES)] if len(self.k_ints) > 1 else "-"
 
     def k_int(self, k_int: float) -> dict[str, Any]:
-        """Return marker fill and line style."""
         return {"fillstyle": self.fill(k_int), "linestyle": self.line(k_int)}
 
     def algorithm_handles(self, **more: Any) -> list[Line2D]:
-        """Return lines of a legend."""
         return [handle(name.upper(), **{**self.algorithm(name), **more}) for name in self.algorithms]
 
     def robot_handles(self) -> list[Line2D]:
-        """Return lines of a legend."""
         return [handle(robot_name(name), **self.robot(name)) for name in self.robots]
 
     def k_int_handles(self, **more: Any) -> list[Line2D]:
-        """Return lines of a legend."""
         grey = {"color": "0.3", "marker": "o"}
         return [handle(f"k$_{{int}}$ = {k:g}", **{**grey, **self.k_int(k), **more}) for k in self.k_ints]
 
@@ -82,7 +76,6 @@ def policy_colours(policies: Sequence[str]) -> dict[str, str]:
 
 
 def robot_name(robot: str) -> str:
-    """Return it as papers write it."""
     return title(robot) or robot
 
 

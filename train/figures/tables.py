@@ -10,11 +10,11 @@ import pyarrow.compute as pc
 from interactive_nav_common.rows import markdown, where
 from interactive_nav_common.statistics import estimate, over_episodes
 from train.figures import style
+from train.scoring.rows import SCORES
 from train.scoring.statistics import Finding, cells, claims, learned_rows, objects_moved, run_means
 
 SPLITS = {"train": "seen", "test": "unseen"}
 COLUMNS = ("success", "P_eff = SPL = INS_1", "E_eff = INS_0", "INS_0.5")
-NAMES = ("success", "path_efficiency", "effort_efficiency", "ins_0.5")
 
 
 def score_cells(rows: pa.Table) -> str:
@@ -22,7 +22,7 @@ def score_cells(rows: pa.Table) -> str:
     lines = []
     for split, name in SPLITS.items():
         for (robot, algorithm, k_int), runs in cells(run_means(rows, split)).items():
-            scores = [estimate(run.scores[score] for run in runs) for score in NAMES]
+            scores = [estimate(run.scores[score] for run in runs) for score in SCORES]
             episodes = sum(run.episodes for run in runs)
             cell = (style.robot_name(robot), algorithm.upper(), f"{k_int:g}", name)
             lines.append((*cell, len(runs), f"{episodes:,}", *scores))
@@ -36,7 +36,7 @@ def baselines(rows: pa.Table) -> str:
     for robot, policy, split in sorted(set(zip(*(rows[name].to_pylist() for name in names), strict=True))):
         if policy != "learned":
             part = where(rows, robot=robot, policy=policy, split=split)
-            scores = (over_episodes(score, part[score].to_numpy()).with_ends() for score in NAMES)
+            scores = (over_episodes(score, part[score].to_numpy()).with_ends() for score in SCORES)
             lines.append((style.robot_name(robot), policy, SPLITS.get(split, split), f"{len(part):,}", *scores))
     return markdown(("robot", "policy", "scenes", "episodes", *COLUMNS), lines) if lines else ""
 

@@ -329,7 +329,6 @@ class DDPG(ActorCritic):
         return act
 
     def init_noise(self) -> jax.Array:
-        """Return zeros [envs, A]."""
         return jnp.zeros((self.config.num_envs or 1, self.action_size))
 
     def explore(

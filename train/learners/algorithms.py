@@ -32,7 +32,6 @@ class Algorithm:
     policy holds."""
 
     def train(self, env: Env, config: TrainConfig, callbacks: Callbacks) -> TrainResult:
-        """Train a policy."""
         agent = self.make_agent(env, config)
         first = self.start(agent, env, config.run.seed)
         snapshot = callbacks.restore(first) or first

@@ -32,7 +32,6 @@ class CloneData:
 
     @property
     def info(self) -> dict[str, Any]:
-        """Return the environments' `info`."""
         return self.env_state.info
 
     @property
@@ -43,8 +42,6 @@ class CloneData:
 
 @dataclasses.dataclass(frozen=True)
 class CloneParts(ppo.PPOParts):
-    """Holds all that learning does not change."""
-
     clone: CloneConfig = dataclasses.field(default_factory=CloneConfig)
 
 

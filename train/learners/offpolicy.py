@@ -157,7 +157,6 @@ class OffPolicyData:
 
     @property
     def info(self) -> dict[str, Any]:
-        """Return the environments' `info`."""
         return self.env_state.info
 
     @property
@@ -236,7 +235,6 @@ def learn(
 
 
 def update(agent: ActorCritic, env: Env, learner: Any, data: OffPolicyData) -> tuple[Any, OffPolicyData, Update]:
-    """Act, then learn."""
     key_act, key_learn, key_next = jax.random.split(learner.key, 3)
     data, collected = collect(agent, env, learner, data, key_act)
     sums = jax.tree.map(jnp.sum, collected.pop("sums"))

@@ -159,7 +159,6 @@ def set_aside(root: Path, after: int) -> list[Path]:
 
 
 def read_meta(folder: Path) -> CheckpointMeta:
-    """Read `meta.json` of a checkpoint."""
     reader = Reader(CheckpointError, "remove this checkpoint", finite=False)
     return reader.record(reader.json(folder / META), CheckpointMeta, str(folder / META))
 
@@ -246,7 +245,6 @@ def plain_size(size: int | Mapping[str, tuple[int, ...]]) -> int | dict[str, lis
 
 
 def megabytes(tree: Any) -> float:
-    """Return the memory of a tree's arrays."""
     return sum(_raw(x).nbytes for x in jax.tree.leaves(tree)) / 1e6
 
 

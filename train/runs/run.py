@@ -128,7 +128,6 @@ class FolderCallbacks:
         return Snapshot(meta.env_steps, learner, env_state)
 
     def should_stop(self) -> bool:
-        """Return True once a signal has requested it."""
         return bool(self.stops)
 
     def on_start(self, snapshot: Snapshot, total_steps: int) -> None:
@@ -154,7 +153,6 @@ class FolderCallbacks:
         self.bar(completed=snapshot.env_steps, total=total_steps)
 
     def on_update(self, env_steps: int) -> None:
-        """Move the bar."""
         self.bar(completed=env_steps)
 
     def on_log(self, env_steps: int, metrics: dict[str, float]) -> None:
@@ -318,7 +316,6 @@ def _train_in(
 
 
 def learn(env: Any, config: TrainConfig, callbacks: Any) -> TrainResult:
-    """Train on the config's devices."""
     devices, batch = devices_here(config.run.devices), AutoResetEnv(env)
     return ALGORITHMS[config.algorithm].train(
         ShardedEnv(batch, devices) if len(devices) > 1 else batch, config, callbacks

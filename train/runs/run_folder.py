@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from interactive_nav_common.config import Natural, NotNegative, flatten, replace
-from interactive_nav_common.errors import FileError
+from interactive_nav_common.errors import FileError, readable
 from interactive_nav_common.files import write_json, write_text, writing
 from interactive_nav_common.records import METRICS, RUNS, read_metrics
 from interactive_nav_common.rows import digest_of
@@ -65,11 +65,8 @@ class RunFolder:
         """Return the resolved config of the run."""
         if not self.config.is_file():
             raise FileError(f"{self.path}: is no run folder (no config.yaml); expected <out_dir>/<name> of a run")
-        try:
+        with readable(self.config, FileError, "fetch the run again", " as the config of a run"):
             text = self.config.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "not a text file"
-            raise FileError(f"{self.config}: cannot be read ({reason}); expected the config of a run") from None
         if not text.strip():
             raise FileError(f"{self.config}: is empty, expected the config of a run; fetch the run again")
         config, robot = from_yaml(text, where=str(self.config)), self._kept_robot()

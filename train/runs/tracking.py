@@ -24,7 +24,6 @@ ID_FILE = "wandb_id"
 
 
 def import_wandb() -> Any:
-    """Return the package."""
     return optional("wandb", missing("run.wandb=true", "wandb", "wandb", ", or set run.wandb=false"))
 
 
@@ -87,11 +86,9 @@ class Tracker:
         self._run.define_metric("*", step_metric="env_steps")
 
     def log(self, env_steps: int, metrics: dict[str, float]) -> None:
-        """Send the means of a log interval."""
         self._run.log({"env_steps": env_steps, **metrics})
 
     def close(self) -> None:
-        """Send or write what is left."""
         self._run.finish()
 
 

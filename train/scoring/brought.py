@@ -45,7 +45,6 @@ class PlayedEnv:
 
 
 def describe_env(env: Any) -> PlayedEnv:
-    """Describe an environment."""
     obs = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((2,), np.uint32)).obs
     ends = np.cumsum([0, *env.sensors.sizes.values()]).tolist()
     twist = env.robot.twist

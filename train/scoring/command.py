@@ -52,6 +52,5 @@ class Evaluate(Command):
 
     @classmethod
     def epilog(cls) -> str:
-        """Return what --policies may name and the default sizes."""
         batches = ", ".join(f"{backend} {size}" for backend, size in AUTO_BATCH.items())
         return f"policies: {', '.join(POLICIES)}\nplanners: {', '.join(PLANNERS)}\nseed: {SEED}\nbatch: {batches}"

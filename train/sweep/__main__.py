@@ -66,7 +66,6 @@ class Sweep(Command):
 
     @classmethod
     def epilog(cls) -> str:
-        """Return the sweeps, the keys of their files and the exit codes."""
         return (
             f"sweeps: {', '.join(preset_names(spec.SWEEP_DIR))}\n\n"
             f"keys of the file (default):\n{settings_help(SweepConfig(), equals=': ')}\n\n"

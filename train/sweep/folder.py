@@ -80,15 +80,12 @@ class SweepFolder:
                     paths.unlink(missing_ok=True)
 
     def config(self, run: str) -> Path:
-        """Return the path of the config that `python -m train` is given."""
         return self.root / "configs" / f"{run}.yaml"
 
     def log(self, run: str) -> Path:
-        """Return the path of what its programs printed."""
         return self.root / "logs" / f"{run}.log"
 
     def lock(self, run: str) -> Path:
-        """Return the path of the lock held by whoever works on the run."""
         return self.root / "locks" / run
 
     def state(self, run: RunSpec) -> RunState:
@@ -158,11 +155,9 @@ class SweepFolder:
                 paths_beside(path).unlink(missing_ok=True)
 
     def give_up(self, run: str, reason: str, attempts: int) -> None:
-        """Note why a run was given up."""
         write_text(self.root / "failed" / f"{run}.json", json.dumps({"reason": reason, "attempts": attempts}) + "\n")
 
     def try_again(self, run: str) -> None:
-        """Forget that a run was given up."""
         (self.root / "failed" / f"{run}.json").unlink(missing_ok=True)
 
 
@@ -256,7 +251,6 @@ class SweepDisplay(contextlib.ExitStack):
         return self
 
     def event(self, text: str, style: str = "") -> None:
-        """Print a line."""
         self._console.print(Text(f"{time.strftime('%H:%M:%S')} {text}", style))
 
     def update(self, states: Sequence[RunState], where: dict[str, str]) -> None:

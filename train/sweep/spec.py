@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from interactive_nav_common.config import (
     AtLeastOne,
     Natural,
@@ -22,7 +20,6 @@ from interactive_nav_common.config import (
 )
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import check_name
-from interactive_nav_common.untrusted.reading import Loader
 from scenes_mjcf.sets import scene_folders
 from train import config_io
 from train.config import TrainConfig, validate
@@ -197,10 +194,7 @@ def select(sweep: Sweep, where: Sequence[str], shard: str | None) -> Sweep:
         axis, equals, text = word.partition("=")
         if not equals:
             raise ConfigError(f"--where {word!r}: expected setting=value[,value], for example env.robot=fetch")
-        try:
-            chosen = [yaml.load(item, Loader) for item in text.split(",")]
-        except (yaml.YAMLError, ValueError, RecursionError):
-            raise ConfigError(f"--where {word!r}: not readable, expected setting=value[,value]") from None
+        chosen = [config_io.parsed(item, f"--where {word!r}") for item in text.split(",")]
         wanted = _where({axis: chosen}, sweep.config, f"--where {word}")
         runs = [run for run in runs if _matches(wanted, run.values)]
     if shard is not None:

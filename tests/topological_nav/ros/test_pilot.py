@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.errors import ConfigError, FileError
 from topological_nav.config import NavigatorConfig
 from topological_nav.data.dataset import load_rooms
 from topological_nav.learn.training import load_trained
@@ -52,7 +52,7 @@ def test_what_is_missing_is_told(made, tmp_path, capsys):
     with pytest.raises(ConfigError, match="no goal; name a picture"):
         topological_driver(made.map, seeing(made), (), 0.0, NavigatorConfig())
     (tmp_path / "goal.png").write_text("no")
-    with pytest.raises(ConfigError, match="is no picture that can be read"):
+    with pytest.raises(FileError, match="goal.png: not readable .*; take it again, or leave it out"):
         topological_driver(made.map, seeing(made), (tmp_path / "goal.png",), 0.0, NavigatorConfig())
     assert main([]) == 2
     assert "missing --map" in capsys.readouterr().err
