@@ -324,7 +324,6 @@ def validate(config: TrainConfig) -> None:
 
 
 def _validate_devices(name: str, ppo: PPOConfig, devices: int) -> None:
-    """Raise `ConfigError` where several devices cannot take equal shares."""
     if name != "ppo":
         raise ConfigError(
             f"run.devices is {devices}, expected 1 with algorithm {name}: its replay stays on one device; "
@@ -339,7 +338,6 @@ def _validate_devices(name: str, ppo: PPOConfig, devices: int) -> None:
 
 
 def _validate_replay(name: str, config: OffPolicyConfig, num_timesteps: int) -> None:
-    """Raise `ConfigError` where the replay could never be learned from."""
     if config.min_replay_size and config.min_replay_size >= num_timesteps:
         raise ConfigError(
             f"{name}.min_replay_size is {config.min_replay_size}, expected less than run.num_timesteps "

@@ -338,7 +338,6 @@ def _log_lines(graph: TopologicalMap, state: State) -> Iterator[str]:
 
 
 def _film_every(venue: ContestScene) -> int:
-    """Return the control steps per frame."""
     return max(1, round(FILM_EVERY_S / venue.player.env.dt))
 
 

@@ -79,7 +79,6 @@ class Trained:
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _applied(network: Network, method: str, variables: Any, images: jax.Array) -> Any:
-    """Apply a network's method to images."""
     return network.apply(variables, images, method=method)
 
 

@@ -95,7 +95,6 @@ def cell_curves(cells: Mapping[style.Cell, Sequence[Sequence[Mapping[str, Any]]]
 
 
 def _label(axis: Any, label: str) -> None:
-    """Label the axes of a metric over environment steps."""
     axis.set_xlabel("environment steps")
     axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     axis.set_ylabel(label)

@@ -93,15 +93,10 @@ def insert(
     def write(ring: jax.Array, x: jax.Array) -> jax.Array:
         return ring.at[at].set(x.astype(ring.dtype))
 
-    return ReplayBuffer(
-        observation=jax.tree.map(write, replay.observation, observation),
-        action=write(replay.action, action),
-        reward=write(replay.reward, reward),
-        done=write(replay.done, done),
-        truncated=write(replay.truncated, truncated),
-        position=(at + 1) % slots,
-        filled=jnp.minimum(replay.filled + 1, slots),
-    )
+    step = {"observation": observation, "action": action, "reward": reward, "done": done, "truncated": truncated}
+    written = {name: jax.tree.map(write, getattr(replay, name), value) for name, value in step.items()}
+    moved = {"position": (at + 1) % slots, "filled": jnp.minimum(replay.filled + 1, slots)}
+    return replay.replace(**written, **moved)  # type: ignore[attr-defined]
 
 
 def replay_size(replay: ReplayBuffer) -> jax.Array:

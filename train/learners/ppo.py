@@ -95,7 +95,6 @@ class PPOParts:
         )
 
     def policy(self, learner: PPOState, deterministic: bool) -> types.Policy:
-        """Return (observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
         make = ppo_networks.make_inference_fn(self.nets)
         return make((learner.normalizer_params, *whole_params(learner.params)), deterministic)
 

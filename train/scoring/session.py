@@ -168,7 +168,6 @@ def run(arguments: Evaluate, build_env: Callable[[EnvConfig], Any] | None, kept:
 
 
 def _report(console: Console, rows: pa.Table, config: TrainConfig, env: Any, out: Path) -> None:
-    """Print the table of scores, and whether they are in doubt."""
     console.print(score_table(rows, f"{config.run.name}: {', '.join(scene.name for scene in env.scenes)}"))
     # A solve that met its iteration limit is inexact, not lost.
     for name in ("nonfinite", *LOST):

@@ -190,7 +190,6 @@ def _of_sac(means: Sequence[RunMean], robot: str) -> Iterator[Finding]:
 
 
 def _best(of_robot: Cells, alpha: float) -> tuple[str, str, float]:
-    """Return the cell of the highest mean INS."""
     return max(of_robot, key=lambda cell: estimate(run.ins(alpha) for run in of_robot[cell]).mean)
 
 
