@@ -64,7 +64,7 @@ def import_photographs(folder: Path, out: Path, config: DataConfig, scene: Path 
     names = list(dict.fromkeys(row["place"] for row in rows))
     place = np.array([names.index(row["place"]) for row in rows], np.int32)
     where = np.array([[row[name] for name in NUMBERS] for row in rows])
-    fov_deg = np.where(np.isnan(where[:, 4]), lens.fov_deg, where[:, 4])
+    fov_deg = np.where(np.isnan(where[:, 4]), lens.fov_deg, where[:, 4]).tolist()
     turns, taken = where[:, 2] / 360 * around, np.full((len(names), around), -1)
     for k in np.argsort(-np.abs(turns - np.rint(turns))):  # that nearest to a heading stands at last
         taken[place[k], int(np.rint(turns[k])) % around] = k
