@@ -59,21 +59,17 @@ def __getattr__(name: str) -> Any:
 def make(
     robot: str | RobotSpec, scenes: Sequence[str | Path], terms: Sequence[Term] = (), **settings: Any
 ) -> InteractiveNav:
-    """Build an environment.
+    """Build a `brax.envs.Env` with pure `reset` and `step` for one environment; batch it with `jax.vmap`.
 
     Args:
-        robot: a name from `robot_names()`, or a spec of `get_robot`.
+        robot: what `get_robot` takes, or a spec that it returns.
         scenes: scene folders, or sets of them (`cluttered/train`); each episode draws one.
         terms: reward terms, metrics and observations to add (`interactive_nav.task.terms`).
         **settings: of `NavConfig`'s parts, such as backend, num_objects, observations, k_int, episode_steps; or
             `variant="code"` for the values of the original's code where it differs from its paper.
 
-    Returns:
-        A `brax.envs.Env` with pure `reset` and `step` for one environment; batch it with `jax.vmap`.
-
     Raises:
-        ConfigError: unknown robot or setting (the message names the nearest valid one), or an impossible value.
-        FileError: a robot file that lacks a part, or whose parts do not fit.
+        ConfigError, FileError: as `get_robot`, or an unknown setting or impossible value.
         SceneError: an unusable scene.
     """
     from interactive_nav.config import make_config

@@ -20,17 +20,12 @@ class CameraView(Settings):
     """It looks so far to the left of its body's x axis."""
     pitch_deg: float | None = None
     """Positive looks down."""
-    pos_m: tuple[float, ...] | None = None
+    pos_m: tuple[float, float, float] | None = None
     """In the frame of the body that carries it."""
     fov_deg: FovDeg = None
     """Vertical; none: `image_fov_deg`."""
     size: ImageSide | None = None
     """Side of its square images, pixels; none: `image_size`."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.pos_m is not None and len(self.pos_m) != 3:
-            raise ConfigError(f"pos_m is {self.pos_m!r}, expected three numbers")
 
 
 @dataclasses.dataclass(frozen=True)

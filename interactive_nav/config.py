@@ -185,16 +185,10 @@ class PhysicsConfig(Settings):
         return round(self.control_dt_s / self.sim_dt_s)
 
 
-_NOISE = {
-    part: " ".join([*names, *(f.name for f in dataclasses.fields(CameraNoise) if f.name.startswith(part))])
-    for part, names in {
-        "depth": ("depth_range_m", "depth_dropout", "depth_noise"),
-        "rgb": ("random_colours", "random_light"),
-    }.items()
-}
-"""Image -> the settings that act on it alone."""
-
-
+_OF_DEPTH, _OF_RGB = (
+    " ".join(field.name for field in dataclasses.fields(CameraNoise) if field.name.startswith(part))
+    for part in ("depth", "rgb")
+)
 _OF_IMAGES = "cameras robot_visible image_size image_fov_deg image_dtype image_geometry renderer frame_dropout"
 
 
@@ -254,8 +248,8 @@ class SensorConfig(CameraNoise):
 
     IDLE = (
         _only_with(_OF_IMAGES, *IMAGES),
-        _only_with(_NOISE["depth"], "depth"),
-        _only_with(_NOISE["rgb"], "rgb"),
+        _only_with(f"depth_range_m depth_dropout depth_noise {_OF_DEPTH}", "depth"),
+        _only_with(f"random_colours random_light {_OF_RGB}", "rgb"),
         _only_with("lidar_rays lidar_fov_deg lidar_range_m lidar_pos_m lidar_dropout lidar_noise", "lidar"),
         _only_with("odometry_noise", "odometry"),
     )
@@ -266,8 +260,6 @@ class SensorConfig(CameraNoise):
             raise ConfigError(f"observations is {self.observations!r}, expected a choice from {', '.join(allowed)}")
         if self.image_geometry == "meshes" and self.renderer == "rays":
             raise ConfigError("renderer is 'rays', expected auto or warp with image_geometry=meshes")
-        if len(self.lidar_pos_m) != 3:
-            raise ConfigError(f"lidar_pos_m is {self.lidar_pos_m!r}, expected three numbers")
         super().__post_init__()
         names = [view.name for view in self.views]
         if self.cameras and (len(set(names)) < len(names) or not all(name.isidentifier() for name in names)):

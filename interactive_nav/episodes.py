@@ -28,7 +28,7 @@ from interactive_nav.task.env import InteractiveNav
 from interactive_nav.types import EpisodeStart
 from interactive_nav_common.commands import Command, option, parse
 from interactive_nav_common.config import Natural, NotNegative, Seed
-from interactive_nav_common.errors import ConfigError, UserError, reports_errors
+from interactive_nav_common.errors import ConfigError, UserError, readable, reports_errors
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.records import Reader
 from interactive_nav_common.signals import signals_wait
@@ -218,15 +218,9 @@ def save_episode_file(file: EpisodeFile, path: str | Path) -> None:
 
 def load_episode_file(path: str | Path) -> EpisodeFile:
     """Read and check a file; raise `EpisodeFileError` if it cannot be used."""
-    try:
+    with readable(path, EpisodeFileError, "make one with 'python -m interactive_nav.episodes make'"):
         text = read_bytes(path)
         text = unpack(text, "gzip") if Path(path).suffix == PACKED else text
-    except ValueError as error:
-        raise EpisodeFileError(f"{path}: {error}; make it again") from None
-    except OSError as error:
-        raise EpisodeFileError(
-            f"{path}: cannot read ({error.strerror}); make one with 'python -m interactive_nav.episodes make'"
-        ) from None
     data = _FILES.decoded(text, "JSON", str(path))
     if not isinstance(data, dict) or data.pop("format", None) != FORMAT:
         raise EpisodeFileError(f"{path}: not an episode file (format is not '{FORMAT}')")

@@ -28,30 +28,19 @@ def distance_field(
     resolution: float,
     goal_xy,
     origin: tuple[float, float] = (0.0, 0.0),
-    radius_m: float = 0.0,
-    max_iterations: int = 10_000,
 ):
     """Return the geodesic distance (m) of every cell centre to a goal: [rows, columns] f32, inf where unreachable.
 
-    Paths consist of `MOVES_32`. Jit-able, and vmap-able over goals and maps, but for a positive `radius_m`.
-
-    Args:
-        traversable: [rows along y, columns along x] bool, static structure only.
-        resolution: cell side, m.
-        goal_xy: (2,) world x, y, m. The goal's cell takes its distance from the goal point itself.
-        origin: world x, y of the outer corner of cell [0, 0], m.
-        radius_m: body radius, m; cells nearer than this to a blocked cell are not free.
-        max_iterations: bound on relaxation sweeps; one sweep advances a front by 1 to 3 cells.
-
-    Raises:
-        ValueError: the map is not two-dimensional, or the resolution is not positive.
+    Paths consist of `MOVES_32` over free cells of `traversable`, [rows along y, columns along x] bool, whose outer
+    corner [0, 0] is at `origin`, m, world. The goal's cell takes its distance from the goal point (2,), m, itself.
+    Jit-able, and vmap-able over goals and maps. Raise `ValueError` for a map of other dimensions or a cell side
+    (`resolution`, m) that is not positive.
     """
     if getattr(traversable, "ndim", 0) != 2:
         raise ValueError(f"traversable has shape {getattr(traversable, 'shape', None)}, expected [rows, columns]")
     if resolution <= 0:
         raise ValueError(f"resolution is {resolution} m, expected a positive cell side")
-    free = clearance(np.asarray(traversable), resolution) >= radius_m if radius_m > 0 else traversable
-    (rows, columns), free, goal = free.shape, jnp.asarray(free, bool), jnp.asarray(goal_xy, jnp.float32)
+    (rows, columns), free, goal = traversable.shape, jnp.asarray(traversable, bool), jnp.asarray(goal_xy, jnp.float32)
     x = (origin[0] + (jnp.arange(columns) + 0.5) * resolution)[None] - goal[0]
     y = (origin[1] + (jnp.arange(rows) + 0.5) * resolution)[:, None] - goal[1]
     at_goal = (jnp.abs(x) <= resolution / 2) & (jnp.abs(y) <= resolution / 2)
@@ -63,15 +52,15 @@ def distance_field(
     allowed = [jnp.stack([shifted(free, cell, False) for cell in crossed_cells(move)]).all(0) for move in moves]
 
     def sweep(carry):
-        field, _, i = carry
+        field, _ = carry
         new = field
         for move, mask in zip(moves, allowed, strict=True):
             there = shifted(field, move, jnp.inf) + resolution * math.hypot(*move)
             new = jnp.where(mask, jnp.minimum(new, there), new)
-        return new, jnp.any(new < field), i + 1
+        return new, jnp.any(new < field)
 
-    first = jnp.where(at_goal & free, jnp.hypot(x, y), jnp.inf), jnp.asarray(True), 0
-    return jax.lax.while_loop(lambda carry: carry[1] & (carry[2] < max_iterations), sweep, first)[0]
+    first = jnp.where(at_goal & free, jnp.hypot(x, y), jnp.inf), jnp.asarray(True)
+    return jax.lax.while_loop(lambda carry: carry[1], sweep, first)[0]
 
 
 def navigation_grid(traversable: np.ndarray, resolution_m: float, radius_m: float, cell_m: float) -> np.ndarray:

@@ -7,19 +7,10 @@ GRAVITY = 9.81
 
 
 def path_efficiency(success: Array, shortest_path_m: Array, robot_path_m: Array, clip: bool = True) -> Array:
-    """Return P_eff = 1_suc * L* / l_0, clipped to [0, 1] (paper section IV; with alpha = 1 the INS is SPL).
+    """Return P_eff = 1_suc * L* / l_0 [...] in [0, 1] (paper section IV; with alpha = 1 the INS is SPL).
 
-    A goal is a region, so a robot may succeed on a path shorter than L*: hence the clip. A robot that
-    succeeds without moving scores 1.
-
-    Args:
-        success: [...] 1 or True where the episode reached the goal.
-        shortest_path_m: [...] L*, metres, among static structure only; must not be negative.
-        robot_path_m: [...] l_0, metres travelled.
-        clip: at most 1; else the plain ratio.
-
-    Returns:
-        [...] float in [0, 1], without `clip` 0 or more.
+    `shortest_path_m`, not negative, is L* among static structure only. A goal is a region, so a robot may succeed on a
+    path shorter than L*, for which `clip` counts 1. A robot that succeeds without moving scores 1.
     """
     xp = namespace(success, shortest_path_m, robot_path_m)
     shortest = xp.asarray(shortest_path_m) * 1.0
@@ -30,14 +21,9 @@ def path_efficiency(success: Array, shortest_path_m: Array, robot_path_m: Array,
 
 
 def kinematic_effort(masses_kg: Array, path_lengths_m: Array) -> Array:
-    """Return m_0 l_0 / sum_i m_i l_i: the robot's share of the moved mass (paper section IV).
+    """Return m_0 l_0 / sum_i m_i l_i [...] in [0, 1]: the robot's share of the moved mass (paper section IV).
 
-    Args:
-        masses_kg: [..., K+1], index 0 is the robot.
-        path_lengths_m: [..., K+1], metres each centre of mass travelled.
-
-    Returns:
-        [...] float in [0, 1]; 1 where nothing moved at all.
+    Masses and path lengths of the centres of mass are [..., K+1], the robot first. It is 1 where nothing moved.
     """
     xp = namespace(masses_kg, path_lengths_m)
     work = xp.asarray(masses_kg) * xp.asarray(path_lengths_m) * 1.0
@@ -47,16 +33,10 @@ def kinematic_effort(masses_kg: Array, path_lengths_m: Array) -> Array:
 
 
 def dynamic_effort(robot_mass_kg: Array, force_sum_n: Array, num_steps: Array, gravity: float = GRAVITY) -> Array:
-    """Return T G / (T G + sum_t F_t) with G = m_0 g (paper section IV).
+    """Return T G / (T G + sum_t F_t) [...] in (0, 1] with G = m_0 g (paper section IV).
 
-    Args:
-        robot_mass_kg: [...] m_0.
-        force_sum_n: [...] sum over control steps of the force on everything but the floor, newtons.
-        num_steps: [...] control steps T; with T = 0 and no force the term is 1.
-        gravity: m/s^2.
-
-    Returns:
-        [...] float in (0, 1].
+    `force_sum_n` [...] is the sum over T control steps of the force on everything but the floor. With T = 0 and no
+    force the term is 1.
     """
     xp = namespace(robot_mass_kg, force_sum_n, num_steps)
     weight = xp.asarray(robot_mass_kg) * gravity * xp.asarray(num_steps)
@@ -68,17 +48,9 @@ def dynamic_effort(robot_mass_kg: Array, force_sum_n: Array, num_steps: Array, g
 def effort_efficiency(
     masses_kg: Array, path_lengths_m: Array, forces_n: Array, num_steps: Array, gravity: float = GRAVITY
 ) -> Array:
-    """Return E_eff, the mean of the kinematic and the dynamic effort term (paper section IV).
+    """Return E_eff [...] in [0, 1], the mean of `kinematic_effort` and `dynamic_effort` (paper section IV).
 
-    Args:
-        masses_kg: [..., K+1], index 0 is the robot; padded objects have path length 0.
-        path_lengths_m: [..., K+1].
-        forces_n: [..., T] force of every control step, zero-padded after the episode's end.
-        num_steps: [...] control steps of the episode.
-        gravity: m/s^2.
-
-    Returns:
-        [...] float in [0, 1]; a robot that neither moved nor touched anything scores 1.
+    Padded objects have path length 0; `forces_n` [..., T] of every control step are 0 after the episode's end.
     """
     xp = namespace(masses_kg, path_lengths_m, forces_n, num_steps)
     dynamic = dynamic_effort(xp.asarray(masses_kg)[..., 0], xp.asarray(forces_n).sum(-1), num_steps, gravity)
@@ -86,18 +58,9 @@ def effort_efficiency(
 
 
 def interactive_navigation_score(p_eff: Array, e_eff: Array, alpha: float | Array) -> Array:
-    """Return INS_alpha = alpha P_eff + (1 - alpha) E_eff (paper section IV).
+    """Return INS_alpha = alpha P_eff + (1 - alpha) E_eff [...] in [0, 1] (paper section IV).
 
-    Args:
-        p_eff: [...] path efficiency.
-        e_eff: [...] effort efficiency; it counts on failures too.
-        alpha: weight of the path term; a Python number outside [0, 1] is refused.
-
-    Returns:
-        [...] float in [0, 1].
-
-    Raises:
-        ValueError: alpha outside [0, 1].
+    The effort counts on failures too. Raise `ValueError` for a Python number `alpha` outside [0, 1].
     """
     if isinstance(alpha, (int, float)) and not 0.0 <= alpha <= 1.0:
         raise ValueError(f"alpha is {alpha}, expected a weight in [0, 1]")

@@ -14,24 +14,24 @@ NOISY = "mujoco.mjx.warp"
 
 
 class _QuietPrint:
-    """Find and load `NOISY` as always, with a `print` that prints nothing."""
+    """Find `NOISY` as always, to be loaded with a `print` that prints nothing."""
 
     def find_spec(self, name: str, path: Sequence[str] | None = None, target: Any = None) -> ModuleSpec | None:
         if name != NOISY:
             return None
         sys.meta_path.remove(self)  # type: ignore[arg-type]
         spec = importlib.util.find_spec(name)
-        if spec is not None:
-            self._loader, spec.loader = spec.loader, self  # type: ignore[assignment]
+        if spec is None or spec.loader is None:
+            return spec
+        execute = spec.loader.exec_module
+
+        def execute_quietly(module: ModuleType) -> None:
+            module.__dict__["print"] = lambda *_: None
+            execute(module)
+            del module.__dict__["print"]
+
+        spec.loader.exec_module = execute_quietly
         return spec
-
-    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
-        return None
-
-    def exec_module(self, module: ModuleType) -> None:
-        module.__dict__["print"] = lambda *_: None
-        self._loader.exec_module(module)  # type: ignore[union-attr]
-        del module.__dict__["print"]
 
 
 def hush() -> None:

@@ -4,7 +4,9 @@ The picture shows the robot from behind with its goal and path, its camera's ima
 touches; `--views` shows the home instead. `python -m train.record RUN` plays and draws a run's episode.
 """
 
+import contextlib
 import dataclasses
+import itertools
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -42,7 +44,6 @@ from interactive_nav_common.rotations import yaw_from_quat
 from scenes_mjcf.look import CameraPose, Lens, look_along, straight_down
 
 FORMATS = (".mp4", ".gif", ".webp")
-VIEWS = (*BEHIND_M, "above")
 CAMERA_PIXELS = 68
 """Depth and mask are rendered at the resolution of the paper's policies (section V)."""
 _CAMERA_LAG_S = 1.0
@@ -57,7 +58,7 @@ class Compositor:
     def __init__(self, replay: Replay, scene: Scene, height: int = 360, views: Sequence[str] = ()):
         """Compile the scene that the replay was recorded in; raise `ReplayError` if it has changed since.
 
-        `height` of the view from behind is a multiple of 12, for whole, even pixels. `views` of `VIEWS` replace it and
+        `height` of the view from behind is a multiple of 12, for whole, even pixels. `views` replace it and
         the robot's camera.
         """
         check_height(height)
@@ -205,25 +206,20 @@ def write_mp4(frames: Iterable[np.ndarray], path: Path, rate: float, hold_s: flo
 
     The last frame stays for `hold_s`.
     """
-    count, writer, frame = 0, None, np.zeros((2, 2, 3), np.uint8)
     settings: dict[str, Any] = {"fps": rate, "quality": 7, "codec": "libx264", "macro_block_size": 2}
     settings["output_params"] = ["-movflags", "+faststart", "-preset", "medium"]
-    try:
-        for frame in frames:
-            if writer is None:
-                writer = imageio_ffmpeg.write_frames(str(path), (frame.shape[1], frame.shape[0]), **settings)
-                with warnings.catch_warnings():
-                    # imageio-ffmpeg forks; its child becomes ffmpeg at once and never enters JAX.
-                    warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
-                    writer.send(None)
+    frames, count = iter(frames), 0
+    frame = first = next(frames)
+    with contextlib.closing(imageio_ffmpeg.write_frames(str(path), first.shape[1::-1], **settings)) as writer:
+        with warnings.catch_warnings():
+            # imageio-ffmpeg forks; its child becomes ffmpeg at once and never enters JAX.
+            warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+            writer.send(None)
+        for frame in itertools.chain([first], frames):
             writer.send(np.ascontiguousarray(frame))
             count += 1
         for _ in range(round(hold_s * rate)):
-            assert writer is not None
             writer.send(np.ascontiguousarray(frame))
-    finally:
-        if writer is not None:
-            writer.close()
     return count
 
 

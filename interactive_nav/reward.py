@@ -15,18 +15,9 @@ def interactive_navigation_reward(
     """Return R = R_suc + R_pot + R_int [...], and its terms under `success`, `potential`, `interaction`.
 
     R_suc is `success_value` on the step that reaches the goal. R_pot = GD_{t-1} - GD_t is geodesic progress among
-    static structure; over an episode it adds up to the first less the last distance. R_int = -k_int 1_int.
-
-    Args:
-        success: [...] 1 on the step that reaches the goal (once an episode).
-        geodesic_before_m: [...] distance to the goal before the step.
-        geodesic_after_m: [...] after it.
-        interacts: [...] 1 if the robot touched a movable object in any physics substep.
-        k_int: interaction penalty, not negative; the paper's are 0, 0.1 and 1.
-        success_value: reward of success.
-
-    Raises:
-        ConfigError: k_int is a negative Python number.
+    static structure; over an episode it adds up to the first less the last distance. R_int = -k_int 1_int, where
+    `interacts` is 1 if the robot touched a movable object in any physics substep; the paper's k_int are 0, 0.1 and 1.
+    Raise `ConfigError` for a negative Python number `k_int`.
     """
     if isinstance(k_int, (int, float)) and k_int < 0:
         raise ConfigError(f"k_int is {k_int}, expected a penalty >= 0 (it is subtracted)")

@@ -220,12 +220,7 @@ def whole_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def part_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
-    """Yield an empty, locked folder beside `target`, to be filled and published; else it is removed at the end.
-
-    Args:
-        target: of the folder, where it shall stand in the end.
-        overwrite: a folder that stands there may be replaced.
-    """
+    """Yield an empty, locked folder beside `target`, to be filled and published; else it is removed at the end."""
     if target.parent.is_dir():
         remove_stale(target)
         pattern = re.compile(rf"\.{re.escape(target.name)}\.part-(\d+)-[0-9a-f]+")
@@ -249,14 +244,10 @@ def part_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
 
 
 def publish(folders: Mapping[Path, Path], overwrite: bool = True) -> None:
-    """Rename finished folders to their targets, all or none.
+    """Rename finished folders to their targets on the same file system, all or none.
 
     Signals wait until it is done: a few renames take no time, and half of them would be worse. Of two that replace one
-    target at the same time, the last one stands.
-
-    Args:
-        folders: finished folder -> target, on one file system.
-        overwrite: an older target is replaced; without, only an empty one.
+    target at the same time, the last one stands. Without `overwrite`, only empty targets are replaced.
     """
     placed: list[Path] = []
     moved: list[tuple[Path, Path]] = []

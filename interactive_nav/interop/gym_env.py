@@ -144,18 +144,10 @@ class InteractiveNavVectorEnv(VectorEnv):
         render_mode: str | None = None,
         **settings: Any,
     ):
-        """Build it.
+        """Build it from what `interactive_nav.make` takes; raise `ConfigError` as it does, or for another choice.
 
-        Args:
-            robot: a name from `robot_names()`, or a file (see `docs/add-a-robot.md`).
-            scenes: scene folders; each episode draws one.
-            num_envs: N.
-            autoreset_mode: an `AutoresetMode` or its value ("SameStep", "NextStep", "Disabled").
-            render_mode: none, or "rgb_array": `render` returns a third-person view of each.
-            **settings: of `NavConfig`'s parts.
-
-        Raises:
-            ConfigError: as `interactive_nav.make`, or another choice that does not exist.
+        Values of `autoreset_mode` are "SameStep", "NextStep" and "Disabled". With render_mode="rgb_array", `render`
+        returns a third-person view of each environment.
         """
         if num_envs < 1:
             raise ConfigError(f"num_envs is {num_envs}, expected at least 1")
@@ -286,17 +278,9 @@ class InteractiveNavEnv(gymnasium.Env):
         slot: int | None = None,
         **settings: Any,
     ):
-        """Build it.
+        """Build it as `InteractiveNavVectorEnv`.
 
-        Args:
-            robot: a name from `robot_names()`, or a file (see `docs/add-a-robot.md`).
-            scenes: scene folders; each episode draws one.
-            render_mode: none, or "rgb_array": `render` returns a third-person view.
-            slot: with `scene_choice="slot"`, this environment's number in a batch: which scene it keeps.
-            **settings: of `NavConfig`'s parts.
-
-        Raises:
-            ConfigError: as `interactive_nav.make`, or a slot without that choice or that choice without a slot.
+        With `scene_choice="slot"`, and only then, `slot` is its number in a batch, which decides its scene.
         """
         self.render_mode = render_mode
         if not (_forked() and _SPACES):  # Gymnasium's worker passes on what its first `reset` raises, nothing from here

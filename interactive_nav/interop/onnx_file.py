@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from interactive_nav.sensing.description import KEY
-from interactive_nav_common.errors import UserError, missing, optional, regular
+from interactive_nav_common.errors import UserError, missing, optional, readable
 
 NEEDED = missing("an ONNX policy", "onnxruntime", "onnx")
 TOLERANCE = 1e-5
@@ -27,19 +27,12 @@ class OnnxFile:
 
     def __init__(self, path: str | Path):
         runtime, self.path = optional("onnxruntime", NEEDED), path
-        try:
-            content = regular(Path(path)).read_bytes()
+        with readable(path, OnnxError, "expected a file of interactive-nav export", " as an ONNX model"):
+            content = Path(path).read_bytes()
             self._session = runtime.InferenceSession(content, providers=["CPUExecutionProvider"])
-        except OSError as error:
-            raise OnnxError(f"{path}: cannot be read ({error.strerror})") from None
-        except Exception as error:  # onnxruntime's have no common base
-            raise OnnxError(f"{path}: no ONNX model ({' '.join(str(error).split())[:200]})") from None
-        try:
-            self.about: dict[str, Any] = json.loads(self._session.get_modelmeta().custom_metadata_map[KEY])
-            if not all(isinstance(self.about[part], dict) for part in ("robot", "inputs", "outputs")):
-                raise ValueError
-        except (KeyError, TypeError, ValueError):
-            raise OnnxError(f"{path}: has no description, expected a file of interactive-nav export") from None
+            self.about: dict[str, Any] = json.loads(self._session.get_modelmeta().custom_metadata_map.get(KEY, "{}"))
+            if not all(isinstance(self.about.get(part), dict) for part in ("robot", "inputs", "outputs")):
+                raise ValueError("it has no description")
 
     def run(self, output: str, inputs: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return an output [B, n] for inputs [B, ...]."""

@@ -20,10 +20,6 @@ from interactive_nav.scenes.slots import Layout
 from interactive_nav.scenes.world import FLOOR_FRICTION
 
 
-def _broadcast(tree: Any, batched: Any, size: int) -> Any:
-    return jax.tree.map(lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape)), tree, batched)
-
-
 def _many(batch: Callable[..., Any], args: tuple) -> Any:
     @custom_batching.custom_vmap
     def many(*args):
@@ -31,7 +27,9 @@ def _many(batch: Callable[..., Any], args: tuple) -> Any:
 
     @many.def_vmap
     def rule(axis_size, in_batched, *args):
-        args = _broadcast(args, tuple(in_batched), axis_size)
+        args = jax.tree.map(
+            lambda x, batched: x if batched else jnp.broadcast_to(x, (axis_size, *x.shape)), args, tuple(in_batched)
+        )
         inner = jax.tree.leaves(args)[0].shape[1]
         out = _many(batch, jax.tree.map(lambda x: x.reshape((axis_size * inner, *x.shape[2:])), args))
         out = jax.tree.map(lambda x: x.reshape((axis_size, inner, *x.shape[1:])), out)
@@ -42,17 +40,7 @@ def _many(batch: Callable[..., Any], args: tuple) -> Any:
 
 def one_of_batch(batch: Callable[..., Any], args: tuple) -> Any:
     """Return a batch function's result for one element; vmaps of it call the batch function once, with all elements."""
-
-    @custom_batching.custom_vmap
-    def single(*args):
-        return jax.tree.map(lambda x: x[0], _many(batch, jax.tree.map(lambda x: x[None], args)))
-
-    @single.def_vmap
-    def rule(axis_size, in_batched, *args):
-        out = _many(batch, _broadcast(args, tuple(in_batched), axis_size))
-        return out, jax.tree.map(lambda _: True, out)
-
-    return single(*args)
+    return jax.tree.map(lambda x: x[0], _many(batch, jax.tree.map(lambda x: x[None], args)))
 
 
 TOUCH_FORCE_N = 1e-4

@@ -6,6 +6,7 @@ dropped for environments whose incoming state is not, to the bit, the one last r
 
 import copy
 import dataclasses
+import functools
 import threading
 from collections.abc import Sequence
 from typing import Any
@@ -109,15 +110,13 @@ class NativePhysics(Physics):
             scales = state.change.mass_scale, state.change.friction_scale
             columns += tuple(jnp.ones((n, 1)) if scale is None else scale[:, None] for scale in scales)
         packed = jnp.concatenate([jnp.asarray(x, jnp.float32) for x in columns], 1)
-        step = self._step_host if state.change is None else self._step_scaled
+        step = functools.partial(self._step_host, state.change is not None)
         return jax.pure_callback(step, shapes, packed, vmap_method="sequential")
 
-    def _step_scaled(self, packed):
-        packed = np.asarray(packed)
-        return self._step_host(packed[:, :-2], packed[:, -2:])
-
-    def _step_host(self, packed, scale: Any = 1.0):
-        packed = np.asarray(packed)
+    def _step_host(self, is_scaled: bool, packed):
+        packed, scale = np.asarray(packed), np.ones(2)
+        if is_scaled:
+            packed, scale = packed[:, :-2], packed[:, -2:]
         qpos, qvel, warm, rest = np.split(packed, np.cumsum([self.nq, self.nv, self.nv]), 1)
         command, time_s, scene = np.nan_to_num(rest[:, :-2]), rest[:, -2], rest[:, -1].astype(np.int64)
         pool = self._take_pool(qpos)

@@ -91,9 +91,9 @@ class Painter:
 class PictureCamera:
     """Takes pictures of one environment."""
 
-    def __init__(self, env: Any, engine: str = "auto", fov_deg: float | None = None):
-        """Prepare nothing before it is needed; without a vertical `fov_deg` the camera is that of the observations."""
-        self._env, self._painter, self._fov_deg = env, Painter(engine), fov_deg or env.sensors.lens.fov_deg
+    def __init__(self, env: Any, engine: str = "auto"):
+        """Prepare nothing before it is needed."""
+        self._env, self._painter = env, Painter(engine)
         world, classes = env.world, env.sensors.boxes.classes
         self._model = functools.cache(
             lambda scene: SceneModel(world.robot, world.scenes[scene], world.small_objects, classes)
@@ -142,7 +142,7 @@ class PictureCamera:
         env = self._env
         if view == "robot":
             pose = env.sensors.mount.pose(np.asarray(qpos, np.float32))
-            return CameraPose(np.asarray(pose.pos_w, float), np.asarray(pose.axes_w, float)), self._fov_deg
+            return CameraPose(np.asarray(pose.pos_w, float), np.asarray(pose.axes_w, float)), env.sensors.lens.fov_deg
         if view == "top":
             maps = env.scenes[scene].maps
             size = np.array(maps.traversable.shape[::-1]) * maps.resolution_m

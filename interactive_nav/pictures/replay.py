@@ -50,8 +50,6 @@ class Replay:
     """Names: the robot's base first."""
     num_robot_bodies: int
     """How many of the bodies are the robot's."""
-    start_xy_w: np.ndarray
-    """(2,) f32, m."""
     goal_xy_w: np.ndarray
     """(2,) f32, m."""
     body_pos_w: np.ndarray
@@ -157,7 +155,6 @@ def _replay_of(player: EpisodePlayer, episode: int, first: Any, values: dict[str
         label=player.label,
         bodies=bodies,
         num_robot_bodies=num_robot,
-        start_xy_w=first.start_xy_w,
         goal_xy_w=first.goal_xy_w,
         body_pos_w=pos.astype(np.float32),
         body_quat_w=quat.astype(np.float32),

@@ -21,15 +21,10 @@ def robot_names() -> tuple[str, ...]:
 
 
 def get_robot(name: str, control_mode: str = "native") -> RobotSpec:
-    """Return a robot's spec.
+    """Return the spec of one of `robot_names()`, a URDF or MJCF file, or `path.py:function` (`docs/add-a-robot.md`).
 
-    Args:
-        name: one of `robot_names()`, a URDF or MJCF file, or `path.py:function` (see `docs/add-a-robot.md`).
-        control_mode: one of the robot's `control_modes`; `native` is the original benchmark's action.
-
-    Raises:
-        ConfigError: unknown name or mode (the message lists the available ones), or an unusable file.
-        FileError: a file that lacks a part, or whose parts do not fit.
+    The control mode `native` is the original benchmark's action. Raise `ConfigError` for an unknown name or mode or an
+    unusable file, and `FileError` for a file that lacks a part, or whose parts do not fit.
     """
     factory = _FACTORIES.get(str(name))
     if factory is None and is_reference(str(name)):
@@ -47,14 +42,9 @@ def robot_name(robot: str) -> str:
 
 
 def register(name: str, factory: Callable[[str], RobotSpec]) -> None:
-    """Register a user's robot for `make`, in this process.
+    """Register a user's robot, under a new name, for `make` and `get_robot` in this process.
 
-    Args:
-        name: what `make` and `get_robot` call it; must be new.
-        factory: control mode -> spec; the mode `native` must exist. `from_file` returns one.
-
-    Raises:
-        ConfigError: a name that is taken, or a factory whose spec has another name.
+    The factory maps control modes, `native` among them, to specs of that name; `from_file` returns one.
     """
     if name in _FACTORIES:
         raise ConfigError(f"robot '{name}' exists already; choose another name")

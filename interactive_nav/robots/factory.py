@@ -160,7 +160,7 @@ def from_file(
     max_linear_m_s: float | None = None,
     max_angular_rad_s: float | None = None,
 ) -> Callable[[str], RobotSpec]:
-    """Return a factory for `register` from a wheeled robot's MJCF or URDF. Frame: x forward, y left, z up.
+    """Return (control mode) -> spec, for `register`, of a wheeled robot's MJCF or URDF. Frame: x forward, y left, z up.
 
     Args:
         max_wheel_speed_rad_s: of every driven wheel; the native action's range.
@@ -171,9 +171,6 @@ def from_file(
         body_width_m: success distance; by default the model's width.
         track_m: effective distance of left and right wheels; by default theirs, or for several wheels a side
             (skid steer) track + wheelbase^2 / track, the value for Coulomb friction.
-
-    Returns:
-        control mode -> `RobotSpec`.
 
     Raises:
         ConfigError: an impossible argument, or a file that cannot be read.
@@ -192,7 +189,6 @@ def from_file(
     units = {j.name: "m" if j.type == mujoco.mjtJoint.mjJNT_SLIDE else "rad" for j in child.joints}
     others = tuple(Joint(j, speed, dict(home or {}).get(j, 0.0), unit=units[j]) for j, speed in driven.items())
     base = _base(name, path, wheels, max_wheel_speed_rad_s, others, track_m, max_linear_m_s, max_angular_rad_s)
-    child = read_file(path, base_body)
     complete(path, wheels, bottom_m, base, base_body, casters, limits, dict(home or {}), child)
     rolling = (*(w.body for w in wheels), *casters)
     build = functools.partial(wheeled_robot, base=base, parsed=child, base_body=base_body, rolling=rolling)

@@ -265,10 +265,9 @@ def complete(
     home: Mapping[str, float],
     child: mujoco.MjSpec,
 ) -> None:
-    """Apply every change to the file, in order; warn of each. `bottom_m` is the wheels' lowest point."""
+    """Apply every change but `strip` to the file, in order; warn of each. `bottom_m` is the wheels' lowest point."""
     for name, limit in torque_limits.items():
         child.joint(name).actfrcrange = [-limit, limit]
-    strip(child, path, base_body)
     _fix_masses(child, path, base_body)
     hold(child, path, bottom_m, {joint.name for joint in base.joints}, casters, home)
     for wheel in wheels:

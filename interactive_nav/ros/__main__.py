@@ -9,12 +9,12 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from interactive_nav.config import make_config
 from interactive_nav.ros.commands import beside, need_ros
 from interactive_nav_common.commands import Command, Flag, Words, option, parse, word
-from interactive_nav_common.config import overridden, settings_help
+from interactive_nav_common.config import Positive, overridden, settings_help
 from interactive_nav_common.errors import UserError, reports_errors
 from interactive_nav_common.jobs.progress import say
 from interactive_nav_common.signals import stop_signals
@@ -76,20 +76,14 @@ class Drive(Command):
     """Scene folder, for shortest paths."""
     odom_in_map: Annotated[str, option(metavar="X,Y,YAW")] = "0,0,0"
     """Pose of the odometry's frame in the map, m and rad, until /tf has one."""
-    max_linear: Annotated[float | None, option(metavar="M/S")] = None
+    max_linear: Annotated[Positive | None, option(metavar="M/S")] = None
     """Limit of the speed (default: the policy's)."""
-    max_angular: Annotated[float | None, option(metavar="RAD/S")] = None
+    max_angular: Annotated[Positive | None, option(metavar="RAD/S")] = None
     """Limit of the turn rate (default: the policy's)."""
-    silence: Annotated[float, option(metavar="S")] = 1.0
+    silence: Annotated[Positive, option(metavar="S")] = 1.0
     """Stop when a needed topic is silent for so long."""
     dead_man: Annotated[int | None, option(metavar="BUTTON")] = None
     """Drive only while this button of joy is held."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("max_linear", "max_angular", "silence"):
-            if not (getattr(self, name) is None or getattr(self, name) > 0.0):
-                raise UserError(f"--{name.replace('_', '-')} is {getattr(self, name)}, expected more than 0")
 
 
 COMMANDS = {kind.__name__.lower(): kind for kind in (Drive, Simulate)}
@@ -119,7 +113,7 @@ def _simulate(arguments: Simulate, stops: list[int]) -> None:
     if not (installed(arguments.scene) / "scene.json").is_file():  # before what takes long to import
         raise UserError(f"{arguments.scene}: no scene folder (no scene.json in it)")
     need_ros("interactive_nav.ros")
-    from interactive_nav import InteractiveNav, get_robot, load_scene
+    from interactive_nav import make
     from interactive_nav.ros import messages as ros
     from interactive_nav.ros.nodes import SimulatorNode, recording, ros_node
     from interactive_nav.ros.simulator import NEEDED, Pace, RosSimulator
@@ -128,10 +122,8 @@ def _simulate(arguments: Simulate, stops: list[int]) -> None:
         stop = stack.enter_context(beside(arguments.run, stops)) if arguments.run else lambda: bool(stops)
         with contextlib.redirect_stdout(sys.stderr):  # Warp prints its kernels
             observed = tuple(dict.fromkeys((*config.observations, *NEEDED)))
-            config = dataclasses.replace(config, observations=observed)
-            env = InteractiveNav(
-                get_robot(arguments.robot, config.control_mode), (load_scene(arguments.scene),), config
-            )
+            settings: dict[str, Any] = vars(config) | {"observations": observed}
+            env = make(arguments.robot, [arguments.scene], **settings)
             simulator = RosSimulator(env, arguments.seed, start, arguments.engine)
             topics = ros.TOPICS | ros.camera_topics(simulator.sense().images)
         node = stack.enter_context(ros_node("simulator"))

@@ -19,7 +19,7 @@ import yaml
 
 from interactive_nav.scenes.scene import Movable, body_task_parts, hull_sources, read_movable
 from interactive_nav_common.config import Positive
-from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.errors import ConfigError, readable
 from interactive_nav_common.files import check_name
 from interactive_nav_common.records import Reader
 from interactive_nav_common.untrusted.reading import check_named
@@ -340,13 +340,10 @@ def load_object(folder: str | Path) -> ConvertedObject:
     category, friction = about.category, about.friction
     name = check_name(about.name, f"{described}: name", SceneError)
     check_named(xml, SceneError, _OBJECTS.remedy)
-    try:
+    with readable(xml, SceneError, _OBJECTS.remedy, " as MJCF"):
         hulls = sorted((folder / "assets").glob("*_hull_*.obj"))
         sha256 = hashlib.sha256(b"".join(p.read_bytes() for p in (xml, *hulls))).hexdigest()
         model = mujoco.MjModel.from_xml_path(str(xml))
-    except (OSError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise SceneError(f"{folder}: is no usable object ({reason}), {_OBJECTS.remedy}") from error
     if category not in CATEGORIES:
         raise SceneError(f"{folder}: category is '{category}', expected one of {', '.join(CATEGORIES)}")
     movable = _standing(read_movable(model, xml, name, category, friction))

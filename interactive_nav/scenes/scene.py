@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from scipy import ndimage
 
+from interactive_nav_common.errors import readable
 from interactive_nav_common.grids import clearance, largest_component, value_near
 from interactive_nav_common.rotations import rotate
 from scenes_mjcf.agreement import differences
@@ -299,10 +300,8 @@ def load_scene(folder: str | Path) -> Scene:
     xml = folder / "scene.xml"
     if not xml.is_file():
         raise SceneError(f"{xml}: no such file; convert the scene again")
-    try:
+    with readable(xml, SceneError, "convert it again", " as MJCF"):
         model = mujoco.MjModel.from_xml_path(str(xml))
-    except ValueError as error:
-        raise SceneError(f"{xml}: MuJoCo cannot compile it ({str(error).splitlines()[0]}); convert it again") from error
     digest = hashlib.sha256(xml.read_bytes() + (folder / "maps.npz").read_bytes()).hexdigest()
 
     structure = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "structure")

@@ -119,55 +119,36 @@ class BoxRenderer(Renderer):
     def images_batch(self, names, scene, qpos, camera, look=None):
         if not set(names) & {"rgb", "normals"}:
             return dict(zip(("depth", "segmentation"), self.render_batch(scene, qpos, camera), strict=True))
-        _, index = self.trace_batch(scene, qpos, camera)
-        return paint(self.tables, self.lens, scene, qpos, camera, index, look)
+        tables, lens, (_, index) = self.tables, self.lens, self.trace_batch(scene, qpos, camera)
+        n, shape = len(scene), index.shape
+        assert tables.colour is not None
+        centre, axes = box_poses(tables, scene, qpos)
+        boxes = jnp.concatenate([axes.reshape(n, -1, 9), centre, tables.half_m[scene]], -1)
+        floor = jnp.concatenate([jnp.eye(3).ravel(), jnp.asarray([0.0, 0.0, -_FLOOR_HALF_M[2], *_FLOOR_HALF_M])])
+        boxes = jnp.concatenate([boxes, jnp.broadcast_to(floor, (n, 1, 15))], 1)
+        ids = jnp.pad(tables.class_id, ((0, 0), (0, 1)))[scene]
+        place = jnp.where(index < 0, tables.num_boxes, index).reshape(n, -1)
+        met = index >= 0
 
+        def of_pixel(table: jax.Array) -> jax.Array:
+            """Return a table [N, B + 1, k] by pixel, [N, H, W, k]."""
+            return jnp.take_along_axis(table, place[..., None], 1).reshape(*shape, table.shape[-1])
 
-def paint(
-    tables: BoxTables,
-    lens: Lens,
-    scene: jax.Array,
-    qpos: jax.Array,
-    camera: CameraPose,
-    index: jax.Array,
-    look: Look | None = None,
-) -> dict[str, jax.Array]:
-    """Return images, as `Renderer.images_batch` does, from the box of each pixel.
-
-    Each ray meets its box again, so that depth and face are exact and equal for all renderers. `index` [N, H, W] comes
-    from `BoxRenderer.trace_batch`; a `look` of None changes nothing.
-    """
-    n, shape = len(scene), index.shape
-    assert tables.colour is not None
-    centre, axes = box_poses(tables, scene, qpos)
-    boxes = jnp.concatenate([axes.reshape(n, -1, 9), centre, tables.half_m[scene]], -1)
-    floor = jnp.concatenate([jnp.eye(3).ravel(), jnp.asarray([0.0, 0.0, -_FLOOR_HALF_M[2], *_FLOOR_HALF_M])])
-    boxes = jnp.concatenate([boxes, jnp.broadcast_to(floor, (n, 1, 15))], 1)
-    ids = jnp.pad(tables.class_id, ((0, 0), (0, 1)))[scene]
-    place = jnp.where(index < 0, tables.num_boxes, index).reshape(n, -1)
-    met = index >= 0
-
-    def of_pixel(table: jax.Array) -> jax.Array:
-        """Return a table [N, B + 1, k] by pixel, [N, H, W, k]."""
-        return jnp.take_along_axis(table, place[..., None], 1).reshape(*shape, table.shape[-1])
-
-    row = of_pixel(boxes)
-    axes, centre, half = row[..., :9].reshape(*shape, 3, 3), row[..., 9:12], row[..., 12:]
-    inverse = jnp.swapaxes(axes, -1, -2)
-    forward, right, up = (camera.axes_w[:, None, None, :, i] for i in range(3))
-    across, along = jnp.asarray(lens.columns)[None, None, :, None], jnp.asarray(lens.rows)[None, :, None, None]
-    direction = apply_axes(inverse, forward + right * across + up * along)
-    low, _ = slab(apply_axes(inverse, camera.pos_w[:, None, None] - centre), half, direction)
-    outward = -jnp.sign(direction) * jax.nn.one_hot(jnp.argmax(low, -1), 3)
-    normal = apply_axes(axes, outward) * met[..., None]
-    sky = jnp.broadcast_to(jnp.asarray(SKY_COLOUR), (*shape, 3))
-    base = jnp.where(met[..., None], of_pixel(tables.colour[scene]), sky)
-    classes = jnp.where(met, of_pixel(ids[..., None])[..., 0], 0)
-    return {
-        "depth": jnp.where(met, low.max(-1), 0.0),
-        "segmentation": classes,
-        **lit_images(base, normal, camera, met, classes, look),
-    }
+        # Each ray meets its box again, so that depth and face are exact and equal for all renderers.
+        row = of_pixel(boxes)
+        axes, centre, half = row[..., :9].reshape(*shape, 3, 3), row[..., 9:12], row[..., 12:]
+        inverse = jnp.swapaxes(axes, -1, -2)
+        forward, right, up = (camera.axes_w[:, None, None, :, i] for i in range(3))
+        across, along = jnp.asarray(lens.columns)[None, None, :, None], jnp.asarray(lens.rows)[None, :, None, None]
+        direction = apply_axes(inverse, forward + right * across + up * along)
+        low, _ = slab(apply_axes(inverse, camera.pos_w[:, None, None] - centre), half, direction)
+        outward = -jnp.sign(direction) * jax.nn.one_hot(jnp.argmax(low, -1), 3)
+        normal = apply_axes(axes, outward) * met[..., None]
+        sky = jnp.broadcast_to(jnp.asarray(SKY_COLOUR), (*shape, 3))
+        base = jnp.where(met[..., None], of_pixel(tables.colour[scene]), sky)
+        classes = jnp.where(met, of_pixel(ids[..., None])[..., 0], 0)
+        images = lit_images(base, normal, camera, met, classes, look)
+        return {"depth": jnp.where(met, low.max(-1), 0.0), "segmentation": classes, **images}
 
 
 def lit_images(

@@ -1,16 +1,8 @@
 """Compute the flat observation from pose, velocity, path and other signals, in the original benchmark's order.
 
-Layout by default (reference benchmark, section 1.1), robot frame, full roll-pitch-yaw inverse, no clipping:
-
-| slice | content | unit |
-|---|---|---|
-| 0-19 | ten waypoints x0, y0, ..., x9, y9 | m |
-| 20-22 | goal minus robot position x, y, z | m |
-| 23-25 | base linear velocity | m/s |
-| 26-28 | base angular velocity | rad/s |
-
-Then, where requested: localisation, odometry, collision, joints, lidar, trail. Images stand beside the
-vector, not in it: `interactive_nav.sensing.sensors`.
+By default (reference benchmark, section 1.1) ten waypoints x0, y0, ..., x9, y9, m, and goal minus robot position, m;
+then the base's linear and angular velocity, m/s and rad/s: robot frame, full roll-pitch-yaw inverse, no clipping. Then,
+where requested: localisation, odometry, collision, joints, lidar, trail (`docs/sensors.md`).
 """
 
 import jax
@@ -52,10 +44,6 @@ def advance_odometry(
     It is relative to the episode's start. `moved_w` (2,) m is the true displacement, `noise` (2,) the relative error of
     distance and angle.
     """
-    cos, sin = jnp.cos(yaw_rad), jnp.sin(yaw_rad)
-    ahead, left = cos * moved_w[0] + sin * moved_w[1], -sin * moved_w[0] + cos * moved_w[1]
-    ahead, left = ahead * (1 + noise[0]), left * (1 + noise[0])
-    cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
-    return jnp.stack(
-        [pose[0] + cos * ahead - sin * left, pose[1] + sin * ahead + cos * left, pose[2] + turned_rad * (1 + noise[1])]
-    )
+    cos, sin = jnp.cos(pose[2] - yaw_rad), jnp.sin(pose[2] - yaw_rad)
+    x, y = moved_w * (1 + noise[0])
+    return pose + jnp.stack([cos * x - sin * y, sin * x + cos * y, turned_rad * (1 + noise[1])])

@@ -73,12 +73,8 @@ def camera_boxes(tables: BoxTables, scene: jax.Array, qpos: jax.Array, camera: C
 
 
 def _lesser(a, b):
-    # One instruction on CPUs, where jnp.minimum takes several to pass NaN on.
+    # One instruction on CPUs, where jnp.minimum takes several to pass NaN on; so for the greater below.
     return jnp.where(a < b, a, b)
-
-
-def _greater(a, b):
-    return jnp.where(a > b, a, b)
 
 
 def enter_and_leave(eye, half, directions) -> tuple[jax.Array, jax.Array]:
@@ -89,7 +85,7 @@ def enter_and_leave(eye, half, directions) -> tuple[jax.Array, jax.Array]:
     entry = leave = None
     for o, h, d in zip(eye, half, directions, strict=True):
         low, high = slab(o, h, d)
-        entry = low if entry is None else _greater(entry, low)
+        entry = low if entry is None else jnp.where(entry > low, entry, low)
         leave = high if leave is None else _lesser(leave, high)
     assert entry is not None and leave is not None
     return entry, leave

@@ -1,22 +1,9 @@
 """Compute what the robot observes from the physics' state and the task's memory: a vector, and images on request.
 
-Without images the observation is the flat f32 vector of `interactive_nav.sensing.observation`. With them it is a dict,
-its keys named as Brax's networks for pixels want them:
-
-| key | content |
-|---|---|
-| `state` | the vector (left out if no part of it is requested) |
-| `pixels/depth` | (H, W, 1): distance along the optical axis over `depth_range_m`, cut at 1; 0 where nothing is met |
-| `pixels/segmentation` | (H, W, 1): class id over 11, or over their number (`scenes_mjcf.categories.SEGMENTATIONS`) |
-| `pixels/rgb` | (H, W, 3): colour in [0, 1] |
-| `pixels/normals` | (H, W, 3): unit vectors, camera's frame (right, up, towards the viewer); 0 where nothing is met |
-
-With several cameras (`cameras`) the keys are `pixels/<camera>/depth` and so on.
-
-Images are f32 or f16 in [0, 1], or u8, 255 times that and rounded; normals are in [-1, 1], and f32 where others are u8.
-Errors of cameras are off by default; their formulas and sources stand in `docs/sensors.md`. Other noise is as in
-iGibson: a share of the readings drops out (depth reads 0, a beam 1), the others get a Gaussian error in proportion. It
-depends on the episode's key and the step alone.
+Without images the observation is the flat f32 vector of `interactive_nav.sensing.observation`. With them it is a dict
+of `state`, that vector if a part of it is requested, and images such as `pixels/depth` (H, W, 1), with several cameras
+`pixels/<camera>/depth`. `docs/sensors.md` has their contents, types, ranges and errors. Noise depends on the episode's
+key and the step alone.
 """
 
 import dataclasses

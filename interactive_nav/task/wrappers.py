@@ -104,16 +104,10 @@ def wrap_for_brax_training(
 ) -> AutoResetEnv:
     """Wrap an environment as Brax's learners' `wrap_env_fn`, as MuJoCo Playground has it: every episode is newly drawn.
 
-    Args:
-        env: what `interactive_nav.make` returns, or a wrapper of it: see `AutoResetEnv`.
-        episode_length: at least the environment's `episode_steps`, which ends its episodes; None: that.
-        action_repeat: control steps that an action is held for.
-        randomization_fn: (MJX's model) -> (the model with N values of some fields, axes: 0 for these, else None), as
-            learners pass it on; backend `jax` only. Environment i keeps value i. The model is
-            `env.physics.mjx_model`, in which scenes fill the rows of objects and walls; those values are theirs.
-
-    Raises:
-        ConfigError: a shorter `episode_length`, another backend, or a wrapper that would be passed over.
+    `episode_length` is at least the environment's `episode_steps`, which ends its episodes. On backend `jax`,
+    `randomization_fn` maps `env.physics.mjx_model` to it with N values of some fields, of which environment i keeps
+    number i, and axes: 0 for these, else None. Rows of objects and walls stay the scenes'. For the rest, and errors,
+    see `AutoResetEnv`.
     """
     steps = env.config.episode_steps
     if episode_length is not None and episode_length < steps:
@@ -168,15 +162,11 @@ class AutoResetEnv(Wrapper):
     env: InteractiveNav
 
     def __init__(self, env: Any, action_repeat: int = 1, final_obs: bool = False):
-        """Wrap an environment.
+        """Wrap an environment of one episode, or a wrapper of it.
 
-        Args:
-            env: of one episode; wrappers of it override `draw`, `advance` and `observe`, parts of `reset` and `step`.
-            action_repeat: control steps that an action is held for; rewards are summed.
-            final_obs: whether `info` has `final_obs`, for which every step observes twice.
-
-        Raises:
-            ConfigError: a wrapper that overrides `step` or `reset` alone, and so would never be called.
+        An action is held for `action_repeat` control steps, whose rewards are summed. With `final_obs`, every step
+        observes twice. A wrapper that overrides `step` or `reset` alone would never be called, which is a
+        `ConfigError`: their parts `draw`, `advance` and `observe` are.
         """
         super().__init__(env)
         _refuse_passed_over(env)

@@ -232,10 +232,10 @@ def test_other_files_are_refused(run, tmp_path, capsys):
     onnx.save(model, plain)
     text.write_text("no model")
     for file, line in (
-        (plain, "has no description"),
-        (bad, "has no description"),
-        (text, "no ONNX model"),
-        (tmp_path / "none.onnx", "cannot be read (No such file"),
+        (plain, "not readable as an ONNX model (ValueError: it has no description)"),
+        (bad, "not readable as an ONNX model (ValueError: it has no description)"),
+        (text, "not readable as an ONNX model (InvalidProtobuf"),
+        (tmp_path / "none.onnx", "not readable as an ONNX model (FileNotFoundError"),
     ):
         assert evaluate.main([str(folder.path), "--policies", str(file)], build_env=build_toy) == 2
         (error,) = capsys.readouterr().err.strip().splitlines()

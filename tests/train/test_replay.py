@@ -130,7 +130,7 @@ def test_an_episode_of_a_file_starts_as_the_file_says(run, room, tmp_path, capsy
     asked = [str(run), "--policies", "random", "--episode-file", str(path)]
     assert program.main([*asked, "--episodes", "1"]) == 0
     played, told = replay.load_replay(replay.replay_path(run, "random", 1)), made.episodes[1]
-    np.testing.assert_allclose(played.start_xy_w, told["start_xy_w"], atol=1e-6)
+    np.testing.assert_allclose(played.robot_xy_w[0], told["start_xy_w"], atol=1e-6)
     np.testing.assert_allclose(played.goal_xy_w, told["goal_xy_w"], atol=1e-6)
     small = played.body_pos_w[0, played.bodies.index(body_names(played.small)[0]), :2]
     np.testing.assert_allclose(small, told["objects"][0][:2], atol=1e-5)

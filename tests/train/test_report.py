@@ -153,7 +153,6 @@ def still(room: Path) -> Replay:
         label="",
         bodies=(robot.base_body,),
         num_robot_bodies=1,
-        start_xy_w=np.zeros(2, np.float32),
         goal_xy_w=np.ones(2, np.float32),
         body_pos_w=np.zeros((steps + 1, 1, 3), np.float32),
         body_quat_w=np.tile(np.array([1, 0, 0, 0], np.float32), (steps + 1, 1, 1)),

@@ -80,15 +80,11 @@ def _add_to(spec: mujoco.MjSpec, mode: str) -> None:
         )
 
 
-def _thrusts(acceleration_up, angular_acceleration, xp):
-    """Convert body-frame specific thrust [...] and angular acceleration [..., 3] to thrusts [..., 4] in 0 .. 10 N."""
-    torque = angular_acceleration * xp.broadcast_to(xp.asarray(INERTIA), angular_acceleration.shape)
-    wrench = xp.concatenate([MASS_KG * acceleration_up[..., None], torque], -1)
-    return xp.clip(wrench @ xp.asarray(_MIXER).T, 0.0, MAX_THRUST_N)
-
-
 def _fly_rates(rates, thrust_n, state, xp):
-    return _thrusts(thrust_n / MASS_KG, _RATE_GAIN * (rates - state.qvel[..., 3:6]), xp)
+    """Convert angular rates [..., 3], rad/s, body frame, and a total thrust [...] to thrusts [..., 4] in 0 .. 10 N."""
+    torque = _RATE_GAIN * (rates - state.qvel[..., 3:6]) * xp.broadcast_to(xp.asarray(INERTIA), rates.shape)
+    wrench = xp.concatenate([thrust_n[..., None], torque], -1)
+    return xp.clip(wrench @ xp.asarray(_MIXER).T, 0.0, MAX_THRUST_N)
 
 
 def _rate_law(command, state, xp):
@@ -135,10 +131,8 @@ _LAWS = {"native": _velocity_law, "velocity": _velocity_law, "rate": _rate_law, 
 def quadrotor(control_mode: str = "native") -> RobotSpec:
     """Return the Quadrotor's spec.
 
-    Args:
-        control_mode: `velocity`, also called `native`: velocity along the heading and yaw rate, flown physically;
-            `twist`: forward velocity and yaw rate at a height of 0.8 m; `rate`: angular rates and total thrust;
-            `thrust`: four rotor thrusts; `kinematic`: the original's six base velocities, without gravity.
+    Mode `velocity`, also called `native`, is velocity along the heading and yaw rate, flown physically; `twist` forward
+    velocity and yaw rate at a height of 0.8 m; `rate` angular rates and total thrust; `thrust` four rotor thrusts.
     """
     check_mode("quadrotor", control_mode, _MODES)
     (names, low, high, matrix), law = _TABLE[control_mode], _LAWS.get(control_mode)

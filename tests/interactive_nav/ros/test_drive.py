@@ -178,8 +178,8 @@ def test_mistakes_are_one_line(tmp_path, capsys):
     (tmp_path / "empty.onnx").write_bytes(b"")
     for words, line in (
         ([policy, "--robot", "fetch"], "the policy is for robot 'turtlebot', expected 'fetch'"),
-        ([str(tmp_path / "empty.onnx")], "no ONNX model"),
-        ([policy, "--silence", "0"], "--silence is 0.0, expected more than 0"),
+        ([str(tmp_path / "empty.onnx")], "not readable as an ONNX model"),
+        ([policy, "--silence", "0"], "--silence is 0.0, expected a positive number"),
         ([policy, "--odom-in-map", "1,2"], "--odom-in-map is '1,2', expected X,Y,YAW"),
     ):
         assert main(["drive", *words]) == 2
