@@ -8,7 +8,6 @@ same episodes on every machine and backend. Other scenes, robots or objects are 
 
 import dataclasses
 import functools
-import gzip
 import hashlib
 import json
 import sys
@@ -29,14 +28,13 @@ from interactive_nav.types import EpisodeStart
 from interactive_nav_common.commands import Command, option, parse
 from interactive_nav_common.config import Natural, NotNegative, Seed
 from interactive_nav_common.errors import ConfigError, UserError, readable, reports_errors
-from interactive_nav_common.files import whole_file
+from interactive_nav_common.files import write_text
 from interactive_nav_common.records import Reader
 from interactive_nav_common.signals import signals_wait
 from interactive_nav_common.untrusted.reading import read_bytes, unpack
 
 FORMAT = "interactive-nav-episodes"
 VERSION = 1
-PACKED = ".gz"
 LENGTH_TOLERANCE_M = 1e-3
 """L* of a file and of the environment may differ by rounding only."""
 
@@ -210,17 +208,14 @@ def save_episode_file(file: EpisodeFile, path: str | Path) -> None:
     head = {k: v for k, v in data.items() if k != "episodes"}
     # One line an episode: readable, and small in a diff.
     lines = ",\n".join(json.dumps(row) for row in file.episodes)
-    text = f'{json.dumps(head, indent=1)[:-2]},\n "episodes": [\n{lines}\n ]\n}}\n'
-    with whole_file(path) as partial:
-        data = text.encode("utf-8")
-        partial.write_bytes(gzip.compress(data, mtime=0) if Path(path).suffix == PACKED else data)
+    write_text(path, f'{json.dumps(head, indent=1)[:-2]},\n "episodes": [\n{lines}\n ]\n}}\n')
 
 
 def load_episode_file(path: str | Path) -> EpisodeFile:
     """Read and check a file; raise `EpisodeFileError` if it cannot be used."""
     with readable(path, EpisodeFileError, "make one with 'python -m interactive_nav.episodes make'"):
         text = read_bytes(path)
-        text = unpack(text, "gzip") if Path(path).suffix == PACKED else text
+        text = unpack(text, "gzip") if Path(path).suffix == ".gz" else text
     data = _FILES.decoded(text, "JSON", str(path))
     if not isinstance(data, dict) or data.pop("format", None) != FORMAT:
         raise EpisodeFileError(f"{path}: not an episode file (format is not '{FORMAT}')")

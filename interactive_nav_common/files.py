@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import fcntl
+import gzip
 import json
 import os
 import re
@@ -193,9 +194,10 @@ def append_text(path: Path, text: str) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file (UTF-8) whole or not at all."""
+    """Write a text file (UTF-8), packed where its name ends in .gz, whole or not at all."""
+    data = text.encode()
     with whole_file(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+        partial.write_bytes(gzip.compress(data, mtime=0) if Path(path).suffix == ".gz" else data)
 
 
 def write_json(path: str | Path, content: Any) -> Any:

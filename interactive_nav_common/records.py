@@ -6,7 +6,6 @@ Lines of metrics too, packed or not, and back.
 
 import dataclasses
 import functools
-import gzip
 import json
 import typing
 from collections.abc import Callable, Sequence
@@ -18,7 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from interactive_nav_common.config import STRICT, mistake_of, shown
 from interactive_nav_common.errors import FileError, UserError, readable
-from interactive_nav_common.files import whole_file, write_text
+from interactive_nav_common.files import write_text
 from interactive_nav_common.untrusted.reading import Loader, read_bytes, unpack
 
 Record = TypeVar("Record")
@@ -108,12 +107,7 @@ def read_packaged(path: Path, hint: Any) -> Any:
 
 def write_metrics(path: Path, lines: Sequence[dict[str, Any]]) -> None:
     """Write a metrics.jsonl, or, where the name ends in .gz, a packed one."""
-    text = "".join(json.dumps(line) + "\n" for line in lines)
-    if path.suffix == ".gz":
-        with whole_file(path) as partial:
-            partial.write_bytes(gzip.compress(text.encode(), mtime=0))
-    else:
-        write_text(path, text)
+    write_text(path, "".join(json.dumps(line) + "\n" for line in lines))
 
 
 def cut_metrics(path: Path, keep: Callable[[dict[str, Any]], bool]) -> None:

@@ -1,8 +1,4 @@
-"""Offer a batch of environments as Stable-Baselines3's `VecEnv`.
-
-envs = SB3VecEnv(TorchVectorEnv(interactive_nav.make("turtlebot", ["scenes_mjcf/apartment_0"]), num_envs=16))
-PPO("MlpPolicy", envs).learn(1_000_000)
-"""
+"""Offer a batch of environments as Stable-Baselines3's `VecEnv`; `docs/examples/sb3_ppo.py` trains with it."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,11 +1,7 @@
-"""Step environments with PyTorch tensors, which share JAX's memory through DLPack.
+"""Step environments with PyTorch tensors, which share JAX's memory through DLPack (example: `docs/gymnasium.md`).
 
-    envs = TorchVectorEnv(interactive_nav.make("turtlebot", ["scenes_mjcf/apartment_0"]), num_envs=64)
-    obs = envs.reset(seed=0)
-    obs, reward, terminated, truncated, info = envs.step(torch.zeros(64, 2, device=envs.device))
-
-Both sides then look at the same bytes on the same device. JAX takes its arrays to be constant, so write into
-a tensor that came from JAX only after `clone()`, and into one that was handed to JAX not at all.
+Both sides look at the same bytes on the same device. JAX takes its arrays to be constant, so write into a tensor that
+came from JAX only after `clone()`, and into one that was handed to JAX not at all.
 """
 
 from typing import Any

@@ -16,6 +16,7 @@ from interactive_nav.robots.build import FLOOR, Joint, WheeledBase, half_extents
 from interactive_nav.robots.files import compiled, read_file
 from interactive_nav.robots.repair import Wheel, complete, find, strip
 from interactive_nav.robots.spec import RobotCamera, RobotSpec
+from interactive_nav_common.config import Positive, check
 from interactive_nav_common.errors import ConfigError
 
 _GEOM = mujoco.mjtGeom
@@ -132,16 +133,6 @@ def _base(
     )
 
 
-def _check(name: str, wheel_rad_s: float, optional: Mapping[str, float | None]) -> None:
-    if not re.fullmatch(r"[A-Za-z0-9][\w-]*", name, re.ASCII):
-        raise ConfigError(f"name is {name!r}, expected letters, digits, _ and -, such as 'my_robot'")
-    if not 0 < wheel_rad_s < np.inf:
-        raise ConfigError(f"max_wheel_speed_rad_s is {wheel_rad_s}, expected a number above 0, in rad/s")
-    for setting, value in optional.items():
-        if value is not None and not 0 < value < np.inf:
-            raise ConfigError(f"{setting} is {value}, expected a number above 0; leave it out to take the file's value")
-
-
 def from_file(
     path: str | Path,
     *,
@@ -176,8 +167,11 @@ def from_file(
         ConfigError: an impossible argument, or a file that cannot be read.
         FileError: a file that lacks a named part, or whose parts do not fit.
     """
-    speeds = {"max_linear_m_s": max_linear_m_s, "max_angular_rad_s": max_angular_rad_s}
-    _check(name, max_wheel_speed_rad_s, {"body_width_m": body_width_m, "track_m": track_m} | speeds)
+    if not re.fullmatch(r"[A-Za-z0-9][\w-]*", name, re.ASCII):
+        raise ConfigError(f"name is {name!r}, expected letters, digits, _ and -, such as 'my_robot'")
+    figures = {"max_wheel_speed_rad_s": max_wheel_speed_rad_s, "body_width_m": body_width_m, "track_m": track_m}
+    figures |= {"max_linear_m_s": max_linear_m_s, "max_angular_rad_s": max_angular_rad_s}
+    check(figures, dict.fromkeys(figures, Positive | None))
     sides = _sides(left_wheels, right_wheels)
     driven, limits, path = dict(joints or {}), dict(torque_limits or {}), Path(path).resolve()
     child = read_file(path, base_body)

@@ -122,36 +122,11 @@ def _surfaces(world: World, s: int, tables: BoxTables) -> tuple[list[_Surface], 
     return parts, [*ids, *[class_id("robot", tables.classes)] * len(links)]
 
 
-@dataclasses.dataclass(frozen=True)
-class MeshTables:
-    """Surfaces of all scenes, padded alike: S scenes, K surfaces a scene; equal surfaces and images are kept once."""
+def build_meshes(world: World, tables: BoxTables) -> dict[str, np.ndarray]:
+    """Read the visual meshes of S scenes of up to K surfaces; bodies without any are drawn as their boxes.
 
-    points: np.ndarray
-    """[v, 3] f32, m, each surface in its body's frame."""
-    faces: np.ndarray
-    """[f, 3] i32."""
-    group: np.ndarray
-    """[f] i32: the surface that a face is of."""
-    uv: np.ndarray
-    """[f, 3, 2] f32."""
-    normals: np.ndarray
-    """[f, 3, 3] f32 at the corners, in the body's frame; 0 where the face's own serves."""
-    texels: np.ndarray
-    """[t] u32: red, green, blue from the lowest byte on."""
-    surface: np.ndarray
-    """[S, K] i32, -1 for padding."""
-    slot: np.ndarray
-    """[S, K] i32 body that it moves with."""
-    sphere_b: np.ndarray
-    """[S, K, 4] f32 centre and radius of a sphere around it, m; the radius is negative for padding."""
-    look: np.ndarray
-    """[S, K, 5] i32: class, first texel, width and height of the image (0: none), 1 if it is not to be lit."""
-    colour: np.ndarray
-    """[S, K, 3] f32 where there is no image."""
-
-
-def build_meshes(world: World, tables: BoxTables) -> MeshTables:
-    """Read the visual meshes of every scene; bodies without any are drawn as their boxes."""
+    Equal surfaces and images are kept once.
+    """
     scenes = [_surfaces(world, s, tables) for s in range(len(world.scenes))]
     shape = len(scenes), max(len(parts) for parts, _ in scenes)
     surface, slot = np.full(shape, -1, np.int32), np.zeros(shape, np.int32)
@@ -179,19 +154,19 @@ def build_meshes(world: World, tables: BoxTables) -> MeshTables:
                     images[name] = sum(map(len, texels))
                     texels.append(pixels)
                 look[s, k, 1:4] = images[name], part.image.shape[1], part.image.shape[0]
-    return MeshTables(
-        points=np.concatenate(points).astype(np.float32),
-        faces=np.concatenate(faces).astype(np.int32),
-        group=np.repeat(np.arange(len(faces), dtype=np.int32), [len(f) for f in faces]),
-        uv=np.concatenate(uv).astype(np.float32),
-        normals=np.concatenate(normals).astype(np.float32),
-        texels=np.concatenate(texels),
-        surface=surface,
-        slot=slot,
-        sphere_b=sphere,
-        look=look,
-        colour=colour.astype(np.float32),
-    )
+    return {
+        "points": np.concatenate(points).astype(np.float32),  # [v, 3] m, each surface in its body's frame
+        "faces": np.concatenate(faces).astype(np.int32),  # [f, 3]
+        "group": np.repeat(np.arange(len(faces), dtype=np.int32), [len(f) for f in faces]),  # [f] surface of each face
+        "uv": np.concatenate(uv).astype(np.float32),  # [f, 3, 2]
+        "normals": np.concatenate(normals).astype(np.float32),  # [f, 3, 3] as points; 0 where the face's own serves
+        "texels": np.concatenate(texels),  # [t] red, green, blue from the lowest byte on
+        "surface": surface,  # [S, K], -1 for padding
+        "slot": slot,  # [S, K] body that it moves with
+        "sphere_b": sphere,  # [S, K, 4] centre and radius of a sphere around it, m; the radius is -1 for padding
+        "look": look,  # [S, K, 5] class, first texel, width and height of the image (0: none), 1 if it is not to be lit
+        "colour": colour.astype(np.float32),  # [S, K, 3] where there is no image
+    }
 
 
 @wp.kernel
@@ -333,23 +308,19 @@ class MeshRenderer(Renderer):
         built = build_meshes(world, tables)
         device = "cpu" if jax.default_backend() == "cpu" else "cuda"
         self._mesh = wp.Mesh(
-            wp.array(built.points, dtype=wp.vec3, device=device),
-            wp.array(built.faces.ravel(), dtype=int, device=device),
+            wp.array(built["points"], dtype=wp.vec3, device=device),
+            wp.array(built["faces"].ravel(), dtype=int, device=device),
             # Built slowly and with care, once: rays take a third less time.
             bvh_constructor="sah",
             bvh_leaf_size=1,
-            groups=wp.array(built.group, dtype=int, device=device),
+            groups=wp.array(built["group"], dtype=int, device=device),
         )
-        root = wp.zeros(int(built.group[-1]) + 1, dtype=int, device=device)
+        root = wp.zeros(int(built["group"][-1]) + 1, dtype=int, device=device)
         wp.launch(_roots, len(root), [self._mesh.id], [root], device=device)
-        self._slot, self._sphere_b = built.slot, jnp.asarray(built.sphere_b)
+        self._slot, self._sphere_b = built["slot"], jnp.asarray(built["sphere_b"])
         self._handle = jnp.asarray([self._mesh.id & 0xFFFFFFFF, self._mesh.id >> 32], jnp.uint32)
-        self._constants = tuple(
-            map(
-                jnp.asarray,
-                (root.numpy()[built.surface], built.look, built.colour, built.uv, built.normals, built.texels),
-            )
-        )
+        constants = (built[name] for name in ("look", "colour", "uv", "normals", "texels"))
+        self._constants = tuple(map(jnp.asarray, (root.numpy()[built["surface"]], *constants)))
         self._draw = wp.jax_kernel(_draw, num_outputs=5)
 
     def images_batch(self, names, scene, qpos, camera, look=None):

@@ -6,9 +6,8 @@ episode for ever, and what the task keeps in `info` would leak into it.
     env = ShardedEnv(AutoResetEnv(interactive_nav.make(...)))       # all devices, of all processes
     state = jax.jit(env.reset)(jax.random.split(key, num_envs))     # leaves are sharded along their first axis
 
-Environments are independent, so nothing is exchanged between devices in `reset` and `step`; what a learner computes
-from the sharded arrays (means, gradients) XLA reduces over the devices by itself. Several machines or processes: call
-`start_distributed` first in each of them, before anything else uses JAX.
+Environments are independent: devices exchange nothing in `reset` and `step`. Of several machines or processes, each
+calls `start_distributed` before anything else uses JAX.
 """
 
 from __future__ import annotations
