@@ -71,13 +71,9 @@ class Critic(nn.Module):
 
 
 @flax.struct.dataclass
-class Adapting:
-    """Hold the state that an epoch changes."""
+class Adapting(learning.Learner):
+    """Add a critic to the state of the target's network, whose heads remain the source's."""
 
-    params: Any
-    """Of the target's network; its heads remain the source's."""
-    batch_stats: Any
-    opt_state: Any
     critic: Any
     critic_opt_state: Any
 
@@ -90,9 +86,7 @@ def embed_training(network: Network, variables: Any, images: jax.Array) -> tuple
     return embeddings, new.get("batch_stats", variables["batch_stats"])  # type: ignore[union-attr,return-value]
 
 
-def make_adapting(
-    network: Network, variables: dict[str, Any], size: int, config: AdaptConfig
-) -> tuple[Adapting, Critic]:
+def make_adapting(variables: dict[str, Any], size: int, config: AdaptConfig) -> tuple[Adapting, Critic]:
     """Return a target extractor equal to the source's, and a fresh critic."""
     critic = Critic(config.hidden)
     shapes = jax.eval_shape(critic.init, jax.random.PRNGKey(0), jax.ShapeDtypeStruct((1, size), jnp.float32))
@@ -126,7 +120,7 @@ def adversarial_epoch(network: Network, critic: Critic, config: AdaptConfig):
         rows, key = step
         x = images[rows]
         drawn = source[jax.random.randint(key, (len(rows),), 0, len(source))]
-        target, _ = embed_training(network, {"params": state.params, "batch_stats": state.batch_stats}, x)
+        target, _ = embed_training(network, state.variables, x)
         (critics, right), slope = jax.value_and_grad(critic_loss, has_aux=True)(state.critic, drawn, target)
         change, critic_opt = critic_tx.update(slope, state.critic_opt_state, state.critic)
         weights: Any = optax.apply_updates(state.critic, change)
@@ -161,12 +155,11 @@ def adapt_features(
     with claimed(out, {"task": "features", **to_dict(config), "run": trained.about["digest"][:12], **data}):
         learned, unlabelled = (x.images[~x.test].reshape(-1, *x.images.shape[3:]) for x in (near, far))
         embedded = trained.embed(learned)
-        state, critic = make_adapting(trained.network, trained.variables, embedded.shape[1], config)
+        state, critic = make_adapting(trained.variables, embedded.shape[1], config)
         epoch: Any = learning.over(adversarial_epoch(trained.network, critic, config), unlabelled, embedded)
         keys, kept = learning.phase_key(config.seed, 3), "checkpoint-features.msgpack"
         state = run_epochs(out, "features", state, epoch, config.epochs, keys, host, kept)
-        variables = {"params": state.params, "batch_stats": state.batch_stats}
-        adapted = save_trained(out, Trained(trained.network, variables, adapted_about(trained, config)))
+        adapted = save_trained(out, Trained(trained.network, state.variables, adapted_about(trained, config)))
         fitted = target_statistics(trained, unlabelled, config.batch)
         same = headers[0]["scenes"] == headers[1]["scenes"]
         results = {

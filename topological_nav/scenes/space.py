@@ -144,7 +144,7 @@ def cluster(points: np.ndarray, method: str, count: int, seed: int) -> np.ndarra
     if method not in METHODS:
         raise ConfigError(f"method is '{method}', expected one of {', '.join(METHODS)}")
     if not 1 <= count <= len(points):
-        raise ConfigError(f"count is {count}, expected between 1 and the {len(points)} points")
+        raise ConfigError(f"count is {count}, expected between 1 and the {len(points)} points in free cells")
     if count == 1:
         return np.zeros(len(points), np.int32)
     with threadpool_limits(1):  # on problems this small, threads cost more than they give
@@ -188,8 +188,6 @@ def find_rooms(
         count, by = len(recorded), "recorded"
     else:
         count, by = choose_count(points, method, seed)
-    if count > len(points):
-        raise ConfigError(f"{count} rooms in {len(points)} free cells; expected fewer rooms or a finer map")
     return Rooms(points, cluster(points, method, count, seed), method, by)
 
 

@@ -86,7 +86,7 @@ def test_the_game_moves_the_target_onto_the_source(monkeypatch):
     source = rng.normal([1.0, 2.0], 0.1, (400, 2)).astype(np.float32)
     target = 3.0 * rng.normal([1.0, 2.0], 0.1, (400, 2)).astype(np.float32)
     variables = {"params": {"gain": jnp.ones(2)}, "batch_stats": {}}
-    state, critic = adaptation.make_adapting(None, variables, 2, config)  # type: ignore[arg-type]
+    state, critic = adaptation.make_adapting(variables, 2, config)
     epoch: Any = adaptation.adversarial_epoch(None, critic, config)  # type: ignore[arg-type]
     accuracy = []
     for number in range(20):
