@@ -7,7 +7,7 @@ light, sensor noise, tone curve. All are pure functions of images and a seed.
 import dataclasses
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from scipy.ndimage import convolve1d, map_coordinates
@@ -67,7 +67,7 @@ class AdaptConfig(Settings):
 
     seed: Seed = 0
     """Of weights, order and splits."""
-    domain: str = "camera"
+    domain: Literal[tuple(PRESETS)] = "camera"  # type: ignore[valid-type]
     """The camera that target images are seen by: clean, lens, light, noise, blur, or camera, all of them."""
     epochs: Count = 20
     """features: passes over the target images."""
@@ -99,10 +99,6 @@ class AdaptConfig(Settings):
     """map: nodes nearer than this are joined, both ways."""
     passable: Share = 0.5
     """map: edges with at least this probability count as open."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        preset(self.domain)  # refused where there is none
 
 
 def as_seen(images: np.ndarray, config: DomainConfig, stream: int = 0) -> np.ndarray:

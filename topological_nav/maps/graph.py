@@ -233,11 +233,10 @@ def place_nodes(
             count = max(config.min_per_room, round(len(mine) * space.resolution_m**2 / config.spacing_m**2))
             nodes.append(mine[np.random.default_rng([config.seed, room]).permutation(len(mine))[:count]])
             continue
-        radius = config.spacing_m
-        chosen = _covering(mine, radius, space.resolution_m)
+        radius, chosen = config.spacing_m, mine[:0]
         while len(chosen) < config.min_per_room:
-            radius *= 0.8
             chosen = _covering(mine, radius, space.resolution_m)
+            radius *= 0.8
         nodes.append(chosen)
     xy = np.concatenate(nodes) if nodes else np.zeros((0, 2))
     if not config.connect:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 from interactive_nav_common.commands import Command, Flag, Repeated, Words, option, word
-from interactive_nav_common.config import AtLeastOne, Natural
+from interactive_nav_common.config import AtLeastOne, Bounds, Natural
 from train.scoring import AUTO_BATCH, PLANNERS, POLICIES, SEED
 
 
@@ -33,7 +33,7 @@ class Evaluate(Command):
     """Also play what this function of your module, or of path/to/file.py, returns."""
     scenes: Annotated[tuple[str, ...], option(metavar="SCENE_DIR")] = ()
     """Where to play (default: the scenes that the policy was trained on)."""
-    seed: Annotated[int | None, option()] = None
+    seed: Annotated[int | None, Bounds(-(2**63), 2**63 - 1), option()] = None
     """Of the fixed episodes."""
     checkpoint: Annotated[str, option(metavar="best|last|STEPS")] = "best"
     """Which checkpoint plays."""

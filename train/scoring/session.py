@@ -85,10 +85,8 @@ def _wanted(folder: RunFolder | None, policies: Sequence[str], arguments: Evalua
 
 
 def _checked_seed(arguments: Evaluate) -> int:
-    """Return the seed of drawn episodes, once numbers are in range and no word is without effect."""
+    """Return the seed of drawn episodes, once no word is without effect."""
     seed = SEED if arguments.seed is None else arguments.seed
-    if not -(2**63) <= seed < 2**63:
-        raise ConfigError(f"--seed is {seed}, expected a number of 64 bits")
     if arguments.episode_file:
         refuse_unused(arguments, "--balanced --seed", "with --episode-file, whose episodes are fixed")
     if arguments.dataset:

@@ -5,10 +5,11 @@ import itertools
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from interactive_nav_common.config import (
     AtLeastOne,
+    Bounds,
     Natural,
     NotNegative,
     Positive,
@@ -67,7 +68,7 @@ class LaunchConfig(Settings):
     """Runs that share a GPU; one that runs out of memory is tried again with twice the share."""
     gpu_memory_gb: Positive | None = None
     """Memory that one run needs: on GPUs too small for runs_per_gpu of them fewer are packed; auto: not looked at."""
-    jax_memory_share: float = 0.6
+    jax_memory_share: Annotated[float, Bounds(0.01, 1.0)] = 0.6
     """Part of a run's share of the GPU that JAX reserves; the rest is for Warp, the renderer and CUDA."""
     slots: AtLeastOne = 1
     """Runs at a time on a machine without a GPU; each gets its part of the cores."""
@@ -77,11 +78,6 @@ class LaunchConfig(Settings):
     """Times that a crashed run is started again by one command; a refused config or diverged numbers are not."""
     grace_s: NotNegative = 300.0
     """Time that stopped runs have to write their checkpoints (a compilation under way is not interrupted)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0.0 < self.jax_memory_share <= 1.0:
-            raise ConfigError(f"jax_memory_share is {self.jax_memory_share!r}, expected above 0 and at most 1")
 
 
 @dataclasses.dataclass(frozen=True)

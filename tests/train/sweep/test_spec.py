@@ -97,7 +97,7 @@ def test_machines_can_share_a_sweep():
         ("episodes: 50", "episodes: 0", "evaluate.episodes is 0, expected at least 1"),
         ("episodes: 50", "episods: 50", "unknown key 'evaluate.episods', did you mean"),
         ("episodes: 50", "checkpoint: newest", "checkpoint is 'newest', expected best, last or a number"),
-        ("runs_per_gpu: 4", "jax_memory_share: 0", "launch.jax_memory_share is 0.0, expected above 0 and at most 1"),
+        ("runs_per_gpu: 4", "jax_memory_share: 0", "launch.jax_memory_share is 0.0, expected between 0.01 and 1"),
         ("runs_per_gpu: 2", "runs_per_gup: 2", "unknown key 'launch.runs_per_gup', did you mean"),
         ("env.k_int: 1.0}", "env.k_int: 3.0}", "overrides[0]: env.k_int is 3.0, expected one of [0.0, 1.0]"),
         (
