@@ -301,9 +301,9 @@ def test_looks_keep_apart():
     looks = style.Looks({("fetch", name, k_int): [1] for name in names for k_int in k_ints})
     assert len({tuple(looks.algorithm(name).values()) for name in names}) == 3 and looks.seeds == "1 seed"
     assert [looks.fill(k_int) for k_int in k_ints] == ["none", "left", "full"]
-    assert [looks.line(k_int) for k_int in k_ints] == [":", "--", "-"]
+    assert [looks.k_int(k_int)["linestyle"] for k_int in k_ints] == [":", "--", "-"]
     alone = style.Looks({("fetch", "ppo", 0.5): []})
-    assert (alone.fill(0.5), alone.line(0.5)) == ("full", "-")
+    assert alone.k_int(0.5) == {"fillstyle": "full", "linestyle": "-"}
     assert style.in_order({"zeta", "ddpg", "ppo", "sac"}) == ["ppo", "sac", "ddpg", "zeta"]
 
 

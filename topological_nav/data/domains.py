@@ -68,7 +68,7 @@ class AdaptConfig(Settings):
     seed: Seed = 0
     """Of weights, order and splits."""
     domain: Literal[tuple(PRESETS)] = "camera"  # type: ignore[valid-type]
-    """The camera that target images are seen by: clean, lens, light, noise, blur, or camera, all of them."""
+    """The camera that target images are seen by; `camera` is all the others at once."""
     epochs: Count = 20
     """features: passes over the target images."""
     batch: Count = 50

@@ -234,6 +234,9 @@ class Contender(HostPolicy):
 class NavigatorPlayer(Contender):
     """Play with the navigator through a camera."""
 
+    state: State
+    """Of the batch, once it has begun."""
+
     def __init__(
         self,
         player: Player,
@@ -245,7 +248,6 @@ class NavigatorPlayer(Contender):
         """Store the parts; `watch` is called with time, poses and new state of every step."""
         super().__init__(player, config)
         self._navigator, self._camera, self._watch = navigator, camera, watch
-        self.state: State | None = None
 
     def begin(self, episodes: DrivenEpisodes) -> None:
         """Render the goals' images of the scene at rest; see `NavigatorConfig.goal_images`."""
@@ -263,13 +265,11 @@ class NavigatorPlayer(Contender):
         self._gap = Gap(self.config, self.config.seed, episodes.number, half_m)
 
     def keep(self, rows: np.ndarray) -> None:
-        assert self.state is not None
         self.state, self._images = self.state.take(rows), self._images[rows]
         self._shot = tuple(part[rows] for part in self._shot)
         self._gap.keep(rows)
 
     def step(self, state: Any, now: Snapshot, running: np.ndarray, step: int) -> tuple[Any, Events]:
-        assert self.state is not None
         time_s, robot = step * self.player.env.dt, self.player.env.robot
         heading = self._gap.heading(now.yaw_rad, time_s)
         if step % self.config.image_steps == 0:

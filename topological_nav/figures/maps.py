@@ -308,7 +308,6 @@ def drive_episode(venue: ContestScene, contender: str, number: int, filmed: bool
     player = NavigatorPlayer(venue.player, contest.config, navigator, venue.camera, watch)
     what, limit_s = f"{venue.scene.name}, simulated s", int(contest.config.limit_s)
     played = player.play(journey, lambda _, time_s: progress(what, int(time_s), limit_s))
-    assert player.state is not None
     time_s, xy, yaw, phase = zip(*steps, strict=True)
     columns = (np.array(column) for column in (time_s, xy, yaw, phase))
     node, goals = int(player.state.goal[0]), player.goal_images[0]

@@ -49,12 +49,10 @@ class Looks:
         last = len(self.k_ints) - 1
         return FILLS[round(self.k_ints.index(k_int) * (len(FILLS) - 1) / last)] if last else "full"
 
-    def line(self, k_int: float) -> Any:
-        """Return the line style of a k_int: the higher, the more solid."""
-        return LINES[self.k_ints.index(k_int) % len(LINES)] if len(self.k_ints) > 1 else "-"
-
     def k_int(self, k_int: float) -> dict[str, Any]:
-        return {"fillstyle": self.fill(k_int), "linestyle": self.line(k_int)}
+        """Return marker fill and line style: the higher, the fuller and the more solid."""
+        line = LINES[self.k_ints.index(k_int) % len(LINES)] if len(self.k_ints) > 1 else "-"
+        return {"fillstyle": self.fill(k_int), "linestyle": line}
 
     def algorithm_handles(self, **more: Any) -> list[Line2D]:
         return [handle(name.upper(), **{**self.algorithm(name), **more}) for name in self.algorithms]
