@@ -26,7 +26,15 @@ from interactive_nav_common.files import write_arrays
 from interactive_nav_common.jobs.progress import Progress
 from interactive_nav_common.rows import Rows
 from topological_nav.config import DataConfig
-from topological_nav.data.folders import Folder, draw_missing, load_scenes, numbered, read_arrays, read_shards
+from topological_nav.data.folders import (
+    Folder,
+    draw_missing,
+    load_scenes,
+    numbered,
+    read_arrays,
+    read_shard,
+    read_shards,
+)
 from topological_nav.data.objects import bodies, clear_of, fewer_at_furniture, strew
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.space import FreeSpace, Rooms, agreement, free_space, recorded_rooms, scene_rooms, spread
@@ -192,6 +200,13 @@ def load_rooms(folder: Path) -> RoomImages:
     images, label, scene_index, xy, test = (np.concatenate(column) for column in zip(*parts, strict=True))
     names = tuple(f"{s['name']}/{k}" for s in header["scenes"] for k in range(s["rooms"]))
     return RoomImages(images, label, names, scene_index, xy, test)
+
+
+def images_at(folder: Path, scene: str, position: int, config: DataConfig) -> np.ndarray:
+    """Read the room images [3, K, H, W, 3] u8 of one of a scene's positions, which are a sheet of a file."""
+    images = read_shard(Path(folder) / scene / f"rooms-{position // config.shard:03d}.npz")
+    images = images.reshape(-1, 3, config.headings, config.height, config.width, 3)
+    return images[position % config.shard]
 
 
 def load_passages(folder: Path) -> PassageImages:

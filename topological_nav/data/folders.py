@@ -159,7 +159,7 @@ def encode(images: np.ndarray, quality: int) -> bytes:
     padded = np.concatenate([images, np.zeros((rows * columns - n, height, width, 3), np.uint8)])
     sheet = padded.reshape(rows, columns, height, width, 3).swapaxes(1, 2).reshape(rows * height, columns * width, 3)
     out = io.BytesIO()
-    Image.fromarray(sheet).save(out, "WEBP", quality=quality, lossless=quality == 100, method=4)
+    Image.fromarray(sheet).save(out, "WEBP", quality=quality, lossless=quality == 100, method=2)
     return out.getvalue()
 
 

@@ -21,7 +21,7 @@ from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.figures import BLUE, GREEN, ORANGE, PINK, SKY, VERMILION, parts, plt, scene_axes
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.jobs.progress import Progress
-from topological_nav.data.dataset import load_plan, load_rooms, read_header
+from topological_nav.data.dataset import images_at, load_plan, read_header
 from topological_nav.evaluate.contest import ContestScene
 from topological_nav.evaluate.evaluation import DrivenEpisodes, NavigatorPlayer, Played
 from topological_nav.maps.graph import Route, TopologicalMap
@@ -137,8 +137,8 @@ def dataset_figure(folder: Path) -> Figure:
     """Draw a dataset's positions, a panel per scene, and level images of some positions below."""
     header, config = read_header(folder)
     scenes = [(s["name"], load_plan(folder, s["name"])) for s in header["scenes"]]
-    rooms = load_rooms(folder)
-    shown = np.linspace(0, len(rooms.xy_w) - 1, min(6, len(rooms.xy_w))).astype(int)
+    places = [(name, plan, k) for name, plan in scenes for k in range(len(plan.xy_w))]
+    shown = [places[k] for k in np.linspace(0, len(places) - 1, min(6, len(places))).astype(int)]
     lines = -(-len(scenes) // min(4, len(scenes)))
     heights = [3.4 * lines, 1.25 * len(shown)]
     figure, (above, below) = parts((12, sum(heights)), heights)
@@ -159,11 +159,11 @@ def dataset_figure(folder: Path) -> Figure:
             fontsize=7,
         )
     grid = below.subplots(len(shown), 1, squeeze=False)[:, 0]
-    for axis, position in zip(grid, shown, strict=True):
-        strip = rooms.images[position, 1, :: max(config.headings // 9, 1)]
+    for axis, (name, plan, k) in zip(grid, shown, strict=True):
+        strip = images_at(folder, name, k, config)[1, :: max(config.headings // 9, 1)]
         axis.imshow(np.concatenate(list(strip), 1))
         axis.set_axis_off()
-        axis.set_title(f"room {rooms.names[rooms.label[position]]}, level, turning left", fontsize=7, loc="left")
+        axis.set_title(f"room {name}/{plan.room[k]}, level, turning left", fontsize=7, loc="left")
     return figure
 
 
