@@ -42,6 +42,8 @@ CLUTTER = {
     "evaluation-expert": "the expert",
 }
 """Here it is from the first row."""
+FIRST = 12
+"""Episodes of each home that climb the ladder."""
 HEADER = ("Navigator", "Homes", "Success in 600 s", "in 175 s", "SPL", "RC", "AD (s)", "Difference in success")
 EXACT = 2**16
 
@@ -76,16 +78,25 @@ def scores(rows: pa.Table) -> dict[str, dict[str, np.ndarray]]:
         won, seconds = part["success"].to_numpy(), part["duration_s"].to_numpy()
         soon = won * (seconds <= 175.0)
         out[scene] = {"600": won, "175": soon, "spl": part["spl"].to_numpy(), "ad": seconds}
+        out[scene]["episode"] = part["episode"].to_numpy()
         out[scene]["contact"] = part["contact"].to_numpy()[won > 0]
     return out
 
 
+def _gain(mine: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> float:
+    """Return the mean difference in success over the episodes of both."""
+    _, left, right = np.intersect1d(mine["episode"], other["episode"], return_indices=True)
+    return float((mine["600"][left] - other["600"][right]).mean())
+
+
 def table(rows: pa.Table, variants: dict[str, str]) -> str:
-    """Return a Markdown table with a line for each variant that the rows have."""
-    lines, before = [], None
+    """Return a Markdown table with a line for each variant; those without rows are empty on the ladder, else absent."""
+    lines, before, climbs = [], None, variants is LADDER
+    rows = rows.filter(pc.less(rows["episode"], FIRST)) if climbs else rows
     for variant, title in variants.items():
         part = where(rows, variant=variant)
         if not len(part):
+            before, lines = (None, [*lines, [title, "0", *[""] * 6]]) if climbs else (before, lines)
             continue
         mine = scores(part)
         cells = [
@@ -94,12 +105,11 @@ def table(rows: pa.Table, variants: dict[str, str]) -> str:
         ]
         change = ""
         if before is not None:
-            change = estimate(
-                (mine[home]["600"] - before[home]["600"]).mean() for home in mine if home in before
-            ).with_ends(2)
+            pairs = [(mine[home], before[home]) for home in mine if home in before]
+            change = estimate(_gain(one, other) for one, other in pairs).with_ends(2)
         texts = [cell.with_ends(0 if place == 4 else 2) for place, cell in enumerate(cells)]
         lines.append([title, str(len(mine)), *texts, change])
-        before = mine if variants is LADDER or before is None else before
+        before = mine if climbs or before is None else before
     return markdown(HEADER, lines)
 
 
