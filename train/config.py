@@ -27,7 +27,7 @@ class EnvConfig(NavConfig):
 
 @dataclasses.dataclass(frozen=True)
 class NetworkConfig(Settings):
-    """Encoders of observations with images (reference benchmark, section 8.1); a vector alone needs none."""
+    """Encoders of observations with images (reference benchmark, section 8.1), and memory; a vector needs neither."""
 
     conv_channels: tuple[AtLeastOne, ...] = (32, 64, 64)
     """Channels of the convolutions."""
@@ -47,6 +47,12 @@ class NetworkConfig(Settings):
     """state: the critic takes the vector alone, the actor everything (not with share_encoder)."""
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     """Arithmetic of the image encoder; parameters stay float32."""
+    memory: Literal["none", "gru"] = "none"
+    """gru: a recurrent layer between encoder and head; ppo only."""
+    memory_size: AtLeastOne = 128
+    """Numbers that the recurrent layer keeps from step to step, for actor and critic each."""
+
+    IDLE = (("memory_size", "memory 'gru'", lambda c: c.memory == "gru"),)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -60,6 +66,10 @@ class NetworkConfig(Settings):
                 f"share_encoder is true and critic_inputs is {self.critic_inputs!r}, expected 'all': "
                 "who shares an encoder sees the same"
             )
+
+
+OF_MEMORY = ("memory", "memory_size", "state_features", "share_encoder")
+"""Settings of `NetworkConfig` that have an effect on a vector alone, if the network has memory."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -302,12 +312,19 @@ def validate(config: TrainConfig) -> None:
         section, auto = getattr(config, name), AUTO.get(name, {}).values()
         if images if name == "network" else name == config.algorithm:
             continue
+        used = OF_MEMORY if name == "network" and config.network.memory != "none" else ()
         for field in dataclasses.fields(section):
             value = getattr(section, field.name)
-            if value not in (field.default, *(sizes.get(field.name) for sizes in auto)):  # `resolve` fills all sections
+            known = (field.default, *(sizes.get(field.name) for sizes in auto))  # `resolve` fills all sections
+            if field.name not in used and value not in known:
                 needs = "images among env.observations" if name == "network" else f"algorithm {name}"
                 problem = f"{name}.{field.name} is {value!r}, which changes nothing here"
                 raise ConfigError(f"{problem}: expected {needs}; or leave it out")
+    if config.network.memory != "none" and config.algorithm != "ppo":
+        raise ConfigError(
+            f"network.memory is {config.network.memory!r} with algorithm {config.algorithm}, expected algorithm ppo, "
+            "which learns from whole sequences; set network.memory=none, or algorithm=ppo"
+        )
     section = getattr(config, config.algorithm)
     if isinstance(section, OffPolicyConfig):
         _validate_replay(config.algorithm, section, config.run.num_timesteps)

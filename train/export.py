@@ -24,6 +24,7 @@ from interactive_nav_common.jobs.progress import SafeConsole
 from interactive_nav_common.rows import read_rows
 from interactive_nav_common.versions import versions
 from train.config import EnvConfig, TrainConfig
+from train.learners.memory import lost
 from train.learners.networks import PIXELS
 from train.runs.checkpoint import CheckpointMeta
 from train.runs.run import build_env, config_to_play
@@ -110,6 +111,8 @@ def main(argv: Sequence[str] | None = None, build_env: Callable[[EnvConfig], Any
         raise ConfigError(f"--out is {str(arguments.out)!r}, expected a file that ends in .onnx")
     folder = RunFolder(arguments.run)
     config = config_to_play(folder, ["env.backend=native", *arguments.settings], None, console)
+    if config.network.memory != "none":
+        raise lost("an ONNX file")
     config = dataclasses.replace(config, network=dataclasses.replace(config.network, compute_dtype="float32"))
     env = build_env(config.env)
     policy, meta = load_policy(folder, config, env, arguments.checkpoint, deterministic=True)

@@ -98,11 +98,17 @@ def whole_updates(steps: int, steps_per_update: int) -> int:
 
 
 def reset_envs(agent: Any, env: Env, key: jax.Array) -> PyTree:
-    """Start a new episode in every environment."""
+    """Start a new episode in every environment, with the memory of a policy that has one in `info["policy"]`."""
     number = agent.config.num_envs or 1
+    first_memory = getattr(agent, "first_memory", tuple)()
+
+    def reset(key: jax.Array) -> PyTree:
+        state = env.reset(jax.random.split(key, number))
+        return state.replace(info=state.info | {"policy": first_memory}) if first_memory else state
+
     # A program of several processes takes an array of none of their devices.
     begin = np.asarray(key) if jax.process_count() > 1 else key
-    return jax.jit(lambda k: env.reset(jax.random.split(k, number)))(begin)
+    return jax.jit(reset)(begin)
 
 
 def run_loop(

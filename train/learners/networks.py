@@ -205,6 +205,9 @@ class Split(FeedForwardNetwork):
     """init(key), apply(normalizer, params, observation) -> features [..., F]."""
     head: FeedForwardNetwork
     """init(key), apply(None, params, features, *action)."""
+    remember: Callable[[Any, jax.Array, jax.Array], jax.Array] | None = None
+    """(encoder's params, memory [N, H], features [N, F]) -> new memory [N, H], which the head takes for features; None:
+    the network has no memory. With memory, `encoder` gives what goes into it, and `apply` takes no memory along."""
 
 
 def make_split(
@@ -239,10 +242,23 @@ def make_split(
         )
     module, zeros = Encoder(config, images), {name: jnp.zeros((1, *shape)) for name, shape in size.items()}
     features = jnp.zeros((1, images * config.image_features + ("state" in size) * config.state_features))
-    inputs = (features, jnp.zeros((1, action_size))) if action_size else (features,)
+    remembers, memory = config.memory == "gru", jnp.zeros((1, config.memory_size))
+    cell = linen.GRUCell(config.memory_size)
+    read = memory if remembers else features
+    inputs = (read, jnp.zeros((1, action_size))) if action_size else (read,)
 
     def encode(statistics: Any, params: Any, observation: Any) -> Any:
-        return module.apply(params, prepare(observation, statistics))
+        return module.apply(params["features"] if remembers else params, prepare(observation, statistics))
+
+    def remember(params: Any, memory: jax.Array, features: jax.Array) -> jax.Array:
+        new, _ = cell.apply(params["memory"], memory, features)
+        return new
+
+    def first_encoder(key: jax.Array) -> Any:
+        if not remembers:
+            return module.init(key, zeros)
+        key_features, key_memory = jax.random.split(key)
+        return {"features": module.init(key_features, zeros), "memory": cell.init(key_memory, memory, features)}
 
     def decide(_: Any, params: Any, features: jax.Array, *action: jax.Array) -> jax.Array:
         out = head.apply(params, features, *action)
@@ -250,7 +266,7 @@ def make_split(
         return out[..., 0] if squeeze else out
 
     # Each init as one program, not one for each operation.
-    init_encoder, init_head = jax.jit(lambda key: module.init(key, zeros)), jax.jit(lambda key: head.init(key, *inputs))
+    init_encoder, init_head = jax.jit(first_encoder), jax.jit(lambda key: head.init(key, *inputs))
 
     def init(key: jax.Array) -> dict[str, Any]:
         key_encoder, key_head = jax.random.split(key)
@@ -259,7 +275,8 @@ def make_split(
     def apply(statistics: Any, params: Any, observation: Any, *action: jax.Array) -> jax.Array:
         return decide(None, params["head"], encode(statistics, params["encoder"], observation), *action)
 
-    return Split(init, apply, FeedForwardNetwork(init_encoder, encode), FeedForwardNetwork(init_head, decide))
+    parts = FeedForwardNetwork(init_encoder, encode), FeedForwardNetwork(init_head, decide)
+    return Split(init, apply, *parts, remember if remembers else None)
 
 
 def make_ppo_networks(
@@ -270,8 +287,11 @@ def make_ppo_networks(
     value_sizes: Sequence[int],
     normalize_observations: bool,
 ) -> ppo_networks.PPONetworks:
-    """Build the policy (mean and deviation of a Gaussian before tanh) and the value network, of images as `Split`s."""
-    prepare = preprocess(normalize_observations)
+    """Build policy (mean and deviation of a Gaussian before tanh) and value network; `Split`s with images or memory."""
+    prepare, images = preprocess(normalize_observations), isinstance(size, Mapping)
+    if not isinstance(size, Mapping) and config.memory != "none":
+        vector, size = prepare, {"state": (size,)}
+        prepare = lambda observation, statistics: {"state": vector(observation, statistics)}  # noqa: E731
     if not isinstance(size, Mapping):
         return ppo_networks.make_ppo_networks(
             size,
@@ -281,7 +301,7 @@ def make_ppo_networks(
             value_hidden_layer_sizes=value_sizes,
         )
     actions = distribution.NormalTanhDistribution(event_size=action_size)
-    policy = make_split(config, size, True, prepare, Head(policy_sizes, actions.param_size))
-    value_head, images = Head(value_sizes, 1, output_init=critic_output_init), config.critic_inputs == "all"
-    value = make_split(config, size, images, prepare, value_head, squeeze=True)
+    policy = make_split(config, size, images, prepare, Head(policy_sizes, actions.param_size))
+    value_head = Head(value_sizes, 1, output_init=critic_output_init)
+    value = make_split(config, size, images and config.critic_inputs == "all", prepare, value_head, squeeze=True)
     return ppo_networks.PPONetworks(policy, value, actions)  # type: ignore[call-arg]

@@ -29,6 +29,7 @@ from brax.training.agents.ppo import losses as ppo_losses
 from brax.training.agents.ppo import networks as ppo_networks
 
 from train.config import PPOConfig, TrainConfig
+from train.learners import memory
 from train.learners import networks as nets
 from train.learners.learner import Snapshot, Update, all_finite, episode_sums, reset_envs
 from train.learners.networks import ObservationSize
@@ -67,7 +68,8 @@ class PPOParts:
     optimizer: optax.GradientTransformation
     observation_size: ObservationSize
     shared: bool = False
-    """Actor and critic have one encoder."""
+    """Actor and critic have one encoder, and one memory."""
+    memory_size: int = 0
     groups: int = 1
     """Equal groups of environments, within which sequences are shuffled: one for each device."""
 
@@ -94,9 +96,25 @@ class PPOParts:
             key=key,
         )
 
+    @property
+    def remembers(self) -> bool:
+        """Return whether the policy has memory."""
+        return getattr(self.nets.policy_network, "remember", None) is not None
+
+    def first_memory(self) -> list[jax.Array]:
+        """Return what actor and critic remember when episodes start, [envs, H] of each recurrent layer."""
+        size = (self.config.num_envs or 1, self.memory_size)
+        return [jnp.zeros(size)] * (self.remembers * (1 if self.shared else 2))
+
     def policy(self, learner: PPOState, deterministic: bool) -> types.Policy:
+        if self.remembers:
+            raise memory.lost("a function of the observation alone")
         make = ppo_networks.make_inference_fn(self.nets)
         return make((learner.normalizer_params, *whole_params(learner.params)), deterministic)
+
+    def recurrent_policy(self, learner: PPOState, deterministic: bool) -> memory.Act:
+        """Return the policy of networks with memory; it carries on as many of their memories as it is given."""
+        return memory.make_act(self.nets, learner.normalizer_params, whole_params(learner.params), deterministic)
 
 
 def make_agent(env: Any, config: TrainConfig) -> PPOParts:
@@ -105,8 +123,8 @@ def make_agent(env: Any, config: TrainConfig) -> PPOParts:
     layers = c.policy_hidden_layer_sizes, c.value_hidden_layer_sizes
     built = nets.make_ppo_networks(network, size, env.action_size, *layers, c.normalize_observations)
     optimizer = optax.chain(optax.clip_by_global_norm(c.max_grad_norm), optax.adam(c.learning_rate))
-    shared = network.share_encoder and isinstance(size, Mapping)
-    return PPOParts(c, built, optimizer, size, shared, config.run.devices)
+    shared = network.share_encoder and isinstance(built.policy_network, nets.Split)
+    return PPOParts(c, built, optimizer, size, shared, network.memory_size, config.run.devices)
 
 
 def policy_part(learner: Mapping[str, Any]) -> dict[str, Any]:
@@ -126,13 +144,17 @@ def collect(
     parts: PPOParts, env: Env, state: PPOState, env_state: Any, key: jax.Array
 ) -> tuple[Any, types.Transition, dict[str, jax.Array]]:
     """Act for one update; return environment state, transitions [sequences, time, ...], and ended episodes' sums."""
-    act, config = parts.policy(state, deterministic=False), parts.config
+    config = parts.config
+    make, generate_unroll = parts.policy, acting.generate_unroll
+    if parts.remembers:
+        make, generate_unroll = parts.recurrent_policy, memory.generate_unroll
+    act: Any = make(state, deterministic=False)
     assert config.batch_size and config.num_minibatches and config.num_envs
 
     def unroll(carry: tuple[Any, jax.Array], _: None) -> tuple[tuple[Any, jax.Array], Any]:
         env_state, key = carry
         key, next_key = jax.random.split(key)
-        env_state, data = acting.generate_unroll(
+        env_state, data = generate_unroll(
             env,
             env_state,
             act,
@@ -160,7 +182,7 @@ def collect(
     return env_state, jax.tree.map(sequences, data), jax.tree.map(jnp.sum, sums)
 
 
-def loss_of_images(
+def loss_of_splits(
     both: ppo_networks.PPONetworks,
     params: ppo_losses.PPONetworkParams | SharedParams,
     normalizer_params: Any,
@@ -171,7 +193,7 @@ def loss_of_images(
     """Return Brax's loss of the two heads, on features of one shared encoder or of one each.
 
     Features are computed before Brax puts time first: otherwise a convolution over [time, sequences] would gather all
-    images on every device.
+    images on every device. Networks with memory go through each sequence from the memory that it was collected with.
     """
     networks, whole = (both.policy_network, both.value_network), whole_params(params)
     encoders = [network.encoder.apply for network in networks]  # type: ignore[attr-defined]
@@ -184,6 +206,7 @@ def loss_of_images(
         return dataclasses.replace(network.head, apply=lambda _, p, features: network.head.apply(_, p, features[index]))
 
     data = data._replace(observation=encode(data.observation), next_observation=encode(data.next_observation))
+    data = memory.replay(networks, whole, data) if getattr(networks[0], "remember", None) else data
     heads = ppo_losses.PPONetworkParams(policy=whole[0]["head"], value=whole[1]["head"])  # type: ignore[call-arg]
     of_heads: Any = both.replace(policy_network=head(networks[0], 0), value_network=head(networks[1], -1))  # type: ignore
     return ppo_losses.compute_ppo_loss(heads, None, data, key, ppo_network=of_heads, **settings)
@@ -198,9 +221,9 @@ def learn(
     """
     config = parts.config
     of_vectors = functools.partial(ppo_losses.compute_ppo_loss, ppo_network=parts.nets)
-    images = isinstance(parts.observation_size, Mapping)
+    splits = isinstance(parts.nets.policy_network, nets.Split)
     loss_fn = functools.partial(
-        functools.partial(loss_of_images, parts.nets) if images else of_vectors,
+        functools.partial(loss_of_splits, parts.nets) if splits else of_vectors,
         **{name: getattr(config, name) for name in OF_LOSS},
         vf_coefficient=config.vf_loss_coefficient,
     )

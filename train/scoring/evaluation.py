@@ -21,6 +21,7 @@ from interactive_nav_common.versions import versions
 from train.config import TrainConfig
 from train.learners import demonstrations
 from train.learners.algorithms import ALGORITHMS
+from train.learners.memory import RecurrentPolicy
 from train.runs import checkpoint
 from train.runs.checkpoint import CheckpointMeta
 from train.runs.run import check_fits
@@ -81,7 +82,7 @@ def load_policy(
     which: str,
     deterministic: bool,
     cached: dict[Any, Any] | None = None,
-) -> tuple[PolicyFn, CheckpointMeta]:
+) -> tuple[PolicyFn | RecurrentPolicy, CheckpointMeta]:
     """Load a checkpoint's policy (`which`: best, last or env steps) to act in `env`; raise `CheckpointError`.
 
     A `deterministic` one takes the mode of its actions. `cached` lets policies of equal networks in the same
@@ -91,13 +92,20 @@ def load_policy(
     check_fits(meta, path, dataclasses.replace(config.env, robot=env.robot.name), env)
     algorithm = ALGORITHMS[config.algorithm]
     learner = checkpoint.load_learner(path, algorithm.template(env, config))
+    remembers = config.network.memory != "none"
 
     def act(learner: Any, observation: Any, key: jax.Array) -> jax.Array:
         return algorithm.policy(env, config, learner, deterministic)(observation, key)[0]
 
+    def act_with_memory(learner: Any, *inputs: Any) -> Any:
+        return algorithm.make_agent(env, config).recurrent_policy(learner, deterministic)(*inputs)
+
     kind = (config.algorithm, config.network, getattr(config, config.algorithm), deterministic)
-    act = act if cached is None else cached.setdefault(kind, act)
-    return jax.tree_util.Partial(act, learner), meta
+    made = act_with_memory if remembers else act
+    made = made if cached is None else cached.setdefault(kind, made)
+    if remembers:
+        return RecurrentPolicy(learner, made, config.network.memory_size), meta
+    return jax.tree_util.Partial(made, learner), meta
 
 
 def make_policies(

@@ -158,7 +158,7 @@ def test_shared_and_separate_encoders_give_the_same_loss_and_gradient():
     settings = {"entropy_cost": 0.01, "normalize_advantage": False, "discounting": 0.9}
 
     def loss_shared(params):
-        return ppo.loss_of_images(shared.nets, params, one.normalizer_params, data, KEY, **settings)[0]
+        return ppo.loss_of_splits(shared.nets, params, one.normalizer_params, data, KEY, **settings)[0]
 
     def loss_apart(params):
         return ppo_losses.compute_ppo_loss(
@@ -166,7 +166,7 @@ def test_shared_and_separate_encoders_give_the_same_loss_and_gradient():
         )[0]
 
     def loss_on_features(params):
-        return ppo.loss_of_images(apart.nets, params, one.normalizer_params, data, KEY, **settings)[0]
+        return ppo.loss_of_splits(apart.nets, params, one.normalizer_params, data, KEY, **settings)[0]
 
     both = ppo_losses.PPONetworkParams(policy=policy, value=value)  # type: ignore[call-arg]
     loss, grad = jax.jit(jax.value_and_grad(loss_shared))(one.params)
