@@ -6,15 +6,11 @@ dataclass may be composed of others: in files and on the command line they are s
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import difflib
 import functools
-import inspect
 import json
 import math
-import sys
-import textwrap
 import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -264,26 +260,12 @@ def read_words(words: Sequence[str], example: str = "ppo.learning_rate=1e-4") ->
 
 
 @functools.cache
-def _classes(module: str) -> dict[str, ast.ClassDef]:
-    """Return the classes at the top of a module, parsed once: `inspect.getsource` parses it again for each class."""
-    source = inspect.getsource(sys.modules[module])
-    return {node.name: node for node in ast.parse(source).body if isinstance(node, ast.ClassDef)}
-
-
-@functools.cache
 def field_docs(config_type: type) -> dict[str, str]:
     """Return the docstring under each field by its name, for the class and the classes that it extends."""
-    docs: dict[str, str] = {}
-    for cls in reversed(config_type.__mro__[:-1]):
-        class_node = _classes(cls.__module__).get(cls.__qualname__)
-        if class_node is None:  # a class within a function
-            class_node = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
-        assert isinstance(class_node, ast.ClassDef)
-        for field, after in zip(class_node.body, class_node.body[1:], strict=False):
-            doc = after.value if isinstance(after, ast.Expr) else None
-            if isinstance(field, ast.AnnAssign) and isinstance(doc, ast.Constant):
-                docs[ast.unparse(field.target)] = " ".join(str(doc.value).split())
-    return docs
+    from tyro._docstrings import get_field_docstring  # parses each class once; the lock file pins tyro's version
+
+    docs = {name: get_field_docstring(config_type, name, ()) for name in _hints(config_type)}
+    return {name: " ".join(doc.split()) for name, doc in docs.items() if doc}
 
 
 def overlay(base: Config, plain: Any, where: str, prefix: str = "", elsewhere: Sequence[str] = ()) -> Config:

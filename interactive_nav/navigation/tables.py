@@ -6,7 +6,6 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
-import mujoco
 import numpy as np
 
 from interactive_nav.config import TaskRules
@@ -14,7 +13,7 @@ from interactive_nav.geodesic import CornerGraph, corner_graph, navigation_grid
 from interactive_nav.navigation.lookup import geodesic_at, goal_field
 from interactive_nav.navigation.placement import CLEARANCE_M
 from interactive_nav.scenes.scene import Scene
-from interactive_nav.scenes.world import World
+from interactive_nav.scenes.world import World, world_poses
 from interactive_nav.types import SceneTables
 from interactive_nav_common.grids import cell_centres, sampled_clearance
 from interactive_nav_common.rotations import matrix_from_quat
@@ -57,11 +56,9 @@ def furniture_map(scene: Scene, poses: dict[str, tuple[np.ndarray, np.ndarray]],
 
 def rest_poses(world: World, index: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return body name -> (position, quaternion) of a scene's furniture at rest, world frame."""
-    data, layout = mujoco.MjData(world.models[index]), world.layout
-    data.qpos[:] = world.rest_qpos[index]
-    mujoco.mj_kinematics(world.models[index], data)
-    slots = zip(world.slots.names[index], layout.slot_kind, layout.slot_body, strict=True)
-    return {n: (data.xpos[body].copy(), data.xquat[body].copy()) for n, kind, body in slots if n and kind != "small"}
+    names, robots, pos, quat = world_poses(world, index, world.rest_qpos[index][None])
+    first = robots + len(world.small_objects)
+    return dict(zip(names[first:], zip(pos[0, first:], quat[0, first:], strict=True), strict=True))
 
 
 def friction_share(world: World, index: int) -> np.ndarray:

@@ -12,8 +12,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from interactive_nav.pictures.scene_model import world_poses
 from interactive_nav.scenes.objects import SmallObject, small_objects
+from interactive_nav.scenes.world import world_poses
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav.task.rollout import HostPolicy, Player, PolicyFn, Recorder
 from interactive_nav.types import EpisodeStart
@@ -135,44 +135,40 @@ class EpisodePlayer(Player):
         """Play one episode from the key or `start` (leaves [1, ...]); call `on_progress` with the number of steps."""
         played = self.rollout(self.policy, key[None], start, on_progress=lambda finished, step: on_progress(step))
         first, values = jax.tree.map(lambda x: x[0], (played.first, played.values))
-        return _replay_of(self, episode, first, values)
-
-
-def _replay_of(player: EpisodePlayer, episode: int, first: Any, values: dict[str, Any]) -> Replay:
-    env, joined = player.env, values["steps"]
-    qpos = np.concatenate([values["qpos"][None], joined["qpos"]])
-    scene = int(first.scene_index)
-    bodies, num_robot, pos, quat = world_poses(env.world, scene, qpos)
-    counts = {name: np.diff(joined[name], prepend=0) > 0 for name in ("interaction_steps", "structure_steps")}
-    return Replay(
-        robot=env.robot.reference or env.robot.name,
-        scene=str(env.scenes[scene].path),
-        scene_digest=env.scenes[scene].digest,
-        control_dt_s=env.config.control_dt_s,
-        num_objects=env.config.num_objects,
-        policy=player.name,
-        episode=episode,
-        label=player.label,
-        bodies=bodies,
-        num_robot_bodies=num_robot,
-        goal_xy_w=first.goal_xy_w,
-        body_pos_w=pos.astype(np.float32),
-        body_quat_w=quat.astype(np.float32),
-        action=joined["action"],
-        reward=joined["reward"],
-        force_n=np.diff(joined["force_sum_n"], prepend=0.0).astype(np.float32),
-        touches_movable=counts["interaction_steps"],
-        touches_structure=counts["structure_steps"],
-        metrics={name: float(values["metrics"][name]) for name in env.metric_names},
-        small_objects=env.config.small_objects,
-        objects=tuple(str(Path(folder).absolute()) for folder in env.config.objects),
-        segmentation_classes=env.config.segmentation_classes,
-        success_distance_m=env.success_distance_m,
-        image_fov_deg=env.sensors.lens.fov_deg,
-        waypoints_b=np.concatenate([first.waypoints_b[None], joined["waypoints"]]),
-        reward_names=env.reward_names,
-        reward_terms=np.stack([joined[name] for name in env.reward_names], -1),
-    )
+        env, joined = self.env, values["steps"]
+        qpos = np.concatenate([values["qpos"][None], joined["qpos"]])
+        scene = int(first.scene_index)
+        bodies, num_robot, pos, quat = world_poses(env.world, scene, qpos)
+        counts = {name: np.diff(joined[name], prepend=0) > 0 for name in ("interaction_steps", "structure_steps")}
+        return Replay(
+            robot=env.robot.reference or env.robot.name,
+            scene=str(env.scenes[scene].path),
+            scene_digest=env.scenes[scene].digest,
+            control_dt_s=env.config.control_dt_s,
+            num_objects=env.config.num_objects,
+            policy=self.name,
+            episode=episode,
+            label=self.label,
+            bodies=bodies,
+            num_robot_bodies=num_robot,
+            goal_xy_w=first.goal_xy_w,
+            body_pos_w=pos.astype(np.float32),
+            body_quat_w=quat.astype(np.float32),
+            action=joined["action"],
+            reward=joined["reward"],
+            force_n=np.diff(joined["force_sum_n"], prepend=0.0).astype(np.float32),
+            touches_movable=counts["interaction_steps"],
+            touches_structure=counts["structure_steps"],
+            metrics={name: float(values["metrics"][name]) for name in env.metric_names},
+            small_objects=env.config.small_objects,
+            objects=tuple(str(Path(folder).absolute()) for folder in env.config.objects),
+            segmentation_classes=env.config.segmentation_classes,
+            success_distance_m=env.success_distance_m,
+            image_fov_deg=env.sensors.lens.fov_deg,
+            waypoints_b=np.concatenate([first.waypoints_b[None], joined["waypoints"]]),
+            reward_names=env.reward_names,
+            reward_terms=np.stack([joined[name] for name in env.reward_names], -1),
+        )
 
 
 def replay_path(run: Path, policy: str, episode: int) -> Path:

@@ -13,7 +13,7 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import VISUAL_GROUP, SmallObject, add_boxes, body_names
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.slots import bodies_by_name
-from interactive_nav.scenes.world import World
+from interactive_nav.scenes.world import World, world_poses
 from interactive_nav.sensing.boxes import FLOOR_COLOUR, PALETTES
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import matrix_from_quat
@@ -187,22 +187,3 @@ def _add_cut_walls(spec: mujoco.MjSpec, walls: np.ndarray) -> None:
             size=[row[7], row[8], max(top / 2, 1e-3)],
             group=CUT_WALLS,
         )
-
-
-def world_poses(world: World, scene: int, qpos: np.ndarray) -> tuple[tuple[str, ...], int, np.ndarray, np.ndarray]:
-    """Return world poses of the robot's bodies and a scene's movable objects, for `qpos` [T, nq].
-
-    These are names (B), the number of robot bodies, positions [T, B, 3] and orientations [T, B, 4]. A non-finite row of
-    `qpos` repeats the one before it.
-    """
-    layout, slots, model = world.layout, world.slots, world.models[scene]
-    data = mujoco.MjData(model)
-    ids = np.concatenate([layout.robot_bodies, layout.slot_body[slots.occupied[scene]]])
-    names = [*(model.body(int(b)).name for b in layout.robot_bodies), *filter(None, slots.names[scene])]
-    pos, quat = np.zeros((len(qpos), len(ids), 3)), np.zeros((len(qpos), len(ids), 4))
-    for t, row in enumerate(qpos):
-        if np.isfinite(row).all():
-            data.qpos[:] = row
-        mujoco.mj_kinematics(model, data)
-        pos[t], quat[t] = data.xpos[ids], data.xquat[ids]
-    return tuple(names), len(layout.robot_bodies), pos, quat

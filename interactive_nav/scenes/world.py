@@ -313,3 +313,22 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
         robot_mass_kg=float(models[0].body_mass[layout.robot_bodies].sum()),
         slots=build_slot_tables(slots, scenes, models, layout),
     )
+
+
+def world_poses(world: World, scene: int, qpos: np.ndarray) -> tuple[tuple[str, ...], int, np.ndarray, np.ndarray]:
+    """Return world poses of the robot's bodies and a scene's movable objects, for `qpos` [T, nq].
+
+    These are names (B), the number of robot bodies, positions [T, B, 3] and orientations [T, B, 4]. A non-finite row of
+    `qpos` repeats the one before it.
+    """
+    layout, slots, model = world.layout, world.slots, world.models[scene]
+    data = mujoco.MjData(model)
+    ids = np.concatenate([layout.robot_bodies, layout.slot_body[slots.occupied[scene]]])
+    names = [*(model.body(int(b)).name for b in layout.robot_bodies), *filter(None, slots.names[scene])]
+    pos, quat = np.zeros((len(qpos), len(ids), 3)), np.zeros((len(qpos), len(ids), 4))
+    for t, row in enumerate(qpos):
+        if np.isfinite(row).all():
+            data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        pos[t], quat[t] = data.xpos[ids], data.xquat[ids]
+    return tuple(names), len(layout.robot_bodies), pos, quat

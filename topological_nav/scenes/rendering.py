@@ -17,11 +17,11 @@ import mujoco
 import numpy as np
 
 from interactive_nav import InteractiveNav, make
-from interactive_nav.pictures.scene_model import SCENE, carried_geoms, picture_spec, world_poses
+from interactive_nav.pictures.scene_model import SCENE, carried_geoms, picture_spec
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import SmallObject, body_names
 from interactive_nav.scenes.scene import Scene
-from interactive_nav.scenes.world import World
+from interactive_nav.scenes.world import World, world_poses
 from interactive_nav.types import LOST, EpisodeStart
 from interactive_nav_common.errors import UserError, missing, optional
 from interactive_nav_common.rotations import matrix_from_quat

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 import pytest
 
-from interactive_nav.pictures.scene_model import world_poses
 from interactive_nav.robots import get_robot
+from interactive_nav.scenes.world import world_poses
 from interactive_nav_common.config import replace
 from interactive_nav_common.errors import ConfigError, FileError
 from interactive_nav_common.rows import read_rows

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from interactive_nav.pictures.scene_model import SCENE, SceneModel, world_poses
+from interactive_nav.pictures.scene_model import SCENE, SceneModel
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import body_names
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav.scenes.world import world_poses
 from interactive_nav.task.rollout import episode_keys
 from scenes_mjcf.look import Lens, trace
 from topological_nav.scenes.rendering import (
