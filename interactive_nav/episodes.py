@@ -276,7 +276,6 @@ COMMANDS = {"make": Make}
 
 @reports_errors("interactive_nav.episodes")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Write a file; return 0 when done, 2 on a user's error."""
     arguments = parse(COMMANDS, "python -m interactive_nav.episodes", argv)
     env = interactive_nav.make(
         arguments.robot,

@@ -292,7 +292,6 @@ class Record(Picture):
     """A replay (.npz), or a run folder that holds the episode's."""
 
     def source(self, console: Console) -> Path:
-        """Return the replay, or where a run keeps it."""
         if self.replay.suffix == ".npz":
             return self.replay
         path = replay_path(self.replay, self.policy, self.episode)

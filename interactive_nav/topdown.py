@@ -5,6 +5,7 @@ arrows between, and the robot's path coloured by time or contact.
 """
 
 import dataclasses
+import itertools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,13 +42,10 @@ MOVED_M = 0.02
 
 def shadow(boxes: np.ndarray, pos_w: np.ndarray, quat_w: np.ndarray) -> Any:
     """Return what the boxes [n, 10] of a body at (3,) with quaternion (4,) cover of the floor, in world m."""
-    corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
-    body = matrix_from_quat(quat_w)
-    hulls = []
-    for row in boxes:
-        points = row[:3] + (corners * row[7:10]) @ matrix_from_quat(row[3:7]).T
-        hulls.append(shapely.MultiPoint((points @ body.T + pos_w)[:, :2]).convex_hull)
-    return shapely.union_all(hulls)
+    corners = np.array(list(itertools.product((-1, 1), repeat=3))) * boxes[:, None, 7:10]
+    points_b = boxes[:, None, :3] + corners @ matrix_from_quat(boxes[:, 3:7]).swapaxes(1, 2)
+    points_w = points_b @ matrix_from_quat(quat_w).T + pos_w
+    return shapely.union_all([shapely.MultiPoint(points[:, :2]).convex_hull for points in points_w])
 
 
 def draw_topdown(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "time") -> None:
@@ -184,7 +182,6 @@ class TopDown(Command):
 
 @reports_errors("interactive_nav.topdown")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Draw; return 0 when done, 2 on a user's error."""
     arguments = parse(TopDown, "python -m interactive_nav.topdown", argv)
     replays = [load_replay(path) for path in _files(arguments.replays)]
     scenes = {path: load_scene(path) for path in dict.fromkeys(r.scene for r in replays)}

@@ -55,7 +55,6 @@ def can_open_window() -> bool:
 
 
 def has_browser_viewer() -> bool:
-    """Return whether mjviser is installed."""
     return importlib.util.find_spec("mjviser") is not None
 
 
@@ -204,7 +203,6 @@ class View(Command):
 
     @classmethod
     def epilog(cls) -> str:
-        """Return the names of robots."""
         return f"robots: {', '.join(robot_names())}"
 
 

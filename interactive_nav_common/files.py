@@ -67,9 +67,7 @@ def take_lock(path: Path) -> int | None:
     """Hold a lock as long as the returned file descriptor is open, here or in a child; None if another holds it.
 
     The path is of a folder that is there, or of a file, which is created and names its holder. The system frees the
-    lock however its holder ends. A lock and not a process id in a file: ids are used again, and mean nothing in another
-    container. And a descriptor and not a `filelock.FileLock`, which opens no folders, and whose release frees what a
-    child has inherited.
+    lock however its holder ends. A `filelock.FileLock` would open no folders, and its release free what a child has.
     """
     is_folder = path.is_dir()
     with contextlib.ExitStack() as unless_held:

@@ -26,7 +26,6 @@ class Estimate:
 
     @property
     def half(self) -> float:
-        """Return half the interval's width."""
         return 0.5 * (self.high - self.low)
 
     def with_ends(self, digits: int = 3) -> str:

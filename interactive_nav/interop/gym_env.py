@@ -126,8 +126,6 @@ class InteractiveNavVectorEnv(VectorEnv):
     SAME_STEP (default): the same `step` returns the new episode's observation, the old one's last is in
     `info["final_obs"]` and its scores are in `info["final_info"]`; NEXT_STEP: the next `step` ignores
     the action and resets; DISABLED: `reset(options={"reset_mask": ended})` does.
-
-    Learners whose tensors stay on the device take `interactive_nav.interop.torch_bridge.TorchVectorEnv` instead.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
@@ -259,8 +257,7 @@ class InteractiveNavVectorEnv(VectorEnv):
 class InteractiveNavEnv(gymnasium.Env):
     """One environment: a batch of one, whose values have no batch axis.
 
-    Observation: float32 (29,) by default, see `interactive_nav.sensing.observation`; a dictionary where it has images.
-    Action: float32 (A,) in [-1, 1].
+    Observations and actions are those of `interactive_nav.InteractiveNav`.
     `terminated` on success or a state that is no longer finite, `truncated` at the time limit.
     `info` holds the step's reward terms (`reward/...`), how many entries of the action were not finite and counted as
     0 (`nonfinite_actions`) and, on an episode's last step, its scores

@@ -11,11 +11,10 @@ TensorDict = optional("tensordict", MISSING).TensorDict
 
 
 class RslRlVecEnv(optional("rsl_rl.env", MISSING).VecEnv):
-    """Adapt `TorchVectorEnv` to rsl_rl's interface, on its device.
+    """Adapt `TorchVectorEnv` to rsl_rl's interface, on its device (`docs/gymnasium.md` describes its observations).
 
-    A flat observation is the group `policy`. One in parts has a group for each, images as floats, channels first (u8
-    becomes 0 to 1). Time limits are in `extras["time_outs"]`, mean scores of finished episodes in `extras["log"]`.
-    rsl_rl may assign to `episode_length_buf` to spread the ends of first episodes.
+    Time limits are in `extras["time_outs"]`, mean scores of finished episodes in `extras["log"]`. rsl_rl may assign to
+    `episode_length_buf` to spread the ends of first episodes.
     """
 
     episode_length_buf = property(
@@ -29,12 +28,10 @@ class RslRlVecEnv(optional("rsl_rl.env", MISSING).VecEnv):
         self._obs = envs.reset()
 
     def get_observations(self) -> Any:
-        """Return the present observations by group."""
         parts = self._obs if isinstance(self._obs, Mapping) else {"policy": self._obs}
         return TensorDict({name: _channels_first(x) for name, x in parts.items()}, [self.num_envs], self.device)
 
     def step(self, actions: Any) -> tuple[Any, ...]:
-        """Return observations, rewards, ends and extras."""
         self._obs, reward, terminated, truncated, info = self.envs.step(actions)
         log = {"log": {f"/{name}": mean for name, mean in info["episode"].items()}} if info else {}
         return self.get_observations(), reward, (terminated | truncated).long(), {"time_outs": truncated.float()} | log

@@ -41,11 +41,9 @@ class SB3VecEnv(optional("stable_baselines3.common.vec_env", MISSING).VecEnv):
         return _to_numpy(self.envs.reset(seed))
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take the actions of the next step."""
         self._actions = torch.tensor(actions, device=self.envs.device)
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Return observations, rewards, ends, and an info for each environment."""
         *step, info = self.envs.step(self._actions)
         obs, rewards, terminated, truncated = _to_numpy(step)
         done = terminated | truncated
@@ -62,7 +60,6 @@ class SB3VecEnv(optional("stable_baselines3.common.vec_env", MISSING).VecEnv):
         """Do nothing: there is nothing to release."""
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Return a third-person view of each environment, with render_mode="rgb_array"."""
         return self._camera.frames(self.envs.state) if self._camera else [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:

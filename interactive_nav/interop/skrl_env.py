@@ -21,7 +21,6 @@ class SkrlEnv(optional("skrl.envs.wrappers.torch", MISSING).Wrapper):
         self._unwrapped = SimpleNamespace(num_envs=envs.num_envs, **spaces)  # where the base class looks
 
     def reset(self) -> tuple[Any, dict[str, Any]]:
-        """Begin new episodes everywhere."""
         return flatten(self._env.reset()), {}
 
     def step(self, actions: Any) -> tuple[Any, ...]:

@@ -6,7 +6,6 @@ Pictures show the scene's visual meshes. Depth, normals and segmentation come fr
 anywhere. RGB comes from MuJoCo's renderer where a GL is (see `scenes_mjcf.look`), or
 from MJX-Warp's, both with textures; where neither is, from rays with a flat colour for each object. MJX-Warp's runs
 on a CPU too, after a compilation of ten seconds a size, so there it is used only on request.
-Policies see `interactive_nav.sensing` (or nothing but numbers); nothing here is on their path.
 """
 
 import colorsys

@@ -87,7 +87,6 @@ class Replay:
 
     @property
     def small(self) -> tuple[SmallObject, ...]:
-        """Return the small objects."""
         return small_objects(self.num_objects, self.small_objects, self.objects)
 
     @property

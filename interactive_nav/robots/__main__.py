@@ -54,7 +54,6 @@ def _print_table(names: tuple[str, ...], console: Console) -> None:
 
 @reports_errors("interactive_nav.robots")
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit status."""
     arguments = parse(Robots, "python -m interactive_nav.robots", argv)
     console = SafeConsole(width=None if sys.stdout.isatty() else 220)
     _print_table(arguments.names(), console)

@@ -132,7 +132,6 @@ class RobotSpec:
 
     @property
     def action_size(self) -> int:
-        """Return the number of actions."""
         return len(self.action_low)
 
     def symmetric(self) -> RobotSpec:

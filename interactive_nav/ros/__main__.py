@@ -59,7 +59,6 @@ class Simulate(Command):
 
     @classmethod
     def epilog(cls) -> str:
-        """Return the settings."""
         return f"settings (key=default):\n{settings_help(make_config(**DEFAULTS))}"
 
 
@@ -91,7 +90,6 @@ COMMANDS = {kind.__name__.lower(): kind for kind in (Drive, Simulate)}
 
 @reports_errors("interactive_nav.ros")
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command."""
     run = {Drive: _drive, Simulate: _simulate}
     with stop_signals() as stops:
         arguments = parse(COMMANDS, "python -m interactive_nav.ros", argv)

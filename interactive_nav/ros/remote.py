@@ -39,7 +39,6 @@ class RosPolicy(HostPolicy):
         self._steps, self._stop = 0, lambda: bool(raise_stop())
 
     def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> np.ndarray:
-        """Return the action [1, A] of one control step, when its command has come."""
         if len(episode) > 1:
             raise UserError("policy ros: one episode at a time can be driven; set --batch 1")
         one = jax.tree.map(operator.itemgetter(0), jax.tree.map(np.asarray, state))

@@ -79,7 +79,6 @@ class Tally:
     """x, y (m), yaw (rad), world."""
 
     def add(self, before: Sensed, after: Sensed) -> None:
-        """Add a control step."""
         step = after.time_s - before.time_s
         self.seconds += step
         self.path_m += float(np.linalg.norm(after.truth_w[:2] - before.truth_w[:2]))
@@ -196,7 +195,6 @@ class RosSimulator(RosSensors):
         return self.sense()
 
     def sense(self) -> Sensed:
-        """Return what the sensors measure now."""
         nav = self._state.info["nav"]
         force_n = float(nav.memory["force_sum_n"]) - self._force_before
         return self.read(self._state, int(nav.step_count) * self.dt_s, force_n)

@@ -214,7 +214,6 @@ _BUILT = {"basket": (_basket, 0, 0.5), "shoe": (_shoe, 10, 0.7), "pot": (_pot, 7
 
 
 def _model(kind: str, name: str, mass: float, segmentation_id: int | None = None, **about: Any) -> SmallObject:
-    """Build a model of the file."""
     build, number, friction = _BUILT[kind]
     about |= {key: (*about[key], 1.0) for key in ("colour", "sole", "accent") if key in about}
     boxes, shapes = build(**about)

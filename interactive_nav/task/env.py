@@ -47,8 +47,7 @@ LIFT_M = 0.2
 class InteractiveNav(Env):
     """A robot reaches a goal in a cluttered home; pushing things aside is allowed and costs something.
 
-    Observation: f32 (29,) by default, see `interactive_nav.sensing.observation`; a dict with images, see
-    `interactive_nav.sensing.sensors`.
+    Observation: f32 (29,) by default, a dict with images, see `interactive_nav.sensing.sensors`.
     Action: f32 (A,) in [-1, 1], one per actuator (wheels: left, right).
     Reward: the sum of its reward terms: success + potential + interaction, see `interactive_nav.reward`.
     Done: success, time limit, a non-finite state, or dropped contacts; `info["truncation"]` is 1 where the
@@ -59,11 +58,7 @@ class InteractiveNav(Env):
     """
 
     def __init__(self, robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig, terms: Sequence[Term] = ()):
-        """Build models, tables and the physics backend for loaded scenes, with reward `terms` added to the benchmark's.
-
-        Raise `ConfigError` for settings that do not fit each other or the backend, or terms of equal names, and
-        `SceneError` for a scene without room.
-        """
+        """Build models, tables and physics of loaded scenes, with added `terms`; raise what `make` does."""
         robot = robot.symmetric() if config.symmetric_actions else robot
         self.robot, self.scenes, self.config = robot, scenes, config
         self.world = build_world(robot, scenes, config)

@@ -87,7 +87,6 @@ class Term:
     """Length of an observation."""
 
     def __post_init__(self) -> None:
-        """Raise ConfigError where the fields do not fit the kind."""
         if (self.value is None) != (self.kind == "memory"):
             expected = _VALUES[self.kind]
             raise ConfigError(f"term '{self.name}' ({self.kind}): value is {self.value}, expected {expected}")

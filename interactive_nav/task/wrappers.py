@@ -230,7 +230,6 @@ class ShardedEnv(Wrapper):
     """Steps equal shares of a batch on each device."""
 
     def __init__(self, env: Env, devices: Sequence[Any] | None = None):
-        """Wrap an environment."""
         super().__init__(env)
         self.mesh = Mesh(np.asarray(devices if devices is not None else jax.devices()), (AXIS,))
         spec = PartitionSpec(AXIS)
@@ -240,11 +239,9 @@ class ShardedEnv(Wrapper):
 
     @property
     def num_devices(self) -> int:
-        """Return the number of devices that share the batch."""
         return self.mesh.size
 
     def reset(self, rng: jax.Array) -> State:
-        """Return N states for [N, 2] keys."""
         if rng.shape[0] % self.num_devices:
             raise ConfigError(
                 f"{rng.shape[0]} environments over {self.num_devices} devices, expected a multiple: "
@@ -255,7 +252,6 @@ class ShardedEnv(Wrapper):
         return self._reset(*(jax.lax.with_sharding_constraint(x, self.sharding) for x in whole))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Return the states that follow N states and [N, A] actions."""
         return self._step(state, jax.lax.with_sharding_constraint(action, self.sharding))
 
 

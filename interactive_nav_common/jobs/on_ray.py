@@ -25,7 +25,6 @@ class Actor:
         self._ray, self._worker, self._code = ray, worker, worker.wait.remote()
 
     def poll(self) -> int | None:
-        """Return the exit code, or None while it runs."""
         ready, _ = self._ray.wait([self._code], timeout=0)
         if not ready:
             return None
@@ -37,7 +36,6 @@ class Actor:
         return code
 
     def send(self, number: signal.Signals) -> None:
-        """Send the job a signal."""
         self._worker.send.remote(number)
 
 
@@ -69,7 +67,6 @@ class RayLauncher(Launcher):
         return None if cpus < job.cpus or gpus < fraction - 1e-9 else (None, fraction)
 
     def begin(self, job: Job, share: Share) -> Actor:
-        """Start an actor."""
         room = self._worker.options(num_cpus=job.cpus, num_gpus=share[1])
         return Actor(self._ray, room.remote(job, os.getcwd(), share[1]))
 
@@ -78,6 +75,5 @@ class RayLauncher(Launcher):
         return "ray"
 
     def close(self) -> None:
-        """Leave the cluster."""
         if self._mine:
             self._ray.shutdown()

@@ -174,7 +174,6 @@ class LocalLauncher(Launcher):
         self._side_by_side = side_by_side
 
     def take(self, job: Any) -> Share | None:
-        """Return an equal part of the cores."""
         return (None, 1.0 / self._side_by_side) if len(self.running) < self._side_by_side else None
 
 

@@ -24,7 +24,6 @@ class SafeConsole(Console):
     """
 
     def print(self, *objects: Any, **how: Any) -> None:
-        """Print lines, or tables."""
         lines = all(isinstance(each, str | Text) for each in objects)
         super().print(*objects, **{"soft_wrap": lines, "highlight": not lines, **how})
 

@@ -1,8 +1,5 @@
 """Build the `RobotSpec`s of the legged robots from rows of `legged.yaml`, gaits and `mjcf/<robot>.xml`.
 
-A gait is a pure function of the twist command, the robot's state and the clock, run at every physics step: its
-targets are `home + reference(phase, command, base)`, a scripted stepping motion.
-
 Control modes: `native`, the original's action (Ant, hip and ankle of legs front left, back left, back right, front
 right, and Humanoid: torques); `position` or `velocity` of each joint, Minitaur also `torque`, or `leg`: swing and
 extension of each leg; or `twist`, linear and angular velocity of the base through the gait.
@@ -352,7 +349,6 @@ def _leg_angles(command, state, xp):
 
 
 def minitaur(control_mode: str = "native") -> RobotSpec:
-    """Return Minitaur's spec."""
     parts = (("motor", _MINITAUR.home[0]), ("knee", _KNEE_HOME_RAD))
     home = tuple((joint.replace("motor", part), value) for joint in _MINITAUR.joints for part, value in parts)
     figures: dict[str, Any] = {"home_qpos": home}
