@@ -125,7 +125,7 @@ def test_two_processes_learn_as_one_and_one_continues_their_run(tmp_path):
     process = start(f"train_toy(t.Path({str(two)!r}), 3, gpus=2)", 1)
     printed, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors[-3000:]
-    assert printed.count("done at 768 steps") == 1
+    assert " ".join(printed.split()).count("done at 768 steps") == 1  # a long path breaks the line
     for updates in (3, 5):  # 5: each goes on from its checkpoint
         in_two_devices(f"train_toy(t.Path({str(one)!r}), {updates})")
         if updates == 5:
