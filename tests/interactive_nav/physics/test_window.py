@@ -196,8 +196,8 @@ def test_a_pushed_sofa_does_not_enter_a_wall_in_a_window(narrow):
         data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = inner.qpos, inner.qvel, inner.qacc_warmstart
         data.ctrl[:] = command
         mujoco.mj_step(model, data, nstep=5)
-        new = (jnp.asarray(x, jnp.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart))
-        part = window.leave(part, PhysicsState(*new), chosen)
+        qpos, qvel, warmstart = (jnp.asarray(x, jnp.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart))
+        part = window.leave(part, PhysicsState(qpos, qvel, warmstart), chosen)
     sofa = world.layout.slot_qpos[world.slots.names[0].index("sofa_0")]
     moved = [float(s.qpos[sofa] - first.qpos[sofa]) for s in (whole, part)]
     assert moved == pytest.approx([0.05, 0.05], abs=2e-3), "0.05 m to the wall"

@@ -328,7 +328,7 @@ def playground(model, rng):
     return model.tree_replace({"actuator_gainprm": gains, "body_mass": mass}), axes
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_a_playground_randomization_fn_gives_each_environment_its_model(make):
     env = make(backend="jax", episode_steps=4)
     wrapped = wrap_for_brax_training(env, randomization_fn=functools.partial(playground, rng=keys()))
