@@ -242,6 +242,7 @@ class ShardedEnv(Wrapper):
         return self.mesh.size
 
     def reset(self, rng: jax.Array) -> State:
+        """Return N states for [N, 2] keys; raise `ConfigError` unless N is a multiple of the devices."""
         if rng.shape[0] % self.num_devices:
             raise ConfigError(
                 f"{rng.shape[0]} environments over {self.num_devices} devices, expected a multiple: "
@@ -252,6 +253,7 @@ class ShardedEnv(Wrapper):
         return self._reset(*(jax.lax.with_sharding_constraint(x, self.sharding) for x in whole))
 
     def step(self, state: State, action: jax.Array) -> State:
+        """Return the states that follow N states and [N, A] actions."""
         return self._step(state, jax.lax.with_sharding_constraint(action, self.sharding))
 
 
