@@ -24,7 +24,6 @@ from converters.propose.proposals import floor_of, with_retrieved
 from converters.read.homes.parts import built_in
 from converters.read.source import read_source
 from converters.read.surfaces import split_storeys
-from converters.records.cache import NOT_HASHED, StageCache
 from converters.records.errors import Gate, SceneRejected
 from converters.records.raw import (
     ATTRIBUTION,
@@ -45,6 +44,7 @@ from converters.write.light import VOXEL_M, Daylight, daylight
 from converters.write.manifest import make_manifest, scene_objects
 from converters.write.texture import Drawn, as_it_is, bake_structure, colour_cloud, draw_objects
 from interactive_nav_common.files import check_name, part_folder, publish, write_text
+from interactive_nav_common.jobs.cache import NOT_HASHED, StageCache
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.schema import SceneManifest, SceneMaps, save_manifest, save_maps
 

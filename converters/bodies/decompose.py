@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from converters.geometry.boxes import Hull, convex_hull
-from converters.records.cache import MISSING, NOT_HASHED, StageCache
 from converters.records.errors import CANNOT_WRITE, StageFailed
 from interactive_nav_common import files
+from interactive_nav_common.jobs.cache import MISSING, NOT_HASHED, StageCache
 from interactive_nav_common.jobs.processes import LATE, Job, LocalLauncher, our_env, run_jobs
 
 WORKER = "converters.bodies.coacd_worker"

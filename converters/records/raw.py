@@ -10,8 +10,8 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from converters.records.cache import NOT_HASHED
 from converters.records.errors import SceneRejected
+from interactive_nav_common.jobs.cache import NOT_HASHED
 from interactive_nav_common.rotations import transform, transformed
 from scenes_mjcf.categories import TABLE
 

@@ -32,7 +32,7 @@ POINTS, BATCH = 800, 64
 def scene_tables(values: dict[str, Any]) -> SceneTables:
     """What navigation reads, without the rest."""
     others: dict[str, Any] = {field.name: None for field in dataclasses.fields(SceneTables) if field.name not in values}
-    return SceneTables(**values, **others)
+    return jax.device_put(SceneTables(**values, **others))
 
 
 def random_room(seed: int) -> np.ndarray:

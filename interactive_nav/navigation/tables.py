@@ -12,12 +12,13 @@ from interactive_nav.config import TaskRules
 from interactive_nav.geodesic import CornerGraph, corner_graph, navigation_grid
 from interactive_nav.navigation.lookup import geodesic_at, goal_field
 from interactive_nav.navigation.placement import CLEARANCE_M
+from interactive_nav.scenes.many import check_fits, for_each_home
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import World, world_poses
 from interactive_nav.types import SceneTables
 from interactive_nav_common.grids import cell_centres, sampled_clearance
 from interactive_nav_common.rotations import matrix_from_quat
-from scenes_mjcf.schema import SceneError
+from scenes_mjcf.schema import SceneError, SceneMaps
 
 FINE_CELLS = 2
 """Fine cells along the side of a navigation cell: corners and places are 0.05 m fine, nodes 0.1 m apart."""
@@ -30,27 +31,33 @@ robot wide, so nothing is stepped over; a corner clipped between two samples is 
 
 def furniture_map(scene: Scene, poses: dict[str, tuple[np.ndarray, np.ndarray]], height_m: float) -> np.ndarray:
     """Return [rows, columns] bool: cells of the scene's map over which furniture stands below a height."""
-    maps = scene.maps
+    return _covered(scene.maps, _placed_boxes(scene, poses), height_m)
+
+
+def _placed_boxes(scene: Scene, poses: dict[str, tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Return [n, 17]: position and quaternion of each box's body, and the box's row."""
+    placed = [(*poses[m.name], row) for m in scene.movables if m.name in poses for row in m.boxes]
+    return np.array([np.concatenate(each) for each in placed]).reshape(-1, 17)
+
+
+def _covered(maps: SceneMaps, boxes: np.ndarray, height_m: float) -> np.ndarray:
+    """Return [rows, columns] bool: cells of a map over which `_placed_boxes` lie below a height."""
     rows, columns = maps.traversable.shape
     x = maps.origin_w[0] + (np.arange(columns) + 0.5) * maps.resolution_m
     y = maps.origin_w[1] + (np.arange(rows) + 0.5) * maps.resolution_m
     z = np.arange(0.02, height_m, 0.03)
     covered = np.zeros((rows, columns), bool)
-    for movable in scene.movables:
-        if movable.name not in poses:
+    for row in boxes:
+        body = matrix_from_quat(row[3:7])
+        centre, axes, half = row[:3] + body @ row[7:10], body @ matrix_from_quat(row[10:14]), row[14:]
+        reach = np.abs(axes) @ half
+        cs = np.flatnonzero(np.abs(x - centre[0]) <= reach[0] + maps.resolution_m)
+        rs = np.flatnonzero(np.abs(y - centre[1]) <= reach[1] + maps.resolution_m)
+        if not len(cs) or not len(rs):
             continue
-        pos, quat = poses[movable.name]
-        body = matrix_from_quat(quat)
-        for row in movable.boxes:
-            centre, axes, half = pos + body @ row[:3], body @ matrix_from_quat(row[3:7]), row[7:10]
-            reach = np.abs(axes) @ half
-            cs = np.flatnonzero(np.abs(x - centre[0]) <= reach[0] + maps.resolution_m)
-            rs = np.flatnonzero(np.abs(y - centre[1]) <= reach[1] + maps.resolution_m)
-            if not len(cs) or not len(rs):
-                continue
-            grid = np.stack(np.meshgrid(x[cs], y[rs], z, indexing="xy"), -1)
-            inside = (np.abs((grid - centre) @ axes) <= half + maps.resolution_m / 2).all(-1).any(-1)
-            covered[np.ix_(rs, cs)] |= inside
+        grid = np.stack(np.meshgrid(x[cs], y[rs], z, indexing="xy"), -1)
+        inside = (np.abs((grid - centre) @ axes) <= half + maps.resolution_m / 2).all(-1).any(-1)
+        covered[np.ix_(rs, cs)] |= inside
     return covered
 
 
@@ -86,36 +93,55 @@ def round_tables(world: World, tables: SceneTables, rules: TaskRules, limit: flo
         return corner_graph(free, fine, rules.nav_cell_m, maps.origin_w)
 
     with ThreadPoolExecutor() as pool:
-        return tables.replace(**navigation_tables(list(pool.map(graph, range(len(world.scenes))))))
+        graphs = list(pool.map(graph, range(len(world.scenes))))
+    return jax.device_put(tables.replace(**navigation_tables(graphs)))
 
 
-def _scene_places(world: World, index: int, rules: TaskRules) -> tuple[CornerGraph, np.ndarray, np.ndarray, np.ndarray]:
-    """Return shortest paths, start cells [p, 2], goal cells [g, 2] and clutter cells [q, 2] of one scene."""
-    scene, robot = world.scenes[index], world.robot
-    maps, fine = scene.maps, rules.nav_cell_m / FINE_CELLS
-    free = navigation_grid(maps.traversable, maps.resolution_m, robot.footprint_radius_m, fine)
+Places = tuple[CornerGraph, np.ndarray, np.ndarray, np.ndarray]
+"""Shortest paths, start positions [p, 2], goal positions [g, 2] and clutter positions [q, 2] of one scene, m, world."""
+
+
+def _places(
+    maps: SceneMaps, boxes: np.ndarray, radius_m: float, height_m: float, largest_m: float, cell_m: float, clear: bool
+) -> Places | None:
+    """Return the places of a map with furniture of `boxes`, for a robot of this radius and height; None: no room.
+
+    `largest_m` is the radius of the largest small object; goals are `clear` of furniture, or of structure only.
+    """
+    fine = cell_m / FINE_CELLS
+    free = navigation_grid(maps.traversable, maps.resolution_m, radius_m, fine)
     if not free.any():
-        raise SceneError(
-            f"{scene.path}: no room for robot '{robot.name}' (radius {robot.footprint_radius_m} m) on the traversable "
-            "map; use a smaller robot or check the scan's floor"
-        )
-    graph = corner_graph(free, fine, rules.nav_cell_m, maps.origin_w)
+        return None
+    graph = corner_graph(free, fine, cell_m, maps.origin_w)
 
     def room(blocked: np.ndarray | bool) -> np.ndarray:
         """Return the clearance in metres that every point of a fine cell has."""
         open_ = maps.traversable & ~np.asarray(blocked)
         return sampled_clearance(open_, maps.resolution_m, fine) - math.sqrt(0.5) * fine
 
-    furnished = room(furniture_map(scene, rest_poses(world, index), robot.height_m))
-    largest = max((o.radius_m for o in world.small_objects), default=0.0)
-    needed = robot.footprint_radius_m + CLEARANCE_M
-
+    furnished, needed = room(_covered(maps, boxes, height_m)), radius_m + CLEARANCE_M
     centres = functools.partial(cell_centres, cell_m=fine, origin_w=maps.origin_w)
     starts = centres(graph.free & (furnished >= needed))
     # Unless the option says otherwise the robot must fit at the goal too, or one under a sofa could never be reached.
-    goals = starts if rules.goal_clear else centres(graph.free & (room(False) >= needed))
-    clutter = centres(furnished >= largest + CLEARANCE_M)
+    goals = starts if clear else centres(graph.free & (room(False) >= needed))
+    clutter = centres(furnished >= largest_m + CLEARANCE_M)
     return graph, starts, goals, clutter
+
+
+def _world_places(world: World, rules: TaskRules) -> list[Places]:
+    """Return the places of every scene."""
+    robot, largest_m = world.robot, max((o.radius_m for o in world.small_objects), default=0.0)
+    shared = robot.footprint_radius_m, robot.height_m, largest_m, rules.nav_cell_m, rules.goal_clear
+    boxes = [_placed_boxes(scene, rest_poses(world, i)) for i, scene in enumerate(world.scenes)]
+    calls = [(scene.maps, placed, *shared) for scene, placed in zip(world.scenes, boxes, strict=True)]
+    every = for_each_home(_places, calls, "finding paths in homes")
+    full = [scene for scene, places in zip(world.scenes, every, strict=True) if places is None]
+    if full:
+        raise SceneError(
+            f"{full[0].path}: no room for robot '{robot.name}' (radius "
+            f"{robot.footprint_radius_m} m) on the traversable map; use a smaller robot or check the scan's floor"
+        )
+    return every  # pyright: ignore[reportReturnType]
 
 
 def _fallback_pairs(world: World, tables: SceneTables, rules: TaskRules) -> np.ndarray:
@@ -183,19 +209,19 @@ def navigation_tables(graphs: list[CornerGraph]) -> dict[str, Any]:
     # The tables are large: the smallest type that numbers every corner.
     index = np.uint16 if count < 2**16 else np.int32
 
-    visible = [np.where(g.visible < len(g.corner_xy_w), g.visible, count) for g in graphs]
+    visible = [np.where(g.visible < len(g.corner_xy_w), g.visible, count).astype(index) for g in graphs]
     extent = max(math.hypot(*g.free.shape) * g.fine_m for g in graphs)
     arrays = {
         "node_of_cell": np.int32(_pad([g.node_of_cell for g in graphs], 2)),
         "grid_origin_w": np.asarray([g.origin_w for g in graphs], np.float32),
         "node_xy_w": np.float32(_pad([g.node_xy_w for g in graphs], 1)),
-        "visible": _pad(visible, 2, fill=count).astype(index),
+        "visible": _pad(visible, 2, fill=count),
         "corner_xy_w": _pad([g.corner_xy_w for g in graphs], 1, least=count + 1),
         "corner_distance_m": _pad([g.distance_m for g in graphs], 2, np.inf, count + 1),
         "next_corner": _pad([g.next_corner for g in graphs], 2, count, count + 1).astype(index),
         "free": _pad([g.free for g in graphs], 2),
     }
-    return jax.device_put(arrays) | {
+    return arrays | {
         "cell_m": graphs[0].cell_m,
         "fine_m": graphs[0].fine_m,
         "sight_samples": math.ceil(extent / (SIGHT_STEP_CELLS * graphs[0].fine_m)),
@@ -204,15 +230,12 @@ def navigation_tables(graphs: list[CornerGraph]) -> dict[str, Any]:
 
 def build_tables(world: World, rules: TaskRules) -> SceneTables:
     """Solve navigation for every scene and stack all constants on the device."""
-    with ThreadPoolExecutor() as pool:  # NumPy works on large arrays here, without holding Python's lock
-        places = list(pool.map(lambda i: _scene_places(world, i, rules), range(len(world.scenes))))
+    places = _world_places(world, rules)
     mass = np.concatenate([np.full((len(world.scenes), 1), world.robot_mass_kg), world.slots.mass_kg], 1)
 
-    def f32(value: Any, dtype: Any = np.float32) -> jax.Array:
-        return jax.device_put(np.asarray(value, dtype))
-
-    i32 = functools.partial(f32, dtype=np.int32)
-    tables = SceneTables(
+    f32: Any = functools.partial(np.asarray, dtype=np.float32)
+    i32: Any = functools.partial(np.asarray, dtype=np.int32)
+    tables: Any = SceneTables(
         rest_qpos=f32(world.rest_qpos),
         mass_kg=f32(mass),
         com_m=f32(world.slots.com_b_m),
@@ -225,4 +248,6 @@ def build_tables(world: World, rules: TaskRules) -> SceneTables:
         num_clutter=i32([len(p[3]) for p in places]),
         fallback_pairs_xy_w=f32(np.zeros((len(places), 1, 2, 2))),
     )
-    return tables.replace(fallback_pairs_xy_w=f32(_fallback_pairs(world, tables, rules)))
+    check_fits("homes", len(places), tables)
+    tables = jax.device_put(tables)
+    return tables.replace(fallback_pairs_xy_w=jax.device_put(f32(_fallback_pairs(world, tables, rules))))

@@ -8,7 +8,6 @@ import copy
 import dataclasses
 import functools
 import threading
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -21,24 +20,27 @@ from interactive_nav.config import NavConfig
 from interactive_nav.physics import base
 from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces
 from interactive_nav.scenes.contacts import from_sensors, sensor_addresses
-from interactive_nav.scenes.world import World
+from interactive_nav.scenes.slots import find_slots
+from interactive_nav.scenes.world import World, build_spec
 
 _W = mujoco.mjtWarning
 _ENGINE_FAILURES = [w.value for w in (_W.mjWARN_BADQPOS, _W.mjWARN_BADQVEL, _W.mjWARN_BADQACC, _W.mjWARN_INERTIA)]
 _OVERFLOWS = [_W.mjWARN_CONTACTFULL.value, _W.mjWARN_CNSTRFULL.value]
 
 
-def with_feet_apart(spec: mujoco.MjSpec, names: Sequence[str]) -> mujoco.MjModel:
-    """Return a scene's model that steps bit for bit as its spec's does, and faster.
+def with_feet_apart(world: World, scene: int, config: NavConfig) -> mujoco.MjModel:
+    """Return a scene's model that steps bit for bit as the world's does, and faster.
 
-    The broadphase measures every geom of colliding bodies, and most are feet. Here the feet of `names` are on separate
-    bodies that collide with nothing, and explicit pairs let them touch the floor.
+    The broadphase measures every geom of colliding bodies, and most are feet. Here they are on separate bodies that
+    collide with nothing, and explicit pairs let them touch the floor.
     """
-    spec = spec.copy()
+    # Taking the feet out of the world's spec takes six times as long: MuJoCo lists all elements again for each.
+    slots = find_slots(world.scenes, world.small_objects)
+    spec, names = build_spec(world.robot, scene, world.scenes, slots, config, feet=False), [slot.name for slot in slots]
     floor = spec.geom("floor")
     for name in names:
         legs = spec.body(name).add_body(name=f"{name}_feet", explicitinertial=True, mass=0.0, inertia=[0.0] * 3)
-        for foot in [geom for geom in spec.body(name).geoms if geom.name.startswith(f"{name}_foot_")]:
+        for foot in [geom for geom in world.specs[scene].body(name).geoms if geom.name.startswith(f"{name}_foot_")]:
             shape = {"type": foot.type, "pos": foot.pos, "size": foot.size, "mass": 0.0}
             legs.add_geom(name=f"{foot.name}_apart", contype=0, conaffinity=0, **shape)
             # As the engine would mix them: the larger friction, and both have the same solref and solimp.
@@ -50,7 +52,6 @@ def with_feet_apart(spec: mujoco.MjSpec, names: Sequence[str]) -> mujoco.MjModel
                 solref=foot.solref,
                 solimp=foot.solimp,
             )
-            spec.delete(foot)
     model = spec.compile()
     for name in names:
         model.body(f"{name}_feet").invweight0 = model.body(name).invweight0
@@ -81,8 +82,7 @@ class NativePhysics(Physics):
         self._contacts = sensor_addresses(world.models[0]) if config.needs_contacts else None
         self._slots = world.layout.num_slots
         self._robot, self._layout = world.robot, world.layout
-        names = [world.models[0].body(body).name for body in world.layout.slot_body]
-        self._models = tuple(with_feet_apart(spec, names) for spec in world.specs)
+        self._models = tuple(with_feet_apart(world, scene, config) for scene in range(len(world.scenes)))
         self._iterations = int(world.models[0].opt.iterations)
         for model in self._models:
             # A failed state must show, not be silently replaced by the model's default.

@@ -6,11 +6,13 @@ import hashlib
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 from scipy import ndimage
 
+from interactive_nav.scenes.many import for_each_home
 from interactive_nav_common.errors import readable
 from interactive_nav_common.grids import clearance, largest_component, value_near
 from interactive_nav_common.rotations import rotate
@@ -32,6 +34,8 @@ BESIDE_M = 1.0
 
 TASK_DIGEST = "task-1:"
 """Begins a digest of what decides a task, and names the method; what does not begin so is `Scene.digest`."""
+# MuJoCo would keep 500 MB of textures and meshes that it has read, 50 MB of each cluttered home.
+mujoco.mj_setCacheCapacity(mujoco.mj_getCache(), 100 * 2**20)
 _DECIMALS = 9
 """Numbers are rounded before they are hashed: what MuJoCo computes differs between machines in its last bits."""
 
@@ -162,14 +166,19 @@ def hull_sources(xml: Path) -> dict[str, list]:
 
 
 def check_scene(scene: Scene, model: mujoco.MjModel) -> None:
-    """Raise `SceneError` for absurd poses, masses, walls or maps; warn where most furniture is out of reach."""
+    """Raise `SceneError` for absurd poses, masses, walls or maps."""
     path, maps, movables = scene.path, scene.maps, scene.movables
     faults = [*_wall_faults(maps, scene.walls), *_object_faults(maps, movables, model)]
     faults += differences(model, scene.manifest.objects)
     if faults:
         more = f" (and {len(faults) - 1} more faults)" if len(faults) > 1 else ""
         raise SceneError(f"{path}: {faults[0]}{more}; convert the scene again")
-    apart = objects_apart(maps, movables)
+
+
+def warn_of_reach(scene: Scene) -> None:
+    """Warn where most furniture is out of reach."""
+    path, movables = scene.path, scene.movables
+    apart = objects_apart(scene.maps, movables)
     if 2 * len(apart) > len(movables):
         warnings.warn(
             f"{path}: {len(apart)} of {len(movables)} movable objects stand on floor that no robot can reach from the "
@@ -212,7 +221,7 @@ def _object_faults(maps: SceneMaps, movables: Sequence[Movable], model: mujoco.M
         if not all(np.isfinite(n).all() for n in (data.xpos[body], data.xquat[body], movable.inertia, movable.boxes)):
             faults.append(f"{name} of scene.xml has numbers that are not finite")
             continue
-        boxes = np.flatnonzero((model.geom_bodyid == body) & (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX))
+        boxes, _ = _geoms(model, body)
         down_m = np.einsum("nk,nk->n", np.abs(data.geom_xmat[boxes, 6:]), model.geom_size[boxes])
         base_m, (x, y) = float((data.geom_xpos[boxes, 2] - down_m).min()), movable.pos_w[:2]
         if not (x0 - BESIDE_M < x < x1 + BESIDE_M and y0 - BESIDE_M < y < y1 + BESIDE_M):
@@ -238,9 +247,9 @@ def _boxes(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
 
 def _geoms(model: mujoco.MjModel, body: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a body's boxes and what of it collides."""
-    mine = model.geom_bodyid == body
-    solid = mine & ((model.geom_contype != 0) | (model.geom_conaffinity != 0))
-    return np.flatnonzero(mine & (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX)), np.flatnonzero(solid)
+    mine = model.body_geomadr[body] + np.arange(model.body_geomnum[body])
+    solid = (model.geom_contype[mine] != 0) | (model.geom_conaffinity[mine] != 0)
+    return mine[model.geom_type[mine] == mujoco.mjtGeom.mjGEOM_BOX], mine[solid]
 
 
 def read_movable(model: mujoco.MjModel, xml: Path, name: str, category: str, friction: float) -> Movable:
@@ -290,6 +299,27 @@ def load_scene(folder: str | Path) -> Scene:
 
     Raise `SceneError` if the folder or a file is missing or damaged, or if files disagree.
     """
+    return load_scenes([folder])[0]
+
+
+def load_scenes(folders: Sequence[str | Path]) -> tuple[Scene, ...]:
+    """Do `load_scene` for each folder, see `for_each_home`."""
+    calls = [(folder, _files(installed(folder))) for folder in folders]
+    scenes = tuple(for_each_home(_read_scene, calls, "loading homes"))
+    for scene in scenes:
+        warn_of_reach(scene)
+    return scenes
+
+
+def _files(folder: Path) -> list[Any]:
+    """Return what tells apart the states of a scene's folder: the content of its data, sizes and times of all files."""
+    data = [path.read_bytes() for name in ("scene.xml", "scene.json", "maps.npz") if (path := folder / name).is_file()]
+    states = [(str(path), path.stat()) for path in sorted(folder.rglob("*")) if path.exists()]
+    return [hashlib.sha256(b"".join(data)).hexdigest(), *((path, s.st_size, s.st_mtime_ns) for path, s in states)]
+
+
+def _read_scene(folder: str | Path, _files: object = None) -> Scene:
+    """Do `load_scene` without its warning; `_files` only tells states of the folder apart in a cache."""
     folder, word = installed(folder), str(folder)
     if not folder.exists():
         raise SceneError(

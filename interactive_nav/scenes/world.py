@@ -15,6 +15,7 @@ import numpy as np
 from interactive_nav.config import NavConfig
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.contacts import add_contact_sensors, add_sensor
+from interactive_nav.scenes.many import for_each_home
 from interactive_nav.scenes.objects import ConvertedObject, SmallObject, add_box, add_boxes, small_objects, solid
 from interactive_nav.scenes.scene import Joint, Movable, Scene
 from interactive_nav.scenes.slots import (
@@ -117,7 +118,7 @@ def _nothing(slot: int, kind: str) -> Movable:
 
 
 def _add_movable(
-    spec: mujoco.MjSpec, name: str, movable: Movable, n_boxes: int, collision: str, gravcomp: float = 0.0
+    spec: mujoco.MjSpec, name: str, movable: Movable, n_boxes: int, collision: str, gravcomp: float, feet: bool = True
 ) -> None:
     body = spec.worldbody.add_body(name=name, pos=movable.pos_w, quat=movable.quat_w, gravcomp=gravcomp)
     boxes, friction, com = movable.boxes, movable.friction, movable.com_m
@@ -148,19 +149,21 @@ def _add_movable(
     hidden[:3] = com
     for i in range(n_boxes):
         add_box(body, boxes[i] if i < len(boxes) else hidden, f"{name}_box_{i}", friction)
-    _add_feet(body, name, boxes, com, friction)
+    if feet:
+        _add_feet(body, name, boxes, com, friction)
 
 
-def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject, park: int, collision: str) -> None:
+def _add_small(spec: mujoco.MjSpec, name: str, obj: SmallObject, park: int, collision: str, feet: bool) -> None:
     x, y = parking_spot(park)
     if isinstance(obj, ConvertedObject):
         parked = dataclasses.replace(obj.movable, pos_w=np.array([x, y, 0.0]))
-        _add_movable(spec, name, parked, len(obj.boxes), collision)
+        _add_movable(spec, name, parked, len(obj.boxes), collision, 0.0, feet)
         return
     body = spec.worldbody.add_body(name=name, pos=[x, y, 0.0])
     body.add_freejoint(name=f"{name}_joint")
     add_boxes(body, obj, name)
-    _add_feet(body, name, obj.rows, obj.rows[:, :3].mean(0), obj.friction)
+    if feet:
+        _add_feet(body, name, obj.rows, obj.rows[:, :3].mean(0), obj.friction)
 
 
 def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
@@ -210,22 +213,22 @@ def build_empty_spec(
 
 
 def build_spec(
-    robot: RobotSpec, scene_index: int, scenes: tuple[Scene, ...], slots: Sequence[Slot], config: NavConfig
+    robot: RobotSpec, index: int, scenes: tuple[Scene, ...], slots: Sequence[Slot], config: NavConfig, feet: bool = True
 ) -> mujoco.MjSpec:
-    """Return the padded spec of one scene."""
+    """Return the padded spec of one scene; without `feet`, nothing movable touches the floor."""
     spec, collision = _empty_spec(robot, config), config.collision
     for i, slot in enumerate(slots):
-        body = slot.bodies[scene_index]
+        body = slot.bodies[index]
         if isinstance(body, SmallObject):
-            _add_small(spec, slot.name, body, i, collision)
+            _add_small(spec, slot.name, body, i, collision, feet)
             continue
         n_boxes = max(len(m.boxes) for m in slot.bodies if m is not None)
         # The tiny value keeps the models' structure equal.
         floats = [m is None or bool(m.joint and m.joint.balanced) for m in slot.bodies]
-        gravcomp = _FLOATS if floats[scene_index] else 1e-9 if any(floats) else 0.0
-        _add_movable(spec, slot.name, body or _nothing(i, slot.kind), n_boxes, collision, gravcomp)
+        gravcomp = _FLOATS if floats[index] else 1e-9 if any(floats) else 0.0
+        _add_movable(spec, slot.name, body or _nothing(i, slot.kind), n_boxes, collision, gravcomp, feet)
     named, most = [(slot.name, slot.kind) for slot in slots], max(len(s.walls) for s in scenes)
-    _finish(spec, robot, scenes[scene_index].walls, most, named, config)
+    _finish(spec, robot, scenes[index].walls, most, named, config)
     return spec
 
 
@@ -260,15 +263,19 @@ def _finish(
             geom.solmix = 1e6  # a contact's is the mean of both geoms', weighted by this: the robot's holds
 
 
-def _settle(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> np.ndarray:
-    """Return the rest configuration [nq]: furniture falls and slides to rest, with the robot parked."""
-    data = mujoco.MjData(model)
-    x, y = parking_spot(layout.num_slots)
-    adr = layout.robot_qpos
-    data.qpos[adr : adr + 7] = [x, y, robot.spawn_height_m, 1, 0, 0, 0]
+def _parked(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> tuple[int, np.ndarray]:
+    """Return where the robot's configuration begins, and what it is while the robot is parked."""
+    first, qpos = layout.robot_qpos, model.qpos0.copy()
+    qpos[first : first + 7] = [*parking_spot(layout.num_slots), robot.spawn_height_m, 1, 0, 0, 0]
     for name, value in robot.home_qpos:
-        data.qpos[model.joint(name).qposadr[0]] = value
-    start = data.qpos.copy()
+        qpos[model.joint(name).qposadr[0]] = value
+    return first, qpos[first : first + layout.robot_nq]
+
+
+def _settle(model: mujoco.MjModel, first: int, parked: np.ndarray) -> np.ndarray:
+    """Return the rest configuration [nq]: furniture falls and slides to rest, with the robot parked (`_parked`)."""
+    data, robot = mujoco.MjData(model), slice(first, first + len(parked))
+    data.qpos[robot] = parked
     steps = math.ceil(_SETTLE_TIME_S / model.opt.timestep)
     iterations = model.opt.iterations
     model.opt.iterations = max(100, iterations)
@@ -279,8 +286,7 @@ def _settle(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> np.ndarr
             data.qvel *= 0.8
     model.opt.iterations = iterations
     qpos = data.qpos.copy()
-    robots = slice(adr, adr + layout.robot_nq)
-    qpos[robots] = start[robots]
+    qpos[robot] = parked
     return qpos
 
 
@@ -298,7 +304,8 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
     specs = [build_spec(robot, i, scenes, slots, config) for i in range(len(scenes))]
     models = [spec.compile() for spec in specs]
     layout = find_layout(models[0], robot, [(slot.name, slot.kind) for slot in slots])
-    rest = [_settle(model, layout, robot) for model in models]
+    parked = _parked(models[0], layout, robot)
+    rest = for_each_home(_settle, [(model, *parked) for model in models], "settling homes")
     for scene, qpos in zip(scenes, rest, strict=True):
         if not np.isfinite(qpos).all():
             raise SceneError(f"{scene.path}: its furniture does not settle (non-finite); convert the scene again")

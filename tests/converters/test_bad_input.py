@@ -174,7 +174,7 @@ def test_a_cache_on_a_full_disk_costs_nothing(gibson_raw, tmp_path, monkeypatch)
         Path(target).write_bytes(b"\x80")
         raise FULL
 
-    monkeypatch.setattr("converters.records.cache.joblib.dump", full)
+    monkeypatch.setattr("interactive_nav_common.jobs.cache.joblib.dump", full)
     convert(gibson_raw, tmp_path / "out", SMALL, cache=tmp_path / "cache")
     assert load_manifest(tmp_path / "out").warnings == ()
     assert list((tmp_path / "cache").iterdir()) == []

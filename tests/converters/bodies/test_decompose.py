@@ -11,8 +11,8 @@ import trimesh
 
 from converters.bodies import decompose
 from converters.bodies.decompose import DecomposeConfig, decompose_all
-from converters.records.cache import StageCache
 from converters.records.errors import StageFailed
+from interactive_nav_common.jobs.cache import StageCache
 from tests.converters import tiny_raw
 
 CONFIG = DecomposeConfig()

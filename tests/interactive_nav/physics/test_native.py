@@ -15,11 +15,12 @@ def test_feet_on_bodies_of_their_own_change_nothing(tmp_path):
     # Scene 1 has an empty slot; the robot pushes the basket of scene 0, with objects asleep and awake about it.
     baskets = (("basket", 0.5, 0.0, 1.0, 0.4), ("basket", 1.5, 0.8, 2.0, 0.7))
     scenes = [load_scene(write_room(tmp_path / str(i), (5.0, 3.0), baskets[: 2 - i])) for i in range(2)]
-    world = build_world(get_robot("turtlebot"), tuple(scenes), NavConfig.of(num_objects=2))
+    config = NavConfig.of(num_objects=2)
+    world = build_world(get_robot("turtlebot"), tuple(scenes), config)
     names = [world.models[0].body(body).name for body in world.layout.slot_body]
     for scene, spec in enumerate(world.specs):
         told = {}
-        for name, model in (("plain", spec.compile()), ("apart", with_feet_apart(spec, names))):
+        for name, model in (("plain", spec.compile()), ("apart", with_feet_apart(world, scene, config))):
             feet = [model.body(b).name.endswith("_feet") for b in range(model.nbody)]
             assert sum(feet) == len(names) * (name == "apart") and not model.body_contype[feet].any()
             model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP

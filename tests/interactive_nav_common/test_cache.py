@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from converters.geometry.boxes import Hull, OrientedBox
-from converters.records import cache
-from converters.records.cache import KEEP_S, LIMIT_BYTES, StageCache, fingerprint, prune
 from converters.records.raw import RawScene, ScanMesh
+from interactive_nav_common.jobs import cache
+from interactive_nav_common.jobs.cache import KEEP_S, LIMIT_BYTES, StageCache, fingerprint, prune
 
 CALLS: list[tuple] = []
 
@@ -164,3 +164,27 @@ def test_the_fingerprint_follows_the_module_its_table_and_what_it_imports(tmp_pa
     (folder / "other.py").write_text("a = 2")
     assert len(set(digests)) == 5 and digest() == digests[-1]
     fingerprint.cache_clear()
+
+
+def square(x):
+    return x * x
+
+
+def test_many_calls_are_computed_once_each_and_what_is_there_is_read(tmp_path, monkeypatch, capsys):
+    store = StageCache(tmp_path)
+    store.call(square, 3)
+    asked = []
+    compute = cache._labelled
+    monkeypatch.setattr(cache, "LEAST_EACH", 100)  # one process: this one
+    monkeypatch.setattr(cache, "_labelled", lambda key, *rest: asked.append(rest[1]) or compute(key, *rest))
+    assert store.call_many(square, [(2,), (3,), (2,), (5,)], "squares") == [4, 9, 4, 25]
+    assert asked == [(2,), (5,)] and "squares: 2 of 2" in capsys.readouterr().err
+    assert store.call_many(square, [(5,), (2,)], "squares") == [25, 4] and len(asked) == 2
+    assert capsys.readouterr().err == ""
+
+
+def test_what_is_done_before_an_error_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(cache, "LEAST_EACH", 100)
+    with pytest.raises(TypeError):
+        StageCache(tmp_path).call_many(square, [(2,), ("two",)], "squares")
+    assert len(list(tmp_path.glob("square-*.pkl"))) == 1

@@ -11,8 +11,8 @@ import functools
 import hashlib
 import os
 import time
-from collections.abc import Callable
-from importlib.metadata import version
+import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,6 +20,8 @@ import joblib
 
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import PARTIAL, whole_file
+from interactive_nav_common.jobs.progress import bar
+from interactive_nav_common.versions import package_versions, usable_cores
 
 T = TypeVar("T")
 
@@ -29,8 +31,11 @@ LIMIT_BYTES = 2 * 2**30
 KEEP_S = 3600.0
 """Entries read or written within this time may belong to a running conversion, and stay."""
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("converters", "scenes_mjcf", "interactive_nav_common")
-"""The converter and what it is built on: categories and their labels, rotations."""
+PACKAGES = ("converters", "interactive_nav", "scenes_mjcf", "interactive_nav_common")
+LEAST_EACH = 4
+"""Calls for each process: one takes seconds to start."""
+IDLE_S = 10
+"""Idle processes end after this time, and free their memory."""
 NOT_HASHED = {"hashed": False}
 """Metadata of dataclass fields that no result depends on (names, reports)."""
 MISSING = object()
@@ -54,7 +59,7 @@ def fingerprint(module: str) -> str:
                 left += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
             elif isinstance(node, ast.Import):
                 left += [alias.name for alias in node.names]
-    parts = ([(name, version(name)) for name in COMPUTING], sorted(contents.items()))
+    parts = (sorted(package_versions(COMPUTING).items()), sorted(contents.items()))
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
@@ -85,6 +90,29 @@ class StageCache:
             self.store(key, value)
         return value
 
+    def call_many(self, function: Callable[..., T], calls: Sequence[tuple], what: str) -> list[T]:
+        """Return `call` of each tuple of arguments; compute on all cores what is missing, with a bar that shows `what`.
+
+        Each result is stored once it is there: after a stop, the same call goes on.
+        """
+        keys = [self.key(function.__name__.strip("_"), function.__module__, *arguments) for arguments in calls]
+        values = {key: self.load(key) for key in dict.fromkeys(keys)}
+        todo = {key: arguments for key, arguments in zip(keys, calls, strict=True) if values[key] is MISSING}
+        if todo:
+            # joblib's processes, unlike those of multiprocessing, neither fork JAX's threads nor run the main module.
+            jobs = min(usable_cores(), -(-len(todo) // LEAST_EACH))
+            pool = joblib.Parallel(jobs, return_as="generator_unordered", max_nbytes=None, idle_worker_timeout=IDLE_S)
+            results: Any = pool(joblib.delayed(_labelled)(key, function, arguments) for key, arguments in todo.items())
+            with bar([]) as report, warnings.catch_warnings():
+                # It replaces a process whose memory has grown, such as one that has read many textures.
+                warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
+                for done, (key, value) in enumerate(results, 1):
+                    values[key] = value
+                    self._write(key, value)
+                    report(what, done, len(todo))
+            prune(self.folder, self._limit_bytes, time.time())
+        return [values[key] for key in keys]
+
     def key(self, name: str, module: str, *arguments: Any) -> str:
         """Return the name of the entry of a module's function of these arguments."""
         return f"{name}-{joblib.hash((fingerprint(module), hashed(arguments)), 'sha1')}.pkl"
@@ -101,9 +129,16 @@ class StageCache:
 
     def store(self, key: str, value: Any) -> None:
         """Write an entry atomically and prune the folder; if it cannot be written, continue without the entry."""
+        self._write(key, value)
+        prune(self.folder, self._limit_bytes, time.time())
+
+    def _write(self, key: str, value: Any) -> None:
         with contextlib.suppress(FileError), whole_file(self.folder / key) as partial:
             joblib.dump(value, partial)
-        prune(self.folder, self._limit_bytes, time.time())
+
+
+def _labelled(key: str, function: Callable, arguments: tuple) -> tuple[str, Any]:
+    return key, function(*arguments)
 
 
 def prune(folder: Path, limit_bytes: int, now_s: float) -> None:
