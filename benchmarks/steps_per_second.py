@@ -7,7 +7,7 @@ end. `physics`, `task` and `observed` are the same with parts left out, for thei
 `windows` counts instead what an environment needs in its window while it drives at random, and proposes settings.
 `train` trains with `python -m train`'s own code and a preset of any algorithm, and reads the rate that it
 logs, compiling and checkpoints apart. Rows carry device, versions and commit, and are appended to
-`benchmarks/results/steps_per_second.jsonl`.
+`benchmarks/results/steps_per_second.jsonl.gz`.
 """
 
 import dataclasses
@@ -333,7 +333,7 @@ class Bench(Command):
     """Laid over the preset, for train."""
     commit: Annotated[str | None, option()] = None
     """Recorded in the row (default: git's HEAD)."""
-    out: Path = RESULTS / "steps_per_second.jsonl"
+    out: Path = RESULTS / "steps_per_second.jsonl.gz"
     """Where rows are appended."""
 
 

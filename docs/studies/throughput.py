@@ -3,10 +3,11 @@
     python -m docs.studies.throughput -o docs/throughput.png
 
 Takes the rows of one program over ten scenes on one NVIDIA H200 (commits 3163049, 5e8efe7 and 773b647 of
-`benchmarks/results/steps_per_second.jsonl`) and of PyBullet on one CPU core (`pybullet_peer.jsonl`).
+`benchmarks/results/steps_per_second.jsonl.gz`) and of PyBullet on one CPU core (`pybullet_peer.jsonl`).
 """
 
 import argparse
+import gzip
 import json
 from pathlib import Path
 
@@ -24,13 +25,15 @@ NUMBERS, PICTURES, PEER = "#1b6ca8", "#d1603d", "#666666"
 
 def rows(name: str) -> list[dict]:
     """The lines of a file of results."""
-    return [json.loads(line) for line in (ROWS / name).read_text().splitlines()]
+    read = gzip.open if name.endswith(".gz") else open
+    with read(ROWS / name, "rt") as lines:
+        return [json.loads(line) for line in lines]
 
 
 def curve(settings: dict) -> list[tuple[int, float]]:
     """(environments, env steps/s) of the TurtleBot in ten scenes on one GPU; of equal batches the newest."""
     found = {}
-    for row in rows("steps_per_second.jsonl"):
+    for row in rows("steps_per_second.jsonl.gz"):
         same = row["mode"] == "simulation" and len(row["scenes"]) == 10 and row.get("devices", 1) == 1
         if (
             same
@@ -54,7 +57,7 @@ def main() -> None:
     ):
         x, y = zip(*curve(settings), strict=True)
         axes.plot(x, y, "o-", color=colour, label=label)
-    measured = [r for r in rows("steps_per_second.jsonl") if r["commit"] == "773b647" and len(r["scenes"]) == 10]
+    measured = [r for r in rows("steps_per_second.jsonl.gz") if r["commit"] == "773b647" and len(r["scenes"]) == 10]
     best = next(r for r in measured if (r.get("settings") or {}).get("active_furniture") == 4)
     axes.plot(
         best["num_envs"], best["env_steps_per_s"], "*", ms=13, color=NUMBERS, label="29 numbers, fewer bodies at a time"
