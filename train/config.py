@@ -48,7 +48,7 @@ class NetworkConfig(Settings):
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     """Arithmetic of the image encoder; parameters stay float32."""
     memory: Literal["none", "gru"] = "none"
-    """gru: a recurrent layer between encoder and head; ppo only."""
+    """gru: a recurrent layer between encoder and head; not for clone."""
     memory_size: AtLeastOne = 128
     """Numbers that the recurrent layer keeps from step to step, for actor and critic each."""
 
@@ -132,6 +132,10 @@ class OffPolicyConfig(Settings):
     """A replay that would take more device memory (1e9 bytes) is refused."""
     n_steps: AtLeastOne = 1
     """Rewards summed before the critic's estimate takes over."""
+    unroll_length: AtLeastOne = 16
+    """Transitions of a sequence, with memory; a batch holds batch_size / unroll_length, rounded down, at least one."""
+    burn_in: Annotated[int, Bounds(0)] = 8
+    """Steps before each sequence that bring stored memory up to the newest parameters."""
     discounting: Share = 0.99
     """Discount of one control step."""
     reward_scaling: Positive = 1.0
@@ -150,6 +154,10 @@ class OffPolicyConfig(Settings):
         """Return the steps of each environment that the replay keeps."""
         assert self.max_replay_size and self.num_envs, "the config must be resolved"
         return self.max_replay_size // self.num_envs
+
+    def younger_slots(self, remembers: bool) -> int:
+        """Return the steps that must have followed a step before a batch can begin with it."""
+        return self.n_steps + remembers * (self.burn_in + self.unroll_length - 1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -313,6 +321,7 @@ def validate(config: TrainConfig) -> None:
         if images if name == "network" else name == config.algorithm:
             continue
         used = OF_MEMORY if name == "network" and config.network.memory != "none" else ()
+        used += ("action_features",) if used and config.algorithm != "ppo" else ()
         for field in dataclasses.fields(section):
             value = getattr(section, field.name)
             known = (field.default, *(sizes.get(field.name) for sizes in auto))  # `resolve` fills all sections
@@ -320,14 +329,14 @@ def validate(config: TrainConfig) -> None:
                 needs = "images among env.observations" if name == "network" else f"algorithm {name}"
                 problem = f"{name}.{field.name} is {value!r}, which changes nothing here"
                 raise ConfigError(f"{problem}: expected {needs}; or leave it out")
-    if config.network.memory != "none" and config.algorithm != "ppo":
+    section, remembers = getattr(config, config.algorithm), config.network.memory != "none"
+    if remembers and config.algorithm == "clone":
         raise ConfigError(
-            f"network.memory is {config.network.memory!r} with algorithm {config.algorithm}, expected algorithm ppo, "
-            "which learns from whole sequences; set network.memory=none, or algorithm=ppo"
+            f"network.memory is {config.network.memory!r} with algorithm clone, expected an algorithm that learns from "
+            "whole sequences; set network.memory=none, or algorithm=ppo, sac or ddpg"
         )
-    section = getattr(config, config.algorithm)
     if isinstance(section, OffPolicyConfig):
-        _validate_replay(config.algorithm, section, config.run.num_timesteps)
+        _validate_replay(config.algorithm, section, config.run.num_timesteps, remembers)
     ppo = config.ppo
     if config.run.devices > 1:
         _validate_devices(config.algorithm, ppo, config.run.devices)
@@ -354,7 +363,11 @@ def _validate_devices(name: str, ppo: PPOConfig, devices: int) -> None:
             )
 
 
-def _validate_replay(name: str, config: OffPolicyConfig, num_timesteps: int) -> None:
+def _validate_replay(name: str, config: OffPolicyConfig, num_timesteps: int, remembers: bool) -> None:
+    for key in () if remembers else ("unroll_length", "burn_in"):
+        if (value := getattr(config, key)) != getattr(OffPolicyConfig, key):
+            problem = f"{name}.{key} is {value!r}, which changes nothing here"
+            raise ConfigError(f"{problem}: expected network.memory 'gru'; or leave it out")
     if config.min_replay_size and config.min_replay_size >= num_timesteps:
         raise ConfigError(
             f"{name}.min_replay_size is {config.min_replay_size}, expected less than run.num_timesteps "
@@ -363,11 +376,12 @@ def _validate_replay(name: str, config: OffPolicyConfig, num_timesteps: int) -> 
     if not (config.num_envs and config.min_replay_size and config.max_replay_size and config.steps_per_update):
         return
     slots = config.replay_slots
-    least = max(config.n_steps + 1, config.steps_per_update, -(-config.min_replay_size // config.num_envs))
+    sampled = config.younger_slots(remembers) + 1
+    least = max(sampled, config.steps_per_update, -(-config.min_replay_size // config.num_envs))
     if slots < least:
         raise ConfigError(
             f"{name}.max_replay_size is {config.max_replay_size}, {slots} steps of {config.num_envs} environments, "
             f"expected at least {least * config.num_envs}: it must hold {name}.min_replay_size "
-            f"({config.min_replay_size}), one update ({config.steps_per_update} steps) and n_steps + 1 "
-            f"({config.n_steps + 1} steps)"
+            f"({config.min_replay_size}), one update ({config.steps_per_update} steps) and a sample "
+            f"({'burn_in + unroll_length + n_steps' if remembers else 'n_steps + 1'}, {sampled} steps)"
         )

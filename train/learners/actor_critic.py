@@ -26,7 +26,7 @@ from brax.training.agents.sac import losses as sac_losses
 from brax.training.agents.sac import networks as sac_networks
 
 from train.config import DDPGConfig, OffPolicyConfig, SACConfig, TrainConfig
-from train.learners import networks
+from train.learners import memory, networks
 from train.learners.networks import ObservationSize
 
 
@@ -52,11 +52,13 @@ class ActorCritic(abc.ABC):
     """The name of its settings in the config."""
     config: OffPolicyConfig
     networks: sac_networks.SACNetworks
-    """[..., outputs] and [..., critics] of observations, and actions."""
+    """[..., outputs] and [..., critics] of observations, and actions. With memory they take a `memory.History`."""
     size: ObservationSize
     action_size: int
     shared: bool
     """The policy looks through the critics' encoder: its parameters are then `{"head": ...}` alone."""
+    memory_size: int = 0
+    """Numbers that actor and critics each remember, or together where they share an encoder."""
 
     @classmethod
     def of(cls, env: Any, config: TrainConfig) -> Self:
@@ -66,11 +68,14 @@ class ActorCritic(abc.ABC):
         outputs, critics = actions.param_size if actions else env.action_size, getattr(c, "num_critics", 2)
         prepare: Any = networks.preprocess(c.normalize_observations)
         layers, q_layers, norm = c.policy_hidden_layer_sizes, c.q_hidden_layer_sizes, c.q_layer_norm
-        if isinstance(size, Mapping):
-            images, head = network.critic_inputs == "all", networks.Head(layers, outputs)
+        images, remembers = isinstance(size, Mapping), network.memory != "none"
+        if images or remembers:
+            of_critics, head = images and network.critic_inputs == "all", networks.Head(layers, outputs)
             q_head = networks.TwinHead(q_layers, network.action_features, critics, norm)
-            policy = networks.make_split(network, size, True, prepare, head)
-            q = networks.make_split(network, size, images, prepare, q_head, env.action_size)
+            policy = networks.make_split(network, size, images, prepare, head)
+            q = networks.make_split(network, size, of_critics, prepare, q_head, env.action_size)
+            if remembers:
+                policy, q = memory.over_history(policy, 0), memory.over_history(q, -1)
         else:
             policy = brax_networks.make_policy_network(
                 outputs, size, preprocess_observations_fn=prepare, hidden_layer_sizes=layers
@@ -79,8 +84,8 @@ class ActorCritic(abc.ABC):
                 size, env.action_size, prepare, hidden_layer_sizes=q_layers, n_critics=critics, layer_norm=norm
             )
         both = sac_networks.SACNetworks(policy, q, actions)  # type: ignore[call-arg]
-        shared = network.share_encoder and isinstance(size, Mapping)
-        return cls(config.algorithm, c, both, size, env.action_size, shared)
+        shared = network.share_encoder and (images or remembers)
+        return cls(config.algorithm, c, both, size, env.action_size, shared, network.memory_size * remembers)
 
     @staticmethod
     def distribution(action_size: int) -> Any:
@@ -106,6 +111,27 @@ class ActorCritic(abc.ABC):
     def policy(self, learner: Any, deterministic: bool) -> types.Policy:
         """Return (observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
 
+    def first_memory(self) -> memory.Memory:
+        """Return what the networks remember when episodes start, [envs, H] of each recurrent layer, if any."""
+        return [jnp.zeros((self.config.num_envs or 1, self.memory_size))] * bool(self.memory_size) * (2 - self.shared)
+
+    def recall(self, learner: Any, observation: Any, kept: memory.Memory) -> tuple[Self, memory.Memory]:
+        """Return an agent with the policy for this observation [N, ...] after what was kept, and the new memory."""
+        params = self.whole_policy(learner.policy_params, learner.q_params), learner.q_params
+        of_both = self.networks.policy_network, self.networks.q_network
+        policy, new = memory.advance(of_both, params, learner.normalizer_params, observation, kept)
+        return dataclasses.replace(self, networks=self.networks.replace(policy_network=policy)), new  # type: ignore
+
+    def recurrent_policy(self, learner: Any, deterministic: bool) -> memory.Act:
+        """Return the policy of networks with memory; it carries on as many of their memories as it is given."""
+
+        def act(observation: Any, kept: memory.Memory, key: jax.Array) -> tuple[jax.Array, dict[str, Any]]:
+            agent, new = self.recall(learner, observation, kept)
+            action, extras = agent.policy(learner, deterministic)(observation, key)
+            return action, {**extras, "memory": new}
+
+        return act
+
     def init_noise(self) -> Any:
         """Return the exploration noise of every environment at the start of an episode; none by default."""
         return ()
@@ -118,7 +144,7 @@ class ActorCritic(abc.ABC):
     def gradient_step(
         self, learner: Any, transitions: types.Transition, key: jax.Array
     ) -> tuple[Any, dict[str, jax.Array]]:
-        """Return the learner after one gradient step on transitions [batch, ...], and scalar metrics."""
+        """Return the learner after a gradient step on transitions, [batch, ...] or sequences, and scalar metrics."""
 
     def first_fields(self, key: jax.Array) -> dict[str, Any]:
         """Return the fields of a new `ActorCriticState`, without its key."""

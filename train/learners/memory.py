@@ -1,7 +1,8 @@
-"""Give PPO's policies memory: act with it, collect sequences, and replay them from the memory that they started with.
+"""Give policies memory: act with it, collect sequences, and replay them from the memory that they started with.
 
 Actor and critic have a GRU each behind their encoders, or one where they share the encoder. What it remembers travels
-as `state.info["policy"]`, is zero when an episode starts, and gradients go back to a sequence's start.
+as `state.info["policy"]`, is zero when an episode starts, and gradients go back to a sequence's start. Off-policy
+learners take each sequence as a `History`, which their networks read in place of an observation.
 """
 
 import dataclasses
@@ -35,19 +36,24 @@ def make_act(both: ppo_networks.PPONetworks, statistics: Any, params: Sequence[A
     """Return a policy that draws actions as Brax's does."""
 
     def act(observation: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, dict[str, Any]]:
-        networks: Any = (both.policy_network, both.value_network)
-        # An evaluation keeps the actor's memory alone.
-        new = [
-            network.remember(each["encoder"], old, network.encoder.apply(statistics, each["encoder"], observation))
-            for network, each, old in zip(networks, params, memory, strict=False)
-        ]
-        logits = networks[0].head.apply(None, params[0]["head"], new[0])
-        head = dataclasses.replace(networks[0].head, apply=lambda *_: logits)
+        networks = (both.policy_network, both.value_network)
+        head, new = advance(networks, params, statistics, observation, memory)
         policy = ppo_networks.make_inference_fn(both.replace(policy_network=head))  # type: ignore[attr-defined]
         action, extras = policy((None, None), deterministic)(observation, key)
         return action, {**extras, "memory": new}
 
     return act
+
+
+def advance(networks: Any, params: Any, statistics: Any, observation: Any, memory: Memory) -> tuple[Any, Memory]:
+    """Return a network that gives the actor's outputs for an observation [N, ...], and the new memory."""
+    # An evaluation keeps the actor's memory alone.
+    new = [
+        network.remember(each["encoder"], old, network.encoder.apply(statistics, each["encoder"], observation))
+        for network, each, old in zip(networks, params, memory, strict=False)
+    ]
+    outputs = networks[0].head.apply(None, params[0]["head"], new[0])
+    return dataclasses.replace(networks[0].head, apply=lambda *_: outputs), new
 
 
 def forget(memory: Any, over: jax.Array) -> Any:
@@ -77,21 +83,68 @@ def generate_unroll(
     return env_state, data._replace(extras={**extras, "memory": first})
 
 
+def unroll(network: Any, encoder: Any, first: Any, features: Any, over: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Go through sequences from their first memory [N, H]; `over` [N, T] says which steps ended an episode.
+
+    Return the memory [N, T, H] after each of the features [N, T, F], and that [N, H] with which the next step starts.
+    """
+
+    def step(memory: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        memory = network.remember(encoder, memory, inputs[0])
+        return forget(memory, inputs[1]), memory
+
+    after, kept = jax.lax.scan(step, first, (features.swapaxes(0, 1), over.swapaxes(0, 1)))
+    return kept.swapaxes(0, 1), after
+
+
+@flax.struct.dataclass
+class History:
+    """Holds observations [N, T, ...] of sequences; in a replay, of single steps, with observation and memory alone."""
+
+    observation: Any
+    memory: Memory
+    """[N, H] before the first step, as it was collected."""
+    over: Any = None
+    """[N, T] bool: the step ended its episode."""
+    at: Any = None
+    """[N, L] i32: steps after the burn-in whose outputs are wanted."""
+    burn_in: int = flax.struct.field(pytree_node=False, default=0)
+    """The first steps, which only bring the memory up to the newest parameters."""
+
+
+def over_history(network: Any, index: int) -> Any:
+    """Return a `Split` whose `apply` takes a `History`, its memory at `index`; gradients do not reach the burn-in."""
+
+    def apply(statistics: Any, params: Any, history: Any, *action: jax.Array) -> jax.Array:
+        if not isinstance(history, History):
+            raise lost("a function of the observation alone")
+
+        def through(encoder: Any, first: jax.Array, steps: slice) -> tuple[jax.Array, jax.Array]:
+            observation = jax.tree.map(lambda x: x[:, steps], history.observation)
+            features = network.encoder.apply(statistics, encoder, observation)
+            return unroll(network, encoder, first, features, history.over[:, steps])
+
+        first, burn_in = history.memory[index], history.burn_in
+        if burn_in:
+            _, first = through(jax.lax.stop_gradient(params["encoder"]), first, slice(burn_in))
+        kept, _ = through(params["encoder"], first, slice(burn_in, None))
+        wanted = jnp.take_along_axis(kept, history.at[..., None], 1)
+        return network.head.apply(None, params["head"], wanted, *action)
+
+    return dataclasses.replace(network, apply=apply)
+
+
 def replay(networks: Sequence[Any], params: Sequence[Any], data: types.Transition) -> types.Transition:
     """Return transitions [sequences, time, ...] with memory [..., H] in place of features, a list of one or two.
 
     The next observation's is of the episode that goes on; where the last step ended one, losses do not read it.
     """
-    over, extras = (data.discount == 0).swapaxes(0, 1), data.extras
+    over, extras = data.discount == 0, data.extras
     firsts: Any = extras["memory"]  # type: ignore[index]
 
     def through(network: Any, encoder: Any, first: jax.Array, features: jax.Array, last: jax.Array) -> Any:
-        def step(memory: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-            memory = network.remember(encoder, memory, inputs[0])
-            return forget(memory, inputs[1]), memory
-
-        after, kept = jax.lax.scan(step, first[:, 0], (features.swapaxes(0, 1), over))
-        return kept.swapaxes(0, 1), network.remember(encoder, after, last[:, 0])[:, None]
+        kept, after = unroll(network, encoder, first[:, 0], features, over)
+        return kept, network.remember(encoder, after, last[:, 0])[:, None]
 
     of_both = zip(networks, params, firsts, data.observation, data.next_observation, strict=False)
     kept, last = zip(*(through(network, each["encoder"], *rest) for network, each, *rest in of_both), strict=True)

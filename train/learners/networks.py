@@ -220,7 +220,9 @@ def make_split(
     squeeze: bool = False,
 ) -> Split:
     """Build an encoder with a head behind it."""
-    assert isinstance(size, Mapping)
+    if not isinstance(size, Mapping):
+        vector, size = prepare, {"state": (size,)}
+        prepare = lambda observation, statistics: {"state": vector(observation, statistics)}  # noqa: E731
     sides = {shape[0] for name, shape in size.items() if name.startswith(PIXELS)}
     if len(sides) > 1:
         raise ConfigError(
@@ -289,10 +291,7 @@ def make_ppo_networks(
 ) -> ppo_networks.PPONetworks:
     """Build policy (mean and deviation of a Gaussian before tanh) and value network; `Split`s with images or memory."""
     prepare, images = preprocess(normalize_observations), isinstance(size, Mapping)
-    if not isinstance(size, Mapping) and config.memory != "none":
-        vector, size = prepare, {"state": (size,)}
-        prepare = lambda observation, statistics: {"state": vector(observation, statistics)}  # noqa: E731
-    if not isinstance(size, Mapping):
+    if not isinstance(size, Mapping) and config.memory == "none":
         return ppo_networks.make_ppo_networks(
             size,
             action_size,

@@ -12,10 +12,11 @@ It is a ring [slots, envs, ...] of observations and actions. The next observatio
 nothing is stored twice, and the newest `n_steps` slots cannot be drawn yet. After an episode's end the next slot
 belongs to another one: the discount is 0, or, at a time limit, the truncation is 1 and the losses leave it out (see
 `sample`).
+
+With memory its observations are `memory.History`, and a batch is one of sequences.
 """
 
 import functools
-from collections.abc import Mapping
 from typing import Any
 
 import flax.struct
@@ -26,7 +27,7 @@ from brax.training import types
 
 from interactive_nav_common.errors import ConfigError
 from train.config import OffPolicyConfig
-from train.learners import networks
+from train.learners import memory, networks
 from train.learners.actor_critic import ActorCritic
 from train.learners.learner import Snapshot, Update, all_finite, episode_sums, reset_envs
 
@@ -36,7 +37,7 @@ class ReplayBuffer:
     """The ring."""
 
     observation: Any
-    """[slots, envs, ...] before the step, in the environments' types."""
+    """[slots, envs, ...] before the step, in the environments' types; `memory.History` where there is memory."""
     action: jax.Array
     """[slots, envs, A]."""
     reward: jax.Array
@@ -104,7 +105,15 @@ def replay_size(replay: ReplayBuffer) -> jax.Array:
     return replay.filled * replay.reward.shape[1]
 
 
-def sample(replay: ReplayBuffer, key: jax.Array, batch_size: int, n_steps: int, discounting: float) -> types.Transition:
+def sample(
+    replay: ReplayBuffer,
+    key: jax.Array,
+    batch_size: int,
+    n_steps: int,
+    discounting: float,
+    unroll_length: int = 1,
+    burn_in: int = 0,
+) -> types.Transition:
     """Draw transitions [batch, ...] uniformly, with replacement, from all that have `n_steps` >= 1 younger slots.
 
     A transition covers `n_steps` steps, or fewer where the episode ends. For m steps of discount g it holds
@@ -112,33 +121,49 @@ def sample(replay: ReplayBuffer, key: jax.Array, batch_size: int, n_steps: int, 
     Brax's losses multiply by the last g themselves. At a time limit there is no observation of what comes after
     (the next slot shows a new episode): a window that meets one ends before that step and bootstraps from the
     observation there; a window that begins with it has truncation 1, and the losses leave it out, as Brax's do.
+
+    With memory they are [sequences, unroll_length, ...], at least one sequence, and observations are `memory.History`.
+    Sequences start at any step, and may reach into the next episode.
     """
     slots, envs = replay.reward.shape
+    remembers, younger = isinstance(replay.observation, memory.History), n_steps + burn_in + unroll_length - 1
+    shape = (max(1, batch_size // unroll_length), 1)
     key_age, key_env = jax.random.split(key)
-    age = jax.random.randint(key_age, (batch_size,), 0, jnp.maximum(replay.filled - n_steps, 1))
-    env = jax.random.randint(key_env, (batch_size,), 0, envs)
-    first = replay.position - replay.filled + age
+    age = jax.random.randint(key_age, shape, 0, jnp.maximum(replay.filled - younger, 1))
+    env = jax.random.randint(key_env, shape, 0, envs)
+    start, wanted = replay.position - replay.filled + age, jnp.arange(unroll_length)[None]
+    first = start + burn_in + wanted
 
-    step = jnp.arange(n_steps)[None]
-    window = ((first[:, None] + step) % slots, env[:, None])
+    step = jnp.arange(n_steps)[None, None]
+    window = ((first[..., None] + step) % slots, env[..., None])
     done, truncated = replay.done[window], replay.truncated[window]
-    ended_before = jnp.cumsum(done, 1) - done > 0
+    ended_before = jnp.cumsum(done, -1) - done > 0
     counts = ~ended_before & ~(truncated & (step > 0))
-    length = jnp.sum(counts, 1)
-    reward = jnp.sum(jnp.where(counts, replay.reward[window] * discounting**step, 0.0), 1)
-    alive = ~jnp.any(counts & done, 1)
+    length = jnp.sum(counts, -1)
+    reward = jnp.sum(jnp.where(counts, replay.reward[window] * discounting**step, 0.0), -1)
+    alive = ~jnp.any(counts & done, -1)
 
-    def at(slot: jax.Array) -> Any:
-        return jax.tree.map(lambda ring: ring[slot % slots, env], replay.observation)
+    def at(rings: Any, slot: jax.Array) -> Any:
+        return jax.tree.map(lambda ring: ring[slot % slots, env], rings)
 
-    return types.Transition(  # type: ignore[call-arg]
-        observation=at(first),
-        action=replay.action[first % slots, env],
+    def observation(transition: jax.Array) -> Any:
+        """Return the observations before transitions, counted from `first`."""
+        if not remembers:
+            return at(replay.observation, first + transition)
+        steps = start + jnp.arange(younger + 1)[None]
+        seen, over = at((replay.observation.observation, replay.done), steps)
+        kept = jax.tree.map(lambda x: x[:, 0], at(replay.observation.memory, start))
+        return memory.History(seen, kept, over, wanted + transition, burn_in)  # type: ignore[call-arg]
+
+    drawn = types.Transition(  # type: ignore[call-arg]
+        observation=observation(0 * length),
+        action=at(replay.action, first),
         reward=reward,
         discount=alive * jnp.float32(discounting) ** (length - 1),
-        next_observation=at(first + length),
-        extras={"policy_extras": {}, "state_extras": {"truncation": truncated[:, 0].astype(jnp.float32)}},  # type: ignore
+        next_observation=observation(length),
+        extras={"policy_extras": {}, "state_extras": {"truncation": truncated[..., 0].astype(jnp.float32)}},  # type: ignore
     )
+    return drawn if remembers else jax.tree.map(lambda x: x[:, 0], drawn)
 
 
 @flax.struct.dataclass
@@ -160,6 +185,12 @@ class OffPolicyData:
         return describe(self.replay)
 
 
+def stored(env_state: Any) -> Any:
+    """Return what the ring holds of the observation before a step."""
+    kept = env_state.info.get("policy")
+    return memory.History(env_state.obs, kept) if kept else env_state.obs  # type: ignore[call-arg]
+
+
 def collect(
     agent: ActorCritic, env: Env, learner: Any, data: OffPolicyData, key: jax.Array
 ) -> tuple[OffPolicyData, Any]:
@@ -173,12 +204,15 @@ def collect(
     def step(data: OffPolicyData, key: jax.Array) -> tuple[OffPolicyData, Any]:
         key_explore, key_random = jax.random.split(key)
         before = data.env_state
-        action, noise = agent.explore(learner, before.obs, data.noise, key_explore)
+        kept, acting, new = before.info.get("policy"), agent, None
+        if kept:
+            acting, new = agent.recall(learner, before.obs, kept)
+        action, noise = acting.explore(learner, before.obs, data.noise, key_explore)
         random = jax.random.uniform(key_random, action.shape, minval=-1.0, maxval=1.0)
         action = jnp.where(at_random, random, action)
         after = env.step(before, action)
         done, truncated = after.done, after.info["truncation"]
-        replay = insert(data.replay, before.obs, action, after.reward, done, truncated)
+        replay = insert(data.replay, stored(before), action, after.reward, done, truncated)
         collected = {
             "observation": networks.vector_part(before.obs),
             "action": action,
@@ -188,6 +222,8 @@ def collect(
             "sums": episode_sums(after.info),
         }
         ended = done > 0
+        if kept:
+            after = after.replace(info=after.info | {"policy": memory.forget(new, ended)})
         noise = jax.tree.map(
             lambda x, start: jnp.where(ended.reshape(-1, *[1] * (x.ndim - 1)), start, x), noise, agent.init_noise()
         )
@@ -207,6 +243,8 @@ def learn(
     assert c.grad_steps_per_update and c.batch_size and c.min_replay_size, "the config must be resolved"
     keys = jax.random.split(key, c.grad_steps_per_update)
     settings = {"batch_size": c.batch_size, "n_steps": c.n_steps, "discounting": c.discounting}
+    remembers = isinstance(replay.observation, memory.History)
+    settings |= {"unroll_length": c.unroll_length, "burn_in": c.burn_in} if remembers else {}
     draw = functools.partial(sample, replay, **settings)
 
     def one(learner: Any, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
@@ -221,7 +259,7 @@ def learn(
 
     _, metrics = jax.eval_shape(one, learner, keys[0])
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), metrics)
-    ready = (replay_size(replay) >= c.min_replay_size) & (replay.filled > c.n_steps)
+    ready = (replay_size(replay) >= c.min_replay_size) & (replay.filled > c.younger_slots(remembers))
     count = jnp.where(ready, c.grad_steps_per_update, 0)
     learner, sums, good = jax.lax.fori_loop(0, count, body, (learner, zeros, jnp.zeros((), jnp.int32)))
     means = jax.tree.map(lambda x: x / jnp.maximum(count, 1), sums)
@@ -250,7 +288,7 @@ def start(agent: ActorCritic, env: Env, seed: int) -> Snapshot:
     c = agent.config
     key_networks, key_env, key_updates = jax.random.split(jax.random.PRNGKey(seed), 3)
     env_state = reset_envs(agent, env, key_env)
-    make_replay = functools.partial(empty_replay, c.replay_slots, env_state.obs, env.action_size)
+    make_replay = functools.partial(empty_replay, c.replay_slots, stored(env_state), env.action_size)
     check_memory(c, jax.eval_shape(make_replay), agent.section)
     data = OffPolicyData(env_state, make_replay(), agent.init_noise())
     return Snapshot(0, jax.jit(agent.init)(key_networks, key_updates), data)
@@ -259,9 +297,9 @@ def start(agent: ActorCritic, env: Env, seed: int) -> Snapshot:
 def check_memory(config: OffPolicyConfig, replay: ReplayBuffer, section: str) -> None:
     """Raise `ConfigError` where the replay, or one of such shapes, takes more than `replay_limit_gb`."""
     if nbytes(replay) > config.replay_limit_gb * 1e9:
-        smaller = (
-            "choose env.image_dtype=uint8 if it is not chosen yet, " if isinstance(replay.observation, Mapping) else ""
-        )
+        smaller = "lower network.memory_size, " if isinstance(replay.observation, memory.History) else ""
+        if any(leaf.ndim > 3 for leaf in jax.tree.leaves(replay.observation)):
+            smaller += "choose env.image_dtype=uint8 if it is not chosen yet, "
         raise ConfigError(
             f"{section}.replay_limit_gb is {config.replay_limit_gb:g}, but the {describe(replay)}; lower "
             f"{section}.max_replay_size, {smaller}or raise the limit"

@@ -1,4 +1,4 @@
-"""PPO with memory: a goal that is shown once, replayed sequences, resets, checkpoints, and evaluation."""
+"""Memory in PPO, and run folders in SAC: a goal shown once, replayed sequences, resets, checkpoints, evaluation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.train.toy_env import ToyConfig, ToyEnv, batched
 from tests.train.toy_pixels import SMALL, ToyPixels
 from tests.train.toy_run import build_toy, toy_config
 from train import export
-from train.config import EnvConfig, NetworkConfig, PPOConfig, RunConfig, TrainConfig, resolve
+from train.config import EnvConfig, NetworkConfig, PPOConfig, RunConfig, SACConfig, TrainConfig, resolve
 from train.learners import memory, ppo
 from train.learners.algorithms import ALGORITHMS
 from train.runs import checkpoint
@@ -182,13 +182,20 @@ def test_resumed_run_equals_uninterrupted_one():
     assert begun.info["policy"][0].shape == (64, 16)
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Any:
+# Four updates of 256 steps, the first of which only fills the replay.
+SAC = SACConfig(num_envs=16, steps_per_update=16, grad_steps_per_update=2, batch_size=16, unroll_length=4, burn_in=2)
+SAC = dataclasses.replace(SAC, min_replay_size=500, max_replay_size=1024)
+SAC = dataclasses.replace(SAC, policy_hidden_layer_sizes=(16,), q_hidden_layer_sizes=(16,))
+
+
+@pytest.fixture(scope="module", params=["ppo", "sac"])
+def run(request, tmp_path_factory) -> Any:
     """A run folder that was stopped after two updates and continued to four, and one that was not."""
     quiet, out = Console(file=io.StringIO()), tmp_path_factory.mktemp("memory")
+    changed = {"algorithm": request.param, **({"sac": SAC, "ppo": PPOConfig()} if request.param == "sac" else {})}
     for name, sittings in (("stopped", (2, 4)), ("straight", (4,))):
         for updates in sittings:
-            config = dataclasses.replace(toy_config(out / name, updates), network=GRU)
+            config = dataclasses.replace(toy_config(out / name, updates), network=GRU, **changed)
             result, folder, _ = train_run(config, quiet, build_env=build_toy)
             assert result.completed
     return out, folder, result.snapshot
@@ -213,7 +220,7 @@ def test_evaluation_carries_memory_through_each_episode(run, deterministic):
     policy, _ = load_policy(folder, config, env, "last", deterministic)
     keys = episode_keys(5, 6)
     played = BatchPlayer(env).play(policy, keys, record=6)
-    agent, driven_m = ppo.make_agent(env, config), {True: [], False: []}
+    agent, driven_m = ALGORITHMS[config.algorithm].make_agent(env, config), {True: [], False: []}
     act, step = jax.jit(agent.recurrent_policy(snapshot.learner, deterministic)), jax.jit(env.step)
     for key in keys:
         for keeps in (True, False):
@@ -234,15 +241,19 @@ def test_it_is_refused_where_nothing_keeps_memory(run, tmp_path):
     env, config = ToyEnv(), folder.read_config()
     refused = "network.memory is 'gru', and the policy is played as .* expected network.memory 'none', or an evaluation"
     policy, _ = load_policy(folder, config, env, "last", True)
+    keys = jax.random.split(jax.random.PRNGKey(0))
     with pytest.raises(ConfigError, match=refused):
-        jax.vmap(policy)(jnp.zeros((2, 29)), jax.random.split(jax.random.PRNGKey(0)))
+        jax.vmap(policy)(jnp.zeros((2, 29)), keys)
     with pytest.raises(ConfigError, match=refused):
-        ALGORITHMS["ppo"].policy(env, config, snapshot.learner, True)
+        ALGORITHMS[config.algorithm].policy(env, config, snapshot.learner, True)(jnp.zeros((2, 29)), keys[0])
     with pytest.raises(ConfigError, match="played as an ONNX file"):
         export.main.__wrapped__([str(folder.path), "-o", str(tmp_path / "policy.onnx")], build_env=build_toy)
-    for algorithm in ("sac", "ddpg", "clone"):
-        with pytest.raises(ConfigError, match=f"memory is 'gru' with algorithm {algorithm}, expected algorithm ppo"):
-            resolve(TrainConfig(toy_config(tmp_path).env, algorithm, GRU), "native")
+    with pytest.raises(
+        ConfigError, match="memory is 'gru' with algorithm clone, expected an algorithm that learns from"
+    ):
+        resolve(TrainConfig(toy_config(tmp_path).env, "clone", GRU), "native")
+    for algorithm in ("sac", "ddpg"):
+        assert resolve(TrainConfig(toy_config(tmp_path).env, algorithm, GRU), "native").network == GRU
     with pytest.raises(ConfigError, match="memory_size is 64, which changes nothing here: expected memory 'gru'"):
         NetworkConfig(memory_size=64)
     assert resolve(dataclasses.replace(toy_config(tmp_path), network=GRU), "native").network == GRU
