@@ -16,6 +16,7 @@ import functools
 import gzip
 import json
 import os
+import resource
 import statistics
 import sys
 import tempfile
@@ -186,15 +187,16 @@ def simulation(
     """Rate of random driving: chunks of steps, each one compiled scan; the first chunk is not counted.
 
     `part` leaves things out: `physics` steps the backend alone, `task` adds scores and rewards, `observed` adds the
-    observation, `simulation` adds new episodes.
+    observation, `simulation` adds new episodes. `make_s` builds the environment, `reset_s` compiles and draws the first
+    episodes; `tables_mb` of homes are on the device, and the process has held at most `host_mib`.
     """
-    env = _make(robot, tuple(scenes), backend, json.dumps(settings))
+    env, make_s = timed(_make, robot, tuple(scenes), backend, json.dumps(settings))
     batch: Any = AutoResetEnv(env)
     if devices > 1:
         batch = ShardedEnv(batch, jax.devices()[:devices])
     step = _counting(step_of(env, part, num_envs, batch))
     keys = np.asarray(jax.vmap(jax.random.PRNGKey)(jnp.arange(2 + max(1, steps // CHUNK))))  # the same in each process
-    state = jax.jit(lambda key: batch.reset(jax.random.split(key, num_envs)))(keys[0])
+    state, reset_s = timed(jax.jit(lambda key: batch.reset(jax.random.split(key, num_envs))), keys[0])
     # Not donated: the first state may share buffers with constants.
     program = jax.jit(random_driving(step, (num_envs, env.action_size), CHUNK))
     (state, _), compile_s = timed(program, state, keys[1])
@@ -210,7 +212,11 @@ def simulation(
     return {
         "env_steps_per_s": round(rate),
         "physics_steps_per_s": round(rate * round(clock.control_dt_s / clock.sim_dt_s)),
+        "make_s": round(make_s, 1),
+        "reset_s": round(reset_s, 1),
         "compile_s": round(compile_s, 1),
+        "tables_mb": round(sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(env.tables)) / 1e6, 1),
+        "host_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
         "steps": CHUNK * len(rates),
         "env_steps": CHUNK * len(rates) * num_envs,
         **totals,
