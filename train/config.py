@@ -43,8 +43,9 @@ class NetworkConfig(Settings):
     """Width of the layer that takes the action of a critic."""
     share_encoder: bool = False
     """Actor and critic look through one encoder; SAC and DDPG train it with the critic."""
-    critic_inputs: Literal["all", "state"] = "all"
-    """state: the critic takes the vector alone, the actor everything (not with share_encoder)."""
+    critic_inputs: Literal["all", "state", "privileged"] = "all"
+    """state: the critic takes the vector alone, the actor everything (not with share_encoder); privileged: vector and
+    true state, ppo only."""
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     """Arithmetic of the image encoder; parameters stay float32."""
     memory: Literal["none", "gru"] = "none"
@@ -322,6 +323,7 @@ def validate(config: TrainConfig) -> None:
             continue
         used = OF_MEMORY if name == "network" and config.network.memory != "none" else ()
         used += ("action_features",) if used and config.algorithm != "ppo" else ()
+        used += ("critic_inputs",) * (config.network.critic_inputs == "privileged")
         for field in dataclasses.fields(section):
             value = getattr(section, field.name)
             known = (field.default, *(sizes.get(field.name) for sizes in auto))  # `resolve` fills all sections
@@ -334,6 +336,11 @@ def validate(config: TrainConfig) -> None:
         raise ConfigError(
             f"network.memory is {config.network.memory!r} with algorithm clone, expected an algorithm that learns from "
             "whole sequences; set network.memory=none, or algorithm=ppo, sac or ddpg"
+        )
+    if config.network.critic_inputs == "privileged" and config.algorithm != "ppo":
+        raise ConfigError(
+            f"network.critic_inputs is 'privileged' with algorithm {config.algorithm}, expected algorithm ppo; set "
+            "network.critic_inputs=all, or algorithm=ppo"
         )
     if isinstance(section, OffPolicyConfig):
         _validate_replay(config.algorithm, section, config.run.num_timesteps, remembers)

@@ -37,12 +37,17 @@ def cell_centre(tables: SceneTables, scene: jax.Array, xy: jax.Array) -> jax.Arr
     return jnp.broadcast_to(tables.grid_origin_w[scene], offset.shape) + offset
 
 
-def all_free(tables: SceneTables, scene: jax.Array, points: jax.Array) -> jax.Array:
-    """Return [] bool: whether world points [p, 2] all lie in free cells."""
+def free_at(tables: SceneTables, scene: jax.Array, points: jax.Array) -> jax.Array:
+    """Return [p] bool: which of the world points [p, 2] lie in free cells; beyond the map its edge counts."""
     rows, columns = tables.free.shape[1:]
     at = jnp.floor((points - tables.grid_origin_w[scene][None]) / tables.fine_m).astype(jnp.int32)
     r, c = jnp.clip(at[:, 1], 0, rows - 1), jnp.clip(at[:, 0], 0, columns - 1)
-    return tables.free[scene, r, c].all()
+    return tables.free[scene, r, c]
+
+
+def all_free(tables: SceneTables, scene: jax.Array, points: jax.Array) -> jax.Array:
+    """Return [] bool: whether world points [p, 2] all lie in free cells."""
+    return free_at(tables, scene, points).all()
 
 
 def goal_field(tables: SceneTables, scene: jax.Array, goal_xy_w: jax.Array) -> GoalField:

@@ -189,6 +189,16 @@ def build_boxes(world: World, classes: MaskClasses = 4, colours: bool = False, r
     )
 
 
+def half_sizes_m(boxes: BoxTables) -> jax.Array:
+    """Return [S, M, 3] half sizes of the box around each movable object, symmetric about its body's frame."""
+    slots, world = boxes.world.slots, boxes.world
+    rows = slots.boxes_b
+    reach = np.abs(rows[..., :3]) + (np.abs(matrix_from_quat(rows[..., 3:7])) * rows[..., None, 7:]).sum(-1)
+    reach = np.where((rows[..., 7:] > 0).all(-1, keepdims=True), reach, 0.0)
+    of_slot = [reach[:, slots.box_slot == i].max(1, initial=0.0) for i in range(world.layout.num_slots)]
+    return jnp.asarray(np.stack(of_slot, 1) if of_slot else np.zeros((len(rows), 0, 3)), jnp.float32)
+
+
 def apply_axes(axes: jax.Array, vector: jax.Array) -> jax.Array:
     """Return [..., 3, 3] times [..., 3]; a sum of products, because GPUs may round a matmul's factors to TF32."""
     return (axes * vector[..., None, :]).sum(-1)

@@ -31,10 +31,11 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.slots import parking_spot
 from interactive_nav.scenes.world import build_world
-from interactive_nav.sensing.boxes import apply_axes, body_poses
+from interactive_nav.sensing.boxes import apply_axes, body_poses, half_sizes_m
 from interactive_nav.sensing.observation import waypoints_in_body
 from interactive_nav.sensing.sensors import Sensors
 from interactive_nav.task.dynamics import Dynamics
+from interactive_nav.task.privileged import PRIVILEGED_SIZE, privileged_state
 from interactive_nav.task.terms import TERMS, Moment, Step, Term
 from interactive_nav.types import EpisodeStart, GoalField, NavInfo
 from interactive_nav_common.errors import ConfigError
@@ -84,6 +85,7 @@ class InteractiveNav(Env):
         self.score_mass_kg = masses_kg[config.robot_mass]  # m_0 as the scores take it
         self._constants = config, self.tables, self.score_mass_kg
         self._small_radius_m = jnp.asarray([o.radius_m for o in self.world.small_objects], jnp.float32)
+        self._half_m = half_sizes_m(self.sensors.boxes)
         self._num_small = len(self.world.small_objects)
         self._parking = jnp.asarray([parking_spot(i) for i in range(self._num_small)], jnp.float32).reshape(-1, 2)
 
@@ -199,12 +201,20 @@ class InteractiveNav(Env):
 
     def _observation(self, state: State) -> jax.Array | dict[str, jax.Array]:
         """Return the observation of where the state is now, without delay."""
-        nav: NavInfo = state.info["nav"]
-        physics: PhysicsState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-        moment = Moment(*self._constants, nav, physics, self._robot_pose(physics)[1])
+        at = self._moment(state)
         parts = [t for t in self.terms if t.kind == "observation"]
-        remembered = {t.name: t.evaluate(nav.memory.get(t.key), moment) for t in parts}
-        return self.sensors.observe(physics, nav, state.info["rng"], remembered)
+        remembered = {t.name: t.evaluate(at.nav.memory.get(t.key), at) for t in parts}
+        return self.sensors.observe(at.physics, at.nav, state.info["rng"], remembered)
+
+    def _moment(self, state: State) -> Moment:
+        physics: PhysicsState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
+        return Moment(*self._constants, state.info["nav"], physics, self._robot_pose(physics)[1])
+
+    privileged_size = PRIVILEGED_SIZE
+
+    def privileged(self, state: State) -> jax.Array:
+        """Return the true state."""
+        return privileged_state(self._moment(state), self.sensors.boxes, self._half_m)
 
     def advance(self, state: State, action: jax.Array) -> State:
         """Do `step` without an observation: `obs` stays what it was until `observe`."""

@@ -162,11 +162,12 @@ def _trail(trail_w: jax.Array, step: Step) -> jax.Array:
     return jnp.where(step.nav.step_count % TRAIL_STEPS == 0, longer, trail_w)
 
 
-def _masses_kg(step: Step) -> jax.Array:
-    masses_kg, dynamics = step.tables.mass_kg[step.nav.scene_index], step.nav.dynamics
+def masses_kg(at: Moment) -> jax.Array:
+    """Return (M + 1,) kg: the robot's for the scores, then the objects'."""
+    tables_kg, dynamics = at.tables.mass_kg[at.nav.scene_index], at.nav.dynamics
     if dynamics is not None and "random_mass" in dynamics.drawn:
-        masses_kg = masses_kg * dynamics.drawn["random_mass"]
-    return masses_kg.at[0].set(step.score_mass_kg)
+        tables_kg = tables_kg * dynamics.drawn["random_mass"]
+    return tables_kg.at[0].set(at.score_mass_kg)
 
 
 def _path_efficiency(memory: Any, step: Step) -> jax.Array:
@@ -180,7 +181,7 @@ def _counts(step: Step) -> jax.Array | float:
 
 def _kinematic_effort(memory: Any, step: Step) -> jax.Array:
     paths = jnp.concatenate([step.nav.memory["robot_path_m"][None], step.nav.memory["object_path_m"]])
-    return _counts(step) * metrics.kinematic_effort(_masses_kg(step), paths)
+    return _counts(step) * metrics.kinematic_effort(masses_kg(step), paths)
 
 
 def _dynamic_effort(memory: Any, step: Step) -> jax.Array:
@@ -224,7 +225,7 @@ TERMS = (
     Term("shortest_path_m", "L*, m: the geodesic among static structure at the start.", "metric",
          lambda _, step: step.nav.shortest_path_m),
     Term("object_displacement_kg_m", "Sum of m_i l_i over the movable objects, kg m.", "metric",
-         lambda _, step: jnp.sum(_masses_kg(step)[1:] * step.nav.memory["object_path_m"])),
+         lambda _, step: jnp.sum(masses_kg(step)[1:] * step.nav.memory["object_path_m"])),
     Term("force_sum_n", "Sum of F_t over control steps, N.", "metric", lambda force_n, step: force_n,
          lambda nav: jnp.zeros(()), lambda force_n, step: force_n + jnp.where(step.broken, 0.0, step.signals.force_n)),
     Term("episode_steps", "Control steps.", "metric", lambda _, step: step.nav.step_count),

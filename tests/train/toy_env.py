@@ -66,6 +66,14 @@ class ToyEnv(Env):
     def action_size(self) -> int:
         return 2
 
+    privileged_size = 3
+
+    def privileged(self, state: State) -> jax.Array:
+        """Goal minus position, world frame, and the share of time gone."""
+        nav: ToyNav = state.info["nav"]
+        time = nav.step_count / self.config.episode_steps
+        return jnp.append((nav.goal_xy_w - nav.robot_pos_w[:2]) / 2.5, time)
+
     @property
     def backend(self) -> str:
         return "native"

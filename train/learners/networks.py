@@ -17,9 +17,10 @@ import jax.numpy as jnp
 from brax.training import distribution
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
-from brax.training.networks import FeedForwardNetwork
+from brax.training.networks import FeedForwardNetwork, make_policy_network, make_value_network
 from flax import linen
 
+from interactive_nav.task.privileged import PRIVILEGED, without_privileged
 from interactive_nav_common.errors import ConfigError
 from train.config import NetworkConfig
 
@@ -36,6 +37,7 @@ def critic_output_init(key: jax.Array, shape: Sequence[int], dtype: Any = jnp.fl
 
 def vector_part(observation: Any) -> Any:
     """Return what is normalised of an observation: the vector itself, or the dict without its images."""
+    observation = without_privileged(observation)
     if not isinstance(observation, Mapping):
         return observation
     return {name: value for name, value in observation.items() if not name.startswith(PIXELS)}
@@ -57,15 +59,16 @@ def update_normalizer(
 
 
 def normalize(observation: Any, statistics: running_statistics.RunningStatisticsState) -> Any:
-    """Return the observation with its vector part normalised; images pass."""
+    """Return the policy's part of an observation with its vector normalised; images pass."""
+    observation = without_privileged(observation)
     with jax.numpy_rank_promotion("allow"):  # as above
         part = running_statistics.normalize(vector_part(observation), statistics)  # type: ignore[arg-type]
     return {**observation, **part} if isinstance(observation, Mapping) else part  # type: ignore[dict-item]
 
 
 def preprocess(enabled: bool) -> Callable[[Any, Any], Any]:
-    """Return `normalize`, or a function that changes nothing."""
-    return normalize if enabled else lambda observation, _: observation
+    """Return `normalize`, or a function that only takes the policy's part."""
+    return normalize if enabled else lambda observation, _: without_privileged(observation)
 
 
 def conv_as_product(images: jax.Array, kernel: jax.Array, strides: Sequence[int]) -> jax.Array:
@@ -281,6 +284,15 @@ def make_split(
     return Split(init, apply, *parts, remember if remembers else None)
 
 
+def _behind(prepare: Callable[[Any, Any], jax.Array], network: FeedForwardNetwork) -> FeedForwardNetwork:
+    """Return Brax's network of vectors behind `prepare`; Brax itself takes dicts only with statistics of each part."""
+
+    def apply(statistics: Any, params: Any, observation: Any) -> Any:
+        return network.apply(None, params, prepare(observation, statistics))
+
+    return FeedForwardNetwork(network.init, apply)
+
+
 def make_ppo_networks(
     config: NetworkConfig,
     size: ObservationSize,
@@ -288,19 +300,32 @@ def make_ppo_networks(
     policy_sizes: Sequence[int],
     value_sizes: Sequence[int],
     normalize_observations: bool,
+    privileged_size: int = 0,
 ) -> ppo_networks.PPONetworks:
-    """Build policy (mean and deviation of a Gaussian before tanh) and value network; `Split`s with images or memory."""
-    prepare, images = preprocess(normalize_observations), isinstance(size, Mapping)
-    if not isinstance(size, Mapping) and config.memory == "none":
-        return ppo_networks.make_ppo_networks(
-            size,
-            action_size,
-            preprocess_observations_fn=prepare,  # type: ignore[arg-type]
-            policy_hidden_layer_sizes=policy_sizes,
-            value_hidden_layer_sizes=value_sizes,
-        )
+    """Build policy (mean and deviation of a Gaussian before tanh) and value network; `Split`s with images or memory.
+
+    `size` is that of the policy's observation. If `privileged_size` is above 0, the critic takes the vector and the
+    true state.
+    """
+    of_policy, images = preprocess(normalize_observations), isinstance(size, Mapping)
+    of_critic, critic_size, critic_images = of_policy, size, images and config.critic_inputs == "all"
+    if privileged_size:
+
+        def true_state(observation: Any, statistics: Any) -> jax.Array:
+            vector = vector_part(of_policy(observation, statistics))
+            return jnp.concatenate([*jax.tree.leaves(vector), observation[PRIVILEGED]], -1)
+
+        of_critic, critic_images = true_state, False
+        critic_size = privileged_size + (size.get("state", (0,))[0] if isinstance(size, Mapping) else size)
+
     actions = distribution.NormalTanhDistribution(event_size=action_size)
-    policy = make_split(config, size, images, prepare, Head(policy_sizes, actions.param_size))
-    value_head = Head(value_sizes, 1, output_init=critic_output_init)
-    value = make_split(config, size, images and config.critic_inputs == "all", prepare, value_head, squeeze=True)
+    if not images and config.memory == "none":
+        # As Brax's PPO builds them.
+        actor = make_policy_network(actions.param_size, size, hidden_layer_sizes=policy_sizes, activation=linen.swish)
+        critic = make_value_network(critic_size, hidden_layer_sizes=value_sizes, activation=linen.swish)
+        policy, value = _behind(of_policy, actor), _behind(of_critic, critic)
+    else:
+        policy = make_split(config, size, images, of_policy, Head(policy_sizes, actions.param_size))
+        value_head = Head(value_sizes, 1, output_init=critic_output_init)
+        value = make_split(config, critic_size, critic_images, of_critic, value_head, squeeze=True)
     return ppo_networks.PPONetworks(policy, value, actions)  # type: ignore[call-arg]

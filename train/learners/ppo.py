@@ -28,6 +28,7 @@ from brax.training.acme import running_statistics
 from brax.training.agents.ppo import losses as ppo_losses
 from brax.training.agents.ppo import networks as ppo_networks
 
+from interactive_nav.task.privileged import without_privileged
 from train.config import PPOConfig, TrainConfig
 from train.learners import memory
 from train.learners import networks as nets
@@ -118,10 +119,11 @@ class PPOParts:
 
 
 def make_agent(env: Any, config: TrainConfig) -> PPOParts:
-    """Build networks and optimiser for an environment's observations and actions."""
-    network, size, c = config.network, env.observation_size, config.ppo
+    """Build networks and optimiser for what an environment observes and takes."""
+    network, size, c = config.network, without_privileged(env.observation_size), config.ppo
     layers = c.policy_hidden_layer_sizes, c.value_hidden_layer_sizes
-    built = nets.make_ppo_networks(network, size, env.action_size, *layers, c.normalize_observations)
+    n = env.privileged_size if network.critic_inputs == "privileged" else 0
+    built = nets.make_ppo_networks(network, size, env.action_size, *layers, c.normalize_observations, n)
     optimizer = optax.chain(optax.clip_by_global_norm(c.max_grad_norm), optax.adam(c.learning_rate))
     shared = network.share_encoder and isinstance(built.policy_network, nets.Split)
     return PPOParts(c, built, optimizer, size, shared, network.memory_size, config.run.devices)

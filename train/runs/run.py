@@ -16,6 +16,7 @@ import interactive_nav
 from interactive_nav.config import WINDOW
 from interactive_nav.physics import keep_programs, resolve_backend
 from interactive_nav.robots import robot_name
+from interactive_nav.task.privileged import PrivilegedEnv
 from interactive_nav.task.wrappers import AutoResetEnv, ShardedEnv
 from interactive_nav.types import FAILURES
 from interactive_nav_common.config import flatten, replace
@@ -316,7 +317,8 @@ def _train_in(
 
 
 def learn(env: Any, config: TrainConfig, callbacks: Any) -> TrainResult:
-    devices, batch = devices_here(config.run.devices), AutoResetEnv(env)
+    devices, privileged = devices_here(config.run.devices), config.network.critic_inputs == "privileged"
+    batch = AutoResetEnv(PrivilegedEnv(env) if privileged else env)
     return ALGORITHMS[config.algorithm].train(
         ShardedEnv(batch, devices) if len(devices) > 1 else batch, config, callbacks
     )
