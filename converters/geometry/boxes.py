@@ -1,12 +1,12 @@
 """Enclose points by convex hulls and boxes, and join convex pieces of a mesh into few."""
 
 import dataclasses
-import itertools
 import math
 
 import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
 
 from converters.geometry.faces import face_areas
 from interactive_nav_common.rotations import yaw_matrix
@@ -30,14 +30,8 @@ SLIVER_SHARE = 0.1
 """Of a mesh's area that flat pieces may have."""
 CONVEX_SHARE = 0.9
 """A piece that fills this share of its convex hull counts as convex."""
-AXES = np.array(
-    [
-        np.eye(3)[list(order)] * signs
-        for order in itertools.permutations(range(3))
-        for signs in itertools.product((1.0, -1.0), repeat=3)
-    ]
-)
-"""(48, 3, 3) all ways to name and direct three axes."""
+TURNS = np.round(Rotation.create_group("O").as_matrix())
+"""(24, 3, 3) all ways to name and direct the three axes of a right-handed frame."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,8 +107,7 @@ def upright_box(points: np.ndarray, prefer_yaw: float = 0.0, round_fill: float =
 
 def least_turned(rotation: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the axes (3, 3 columns), permuted and flipped to the least rotation, and `along` (3,) permuted."""
-    turns = np.einsum("ij,pjk->pik", rotation, AXES)
-    turns = turns[np.linalg.det(turns) > 0]
+    turns = np.sign(np.linalg.det(rotation)) * rotation @ TURNS  # left-handed axes are flipped first
     order = np.lexsort(np.round([*turns.reshape(-1, 9).T, -np.trace(turns, axis1=1, axis2=2)], TIE_DIGITS))
     best = turns[order[0]]
     return best, np.abs(best.T @ rotation) @ along

@@ -2,9 +2,11 @@
 
 import math
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import fast_simplification
 import numpy as np
+import shapely
 import trimesh
 from scipy import sparse
 from scipy.spatial import KDTree
@@ -176,6 +178,12 @@ def compacted(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.n
     """Return the vertices that some faces use, and the faces into these."""
     used, index = np.unique(faces, return_inverse=True)
     return vertices[used], index.reshape(-1, 3)
+
+
+def triangulated(region: Any) -> np.ndarray:
+    """Return (m, 3, 2) triangles, counter-clockwise, of polygons of shapely with holes, between their own corners."""
+    parts = shapely.orient_polygons(shapely.get_parts(shapely.constrained_delaunay_triangles(region)))
+    return shapely.get_coordinates(parts).reshape(-1, 4, 2)[:, :3]
 
 
 def stacked(parts: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:

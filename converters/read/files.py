@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 import trimesh
 from PIL import Image
 
+from converters.geometry.faces import triangulated
 from converters.records.errors import SceneRejected
 from converters.records.raw import RawScene, ScanMesh
 from interactive_nav_common.errors import printable, readable
@@ -324,29 +326,12 @@ def _unfold(vertices: np.ndarray, index: np.ndarray, corner: np.ndarray, face: n
         axis = int(np.abs(whole[polygon]).argmax())
         flat = np.delete(vertices[index[start : start + count]], axis, axis=1)
         flat = flat if (whole[polygon, axis] > 0) == (axis != 1) else flat[:, ::-1]
-        ears = _ears(flat) if count <= MOST_CORNERS else None
-        if ears is not None:
-            corner[first:end] = start + ears
-
-
-def _ears(outline: np.ndarray) -> np.ndarray | None:
-    """Return (n - 2, 3) triangles of a simple polygon (n, 2), counter-clockwise; None where it crosses itself."""
-    left, ears = list(range(len(outline))), []
-    while len(left) > 2:
-        for k in range(len(left)):
-            triple = left[k - 1], left[k], left[(k + 1) % len(left)]
-            a, b, c = outline[list(triple)]
-            others = outline[[i for i in left if i not in triple]]
-            sides = [
-                (q - p)[0] * (others - p)[:, 1] - (q - p)[1] * (others - p)[:, 0] for p, q in ((a, b), (b, c), (c, a))
-            ]
-            if (b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0] >= 0 and not (np.min(sides, axis=0) > 0).any():
-                ears.append(triple)
-                del left[k]
-                break
-        else:
-            return None
-    return np.array(ears)
+        if count <= MOST_CORNERS:
+            at = {tuple(point): k for k, point in enumerate(flat.tolist())}
+            cut = triangulated(shapely.make_valid(shapely.Polygon(flat))).reshape(-1, 2)
+            numbers = [at.get(tuple(point), -1) for point in cut.tolist()]
+            if len(numbers) == 3 * (end - first) and min(numbers) >= 0:  # else its outline crosses itself
+                corner[first:end] = start + np.reshape(numbers, (-1, 3))
 
 
 def as_number(text: str | None) -> float:

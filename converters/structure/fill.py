@@ -21,6 +21,7 @@ from converters.geometry.faces import (
     face_vectors,
     sample_faces,
     stacked,
+    triangulated,
     unit_normals,
 )
 from converters.records.errors import CLOUD
@@ -180,9 +181,7 @@ class Shown:
             cells = np.argwhere(pieces == k)[:, ::-1] * self.cell_m + self.low
             outline = shapely.union_all(shapely.box(*cells.T, *(cells + self.cell_m).T), grid_size=1e-6)
             outline = outline.simplify(self.cell_m).segmentize(1.5 * OVERLAP * self.cell_m)
-            triangles = shapely.orient_polygons(shapely.get_parts(shapely.constrained_delaunay_triangles(outline)))
-            corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
-            flat, index = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
+            flat, index = np.unique(triangulated(outline).reshape(-1, 2), axis=0, return_inverse=True)
             cell = np.clip(np.floor((flat - self.low) / self.cell_m).astype(int), 0, np.array(pieces.shape[::-1]) - 1)
             points = self.plane.lift(flat) + rearmost[cell[:, 1], cell[:, 0], None] * self.plane.normal
             done.append((points, index.reshape(-1, 3)))

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import shapely
 from scipy import ndimage
-from scipy.spatial import ConvexHull, QhullError
 from shapely import MultiPoint, contains_xy
 
 from converters.bodies.objects import PlacedObject, to_world
@@ -326,16 +325,12 @@ def _heights(shown: _Shown, occupied: np.ndarray, around: int) -> np.ndarray:
 
 def beyond_obstacles(occupied: np.ndarray, resolution_m: float) -> np.ndarray:
     """Return (rows, columns) bool: cells over `BEYOND_M` outside of the convex hull of the occupied cells."""
-    cells = np.argwhere(occupied)
-    try:
-        sides = ConvexHull(cells).equations
-    except (QhullError, ValueError):  # all on one line, or none
+    hull = MultiPoint(np.argwhere(occupied)).convex_hull
+    if not hull.area:  # all on one line, or none
         return np.zeros(occupied.shape, bool)
-    rows, columns = np.indices(occupied.shape)
-    far = np.full(occupied.shape, -np.inf)
-    for row, column, offset in sides:
-        np.maximum(far, row * rows + column * columns + offset, out=far)
-    return far * resolution_m > BEYOND_M
+    # A hair more: cells on the line are within, however it is rounded.
+    around = hull.buffer(BEYOND_M / resolution_m + 1e-6, join_style="mitre", mitre_limit=math.inf)
+    return ~shapely.intersects_xy(around, *np.indices(occupied.shape))
 
 
 def floor_outside(floor: np.ndarray, occupied: np.ndarray, furniture: np.ndarray, resolution_m: float) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 import shapely
 
 from converters.geometry.boxes import MAX_PIECES, convex_pieces
-from converters.geometry.faces import face_vectors, merge_vertices, sample_faces
+from converters.geometry.faces import face_vectors, merge_vertices, sample_faces, triangulated
 from converters.read.files import SourceFolder
 from converters.read.gibson import SHOWN_M, assume_hinge, leaf_turn, read_attribution, read_licence
 from converters.read.meshes import clean_surface, colours_of_faces
@@ -257,20 +257,14 @@ def _on_floors(
     off = covers[..., 2].mean(axis=1) - ground_m
     covers = shapely.polygons(covers[(off > -TOUCH_M) & (off < SLAB_M)][..., :2])
     ground = shapely.get_parts(shapely.difference(shapely.box(*low, *high), shapely.union_all(covers)))
-    corners = [t for p in ground if shapely.get_type_id(p) == 3 and shapely.area(p) > 1e-6 for t in triangles(p)]
-    if corners:
-        vertices = np.column_stack([np.reshape(corners, (-1, 2)), np.zeros(3 * len(corners))])
+    corners = triangulated(ground[(shapely.get_type_id(ground) == 3) & (shapely.area(ground) > 1e-6)])
+    if len(corners):
+        vertices = np.column_stack([corners.reshape(-1, 2), np.zeros(3 * len(corners))])
         faces = np.arange(len(vertices)).reshape(-1, 3)
         colour = np.tile(colours_of_faces(plane.surface)[:1], (len(faces), 1))
         place = transform(np.eye(3), (0.0, 0.0, ground_m))
         rest = [*rest, dataclasses.replace(plane, pose=place, surface=textured_by_face(vertices, faces, colour))]
     return rest, (floor_m,)
-
-
-def triangles(polygon: Any) -> list[np.ndarray]:
-    """Return the triangles (3, 2) of a polygon in plan, counter-clockwise."""
-    parts = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
-    return [shapely.get_coordinates(shapely.orient_polygons(t))[:3] for t in parts if shapely.area(t) > 1e-9]
 
 
 def _by_size(source: SourceFolder, parts: list[HomePart], weighed: bool) -> list[HomePart]:

@@ -1,12 +1,16 @@
 """Unpack a Sweet Home 3D drawing (`.sh3d`, a ZIP) and read the elements of its `Home.xml`."""
 
-import math
+import contextlib
+import itertools
 import re
 import xml.etree.ElementTree as ElementTree
 import zipfile
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+from fontTools.pens.recordingPen import RecordingPen
+from fontTools.svgLib.path import parse_path
+from scipy.interpolate import BPoly
 
 from converters.read.files import as_number
 from converters.read.urdf import parse_xml
@@ -112,51 +116,18 @@ def colour(text: str | None, default: np.ndarray) -> np.ndarray:
     return np.array([int(text[k : k + 2], 16) for k in (2, 4, 6)], np.uint8).reshape(1, 1, 3)
 
 
-def _arc(start: np.ndarray, end: np.ndarray, radii: np.ndarray, large: bool, sweep: bool) -> np.ndarray:
-    """Return (9, 2) points after the start of an SVG arc whose axes are not turned."""
-    a, b = start / radii, end / radii
-    half = (b - a) / 2
-    squared = float(half @ half)
-    if squared > 1 or squared < 1e-12:  # too small an ellipse is enlarged
-        radii, squared = radii * max(math.sqrt(squared), 1e-6), 1.0
-        a, b = start / radii, end / radii
-        half = (b - a) / 2
-    side = math.sqrt(max(1 / max(squared, 1e-12) - 1, 0.0)) * (1 if large == sweep else -1)
-    centre = (a + b) / 2 + side * np.array([half[1], -half[0]])
-    first, last = (math.atan2(*(p - centre)[::-1]) for p in (a, b))
-    turn = (last - first) % math.tau if sweep else -((first - last) % math.tau)
-    angle = first + turn * np.arange(1, 10) / 9
-    return (centre + np.stack([np.cos(angle), np.sin(angle)], axis=1)) * radii
-
-
 def outline(path: str | None) -> np.ndarray | None:
     """Return (n, 2) points of an SVG path of one outline in the unit square, y down; None: the square or unreadable."""
-    counts = {"m": 2, "l": 2, "h": 1, "v": 1, "c": 6, "q": 4, "a": 7}
-    at, points = np.zeros(2), []
-    for word, rest in re.findall(r"([A-Za-z])([^A-Za-z]*)", (path or "")[:2000]):
-        kind, relative = word.lower(), word.islower()
-        values = [float(v) for v in re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)", rest)]
-        if kind == "z":
-            break
-        if kind not in counts or not values or len(values) % counts[kind]:
-            return None
-        for k in range(0, len(values), counts[kind]):
-            some = values[k : k + counts[kind]]
-            if kind in "hv":
-                end = at.copy()
-                end["hv".index(kind)] = some[0] + relative * at["hv".index(kind)]
-            else:
-                end = np.array(some[-2:]) + relative * at
-            if kind in "cq":
-                corners = np.array([at, *(np.reshape(some, (-1, 2)) + relative * at)])
-                for t in np.arange(1, 9) / 9:
-                    left = corners
-                    while len(left) > 1:
-                        left = left[:-1] * (1 - t) + left[1:] * t
-                    points.append(left[0])
-            if kind == "a" and min(some[:2]) > 0:
-                points.extend(_arc(at, end, np.array(some[:2]), some[3] != 0, some[4] != 0)[:-1])
-            points.append(end)
-            at = end
-    corners = np.array(points).reshape(-1, 2)
-    return corners if len(corners) > 2 and np.abs(corners).max() < 10 else None
+    pen = RecordingPen()
+    with contextlib.suppress(ValueError):
+        parse_path((path or "")[:2000], pen)
+    points: list[np.ndarray] = []
+    for word, ends in itertools.takewhile(lambda step: step[0] != "closePath", pen.value):
+        if word in ("curveTo", "qCurveTo"):
+            curve = BPoly(np.array([points[-1], *ends])[:, None], [0.0, 1.0])
+            points.extend(curve(np.linspace(0.0, 1.0, 10)[1:]))
+        elif ends:
+            points.append(np.array(ends[0]))
+    if len(points) > 1 and np.allclose(points[0], points[-1]):
+        points.pop()  # a closed path ends where it starts
+    return np.array(points) if len(points) > 2 and np.abs(points).max() < 10 else None

@@ -17,9 +17,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from converters.geometry.boxes import convex_hull
-from converters.geometry.faces import compacted
+from converters.geometry.faces import compacted, triangulated
 from converters.read.files import SourceFolder, read_image, read_obj
-from converters.read.homes.parts import HomePart, triangles
+from converters.read.homes.parts import HomePart
 from converters.read.homes.sh3d_archive import called, colour, metres, model_path, number, parsed
 from converters.read.meshes import read_surface
 from converters.read.obj import GREYS, TexturedMesh, distinct, join_textures, read_painted_obj
@@ -316,7 +316,7 @@ class Sheet:
         """Add a flat region with holes; `place` turns its points (n, 2) into (n, 3)."""
         image, size = look
         for tile, low in _tiles(region, size):
-            for flat in triangles(tile):
+            for flat in triangulated(tile):
                 flat = flat[::-1] if turned else flat
                 self.corners.append(place(flat))
                 self.uv.append(np.zeros((3, 2)) if size is None else np.clip((flat - low) / size, 0, 1))

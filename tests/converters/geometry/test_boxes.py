@@ -10,7 +10,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.geometry.boxes import AXES, convex_hull, fit_box, hull_of, upright_box
+from converters.geometry.boxes import TURNS, convex_hull, fit_box, hull_of, least_turned, upright_box
 from interactive_nav_common.rotations import yaw_matrix
 
 CUBE = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0])).reshape(3, -1).T
@@ -53,7 +53,11 @@ def test_a_tilted_box_is_named_so_that_it_turns_least():
     box = fit_box(convex_hull(CUBE * [0.02, 0.02, 0.4] @ tilt.T), -9.0)
     np.testing.assert_allclose(box.half, [0.02, 0.02, 0.4], atol=1e-6)
     np.testing.assert_allclose(box.rotation, tilt, atol=1e-6)
-    assert len({tuple(axes.ravel()) for axes in AXES}) == 48
+    assert len({tuple(turn.ravel()) for turn in TURNS}) == 24 and {round(np.linalg.det(turn)) for turn in TURNS} == {1}
+    left_handed = tilt[:, [2, 0, 1]] * [1, -1, 1]
+    rotation, sides = least_turned(left_handed, np.array([3.0, 1.0, 2.0]))
+    np.testing.assert_allclose(rotation, tilt, atol=1e-9)
+    np.testing.assert_allclose(sides, [1.0, 2.0, 3.0], atol=1e-9)
 
 
 def test_hulls_are_those_of_trimesh():

@@ -390,7 +390,16 @@ def test_outlines():
     half = outline("M0,1 a0.5,0.997 0 1,1 1,0 z")
     assert half is not None and half.min() > -0.01 and half[:, 1].min() == pytest.approx(0.0, abs=0.05)
     assert outline("M0,0 v1 h1 v-1 z") == pytest.approx(np.array([(0, 0), (0, 1), (1, 1), (1, 0)]))
-    assert outline("nonsense") is None and outline(None) is None
+    bowed = outline(
+        "m0 0 q.5,1 1,0 V1 H0 Z m.2 .2h.1"
+    )  # y = 2 x (1 - x), in nine steps; the second outline is not read
+    assert bowed is not None and len(bowed) == 12
+    assert bowed[:10, 1] == pytest.approx(2 * bowed[:10, 0] * (1 - bowed[:10, 0])) and bowed[10:].tolist() == [
+        [1, 1],
+        [0, 1],
+    ]
+    for unreadable in ("nonsense", None, "M0,0 L", "M0,0 h1 v99 z", "M0,0 L1e999,1 0,1", "M0,0 h1 z"):
+        assert outline(unreadable) is None, unreadable
 
 
 def test_it_converts(drawing, tmp_path, hull_cache):
