@@ -11,6 +11,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+from trimesh.remesh import subdivide_to_size
 
 from converters.geometry.boxes import upright_box
 from converters.geometry.faces import sample_faces
@@ -308,7 +309,7 @@ def _without_doubles(
 def _with_plane(
     source: SourceFolder, number: int, height_m: float, mesh: TexturedMesh, labels: np.ndarray
 ) -> tuple[TexturedMesh, np.ndarray]:
-    """Return the scan with added 0.1 m squares of the release's floor plane where mesh and map lack visible floor."""
+    """Return the scan with pieces, 0.1 m long, of the release's floor plane where mesh and map lack visible floor."""
     name = f"plane_z_up_{number}.obj"
     if not source.has(name):
         source.note(f"{name} is absent: the floor under the furniture is patched from the floor around it")
@@ -316,38 +317,25 @@ def _with_plane(
     plane = read_scan_obj(source, name, "")
     floor_faces = mesh.faces[(labels[mesh.faces] == FLOOR).all(axis=1)]
     near = np.abs(mesh.vertices[floor_faces, 2].mean(axis=1) - height_m) < 0.5
-    shown = set()
-    if near.any():
-        shown = {tuple(c) for c in _cells(sample_faces(mesh.vertices, floor_faces[near], PLANE_CELL_M / 2)[0])}
+    shown = set(map(tuple, _cells(sample_faces(mesh.vertices, floor_faces[near], PLANE_CELL_M / 2)[0]).tolist()))
     mesh_xy, floor_xy = mesh.vertices[:, :2], mesh.vertices[labels == FLOOR, :2]
     given = read_traversable(source, number, mesh_xy, floor_xy) if len(floor_xy) else None
     check_extent("a floor plane", plane.vertices)
-    points, face = sample_faces(plane.vertices, plane.faces, PLANE_CELL_M / 2)
-    cell, first = np.unique(_cells(points), axis=0, return_index=True)
-    middle = (cell + 0.5) * PLANE_CELL_M
-    inside = np.atleast_1d(((middle > mesh_xy.min(axis=0)) & (middle < mesh_xy.max(axis=0))).all(axis=1))
-    wanted = np.flatnonzero([tuple(c) not in shown and bool(i) for c, i in zip(cell, inside, strict=True)])
+    uv = np.zeros((len(plane.faces), 3, 2)) if plane.corner_uv is None else plane.corner_uv
+    corners = np.dstack([plane.vertices[plane.faces], uv]).reshape(-1, 5)
+    corners, faces, *_ = subdivide_to_size(corners, np.arange(len(corners)).reshape(-1, 3), PLANE_CELL_M, 12)
+    middle = corners[faces, :2].mean(axis=1)
+    wanted = ((middle > mesh_xy.min(axis=0)) & (middle < mesh_xy.max(axis=0))).all(axis=1)
+    wanted &= [tuple(c) not in shown for c in _cells(middle).tolist()]
     if given is not None:
         index = np.floor((middle - given.origin) / given.resolution_m).astype(np.int64)
-        on = np.atleast_1d(((index >= 0) & (index < given.traversable.shape[::-1])).all(axis=1))
-        index = np.where(on[:, None], index, 0)
-        wanted = wanted[on[wanted] & given.traversable[index[wanted, 1], index[wanted, 0]]]
-    cell, face = cell[wanted], face[first[wanted]]
-    if not len(cell):
+        wanted &= ((index >= 0) & (index < given.traversable.shape[::-1])).all(axis=1)
+        wanted[wanted] = given.traversable[index[wanted, 1], index[wanted, 0]]
+    if not wanted.any():
         return mesh, labels
-    corner = (cell[:, None] + np.array([(0, 0), (1, 0), (1, 1), (0, 1)])) * PLANE_CELL_M
-    vertices = np.column_stack([corner.reshape(-1, 2), np.full(4 * len(cell), height_m)])
-    start = 4 * np.arange(len(cell))[:, None]
-    faces = np.concatenate([start + [0, 1, 2], start + [0, 2, 3]])
-    patch = TexturedMesh(vertices, faces, None, None)
-    if plane.corner_uv is not None and plane.texture is not None:
-        a, b, c = (plane.vertices[plane.faces[face, k], :2] for k in range(3))
-        matrix = np.stack([b - a, c - a], axis=2)
-        weights = np.einsum("kij,knj->kni", np.linalg.pinv(matrix), corner - a[:, None])
-        uv = plane.corner_uv[face]
-        at = uv[:, None, 0] + weights @ (uv[:, 1:] - uv[:, :1])
-        corner_uv = np.clip(np.concatenate([at[:, [0, 1, 2]], at[:, [0, 2, 3]]]), 0.0, 1.0)
-        patch = TexturedMesh(vertices, faces, corner_uv, plane.texture)
+    vertices, uv = np.split(corners[faces[wanted]].reshape(-1, 5), [3], axis=1)
+    vertices[:, 2] = height_m
+    patch = TexturedMesh(vertices, np.arange(len(vertices)).reshape(-1, 3), uv.reshape(-1, 3, 2), plane.texture)
     return join_meshes(mesh, patch), np.concatenate([labels, np.full(len(vertices), FLOOR, np.int64)])
 
 
