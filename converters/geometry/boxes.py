@@ -1,6 +1,8 @@
 """Enclose points by convex hulls and boxes, and join convex pieces of a mesh into few."""
 
 import dataclasses
+import functools
+import itertools
 import math
 
 import numpy as np
@@ -175,37 +177,21 @@ def hull_volume(points: np.ndarray) -> float:
 
 def merge_pieces(points: list[np.ndarray], most: int, slack: float | None = None) -> list[np.ndarray]:
     """Join pairs of convex pieces, each time the pair whose common hull encloses least that neither does."""
-    pieces = list(points)
-    boxes = [(p.min(axis=0).tolist(), p.max(axis=0).tolist()) for p in pieces]
 
-    def joined(i: int, j: int) -> tuple[list[float], list[float]]:
-        (low, high), (other_low, other_high) = boxes[i], boxes[j]
-        return list(map(min, low, other_low)), list(map(max, high, other_high))
+    @functools.cache
+    def size(of: frozenset[int]) -> float:
+        corners = np.vstack([points[k] for k in sorted(of)])
+        return hull_volume(corners) if slack is None else float(np.ptp(corners, axis=0).prod())
 
-    def size(box: tuple[list[float], list[float]], *of: int) -> float:
-        if slack is None:
-            return hull_volume(np.vstack([pieces[k] for k in of]))
-        return math.prod(high - low for low, high in zip(*box, strict=True))
+    @functools.cache
+    def cost(one: frozenset[int], other: frozenset[int]) -> float:
+        return size(one | other) - size(one) - size(other)
 
-    volume = [size(box, k) for k, box in enumerate(boxes)]
-
-    def cost(i: int, j: int) -> float:
-        return size(joined(i, j), i, j) - volume[i] - volume[j]
-
-    alive = set(range(len(pieces)))
-    needed = len(alive) > most or slack is not None
-    costs = {(i, j): cost(i, j) for i in alive for j in alive if i < j} if needed else {}
-    while costs:
-        i, j = min(costs, key=lambda pair: (costs[pair], pair))
-        if len(alive) <= most and (slack is None or costs[i, j] > slack):
+    groups = [frozenset([k]) for k in range(len(points))]
+    while len(groups) > (most if slack is None else 1):
+        pair = min(itertools.combinations(groups, 2), key=lambda pair: cost(*pair))
+        if len(groups) <= most and slack is not None and cost(*pair) > slack:
             break
-        both = np.vstack([pieces[i], pieces[j]])
-        volume.append(size(joined(i, j), i, j))
-        boxes.append(joined(i, j))
-        pieces.append(both[ConvexHull(both).vertices])
-        alive -= {i, j}
-        costs = {pair: c for pair, c in costs.items() if not {i, j} & set(pair)}
-        new = len(pieces) - 1
-        costs |= {(k, new): cost(k, new) for k in alive}
-        alive.add(new)
-    return [pieces[k] for k in sorted(alive)]
+        groups = [group for group in groups if group not in pair] + [pair[0] | pair[1]]
+    joined = [np.vstack([points[k] for k in sorted(group)]) for group in groups]
+    return [p if len(group) == 1 else p[ConvexHull(p).vertices] for p, group in zip(joined, groups, strict=True)]

@@ -188,9 +188,7 @@ def triangulated(region: Any) -> np.ndarray:
 
 def stacked(parts: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Join vertices (n, k) and faces (m, 3) of several meshes."""
-    vertices, faces = zip(*parts, strict=True)
-    first = np.cumsum([0, *map(len, vertices)])
-    return np.vstack(vertices), np.vstack([f + k for f, k in zip(faces, first, strict=False)])
+    return trimesh.util.append_faces(*zip(*parts, strict=True))
 
 
 def merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -304,10 +304,6 @@ def _corner_indices(corners: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
     """
     if not corners:
         return np.zeros(0, np.int64), None
-    slashes = corners[0].count("/")
-    if "//" not in corners[0] and all(c.count("/") == slashes for c in corners) and not any("//" in c for c in corners):
-        table = np.array("/".join(corners).split("/"), np.int64).reshape(len(corners), slashes + 1)
-        return table[:, 0], table[:, 1] if slashes else None
     split = [(c.split("/") + [""])[:2] for c in corners]
     index = np.array([s[0] for s in split], np.int64)
     has_uv = any(s[1] for s in split)

@@ -329,11 +329,9 @@ def textured_by_face(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarra
 
 def at_most(image: np.ndarray, side: int) -> np.ndarray:
     """Return the image shrunk until no side is longer."""
-    largest = max(image.shape[:2])
-    if largest <= side:
-        return image
-    size = (max(1, image.shape[1] * side // largest), max(1, image.shape[0] * side // largest))
-    return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BOX))
+    small = Image.fromarray(image)
+    small.thumbnail((side, side), Image.Resampling.BOX, reducing_gap=None)
+    return np.asarray(small)
 
 
 def join_meshes(*meshes: TexturedMesh) -> TexturedMesh:
