@@ -177,7 +177,10 @@ $(D)/drives:
 endif
 $(D)/data-more:
 	$(call run,$(NAV) data $(call folders,$(SEEN)) -o $(RUNS)/data-more $(MORE_POSITIONS))
-$(D)/data-passages:
+$(ALL:%=$(D)/passage-data.%): $(D)/passage-data.%:
+	$(call run,$(NAV) data $(SCENES)/$* -o $(RUNS)/passage-parts/$* $(PASSAGE_DATA))
+$(D)/data-passages: $(ALL:%=$(D)/passage-data.%)
+	@mkdir -p $(RUNS)/data-passages; mv $(foreach name,$(ALL),$(RUNS)/passage-parts/$(name)/$(name)) $(RUNS)/data-passages
 	$(call run,$(NAV) data $(call folders,$(ALL)) -o $(RUNS)/data-passages $(PASSAGE_DATA))
 
 $(D)/rooms: $(D)/data

@@ -124,6 +124,7 @@ def test_the_report_is_one_graph_that_ends_in_its_tables():
     homes = [Path(one).name for one in done["data"][0].scenes]
     data = {"data", "data-passages", "data-unseen"}
     data |= {f"{folder}/{home}" for folder in ("parts", "drives", "embedded") for home in homes}
+    data |= {f"passage-parts/{Path(one).name}" for one in done["data-passages"][0].scenes}
     pairs = {f"policy-grid/alpha-{alpha:g}-lambda-{lam:g}": (alpha, lam) for alpha, lam in GRIDS["report"]}
     assert set(done) == networks | scenes | data | {*pairs, "evaluation", "evaluation-policy"} and len(scenes) == 10
     # A pair by itself is what the grid looks for.

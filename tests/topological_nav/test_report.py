@@ -93,17 +93,20 @@ def test_random_headings_to_test_are_as_many_and_of_the_same_places(made):
     rooms = dataset.load_rooms(made.data)
     config = dataclasses.replace(configs.TASKS["rooms"], pitch="level", test_headings="random", seed=3)
     work = training._work("rooms", made.data, config)
-    held = rooms.images[rooms.test]
-    assert work.held_out.shape == (held.shape[0] * 3 * 6, *held.shape[3:])
-    shown = work.held_out.reshape(len(held), 3, 6, *held.shape[3:])
+    held = rooms.images[rooms.test, configs.PITCHES.index("level")]
+    assert work.held_out.shape == (len(held) * 6, *held.shape[2:])
+    shown = work.held_out.reshape(len(held), 6, *held.shape[2:])
     places = [
-        [np.flatnonzero((held[i, p] == one).all((1, 2, 3)))[0] for one in shown[i, p]]
-        for i in range(len(held))
-        for p in range(3)
+        [np.flatnonzero((every == one).all((1, 2, 3)))[0] for one in some]
+        for every, some in zip(held, shown, strict=True)
     ]
     assert all(len(set(map(int, p))) == 6 for p in places)  # no image twice
-    assert len({tuple(map(int, p)) for p in places[::3]}) > 1  # other headings at other places
-    assert work.groups["level"].tolist() == [i for i in range(len(work.held_out)) if i // 6 % 3 == 1]
+    assert len({tuple(map(int, p)) for p in places}) > 1  # other headings at other places
+    assert work.groups["level"].tolist() == list(range(len(work.held_out)))
+    # Of all three pitches, images of a position follow each other by pitch.
+    work = training._work("rooms", made.data, dataclasses.replace(config, pitch="all"))
+    assert work.groups["down"].tolist() == [i for i in range(len(work.held_out)) if i // 6 % 3 == 2]
+    assert (work.held_out[work.groups["level"]] == shown.reshape(-1, *held.shape[2:])).all()
 
 
 def test_scenes_to_test_passages_by_give_nothing_to_learn_from(made, monkeypatch):

@@ -25,7 +25,7 @@ from interactive_nav_common.errors import ConfigError, FileError, readable
 from interactive_nav_common.files import write_arrays
 from interactive_nav_common.jobs.progress import Progress
 from interactive_nav_common.rows import Rows
-from topological_nav.config import DataConfig
+from topological_nav.config import PITCHES, DataConfig
 from topological_nav.data.folders import (
     Folder,
     draw_missing,
@@ -85,10 +85,10 @@ class ScenePlan:
 
 @dataclasses.dataclass(frozen=True)
 class RoomImages:
-    """Hold the room images of a dataset: P positions, three pitches, K headings."""
+    """Hold the room images of a dataset: P positions, those of L pitches, K headings."""
 
     images: np.ndarray
-    """[P, 3, K, H, W, 3] u8."""
+    """[P, L, K, H, W, 3] u8."""
     label: np.ndarray
     """[P] i32 room among all scenes' rooms."""
     names: tuple[str, ...]
@@ -99,6 +99,12 @@ class RoomImages:
     """[P, 2] m."""
     test: np.ndarray
     """[P] bool."""
+    pitches: tuple[str, ...] = PITCHES
+    """Those of the images, in this order."""
+
+    def of(self, pitches: Sequence[str], positions: np.ndarray) -> np.ndarray:
+        """Return the images [p, pitches, K, H, W, 3] at positions [P] bool with these pitches."""
+        return self.images[np.ix_(positions, np.array([self.pitches.index(pitch) for pitch in pitches]))]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,19 +193,18 @@ def _shards(folder: Path, plan: ScenePlan, robot: RobotSpec, config: DataConfig)
         yield path, poses, bodies(passages.small_w[np.concatenate(sheets)])
 
 
-def load_rooms(folder: Path) -> RoomImages:
-    """Read the room images of a dataset."""
+def load_rooms(folder: Path, pitches: Sequence[str] = PITCHES) -> RoomImages:
+    """Read the room images of a dataset, of some pitches only if memory is to be saved."""
     header, config = read_header(folder)
     parts, first = [], 0
     for index, scene in enumerate(header["scenes"]):
         plan = load_plan(folder, scene["name"])
-        images = _read_all(Path(folder) / scene["name"], "rooms", len(plan.xy_w) * 3 * config.headings, config)
-        images = images.reshape(-1, 3, config.headings, config.height, config.width, 3)
+        images = _read_all(Path(folder) / scene["name"], "rooms", len(plan.xy_w), config, pitches)
         parts.append((images, plan.room + first, np.full(len(plan.xy_w), index, np.int32), plan.xy_w, plan.test))
         first += plan.rooms.count
     images, label, scene_index, xy, test = (np.concatenate(column) for column in zip(*parts, strict=True))
     names = tuple(f"{s['name']}/{k}" for s in header["scenes"] for k in range(s["rooms"]))
-    return RoomImages(images, label, names, scene_index, xy, test)
+    return RoomImages(images, label, names, scene_index, xy, test, tuple(pitches))
 
 
 def images_at(folder: Path, scene: str, position: int, config: DataConfig) -> np.ndarray:
@@ -249,13 +254,20 @@ def about_scene(scene: Any, plan: ScenePlan) -> dict[str, Any]:
     }
 
 
-def _read_all(folder: Path, kind: str, count: int, config: DataConfig) -> np.ndarray:
-    sheets = range(math.ceil(count / (3 * config.headings)))
-    images = list(read_shards([path for path, _ in numbered(folder, kind, sheets, config.shard)]))
-    shape = (config.height, config.width, 3)
-    joined = np.concatenate(images) if images else np.zeros((0, *shape), np.uint8)
-    if joined.shape != (count, *shape):
-        raise FileError(f"{folder}: {kind} are {joined.shape}, expected {(count, *shape)}; delete them and make again")
+def _read_all(folder: Path, kind: str, count: int, config: DataConfig, pitches: Sequence[str] = ()) -> np.ndarray:
+    """Return `count` images, or those of some pitches at `count` positions, in memory that is written once."""
+    one, around = (config.height, config.width, 3), (3, config.headings) if pitches else ()
+    kept = [PITCHES.index(pitch) for pitch in pitches]
+    joined = np.empty((count, *((len(kept), config.headings) if pitches else ()), *one), np.uint8)
+    sheets, done = range(count if pitches else math.ceil(count / (3 * config.headings))), 0
+    for images in read_shards([path for path, _ in numbered(folder, kind, sheets, config.shard)]):
+        read = len(images) // math.prod(around)
+        if images.shape != (read * math.prod(around), *one) or done + read > count:
+            raise FileError(f"{folder}: has {kind} of {images.shape}, expected {one}; delete them and make again")
+        joined[done : done + read] = images.reshape(-1, *around, *one)[:, kept] if pitches else images
+        done += read
+    if done < count:
+        raise FileError(f"{folder}: has {done} of {count} {kind}; delete them and make again")
     return joined
 
 

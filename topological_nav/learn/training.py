@@ -159,7 +159,8 @@ def load_trained(run: Path) -> Trained:
 
 
 def _work(task: str, dataset: Path, config: NetworkTrainConfig) -> _Work:
-    rooms = load_rooms(dataset)
+    names = PITCHES if config.pitch == "all" else (config.pitch,)
+    rooms = load_rooms(dataset, list({"level": 0} if task == "passages" else dict.fromkeys((*names, "level"))))
     size = rooms.images.shape[3:]
     if task == "passages":
         passages = load_passages(dataset)
@@ -179,9 +180,7 @@ def _work(task: str, dataset: Path, config: NetworkTrainConfig) -> _Work:
         return _Work(rooms, *sides, groups, passages.lengths_m, passages.scored)
     if len(rooms.names) < 2:
         raise FileError(f"{dataset}: has one room, expected two to tell apart; label more, or take other networks")
-    names = PITCHES if config.pitch == "all" else (config.pitch,)
-    learned = rooms.images[~rooms.test][:, [PITCHES.index(name) for name in names]]
-    held_out = rooms.images[rooms.test]
+    learned, held_out = rooms.of(names, ~rooms.test), rooms.of(names, rooms.test)
     count, around = len(held_out), held_out.shape[2]
     turns = np.broadcast_to(np.arange(0, around, 3), (count, around // 3))
     if config.test_headings == "random":
@@ -192,8 +191,8 @@ def _work(task: str, dataset: Path, config: NetworkTrainConfig) -> _Work:
         np.broadcast_to(rooms.label[test][:, None, None], images.shape[:3]).ravel().astype(np.int32)
         for test, images in ((~rooms.test, learned), (rooms.test, held_out))
     )
-    pitch = np.broadcast_to(np.arange(3)[None, :, None], held_out.shape[:3]).ravel()
-    groups = {name: np.flatnonzero(pitch == PITCHES.index(name)) for name in names}
+    pitch = np.broadcast_to(np.arange(len(names))[None, :, None], held_out.shape[:3]).ravel()
+    groups = {name: np.flatnonzero(pitch == index) for index, name in enumerate(names)}
     groups |= {"all": np.arange(len(pitch))} if config.pitch == "all" else {}
     return _Work(rooms, learned.reshape(-1, *size), label, held_out.reshape(-1, *size), truth, groups)
 
@@ -240,12 +239,12 @@ def localisation(
     `other` (defaults: the same), in the scenes that both have.
     """
     other, other_rooms = other or trained, other_rooms or rooms
-    level, rows, weights, there = PITCHES.index("level"), {}, [], rows_by_scene(other_rooms)
+    rows, weights, there = {}, [], rows_by_scene(other_rooms)
     for name, mine in rows_by_scene(rooms).items():
         nodes, queries = mine & ~rooms.test, there.get(name, np.zeros_like(other_rooms.test)) & other_rooms.test
         if nodes.any() and queries.any():
-            looked = other.embed(other_rooms.images[queries][:, level, ::3])
-            shown = trained.embed(rooms.images[nodes][:, level])
+            looked = other.embed(other_rooms.of(["level"], queries)[:, 0, ::3])
+            shown = trained.embed(rooms.of(["level"], nodes)[:, 0])
             rows[name] = localisation_scores(
                 Places(looked, other_rooms.xy_w[queries], other_rooms.label[queries]),
                 Places(shown, rooms.xy_w[nodes], rooms.label[nodes]),

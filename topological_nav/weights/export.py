@@ -30,7 +30,7 @@ from interactive_nav_common.records import Reader
 from interactive_nav_common.runs.folder import CONFIG, VERSIONS
 from interactive_nav_common.runs.weights import half, read_weights
 from interactive_nav_common.versions import versions
-from topological_nav.config import PASSAGE_POLICY, PITCHES, RUNS, ExportConfig
+from topological_nav.config import PASSAGE_POLICY, RUNS, ExportConfig
 from topological_nav.data.dataset import headings, load_rooms
 from topological_nav.drives.driving import TrainedPolicy, load_policy
 from topological_nav.learn.learning import (
@@ -175,7 +175,7 @@ def compare(
 def level_images(source: Path, networks: Networks, places: int, progress: Progress = lambda *_: None) -> np.ndarray:
     """Return level images [P, K, H, W, 3] u8 around places of a dataset, or of a scene, which is rendered."""
     if (source / "dataset.json").is_file():
-        images = load_rooms(source).images[:, PITCHES.index("level")]
+        images = load_rooms(source, ["level"]).images[:, 0]
         return images[np.unique(np.linspace(0, len(images) - 1, places).round().astype(int))]
     if not (source / "scene.json").is_file():
         raise ConfigError(

@@ -50,6 +50,12 @@ def test_every_position_has_18_headings_and_3_pitches(made):
         assert (strongest == channel).mean() > 0.8
 
 
+def test_images_of_some_pitches_are_those_of_all(made):
+    rooms, some = dataset.load_rooms(made.data), dataset.load_rooms(made.data, ["level", "up"])
+    assert some.images.shape[1] == 2 and (some.images == rooms.images[:, [1, 0]]).all()
+    assert (some.of(["up"], some.test) == rooms.images[rooms.test, :1]).all()
+
+
 def test_passages_are_stored_with_their_labels(made):
     passages, plan = dataset.load_passages(made.data), dataset.load_plan(made.data, "painted").passages
     assert passages.images.shape == (len(plan), 32, 32, 3)
