@@ -26,8 +26,6 @@ from interactive_nav_common.untrusted.reading import read_npz
 
 LARGEST = 1e12
 """Of a coordinate, whatever its unit: products of larger ones overflow."""
-MOST_CORNERS = 200
-"""Of a polygon that is cut with care; larger ones are fans."""
 
 
 class SourceFolder:
@@ -322,12 +320,11 @@ def _unfold(vertices: np.ndarray, index: np.ndarray, corner: np.ndarray, face: n
         axis = int(np.abs(whole[polygon]).argmax())
         flat = np.delete(vertices[index[start : start + count]], axis, axis=1)
         flat = flat if (whole[polygon, axis] > 0) == (axis != 1) else flat[:, ::-1]
-        if count <= MOST_CORNERS:
-            at = {tuple(point): k for k, point in enumerate(flat.tolist())}
-            cut = triangulated(shapely.make_valid(shapely.Polygon(flat))).reshape(-1, 2)
-            numbers = [at.get(tuple(point), -1) for point in cut.tolist()]
-            if len(numbers) == 3 * (end - first) and min(numbers) >= 0:  # else its outline crosses itself
-                corner[first:end] = start + np.reshape(numbers, (-1, 3))
+        at = {tuple(point): k for k, point in enumerate(flat.tolist())}
+        cut = triangulated(shapely.make_valid(shapely.Polygon(flat))).reshape(-1, 2)
+        numbers = [at.get(tuple(point), -1) for point in cut.tolist()]
+        if len(numbers) == 3 * (end - first) and min(numbers) >= 0:  # else its outline crosses itself
+            corner[first:end] = start + np.reshape(numbers, (-1, 3))
 
 
 def as_number(text: str | None) -> float:

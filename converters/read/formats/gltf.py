@@ -264,10 +264,8 @@ class _File:
         image, sampler = self._image(of), self.tree["samplers"][of["sampler"]] if "sampler" in of else {}
         modes = [WRAPPING.get(sampler.get(key, 0), "repeat") for key in ("wrapS", "wrapT")]
         moved = info.get("extensions", {}).get("KHR_texture_transform", {})
-        turn = moved.get("rotation", 0.0)
-        scale, c, s = np.diag([*moved.get("scale", (1.0, 1.0)), 1.0]), np.cos(turn), np.sin(turn)
-        matrix = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ scale
-        matrix[:2, 2] = moved.get("offset", (0.0, 0.0))
+        turned = trimesh.transformations.planar_matrix(moved.get("offset"), moved.get("rotation"))
+        matrix = turned @ np.diag([*moved.get("scale", (1.0, 1.0)), 1.0])
         return _Layer(
             colour, image, f"TEXCOORD_{moved.get('texCoord', info.get('texCoord', 0))}", matrix, (modes[0], modes[1])
         )

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import shapely
 import trimesh
-from scipy.spatial.transform import Rotation
+from trimesh.registration import procrustes
 
 from converters.geometry.boxes import convex_hull
 from converters.geometry.faces import compacted, triangulated
@@ -231,8 +231,7 @@ class DrawnModels:
             # How somebody has opened it, by its corners in the model's frame.
             corners = mesh.vertices[mesh.faces[once]][:, :: int(np.sign(np.linalg.det(place)))].reshape(-1, 3)
             corners = transformed(corners, np.linalg.inv(place))
-            turn = Rotation.align_vectors(corners - corners.mean(axis=0), part - part.mean(axis=0))[0].as_matrix()
-            drawn = transform(turn, corners.mean(axis=0) - turn @ part.mean(axis=0))
+            drawn = np.asarray(procrustes(part, corners, reflection=False, scale=False, return_cost=False))
             value = joint.value(drawn)
             if (value if abs(value) > 1e-3 else way) < 0:
                 joint, value = dataclasses.replace(joint, axis=-joint.axis), -value

@@ -60,6 +60,17 @@ def test_a_ring_with_a_bridge_keeps_its_hole(tmp_path):
     assert len(mesh.faces) == 8 and np.abs(np.cross(b - a, c - a)).sum() / 2 == pytest.approx(8)
 
 
+def test_a_large_polygon_is_cut_as_a_small_one(tmp_path):
+    """A comb of 200 teeth, 1 x 9 each, on a back of 400 x 1: most triangles of a fan would lie between the teeth."""
+    teeth = [corner for k in range(0, 400, 2) for corner in ((k, 10), (k + 1, 10), (k + 1, 1), (k + 2, 1))]
+    outline = [(0, 0), *teeth[:-1], (400, 1), (400, 0)][::-1]
+    text = "".join(f"v {x} {y} 0\n" for x, y in outline) + f"f {' '.join(map(str, range(1, len(outline) + 1)))}\n"
+    mesh = read_obj(obj(tmp_path, text))
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    assert len(mesh.faces) == len(outline) - 2
+    assert np.abs(np.cross(b - a, c - a)).sum() / 2 == pytest.approx(400 + 200 * 9)
+
+
 def test_a_polygon_that_crosses_itself_is_a_fan(tmp_path):
     text = "v 0 0 0\nv 3 0 0\nv 1 1 0\nv 3 2 0\nv 2 -1 0\nf 1 2 3 4 5\n"
     assert read_obj(obj(tmp_path, text)).faces.shape == (3, 3)
