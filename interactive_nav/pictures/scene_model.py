@@ -16,7 +16,6 @@ from interactive_nav.scenes.slots import bodies_by_name
 from interactive_nav.scenes.world import World, world_poses
 from interactive_nav.sensing.boxes import FLOOR_COLOUR, PALETTES
 from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.categories import MaskClasses, class_id
 from scenes_mjcf.look import cast, geom_colour, glaze, spec_for_people
 
@@ -114,10 +113,9 @@ class SceneModel:
         self.data = mujoco.MjData(self.model)
         for name in body_names(small):  # out of sight until they are placed
             self.data.qpos[self.model.joint(f"{name}_joint").qposadr[0] + 2] = -50.0
-        mujoco.mj_kinematics(self.model, self.data)
+        detach(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
-        self._inertial_axes_b = matrix_from_quat(self.model.body_iquat)
         mine, rest = ((class_id(kind, classes), kind) for kind in ("robot", "structure"))
         robots = np.isin(self.model.geom_group, (ROBOT, ROBOT_SOLIDS))
         names = [self.model.body(int(body)).name for body in self.model.geom_bodyid]
@@ -139,33 +137,19 @@ class SceneModel:
 
     def place(self, bodies: tuple[str, ...], pos_w: np.ndarray, quat_w: np.ndarray) -> None:
         """Put B named bodies at [B, 3] m with orientations [B, 4] w x y z; the others stay at rest."""
-        model, data = self.model, self.data
-        rotation = np.zeros(9)
-        for name, pos, quat in zip(bodies, pos_w, quat_w, strict=True):
-            body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
-            if body < 0:
-                raise ConfigError(f"no body '{name}' in this scene with robot '{self.robot.name}'; record it again")
-            quat = np.asarray(quat, float)
-            mujoco.mju_quat2Mat(rotation, quat)
-            data.xpos[body], data.xquat[body], data.xmat[body] = pos, quat, rotation
-            axes = rotation.reshape(3, 3)
-            data.xipos[body] = pos + axes @ model.body_ipos[body]
-            data.ximat[body] = (axes @ self._inertial_axes_b[body]).ravel()
-            geoms, geom_pos, geom_axes = carried_geoms(model, body, np.asarray(pos)[None], axes[None])
-            data.geom_xpos[geoms], data.geom_xmat[geoms] = geom_pos[0], geom_axes[0].reshape(-1, 9)
+        ids = [mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, name) for name in bodies]
+        if -1 in ids:
+            name = bodies[ids.index(-1)]
+            raise ConfigError(f"no body '{name}' in this scene with robot '{self.robot.name}'; record it again")
+        self.model.body_pos[ids], self.model.body_quat[ids] = pos_w, quat_w
+        mujoco.mj_kinematics(self.model, self.data)
 
 
-def carried_geoms(
-    model: mujoco.MjModel, body: int, pos_w: np.ndarray, axes_w: np.ndarray
-) -> tuple[slice, np.ndarray, np.ndarray]:
-    """Return the ids of a body's geoms (g), their positions [N, g, 3] and axes [N, g, 3, 3] in N moments.
-
-    The body is at `pos_w` [N, 3], m, with `axes_w` [N, 3, 3] as columns.
-    """
-    geoms = slice(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
-    axes_w = axes_w[:, None]
-    pos = pos_w[:, None] + (axes_w @ model.geom_pos[geoms, :, None])[..., 0]
-    return geoms, pos, axes_w @ matrix_from_quat(model.geom_quat[geoms])
+def detach(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Hang each body from the world where it is, without joints: its `body_pos` and `body_quat` then place it."""
+    mujoco.mj_kinematics(model, data)
+    model.body_pos[:], model.body_quat[:] = data.xpos, data.xquat
+    model.body_parentid[:], model.body_jntnum[:] = 0, 0
 
 
 def clear_way(model: SceneModel, target_w: np.ndarray, back_w: np.ndarray) -> float:

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, ListedColormap
 from matplotlib.figure import Figure
-from PIL import Image, ImageDraw
+from PIL import Image
 
 from interactive_nav.record import write_mp4
 from interactive_nav_common import figures
@@ -80,26 +80,6 @@ def journeys_figure(
             f"{scene}, {name}: {won:,} of {len(rows):,} reached (blue; red: not)\n● start, ★ goal{whose}", fontsize=8
         )
     return figure
-
-
-def plan_picture(space: FreeSpace, graph: TopologicalMap, passable: float, height: int) -> tuple[np.ndarray, Any]:
-    """Return a picture [height, W, 3] u8 of plan and map, W even, and a function from world points to its pixels."""
-    extent = np.ptp(space.centres(0.0), axis=0) + 0.8
-    width = int(round(height * extent[0] / extent[1] / 2)) * 2
-    figure = plt.figure(figsize=(width / 100, height / 100), dpi=100)
-    axis = figure.add_axes((0, 0, 1, 1))
-    floor_plan(axis, space)
-    axis.set_aspect("auto")
-    map_lines(axis, graph, passable)
-    canvas: Any = figure.canvas
-    canvas.draw()
-    picture, placed = np.array(canvas.buffer_rgba())[..., :3], axis.transData.frozen()
-    plt.close(figure)
-
-    def pixels(xy_w: np.ndarray) -> np.ndarray:
-        return [0, height] + placed.transform(xy_w) * [1, -1]
-
-    return picture, pixels
 
 
 PALETTE = (BLUE, ORANGE, GREEN, PINK, SKY, VERMILION, "#f0e442", "#332288", "0.3")
@@ -199,7 +179,6 @@ FILM_EVERY_S = 0.5
 FILM_RATE = 20.0
 """Frames per second of film, ten times as fast as real time."""
 FILM_HEIGHT = 480
-PATH_RGB, GOAL_RGB, ROBOT_RGB = (31, 119, 180), (44, 160, 44), (214, 39, 40)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -261,27 +240,32 @@ class Driven:
         style: Any = {"mfc": "none", "mec": GREEN, "markersize": 11, "zorder": 5}
         axis.plot(*self.map.xy_w[self.goal_node], "s", label="goal's node", **style)
 
-    def frame(self, step: int, plan: np.ndarray, pixels: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """Return [H, W, 3] u8: the plan with the path so far, beside it the camera's image, if any."""
-        image = Image.fromarray(plan)
-        draw = ImageDraw.Draw(image)
-        if step:
-            draw.line([tuple(p) for p in pixels(self.xy_w[: step + 1])], fill=PATH_RGB, width=2)
-        x, y = pixels(self.journey.goal_xy_w[0])
-        draw.ellipse((x - 7, y - 7, x + 7, y + 7), outline=GOAL_RGB, width=3)
-        here, yaw = self.xy_w[step], self.yaw_rad[step]
-        nose = here + 0.5 * np.array([np.cos(yaw), np.sin(yaw)])
-        x, y = pixels(here)
-        draw.ellipse((x - 6, y - 6, x + 6, y + 6), fill=ROBOT_RGB)
-        draw.line([(x, y), tuple(pixels(nose))], fill=ROBOT_RGB, width=3)
-        caption = f"{self.venue.scene.name}  {self.time_s[step]:.0f} s  {PHASES[self.phase[step]]}"
-        draw.text((6, 4), caption, fill=(0, 0, 0))
-        view = self.views.get(step)
-        if view is None:
-            return np.asarray(image)
-        width = int(round(len(plan) * view.shape[1] / view.shape[0] / 2)) * 2
-        beside = Image.fromarray(view).resize((width, len(plan)), Image.Resampling.NEAREST)
-        return np.concatenate([np.asarray(image), np.asarray(beside)], 1)
+    def frames(self) -> Iterator[np.ndarray]:
+        """Yield [H, W, 3] u8, even-sided: plan and map with the path so far, beside them the camera's image, if any."""
+        extent = np.ptp(self.venue.space.centres(0.0), axis=0) + 0.8
+        width = int(round(FILM_HEIGHT * extent[0] / extent[1] / 2)) * 2
+        figure = plt.figure(figsize=(width / 100, FILM_HEIGHT / 100), dpi=100)
+        axis, canvas = figure.add_axes((0, 0, 1, 1)), figure.canvas
+        floor_plan(axis, self.venue.space)
+        axis.set_aspect("auto")
+        map_lines(axis, self.map, self.venue.contest.config.passable)
+        axis.plot(*self.journey.goal_xy_w[0], "o", mfc="none", mec=GREEN, mew=2, markersize=9, zorder=4)
+        (path,) = axis.plot([], color=BLUE, linewidth=1.5, zorder=3)
+        (robot,) = axis.plot([], "o-", color=VERMILION, linewidth=2.2, markersize=9, markevery=[0], zorder=5)
+        caption = axis.text(0.01, 0.99, "", fontsize=8, va="top", transform=axis.transAxes)
+        for step in range(0, len(self.time_s), _film_every(self.venue)):
+            here, yaw = self.xy_w[step], self.yaw_rad[step]
+            path.set_data(*self.xy_w[: step + 1].T)
+            robot.set_data(*np.transpose([here, here + 0.5 * np.array([np.cos(yaw), np.sin(yaw)])]))
+            caption.set_text(f"{self.venue.scene.name}  {self.time_s[step]:.0f} s  {PHASES[self.phase[step]]}")
+            canvas.draw()
+            frame = np.array(canvas.buffer_rgba())[..., :3]  # type: ignore[attr-defined]
+            if (view := self.views.get(step)) is not None:
+                side = int(round(FILM_HEIGHT * view.shape[1] / view.shape[0] / 2)) * 2
+                beside = Image.fromarray(view).resize((side, FILM_HEIGHT), Image.Resampling.NEAREST)
+                frame = np.concatenate([frame, np.asarray(beside)], 1)
+            yield frame
+        plt.close(figure)
 
 
 def drive_episode(venue: ContestScene, contender: str, number: int, filmed: bool, progress: Progress) -> Driven:
@@ -342,7 +326,5 @@ def _film_every(venue: ContestScene) -> int:
 
 def film(driven: Driven, path: Path) -> int:
     """Write a film, the plan beside the camera's images; return the number of frames."""
-    plan, pixels = plan_picture(driven.venue.space, driven.map, driven.venue.contest.config.passable, FILM_HEIGHT)
-    steps = range(0, len(driven.time_s), _film_every(driven.venue))
     with whole_file(path) as partial:
-        return write_mp4((driven.frame(step, plan, pixels) for step in steps), partial, FILM_RATE)
+        return write_mp4(driven.frames(), partial, FILM_RATE)

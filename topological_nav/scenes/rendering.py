@@ -17,14 +17,13 @@ import mujoco
 import numpy as np
 
 from interactive_nav import InteractiveNav, make
-from interactive_nav.pictures.scene_model import SCENE, carried_geoms, picture_spec
+from interactive_nav.pictures.scene_model import SCENE, detach, picture_spec
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import SmallObject, body_names
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import World, world_poses
 from interactive_nav.types import LOST, EpisodeStart
 from interactive_nav_common.errors import UserError, missing, optional
-from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.look import CameraPose, GlPainter, Lens, look_along
 
 CPU_IMAGES = (1, 2, 6, 18)
@@ -85,6 +84,7 @@ class SceneRenderer:
         for name in body_names(small):
             self._data.qpos[self._model.joint(f"{name}_joint").qposadr[0] + 2] = HIDDEN_M
         mujoco.mj_forward(self._model, self._data)
+        detach(self._model, self._data)
         self._sizes = batch_sizes(self._large, jax.default_backend()) if engine == "warp" else (1,)
         self._painter = functools.cache(
             functools.partial(_painter, engine, self._model, self._data, self._large, supersample)
@@ -101,15 +101,17 @@ class SceneRenderer:
 
     def _geoms(self, count: int, bodies: Bodies | None) -> tuple[np.ndarray, np.ndarray]:
         """Return positions [count, ngeom, 3] and axes [count, ngeom, 3, 3]."""
-        xpos = np.tile(self._data.geom_xpos.astype(np.float32), (count, 1, 1))
-        xmat = np.tile(self._data.geom_xmat.reshape(-1, 3, 3).astype(np.float32), (count, 1, 1, 1))
-        names, pos_w, quat_w = bodies or ((), xpos, xpos)
-        for i, name in enumerate(names):
-            body = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_BODY, name)
-            if body > 0:
-                axes_w = matrix_from_quat(quat_w[:, i])
-                geoms, pos, axes = carried_geoms(self._model, body, pos_w[:, i], axes_w)
-                xpos[:, geoms], xmat[:, geoms] = pos, axes
+        model, data = self._model, self._data
+        at_rest = model.body_pos.copy(), model.body_quat.copy()
+        names, pos_w, quat_w = bodies or ((), np.empty((count, 0, 3)), np.empty((count, 0, 4)))
+        ids = np.array([mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in names], int)
+        there, geoms = ids > 0, []
+        for pos, quat in zip(pos_w, quat_w, strict=True):
+            model.body_pos[ids[there]], model.body_quat[ids[there]] = pos[there], quat[there]
+            mujoco.mj_kinematics(model, data)
+            geoms.append((data.geom_xpos.astype(np.float32), data.geom_xmat.reshape(-1, 3, 3).astype(np.float32)))
+        model.body_pos[:], model.body_quat[:] = at_rest
+        xpos, xmat = map(np.stack, zip(*geoms, strict=True))
         return xpos, xmat
 
 

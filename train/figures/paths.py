@@ -140,8 +140,5 @@ def spread_episodes(paths: Mapping[str, np.ndarray], most: int) -> Sequence[int]
         begin, end = paths[f"{policy}/object_start_w"], paths[f"{policy}/object_end_w"]
         moved = np.maximum(moved, np.linalg.norm(end - begin, axis=-1).clip(max=5.0).sum(-1))
     order = np.argsort(-moved, kind="stable")
-    count: dict[int, int] = {}
-    rank = {}
-    for i in order:
-        rank[i] = count[int(scene[i])] = count.get(int(scene[i]), -1) + 1
-    return sorted(sorted(order, key=lambda i: rank[i])[:most])
+    rank = [(scene[order[:k]] == scene[i]).sum() for k, i in enumerate(order)]
+    return sorted(order[np.argsort(rank, kind="stable")][:most])

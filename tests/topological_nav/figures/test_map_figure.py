@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.collections import LineCollection
 
-from topological_nav.figures.maps import map_figure
+from topological_nav.figures.maps import Driven, map_figure
 from topological_nav.scenes.space import FreeSpace
 
 
@@ -45,3 +45,27 @@ def test_two_maps_stand_side_by_side():
     assert np.asarray(ways.get_array()).tolist() == [0.1, 0.5, 0.8, 0.9]
     np.testing.assert_array_equal(ways.get_segments()[-1], [[1, 1], [2, 1]])
     plt.close("all")
+
+
+def test_a_film_shows_where_the_robot_is_and_the_camera_s_image_beside_the_plan():
+    there, steps = built(), 11
+    venue = SimpleNamespace(
+        space=there.space,
+        contest=SimpleNamespace(config=SimpleNamespace(passable=0.5)),
+        scene=SimpleNamespace(name="room"),
+        player=SimpleNamespace(env=SimpleNamespace(dt=0.1)),
+    )
+    xy_w = np.stack([np.linspace(1.0, 5.0, steps), np.full(steps, 2.0)], -1)
+    episode = SimpleNamespace(goal_xy_w=np.array([[5.0, 3.0]]))
+    moment, views = 0.1 * np.arange(steps), {10: np.full((30, 40, 3), 77, np.uint8)}
+    yaw_rad = np.full(steps, np.pi)
+    state: Any = venue, there.map, episode, None, 3, moment, xy_w, yaw_rad, np.zeros(steps, int), views, np.zeros(0), []
+    first, _, last = Driven(*state).frames()
+    assert (last[:, len(last[0]) - 640 :] == 77).all()  # 480 pixels high, as the plan, and 4 : 3
+    np.testing.assert_array_equal(np.shape(first), (480, len(last[0]) - 640, 3))
+    for frame, (x, y) in ((first, xy_w[0]), (last[:, :-640], xy_w[10])):
+        red = np.asarray((np.abs(frame - np.array([0xD5, 0x5E, 0x00])) < 3).all(-1))
+        rows, columns = np.nonzero(red)
+        # The plan spans 6.7 x 5.3 m, with half a metre for the bar below; the line ahead reaches to the left.
+        middle_x, middle_y = columns.max() / red.shape[1], np.median(rows) / red.shape[0]
+        assert abs(middle_x - (x + 0.35) / 6.7) < 0.02 and abs(middle_y - (4.35 - y) / 5.3) < 0.02
