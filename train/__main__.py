@@ -1,10 +1,11 @@
 """Run `python -m train`: train as the command line says, write a run folder and return an exit code."""
 
 import dataclasses
+import functools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from interactive_nav_common.commands import Command, Flag, Words, option, parse
 from interactive_nav_common.errors import ConfigError, reports_errors
@@ -61,10 +62,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Heavy: after the config has been checked.
     from train.runs.processes import one_for_each_gpu
     from train.runs.run import train_run
+    from train.scoring.teacher import TaughtEnv
 
+    teacher = config.clone.teacher
+    built: Any = {"build_env": functools.partial(TaughtEnv, teacher)} if teacher else {}
     command = [sys.executable, "-m", "train", *(sys.argv[1:] if argv is None else argv)]
     with one_for_each_gpu(config.run.devices, command):
-        _, _, stopped_by = train_run(config, SafeConsole(), resume_from=arguments.checkpoint)
+        _, _, stopped_by = train_run(config, SafeConsole(), resume_from=arguments.checkpoint, **built)
     return 128 + stopped_by if stopped_by else 0
 
 

@@ -44,8 +44,7 @@ class NetworkConfig(Settings):
     share_encoder: bool = False
     """Actor and critic look through one encoder; SAC and DDPG train it with the critic."""
     critic_inputs: Literal["all", "state", "privileged"] = "all"
-    """state: the critic takes the vector alone, the actor everything (not with share_encoder); privileged: vector and
-    true state, ppo only."""
+    """Inputs of the critic: state, the vector; privileged (ppo), vector and true state. Not with share_encoder."""
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     """Arithmetic of the image encoder; parameters stay float32."""
     memory: Literal["none", "gru"] = "none"
@@ -63,10 +62,8 @@ class NetworkConfig(Settings):
                 f"{len(self.conv_kernels)} and {len(self.conv_strides)} entries, expected the same number, at least 1"
             )
         if self.share_encoder and self.critic_inputs != "all":
-            raise ConfigError(
-                f"share_encoder is true and critic_inputs is {self.critic_inputs!r}, expected 'all': "
-                "who shares an encoder sees the same"
-            )
+            got = f"share_encoder is true and critic_inputs is {self.critic_inputs!r}"
+            raise ConfigError(f"{got}, expected 'all': who shares an encoder sees the same")
 
 
 OF_MEMORY = ("memory", "memory_size", "state_features", "share_encoder")
@@ -208,10 +205,16 @@ class DDPGConfig(OffPolicyConfig):
 
 @dataclasses.dataclass(frozen=True)
 class CloneConfig(Settings):
-    """Behavioural cloning: PPO's policy network learns recorded actions by maximum likelihood."""
+    """Behavioural cloning: PPO's policy network learns recorded actions, or a teacher's, by maximum likelihood."""
 
     demonstrations: str = ""
     """Parquet file of `python -m train.evaluate --demonstrations`."""
+    teacher: str = ""
+    """Who labels the states that the student visits (DAgger): avoider, namo:W, follower, or a run folder."""
+    student_share: Share = 1.0
+    """Share of control steps that the student drives; the teacher drives the others."""
+    buffer_steps: AtLeastOne = 100_000
+    """Newest labelled control steps to keep."""
     episodes: Literal["successful", "all"] = "successful"
     """Episodes to learn from."""
     num_envs: AtLeastOne | None = None
@@ -231,6 +234,11 @@ class CloneConfig(Settings):
     policy_hidden_layer_sizes: tuple[AtLeastOne, ...] = (256, 256)
     """Widths of the policy network, behind its encoder if there are images."""
 
+    IDLE = (
+        ("student_share buffer_steps", "a teacher", lambda c: c.teacher),
+        ("demonstrations episodes", "no teacher", lambda c: not c.teacher),
+    )
+
 
 @dataclasses.dataclass(frozen=True)
 class RunConfig(Settings):
@@ -242,6 +250,8 @@ class RunConfig(Settings):
     """Folder of this run inside out_dir; empty: <config name>-seed<seed>."""
     seed: Seed = 0
     """Seed of networks, environments and sampling."""
+    init: str = ""
+    """Run folder (ppo or clone) whose best policy a new run starts from; critic and optimiser are new."""
     devices: AtLeastOne = 1
     """Devices that share environments and minibatches, with a process per GPU; ppo only."""
     num_timesteps: AtLeastOne = 20_000_000
@@ -270,10 +280,8 @@ class RunConfig(Settings):
         if self.name:
             check_name(self.name, "name", ConfigError)
         if self.checkpoint_every_steps < self.log_every_steps:
-            raise ConfigError(
-                f"checkpoint_every_steps is {self.checkpoint_every_steps}, "
-                f"expected at least log_every_steps ({self.log_every_steps})"
-            )
+            least = f"expected at least log_every_steps ({self.log_every_steps})"
+            raise ConfigError(f"checkpoint_every_steps is {self.checkpoint_every_steps}, {least}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -338,10 +346,8 @@ def validate(config: TrainConfig) -> None:
             "whole sequences; set network.memory=none, or algorithm=ppo, sac or ddpg"
         )
     if config.network.critic_inputs == "privileged" and config.algorithm != "ppo":
-        raise ConfigError(
-            f"network.critic_inputs is 'privileged' with algorithm {config.algorithm}, expected algorithm ppo; set "
-            "network.critic_inputs=all, or algorithm=ppo"
-        )
+        problem = f"network.critic_inputs is 'privileged' with algorithm {config.algorithm}"
+        raise ConfigError(f"{problem}, expected algorithm ppo; set network.critic_inputs=all, or algorithm=ppo")
     if isinstance(section, OffPolicyConfig):
         _validate_replay(config.algorithm, section, config.run.num_timesteps, remembers)
     ppo = config.ppo
@@ -358,10 +364,8 @@ def validate(config: TrainConfig) -> None:
 
 def _validate_devices(name: str, ppo: PPOConfig, devices: int) -> None:
     if name != "ppo":
-        raise ConfigError(
-            f"run.devices is {devices}, expected 1 with algorithm {name}: its replay stays on one device; "
-            "set run.devices=1, or algorithm=ppo"
-        )
+        got = f"run.devices is {devices}, expected 1 with algorithm {name}"
+        raise ConfigError(f"{got}: its replay stays on one device; set run.devices=1, or algorithm=ppo")
     for key, value in (("num_envs", ppo.num_envs), ("batch_size", ppo.batch_size)):
         if value and value % devices:
             raise ConfigError(
@@ -376,10 +380,8 @@ def _validate_replay(name: str, config: OffPolicyConfig, num_timesteps: int, rem
             problem = f"{name}.{key} is {value!r}, which changes nothing here"
             raise ConfigError(f"{problem}: expected network.memory 'gru'; or leave it out")
     if config.min_replay_size and config.min_replay_size >= num_timesteps:
-        raise ConfigError(
-            f"{name}.min_replay_size is {config.min_replay_size}, expected less than run.num_timesteps "
-            f"({num_timesteps}): nothing would be learned"
-        )
+        got = f"{name}.min_replay_size is {config.min_replay_size}, expected less than run.num_timesteps"
+        raise ConfigError(f"{got} ({num_timesteps}): nothing would be learned")
     if not (config.num_envs and config.min_replay_size and config.max_replay_size and config.steps_per_update):
         return
     slots = config.replay_slots

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from interactive_nav.robots import robot_name
 from interactive_nav_common.config import Natural
 from interactive_nav_common.errors import UserError, regular
 from interactive_nav_common.files import check_name, remove_stale, whole_folder, write_text, writing
@@ -25,6 +26,7 @@ from interactive_nav_common.runs import weights
 from interactive_nav_common.runs.folder import GOES_ON
 from interactive_nav_common.runs.weights import write_state
 from interactive_nav_common.untrusted.reading import read_npz
+from train.config import EnvConfig
 from train.runs import STEP
 from train.runs.run_folder import RunFolder
 
@@ -237,6 +239,22 @@ def load_env_state(folder: Path, template: Any) -> Any | None:
         for array, leaf in zip(arrays, leaves, strict=True)
     ]
     return jax.tree.unflatten(structure, restored)
+
+
+def check_fits(meta: CheckpointMeta, path: Path, config: EnvConfig, env: Any) -> None:
+    """Raise `CheckpointError` where a checkpoint was trained on another robot or other observations."""
+    facts = (
+        ("robot", meta.robot, robot_name(config.robot)),
+        ("observations", meta.observations, config.observations),
+        ("observation size", meta.observation_size, plain_size(env.observation_size)),
+        ("action size", meta.action_size, int(env.action_size)),
+    )
+    for name, got, expected in facts:
+        if got != expected:
+            raise CheckpointError(
+                f"{path}: {name} of the checkpoint: {got!r}, of the environment: {expected!r}; "
+                "choose a checkpoint of this robot and these observations, or the run's env settings"
+            )
 
 
 def plain_size(size: int | Mapping[str, tuple[int, ...]]) -> int | dict[str, list[int]]:

@@ -103,7 +103,7 @@ class FolderCallbacks:
         """Return the newest intact checkpoint of the folder, or the one that was requested; None: there is none."""
         checkpoint.remove_partial(self.folder.checkpoints)
         if self.resume_from == "last" and not any(self.folder.checkpoints.glob("[0-9]*")):
-            return None
+            return with_policy_of_init(template, self.config, self.env) if self.config.run.init else None
         with warnings.catch_warnings(record=True) as passed_over:
             path, meta = checkpoint.find(self.folder.checkpoints, self.resume_from)
         for warning in passed_over:
@@ -113,7 +113,7 @@ class FolderCallbacks:
                 f"{path}: holds the policy alone, as `train.sweep --export` writes it, expected all of the learner to "
                 "go on from; train into another folder (run.out_dir, run.name)"
             )
-        check_fits(meta, path, self.config.env, self.env)
+        checkpoint.check_fits(meta, path, self.config.env, self.env)
         for name, digest in meta.scenes.items():
             if self._scenes.get(name, digest) != digest:
                 raise CheckpointError(
@@ -211,20 +211,49 @@ class FolderCallbacks:
             log.close()
 
 
-def check_fits(meta: CheckpointMeta, path: Path, config: EnvConfig, env: Any) -> None:
-    """Raise `CheckpointError` where a checkpoint was trained on another robot or other observations."""
-    facts = (
-        ("robot", meta.robot, robot_name(config.robot)),
-        ("observations", meta.observations, config.observations),
-        ("observation size", meta.observation_size, checkpoint.plain_size(env.observation_size)),
-        ("action size", meta.action_size, int(env.action_size)),
-    )
-    for name, got, expected in facts:
-        if got != expected:
-            raise CheckpointError(
-                f"{path}: {name} of the checkpoint: {got!r}, of the environment: {expected!r}; "
-                "choose a checkpoint of this robot and these observations, or the run's env settings"
-            )
+def settings_of_actions(config: EnvConfig) -> dict[str, Any]:
+    """Return the settings that decide what an action commands."""
+    return {f"env.{name}": getattr(config, name) for name in ("control_mode", "symmetric_actions")}
+
+
+def settings_of_policy(config: TrainConfig) -> dict[str, Any]:
+    """Return the settings that decide what a policy's parameters mean."""
+    section, network = getattr(config, config.algorithm), dataclasses.asdict(config.network)
+    names = "policy_hidden_layer_sizes", "normalize_observations"
+    own = {f"{config.algorithm}.{name}": getattr(section, name) for name in names}
+    of_critic = ("critic_inputs", "action_features", "compute_dtype")  # the last changes no parameter
+    of_network = {f"network.{name}": value for name, value in network.items() if name not in of_critic}
+    return settings_of_actions(config.env) | of_network | own
+
+
+def check_alike(setting: str, folder: RunFolder, expected: dict[str, Any], got: dict[str, Any]) -> None:
+    """Raise `ConfigError` where a run that `setting` names has other values."""
+    for (name, value), wanted in zip(got.items(), expected.values(), strict=True):
+        if value != wanted:
+            problem = f"{setting}: {name} is {value!r}, expected {wanted!r}, as in {folder.path}"
+            raise ConfigError(f"{problem}; set it so, or choose another run")
+
+
+def check_init(config: TrainConfig, env: Any) -> tuple[TrainConfig, Path]:
+    """Return config and best checkpoint of the run `run.init`; raise `ConfigError` where its policy does not fit."""
+    folder = RunFolder(Path(config.run.init))
+    old = folder.read_config()
+    if not {config.algorithm, old.algorithm} <= {"ppo", "clone"}:
+        got = f"algorithm is {config.algorithm}, and that of {folder.path} {old.algorithm}"
+        raise ConfigError(f"run.init: {got}, expected ppo or clone for both; leave it out")
+    check_alike("run.init", folder, settings_of_policy(old), settings_of_policy(config))
+    path, meta = checkpoint.find(folder.checkpoints, "best")
+    checkpoint.check_fits(meta, path, config.env, env)
+    return old, path
+
+
+def with_policy_of_init(template: Snapshot, config: TrainConfig, env: Any) -> Snapshot:
+    """Return the template with the policy and the normaliser of the run `run.init`."""
+    config, path = check_init(config, env)
+    old, new = checkpoint.load_learner(path, ALGORITHMS[config.algorithm].template(env, config)), template.learner
+    params = old.params.replace(value=new.params.value)
+    learner = new.replace(params=params, normalizer_params=old.normalizer_params)
+    return dataclasses.replace(template, learner=learner)
 
 
 def train_run(
@@ -250,11 +279,14 @@ def train_run(
         claim(folder.path)
         try:
             devices_here(config.run.devices)  # before tables are computed
-            if config.algorithm == "clone" and not Path(config.clone.demonstrations).is_file():
-                got = f"clone.demonstrations is {config.clone.demonstrations!r}"
-                raise ConfigError(f"{got}, expected the file that python -m train.evaluate --demonstrations FILE wrote")
+            clone = config.clone
+            if config.algorithm == "clone" and not clone.teacher and not Path(clone.demonstrations).is_file():
+                got = f"clone.demonstrations is {clone.demonstrations!r}, expected the file that"
+                raise ConfigError(f"{got} python -m train.evaluate --demonstrations FILE wrote; or set clone.teacher")
             env = build_env(config.env)
             config = resolve(config, env.backend)
+            if config.run.init and not folder.config.is_file():
+                check_init(config, env)
         except UserError:
             # Nothing half-built stays behind: `rmdir` takes only empty folders.
             with contextlib.suppress(OSError):

@@ -23,8 +23,7 @@ from train.learners import demonstrations
 from train.learners.algorithms import ALGORITHMS
 from train.learners.memory import RecurrentPolicy
 from train.runs import checkpoint
-from train.runs.checkpoint import CheckpointMeta
-from train.runs.run import check_fits
+from train.runs.checkpoint import CheckpointMeta, check_fits
 from train.runs.run_folder import EvaluationRequest, RunFolder
 from train.scoring import AUTO_BATCH, LEARNED
 from train.scoring.brought import BroughtPolicy

@@ -52,7 +52,7 @@ def make_follower(env: Any) -> PolicyFn:
     if "waypoints" not in config.observations:
         raise UserError(
             f"policy follower: observations are {', '.join(config.observations)}, "
-            "expected waypoints among them; leave it out of --policies"
+            "expected waypoints among them; choose another policy"
         )
     first = 2 * min(max(round(LOOK_AHEAD_M / config.waypoint_spacing_m), 1), config.num_waypoints) - 2
 
@@ -91,7 +91,7 @@ def need_twist(robot: RobotSpec, who: str) -> None:
     if robot.twist is None:
         raise UserError(
             f"{who}: robot '{robot.name}' takes no base velocity in control mode '{robot.control_mode}', expected one "
-            "of its modes that does; leave it out of --policies"
+            "of its modes that does; choose another policy"
         )
 
 
@@ -134,7 +134,8 @@ class Planner(HostPolicy):
         linear, angular = np.zeros(len(pos)), np.zeros(len(pos))
         for i in np.flatnonzero(running):
             plan = self._plans.get(int(episode[i]))
-            if plan is None or (step - plan.step >= REPLAN_STEPS and self._stale(plan, pos[i], objects[i])):
+            started = nav.step_count[i] == 0  # a teacher's environments go through many episodes
+            if plan is None or started or (step - plan.step >= REPLAN_STEPS and self._stale(plan, pos[i], objects[i])):
                 path = self._ways.way(int(scene[i]), qpos[i], pos[i], goal[i])
                 self.plans += 1
                 self.no_path += not len(path)

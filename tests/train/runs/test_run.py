@@ -31,8 +31,8 @@ from train.config import resolve
 from train.config_io import from_yaml
 from train.learners.learner import DivergedError
 from train.runs import checkpoint, run, run_folder
-from train.runs.checkpoint import CheckpointError
-from train.runs.run import check_fits, failures, train_run
+from train.runs.checkpoint import CheckpointError, check_fits
+from train.runs.run import failures, train_run
 from train.runs.run_folder import RunFolder, claim
 
 
