@@ -48,6 +48,8 @@ def build_env(config: EnvConfig) -> Any:
         raise ConfigError(f"env: {error}") from error
 
 
+OF_CRITIC = ("network.critic_inputs", "network.action_features", "network.compute_dtype")
+"""Settings of networks that may differ where a run starts from another one's policy."""
 SIZES = (*WINDOW, "active_dofs")
 """Settings of MJX that `native` does not take."""
 
@@ -211,29 +213,6 @@ class FolderCallbacks:
             log.close()
 
 
-def settings_of_actions(config: EnvConfig) -> dict[str, Any]:
-    """Return the settings that decide what an action commands."""
-    return {f"env.{name}": getattr(config, name) for name in ("control_mode", "symmetric_actions")}
-
-
-def settings_of_policy(config: TrainConfig) -> dict[str, Any]:
-    """Return the settings that decide what a policy's parameters mean."""
-    section, network = getattr(config, config.algorithm), dataclasses.asdict(config.network)
-    names = "policy_hidden_layer_sizes", "normalize_observations"
-    own = {f"{config.algorithm}.{name}": getattr(section, name) for name in names}
-    of_critic = ("critic_inputs", "action_features", "compute_dtype")  # the last changes no parameter
-    of_network = {f"network.{name}": value for name, value in network.items() if name not in of_critic}
-    return settings_of_actions(config.env) | of_network | own
-
-
-def check_alike(setting: str, folder: RunFolder, expected: dict[str, Any], got: dict[str, Any]) -> None:
-    """Raise `ConfigError` where a run that `setting` names has other values."""
-    for (name, value), wanted in zip(got.items(), expected.values(), strict=True):
-        if value != wanted:
-            problem = f"{setting}: {name} is {value!r}, expected {wanted!r}, as in {folder.path}"
-            raise ConfigError(f"{problem}; set it so, or choose another run")
-
-
 def check_init(config: TrainConfig, env: Any) -> tuple[TrainConfig, Path]:
     """Return config and best checkpoint of the run `run.init`; raise `ConfigError` where its policy does not fit."""
     folder = RunFolder(Path(config.run.init))
@@ -241,7 +220,14 @@ def check_init(config: TrainConfig, env: Any) -> tuple[TrainConfig, Path]:
     if not {config.algorithm, old.algorithm} <= {"ppo", "clone"}:
         got = f"algorithm is {config.algorithm}, and that of {folder.path} {old.algorithm}"
         raise ConfigError(f"run.init: {got}, expected ppo or clone for both; leave it out")
-    check_alike("run.init", folder, settings_of_policy(old), settings_of_policy(config))
+    mine, theirs = flatten(config), flatten(old)
+    names = ["env.control_mode", "env.symmetric_actions", *(name for name in mine if name.startswith("network."))]
+    pairs = [(name, name) for name in names if name not in OF_CRITIC]
+    of_both = "policy_hidden_layer_sizes", "normalize_observations"
+    for name, there in [*pairs, *((f"{config.algorithm}.{n}", f"{old.algorithm}.{n}") for n in of_both)]:
+        if mine[name] != theirs[there]:
+            problem = f"run.init: {name} is {mine[name]!r}, expected {theirs[there]!r}, as in {folder.path}"
+            raise ConfigError(f"{problem}; set it so, or choose another run")
     path, meta = checkpoint.find(folder.checkpoints, "best")
     checkpoint.check_fits(meta, path, config.env, env)
     return old, path

@@ -1,8 +1,6 @@
-"""Let a teacher, a planner or another run's policy, label the states that a student visits (`clone.teacher`)."""
+"""Let a planner label the states that a student visits (`clone.teacher`)."""
 
-import dataclasses
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,14 +9,9 @@ import numpy as np
 from brax.envs.base import Wrapper
 from jax.experimental import io_callback
 
-from interactive_nav.config import SensorConfig
-from interactive_nav_common.config import replace
 from interactive_nav_common.errors import ConfigError
 from train.config import EnvConfig
-from train.learners.memory import RecurrentPolicy, lost
-from train.runs.run import build_env, check_alike, settings_of_actions
-from train.runs.run_folder import RunFolder
-from train.scoring.evaluation import load_policy
+from train.runs.run import build_env
 from train.scoring.policies import Planner, make_baseline
 
 Teach = Callable[[Any, jax.Array], jax.Array]
@@ -29,43 +22,19 @@ class TaughtEnv(Wrapper):
     """One environment with `teach`, which returns what the teacher would do in its states."""
 
     def __init__(self, teacher: str, config: EnvConfig, build_env: Callable[[EnvConfig], Any] = build_env):
-        """Build an environment and its teacher: a planner or baseline by name, or a run folder."""
+        """Build an environment and its teacher, a planner or baseline by name."""
         super().__init__(build_env(config))
-        self.teach: Teach
-        if teacher in ("avoider", "follower") or teacher.startswith("namo:"):
-            policy = make_baseline(teacher, self.env)
-            self.teach = _on_host(policy, self.env) if isinstance(policy, Planner) else _batched(policy)
-        elif Path(teacher).is_dir():
-            self.teach = _of_run(RunFolder(Path(teacher)), config, self.env, build_env)
-        else:
-            raise ConfigError(f"clone.teacher is {teacher!r}, expected avoider, namo:W, follower, or a run folder")
+        if teacher not in ("avoider", "follower") and not teacher.startswith("namo:"):
+            raise ConfigError(f"clone.teacher is {teacher!r}, expected avoider, namo:W or follower")
+        policy = make_baseline(teacher, self.env)
+        self.teach: Teach = _on_host(policy, self.env) if isinstance(policy, Planner) else _batched(policy)
 
 
-def _batched(policy: Any, see: Callable[[Any], Any] = lambda state: state.obs) -> Teach:
+def _batched(policy: Any) -> Teach:
     def teach(state: Any, key: jax.Array) -> jax.Array:
-        keys = jax.random.split(key, state.done.shape[0])
-        return jax.vmap(lambda state, key: policy(see(state), key))(state, keys)
+        return jax.vmap(policy)(state.obs, jax.random.split(key, state.done.shape[0]))
 
     return teach
-
-
-def _of_run(folder: RunFolder, config: EnvConfig, env: Any, build_env: Callable[[EnvConfig], Any]) -> Teach:
-    """Return a run's best policy, which observes the student's world with its own sensors, without delay."""
-    run = folder.read_config()
-    check_alike("clone.teacher", folder, settings_of_actions(run.env), settings_of_actions(config))
-    sensors = {field.name: getattr(run.env, field.name) for field in dataclasses.fields(SensorConfig)}
-    world = replace(config, **sensors, random_sensor_delay_steps=(0, 0))
-    seen = build_env(world)
-    policy, _ = load_policy(folder, dataclasses.replace(run, env=world), seen, "best", deterministic=True)
-    if isinstance(policy, RecurrentPolicy):
-        raise lost("a teacher")
-    kept, read = ({t.key for t in getattr(each, "terms", ()) if t.start} for each in (env, seen))
-    if lacking := read - kept:
-        raise ConfigError(
-            f"clone.teacher: {folder.path} observes {', '.join(sorted(lacking))}, which the student's environment does "
-            "not keep; add it to env.observations, or choose another teacher"
-        )
-    return _batched(policy, lambda state: seen.observe(state).obs)
 
 
 def _on_host(planner: Planner, env: Any) -> Teach:
