@@ -21,7 +21,7 @@ from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import FLOOR_FRICTION, build_world
 from interactive_nav.task.dynamics import Dynamics
-from interactive_nav.task.terms import _masses_kg
+from interactive_nav.task.terms import masses_kg
 from interactive_nav.task.wrappers import AutoResetEnv, reset_where, wrap_for_brax_training
 from interactive_nav.types import EpisodeDynamics, SceneTables
 from interactive_nav_common.errors import ConfigError
@@ -206,7 +206,7 @@ def test_scores_weigh_objects_by_their_drawn_masses():
     drawn = EpisodeDynamics({"random_mass": jnp.asarray(2.0)}, None, None)
     tables = SimpleNamespace(mass_kg=jnp.asarray([[7.0, 1.0, 3.0]]))
     step = SimpleNamespace(tables=tables, score_mass_kg=5.0, nav=SimpleNamespace(scene_index=0, dynamics=drawn))
-    np.testing.assert_allclose(_masses_kg(step), [5.0, 2.0, 6.0])  # type: ignore[arg-type]
+    np.testing.assert_allclose(masses_kg(step), [5.0, 2.0, 6.0])  # type: ignore[arg-type]
     assert "mass_kg" in SceneTables.__dataclass_fields__
 
 
