@@ -44,7 +44,7 @@ class NetworkConfig(Settings):
     share_encoder: bool = False
     """Actor and critic look through one encoder; SAC and DDPG train it with the critic."""
     critic_inputs: Literal["all", "state", "privileged"] = "all"
-    """Inputs of the critic: state, the vector; privileged (ppo), vector and true state. Not with share_encoder."""
+    """What the critic takes: all that the actor sees, the vector alone, or the vector and the true state (ppo only)."""
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     """Arithmetic of the image encoder; parameters stay float32."""
     memory: Literal["none", "gru"] = "none"

@@ -149,7 +149,7 @@ def detach(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Hang each body from the world where it is, without joints: its `body_pos` and `body_quat` then place it."""
     mujoco.mj_kinematics(model, data)
     model.body_pos[:], model.body_quat[:] = data.xpos, data.xquat
-    model.body_parentid[:], model.body_jntnum[:] = 0, 0
+    model.body_parentid[:], model.body_jntnum[:], model.dof_armature[:] = 0, 0, 1  # `mj_forward` still inverts dofs
 
 
 def clear_way(model: SceneModel, target_w: np.ndarray, back_w: np.ndarray) -> float:

@@ -213,7 +213,7 @@ class InteractiveNav(Env):
     privileged_size = PRIVILEGED_SIZE
 
     def privileged(self, state: State) -> jax.Array:
-        """Return the true state."""
+        """Return the true state (`privileged_size`,) f32 of one environment; see `privileged_state`."""
         return privileged_state(self._moment(state), self.sensors.boxes, self._half_m)
 
     def advance(self, state: State, action: jax.Array) -> State:

@@ -1,7 +1,7 @@
 """Clone behaviour: fit PPO's policy network to actions by maximum likelihood.
 
-Either they are recorded, and environments only score the policy; or a teacher's, in states that the policy visits
-(DAgger: Ross, Gordon and Bagnell 2011). Each update is then a round, and the newest `clone.buffer_steps` are kept.
+The actions are recorded ones, and environments only score the policy; or a teacher chooses them in states that the
+policy visits (DAgger: Ross, Gordon and Bagnell 2011), one round an update, of which `clone.buffer_steps` are kept.
 """
 
 import dataclasses

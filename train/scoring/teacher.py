@@ -15,7 +15,7 @@ from train.runs.run import build_env
 from train.scoring.policies import Planner, make_baseline
 
 Teach = Callable[[Any, jax.Array], jax.Array]
-"""(states of N environments, key) -> actions [N, A]; pure but for planners, which run on the host."""
+"""(states of N environments, key) -> actions [N, A] in [-1, 1]; planners run on the host, so they are not pure."""
 
 
 class TaughtEnv(Wrapper):

@@ -10,6 +10,7 @@ import sys
 import imageio_ffmpeg
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 import shapely
@@ -29,7 +30,7 @@ from interactive_nav.pictures.camera import (
     robot_camera,
 )
 from interactive_nav.pictures.replay import EpisodePlayer, ReplayError
-from interactive_nav.pictures.scene_model import SCENE
+from interactive_nav.pictures.scene_model import SCENE, detach
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import load_scene
@@ -400,3 +401,16 @@ def test_gymnasium_renders_the_view_from_behind(room):
     assert yaw_from_quat(np.array([math.cos(0.4), 0, 0, math.sin(0.4)])) == pytest.approx(0.8)
     with pytest.raises(UserError, match="render_mode is 'human', expected one of rgb_array"):
         gym_env.InteractiveNavEnv("turtlebot", [str(room)], **{**settings, "render_mode": "human"})
+
+
+def test_detached_bodies_are_placed_one_by_one_and_mujoco_does_not_complain():
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body name="arm" pos="1 0 0"><joint/>
+      <geom size=".1" mass="1"/><body name="hand" pos="0 2 0"><joint axis="1 0 0"/>
+      <geom size=".1" mass="1" pos="0 0 3"/></body></body></worldbody></mujoco>""")
+    data = mujoco.MjData(model)
+    detach(model, data)
+    assert data.body("hand").xpos.tolist() == [1, 2, 0] and data.geom_xpos[1].tolist() == [1, 2, 3]
+    model.body("arm").pos[:] = 5, 5, 5
+    mujoco.mj_forward(model, data)  # as the renderer of MJX-Warp does
+    assert data.geom_xpos.tolist() == [[5, 5, 5], [1, 2, 3]]
+    assert [warning.number for warning in data.warning] == [0] * len(data.warning)
