@@ -6,18 +6,21 @@ without inertia take that of their shapes; driven joints get a servo. Actuators,
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from interactive_nav.robots.build import Joint, WheeledBase, half_extents
+from interactive_nav.robots.build import Joint, WheeledBase, half_extents, solid_geoms
 from interactive_nav.robots.files import compiled, warn
 from interactive_nav.robots.spec import set_servo
 from interactive_nav_common.errors import FileError
 
 _GEOM = mujoco.mjtGeom
+_ROUND = (_GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE)
+_SPHERE_WIDTH = 0.25
+"""Half width of a wheel that the file gives as a sphere or capsule, over its radius."""
 _WHEEL_FRICTION = 1.0
 _G_M_S2 = 9.81
 _STIFFNESS_PER_EFFORT = 10.0
@@ -27,18 +30,51 @@ FLOOR_M = 0.02
 
 
 @dataclasses.dataclass(frozen=True)
-class Wheel:
-    """A driven wheel, as the file has it at its zero pose."""
+class Round:
+    """A link that collides as one sphere, capsule or cylinder, as the file has it at its zero pose."""
 
-    joint: str
-    side: int
     body: str
+    joint: str
+    """One of the link's joints; empty: none."""
+    axis: np.ndarray
+    """(3,) of the joint, in the base's frame: y is a wheel's, -y that of one whose positive speed rolls backwards."""
+    rolls: bool
+    """The joint is a hinge about y, and the link's only one; its parent is fixed to the base."""
+    effort: float
+    """Torque limit of the joint, N m; 0: none."""
     pos_m: np.ndarray
-    """In the base's frame."""
+    """(3,) in the base's frame."""
     radius_m: float
     half_width_m: float
-    backwards: bool
-    """The joint's axis points right: its positive speed rolls backwards."""
+    sphere: bool
+
+    @property
+    def low_m(self) -> float:
+        """Return the height of its lowest point in the base's frame."""
+        return float(self.pos_m[2] - self.radius_m)
+
+
+def read_rounds(child: mujoco.MjSpec, path: Path, base_body: str) -> list[Round]:
+    """Return the round links below the base, one for each of their joints."""
+    model = compiled(child, path)
+    data, weld = mujoco.MjData(model), model.body_weldid
+    mujoco.mj_kinematics(model, data)
+    rounds = []
+    for body in range(model.body(base_body).id + 1, model.nbody):
+        geoms = solid_geoms(model, body)
+        if len(geoms) != 1 or (kind := _GEOM(int(model.geom_type[geoms[0]]))) not in _ROUND:
+            continue
+        pos_m, (radius_m, length_m, _) = data.geom_xpos[geoms[0]].copy(), model.geom_size[geoms[0]].tolist()
+        half_width_m = length_m if kind == _GEOM.mjGEOM_CYLINDER else _SPHERE_WIDTH * radius_m
+        first, count, fixed = model.body_jntadr[body], model.body_jntnum[body], weld[model.body_parentid[body]]
+        for j in range(first, first + count) if count else (-1,):
+            axis, joint = data.xaxis[j].copy() if count else np.zeros(3), model.joint(j).name if count else ""
+            rolls = count == 1 and model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE and abs(axis[1]) > 0.95
+            rolls = bool(rolls) and fixed == weld[model.body(base_body).id]
+            effort = float(child.joint(joint).actfrcrange[1]) if count else 0.0
+            shape = pos_m, radius_m, half_width_m, kind == _GEOM.mjGEOM_SPHERE
+            rounds.append(Round(model.body(body).name, joint, axis, rolls, effort, *shape))
+    return rounds
 
 
 def _solid(geom) -> bool:
@@ -101,7 +137,7 @@ def slip_torque_n_m(model: mujoco.MjModel, wheel_radius_m: float) -> float:
     return _WHEEL_FRICTION * _G_M_S2 * float(sum(model.body_mass)) * wheel_radius_m
 
 
-def _replace_wheel(child: mujoco.MjSpec, wheel: Wheel, base_body: str) -> None:
+def _replace_wheel(child: mujoco.MjSpec, wheel: Round, base_body: str) -> None:
     body = child.body(wheel.body)
     old = next(g for g in body.geoms if g.group == 3)
     centre = list(old.pos)
@@ -173,7 +209,10 @@ def turn_freely(joint, path: Path, slip_n_m: float) -> None:
     if joint.limited and joint.range[0] < joint.range[1]:
         warn(path, f"wheel joint '{joint.name}' has position limits {joint.range.tolist()}; it turns without")
     joint.limited, joint.range = False, [0, 0]
-    if joint.actfrcrange[1] > slip_n_m:
+    if not joint.actfrcrange[1] > 0:
+        warn(path, f"wheel joint '{joint.name}' has no torque limit; {slip_n_m:.3g} N m is taken, at which it slips")
+        joint.actfrcrange = [-slip_n_m, slip_n_m]
+    elif joint.actfrcrange[1] > slip_n_m:
         warn(
             path,
             f"wheel joint '{joint.name}' has a torque limit of {joint.actfrcrange[1]:g} N m; bounded to "
@@ -255,30 +294,27 @@ def add_servo(child: mujoco.MjSpec, path: Path, joint: Joint) -> None:
 
 
 def complete(
+    child: mujoco.MjSpec,
     path: Path,
-    wheels: Sequence[Wheel],
-    bottom_m: float,
+    wheels: Mapping[str, Round],
     base: WheeledBase,
     base_body: str,
     casters: tuple[str, ...],
-    torque_limits: Mapping[str, float],
     home: Mapping[str, float],
-    child: mujoco.MjSpec,
 ) -> None:
-    """Apply every change but `strip` to the file, in order; warn of each. `bottom_m` is the wheels' lowest point."""
-    for name, limit in torque_limits.items():
-        child.joint(name).actfrcrange = [-limit, limit]
+    """Apply every change but `strip` to the file, in order; warn of each. `wheels`: the driven ones by joint."""
+    bottom_m = min(wheel.low_m for wheel in wheels.values())
     _fix_masses(child, path, base_body)
     hold(child, path, bottom_m, {joint.name for joint in base.joints}, casters, home)
-    for wheel in wheels:
+    for name, wheel in wheels.items():
         warn(
             path,
             f"wheel '{wheel.body}' now rolls on the floor as a sphere of radius {wheel.radius_m:g} m and "
             "meets furniture as a box",
         )
         _replace_wheel(child, wheel, base_body)
-        if wheel.backwards:
-            joint = child.joint(wheel.joint)
+        if wheel.axis[1] < 0:
+            joint = child.joint(name)
             joint.axis = [-v for v in joint.axis]
     for name in casters:
         for geom in [g for g in find(child, path, "body", name).geoms if g.group == 3]:

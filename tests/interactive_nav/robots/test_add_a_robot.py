@@ -1,5 +1,6 @@
 """A user's URDF and MJCF become robots that drive; the documentation's code runs; what cannot be used is refused."""
 
+import dataclasses
 import functools
 import re
 import warnings
@@ -180,12 +181,14 @@ def test_an_mjcf_with_its_own_actuators_and_degrees_drives(tmp_path, registry):
     [
         (URDF, {"base_body": "base"}, "no body named 'base'; it has base_link, left_wheel"),
         (URDF, {"left_wheels": ("wheel",)}, "no joint named 'wheel'; it has left_wheel_joint"),
-        (URDF, {"left_wheels": ()}, "as many on both"),
-        (URDF.replace('<limit effort="4" velocity="12"/>', ""), {}, "has no torque limit"),
+        (URDF, {"left_wheels": ("left_wheel_joint", "left_wheel_joint")}, "2 wheels on the left and 1 on .* as many"),
+        (URDF, {"torque_limits": {"left_wheel_joint": 0.0}}, "left_wheel_joint is 0.0, expected a positive number"),
+        (_cart("").replace(' limited="true" actuatorfrcrange="-3 3"', ""), {**CART_ARGS, "casters": ()},
+         "joint 'mast' has no torque limit"),
         (URDF.replace('rpy="1.5708 0 0"/><axis', 'rpy="0 0 0"/><axis'), {}, "expected its y axis"),
         (URDF.replace('cylinder radius="0.07" length="0.04"', 'box size="0.1 0.1 0.04"'), {}, "no round one"),
         (URDF.replace('sphere radius="0.03"', 'box size="0.1 0.1 0.04"'), {}, "caster 'front_caster' is no sphere"),
-        (URDF, {"left_wheels": "left_wheel_joint"}, r"left_wheels is the text 'left_wheel_joint', expected a tuple"),
+        (URDF, {"left_wheels": "left_wheel_joint"}, "left_wheels is 'left_wheel_joint', expected a list"),
         (URDF, {"right_wheels": ("left_wheel_joint",)}, "'left_wheel_joint' is on both sides"),
         (
             URDF,
@@ -203,10 +206,19 @@ def test_an_mjcf_with_its_own_actuators_and_degrees_drives(tmp_path, registry):
         (WEIGHTLESS, {}, "base 'base_link' weighs 0.0001 kg, expected its mass"),
         ("<robot name='x'><link", {}, "MuJoCo cannot read it"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_used_is_refused_with_the_remedy(tmp_path, text, settings, message):
     with pytest.raises(UserError, match=message):
         _from_file(_write(tmp_path, text), **{**PORTER, **settings})
+
+
+def test_what_from_file_is_not_given_it_reads_off_the_file(tmp_path):
+    told, shown = _from_file(_write(tmp_path, URDF), **PORTER)("twist"), _from_file(tmp_path / "porter.urdf")("twist")
+    for field in dataclasses.fields(told):
+        if field.name not in ("add_to", "control"):
+            assert getattr(told, field.name) == getattr(shown, field.name), field.name
+    with pytest.raises(UserError, match="unknown setting 'wheels'"):
+        _from_file(tmp_path / "porter.urdf", wheels=2)
 
 
 def test_torque_limits_complete_a_file(tmp_path):

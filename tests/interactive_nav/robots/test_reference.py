@@ -53,8 +53,9 @@ def test_limits_that_say_nothing_are_replaced_with_a_warning(tmp_path, limit):
     assert spec.action_high == pytest.approx((1 / 0.07, 1 / 0.07))
     assert told == [
         "its wheels have no limit below 3 m/s; 1 m/s is taken",
-        "left_joint, right_joint have no torque limit; 9.06 N m is taken, at which wheels slip",
-    ]
+        *(f"wheel joint '{side}_joint' has no torque limit; 9.06 N m is taken, at which it slips"
+          for side in ("left", "right")),
+    ]  # fmt: skip
 
 
 def test_the_file_beside_it_overrides_and_completes(tmp_path):
@@ -72,7 +73,9 @@ def test_the_file_beside_it_overrides_and_completes(tmp_path):
 def test_what_cannot_be_inferred_comes_with_an_example_that_works(tmp_path):
     text = cart().replace('<cylinder radius="0.07" length="0.04"/>', '<box size="0.1 0.1 0.04"/>', 1)
     path = write(tmp_path, text)
-    with pytest.raises(ConfigError, match="0 wheels on the left and 1 on the right stand on the floor") as refused:
+    with pytest.raises(
+        ConfigError, match="0 wheels on the left and 1 on the right are named, or stand on the floor"
+    ) as refused:
         get(path)
     message = str(refused.value)
     example = message[message.index("{base_body") :]
