@@ -1,6 +1,5 @@
 """Measure how long programs take to print their help, and packages to be imported: rows of the best of `--repeats`."""
 
-import dataclasses
 import subprocess
 import sys
 import time
@@ -16,7 +15,6 @@ PROGRAMS = ("interactive_nav", "train", "train.evaluate", "train.sweep", "conver
 PACKAGES = ("interactive_nav", "converters", "train.config_io", "topological_nav.config")
 
 
-@dataclasses.dataclass
 class Startup(Command):
     """Measure how long programs take to print their help, and packages to be imported."""
 

@@ -10,7 +10,6 @@ logs, compiling and checkpoints apart. Rows carry device, versions and commit, a
 `benchmarks/results/steps_per_second.jsonl.gz`.
 """
 
-import dataclasses
 import datetime
 import functools
 import gzip
@@ -313,7 +312,6 @@ def training(
     }
 
 
-@dataclasses.dataclass(kw_only=True)
 class Bench(Command):
     """Measure env steps a second, and append rows."""
 

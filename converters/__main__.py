@@ -67,7 +67,6 @@ def alignment_table(rows: tuple[dict[str, Any], ...]) -> Table:
     return table
 
 
-@dataclasses.dataclass(kw_only=True)
 class Convert(generating.OnCluster, segmenting.MeshFile, segmenting.WithLibrary, generating.Decomposing):
     """Turn a raw scan with alignments into a scene folder: SRC OUT; or many: SRC... --into DIR, or @LIST --into DIR."""
 
@@ -166,7 +165,6 @@ class Convert(generating.OnCluster, segmenting.MeshFile, segmenting.WithLibrary,
         return 0 if all(g.passed for result in results for g in result.gates) else 1
 
 
-@dataclasses.dataclass(kw_only=True)
 class Object(generating.ObjectConfig):
     """Turn one mesh or URDF into a folder with a MuJoCo body."""
 
@@ -193,7 +191,6 @@ class Object(generating.ObjectConfig):
         )
 
 
-@dataclasses.dataclass(kw_only=True)
 class Check(generating.Command):
     """Run the acceptance gates on a scene folder; exit with 1 if one fails."""
 
@@ -218,7 +215,6 @@ class Check(generating.Command):
         return 1 if failed else 0
 
 
-@dataclasses.dataclass(kw_only=True)
 class Preview(generating.Command):
     """Draw a conversion's stages from above."""
 
@@ -237,7 +233,6 @@ class Preview(generating.Command):
         console.print(f"{self.output}: picture of {self.scene}", soft_wrap=True)
 
 
-@dataclasses.dataclass(kw_only=True)
 class Export(generating.Command):
     """Draw a scene for Sweet Home 3D, to edit it there and convert it again."""
 

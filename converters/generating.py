@@ -1,6 +1,5 @@
 """Run the commands of `python -m converters` that generate scenes and prepare furniture."""
 
-import dataclasses
 import functools
 import os
 import shlex
@@ -33,7 +32,6 @@ class Command(AnyCommand):
         raise NotImplementedError
 
 
-@dataclasses.dataclass(kw_only=True)
 class OnCluster(Command):
     """Base of the commands that can run on a cluster."""
 
@@ -48,7 +46,6 @@ class OnCluster(Command):
             refuse_unused(self, "--ray-address", "without --launcher ray")
 
 
-@dataclasses.dataclass(kw_only=True)
 class Decomposing(Command):
     """Base of the commands that decompose models into hulls."""
 
@@ -62,7 +59,6 @@ class Decomposing(Command):
     """Seconds for the decomposition of one model before its convex hull is taken."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class ObjectConfig(Decomposing):
     """Choices of one object."""
 
@@ -80,7 +76,6 @@ class ObjectConfig(Decomposing):
     """Folder that textures are read from (default: the model's folder)."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class Generate(Command):
     """Write a synthetic home in the raw Gibson layout."""
 
@@ -110,7 +105,6 @@ class Generate(Command):
         )
 
 
-@dataclasses.dataclass(kw_only=True)
 class GenerateScenes(OnCluster):
     """Generate, convert and draw the scenes of a recipe file, or homes of a tier; continue where it stopped."""
 
@@ -146,7 +140,6 @@ class GenerateScenes(OnCluster):
         return 1 if failed else 0
 
 
-@dataclasses.dataclass(kw_only=True)
 class MakeScenes(Command):
     """Generate them in the cache folder, where every program looks for them, and compare their digests."""
 
@@ -164,7 +157,6 @@ class MakeScenes(Command):
         return 1 if failed else 0
 
 
-@dataclasses.dataclass(kw_only=True)
 class ListScenes(Command):
     """List the scenes that are here, and those that can be generated: set, split, name, place."""
 
@@ -184,7 +176,6 @@ class ListScenes(Command):
             print(f"{'-':<10} {'-':<6} {scene.relative_to(sets.HERE).as_posix():<15} {scene}")
 
 
-@dataclasses.dataclass(kw_only=True)
 class Models(Command):
     """Draw the CAD models that generated buildings are furnished with."""
 
@@ -201,7 +192,6 @@ class Models(Command):
         console.print(f"{self.output}: picture of {count} models")
 
 
-@dataclasses.dataclass(kw_only=True)
 class Get(Command):
     """Fetch the furniture libraries of Sweet Home 3D."""
 
@@ -223,7 +213,6 @@ class Get(Command):
         console.print(f"{target}: {len(files)} furniture libraries, checked by digest")
 
 
-@dataclasses.dataclass(kw_only=True)
 class Build(Command):
     """Rebuild the packaged selection: models.zip and ATTRIBUTION.md."""
 
@@ -248,7 +237,6 @@ class Build(Command):
         console.print(f"{self.out}: {count} models with their hulls, and ATTRIBUTION.md")
 
 
-@dataclasses.dataclass(kw_only=True)
 class ListModels(Command):
     """List the packaged models, with size and credit."""
 

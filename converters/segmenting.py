@@ -1,6 +1,5 @@
 """Run the commands of `python -m converters` that label and annotate scans."""
 
-import dataclasses
 import json
 import shlex
 import signal
@@ -35,7 +34,6 @@ UNFIT = ("bed", "cabinet", "lamp")
 """Classes of furniture that `propose` does not look for."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class MeshFile(Command):
     """Base of the commands that read mesh files."""
 
@@ -45,7 +43,6 @@ class MeshFile(Command):
     """Of a mesh file."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class WithLibrary(Command):
     """Base of the commands that fit library models."""
 
@@ -75,7 +72,6 @@ def _read(arguments: Any) -> Any:
     )
 
 
-@dataclasses.dataclass(kw_only=True)
 class Segment(MeshFile):
     """Label an unlabelled scan by a network, for propose and convert."""
 
@@ -161,7 +157,6 @@ def _label(arguments: Any, target: Path, weights: Path | None, console: Console)
     console.print(f"{target}: labels of {len(labels)} vertices")
 
 
-@dataclasses.dataclass(kw_only=True)
 class SegmentTrain(Command):
     """Train the network of segment on generated buildings."""
 
@@ -181,7 +176,6 @@ class SegmentTrain(Command):
         _table(console, "held-out crops", scores)
 
 
-@dataclasses.dataclass(kw_only=True)
 class SegmentScore(Command):
     """Score the network on labelled scans and generated buildings."""
 
@@ -244,7 +238,6 @@ def proposal_tables(proposed: Any) -> Iterator[Table]:
     yield table
 
 
-@dataclasses.dataclass(kw_only=True)
 class Propose(WithLibrary):
     """Find furniture in a labelled scan; JSON in Scan2CAD's shape and PNG."""
 
@@ -272,7 +265,6 @@ class Propose(WithLibrary):
         console.print(f"{self.output}: proposals.json and proposals.png")
 
 
-@dataclasses.dataclass(kw_only=True)
 class Annotate(MeshFile, WithLibrary):
     """Say in the browser which models stand where: proposals, models, pairs of points."""
 

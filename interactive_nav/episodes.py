@@ -251,7 +251,6 @@ def load_episode_files(paths: Sequence[str | Path]) -> tuple[EpisodeFile, str]:
     return dataclasses.replace(first, scenes=scenes, episodes=tuple(rows)), hashlib.sha256(content).hexdigest()[:16]
 
 
-@dataclasses.dataclass(kw_only=True)
 class Make(Command):
     """Draw episodes and write them to a file."""
 

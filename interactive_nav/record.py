@@ -5,7 +5,6 @@ touches; `--views` shows the home instead. `python -m train.record RUN` plays an
 """
 
 import contextlib
-import dataclasses
 import itertools
 import sys
 import warnings
@@ -232,7 +231,6 @@ def _write_frames(frames: Iterator[np.ndarray], path: Path, rate: float, hold_s:
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=shown_ms, loop=0, **words)
 
 
-@dataclasses.dataclass(kw_only=True)
 class Picture(Command):
     """Make a video of an episode."""
 
@@ -284,7 +282,6 @@ class Picture(Command):
         return 0
 
 
-@dataclasses.dataclass(kw_only=True)
 class Record(Picture):
     """Make a video of an episode."""
 

@@ -4,7 +4,6 @@ One panel a replay, as in figures 7 and 8 of Interactive Gibson: objects in outl
 arrows between, and the robot's path coloured by time or contact.
 """
 
-import dataclasses
 import itertools
 import sys
 from collections.abc import Sequence
@@ -166,7 +165,6 @@ def _files(sources: Sequence[str]) -> list[Path]:
     return files
 
 
-@dataclasses.dataclass(kw_only=True)
 class TopDown(Command):
     """Draw episodes from above."""
 

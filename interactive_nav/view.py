@@ -4,7 +4,6 @@ Without a screen, it opens a page in the browser (mjviser, an optional dependenc
 """
 
 import contextlib
-import dataclasses
 import functools
 import importlib
 import importlib.util
@@ -178,7 +177,6 @@ def open_browser(model: mujoco.MjModel, data: mujoco.MjData, host: str, port: in
     viewer.run()
 
 
-@dataclasses.dataclass(kw_only=True)
 class View(Command):
     """Look at a scene."""
 

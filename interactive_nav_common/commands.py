@@ -11,7 +11,7 @@ import sys
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeAlias, get_args, get_type_hints
+from typing import Annotated, Any, NoReturn, TypeAlias, dataclass_transform, get_args, get_type_hints
 
 import tyro
 from tyro import _errors as events  # the only way to tyro's mistakes as data; the lock file pins its version
@@ -50,8 +50,12 @@ Words = Annotated[tuple[str, ...], tyro.conf.Suppress]
 """`key=value` words, which may stand anywhere among the others."""
 
 
+@dataclass_transform(kw_only_default=True)
 class Command:
-    """Base of the dataclasses of commands; a field `settings` of type `Words` collects `key=value` words."""
+    """Base of commands, which become dataclasses; a field `settings` of type `Words` collects `key=value` words."""
+
+    def __init_subclass__(cls) -> None:
+        dataclasses.dataclass(kw_only=True)(cls)
 
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self), include_extras=True)

@@ -3,7 +3,6 @@
 Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when stopped: the same command resumes.
 """
 
-import dataclasses
 import importlib
 import signal
 import sys
@@ -20,7 +19,6 @@ from topological_nav.config import DATASET, RUNS
 from topological_nav.data.domains import AdaptConfig
 
 
-@dataclasses.dataclass(kw_only=True)
 class Listed(Command):
     """Base of the commands, with settings."""
 
@@ -35,7 +33,6 @@ class Listed(Command):
         return "\n\n".join(f"settings{of or ' (key=default)'}:\n{settings_help(config)}" for of, config in listed)
 
 
-@dataclasses.dataclass(kw_only=True)
 class UsesNetworks(Listed):
     """Base of the commands that use networks."""
 
@@ -45,7 +42,6 @@ class UsesNetworks(Listed):
     """Network that judges passages (default: as the localiser)."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class _Driving(UsesNetworks):
     """Base of the commands that drive through scenes."""
 
@@ -60,7 +56,6 @@ class _Driving(UsesNetworks):
     """Build maps from the plan, and replace both networks by the truth."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class Data(Listed):
     """Render room and passage images of scenes, or drives of the expert, or import photographs."""
 
@@ -75,7 +70,6 @@ class Data(Listed):
     """The dataset."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class Train(UsesNetworks):
     """Train the room classifier, the passage detector or the local policy."""
 
@@ -90,7 +84,6 @@ class Train(UsesNetworks):
     """Run folder."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class Map(UsesNetworks):
     """Build a scene's topological map and draw it."""
 
@@ -103,7 +96,6 @@ class Map(UsesNetworks):
     """Draw the route between two nodes."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class Explore(_Driving):
     """Build a scene's map while the robot explores it, and draw it."""
 
@@ -113,7 +105,6 @@ class Explore(_Driving):
     """Folder of the map, for `--maps`; with --truth the map has no images and serves no navigation."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class Navigate(_Driving):
     """Drive one episode of a scene and draw it."""
 
@@ -129,7 +120,6 @@ class Navigate(_Driving):
     """Film it as well (.mp4), ten times as fast."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class Evaluate(_Driving):
     """Play fixed episodes of scenes and score them."""
 
@@ -143,7 +133,6 @@ class Evaluate(_Driving):
     """Rows and figures."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class Adapt(UsesNetworks):
     """Adapt networks and maps to another domain."""
 
@@ -160,7 +149,6 @@ class Adapt(UsesNetworks):
     """Folder of the networks, or the map."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class Export(Listed):
     """Write finished runs as a small folder of weights in half precision, or as ONNX files."""
 
@@ -183,7 +171,6 @@ class Export(Listed):
     """The picture (default: DIR.png)."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class Tables(Command):
     """Write the report's tables with ours beside them."""
 
@@ -191,7 +178,6 @@ class Tables(Command):
     """Folder of `make -f benchmarks/topological.mk SIZE=report`, which gets tables.md."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class Figures(_Driving):
     """Draw the report's figures 8 to 11, 13 to 18 and 22 to 24 of one scene; a line says what is missing for others."""
 

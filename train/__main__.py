@@ -14,7 +14,6 @@ from train import config_io
 from train.config import TrainConfig
 
 
-@dataclasses.dataclass
 class Train(Command):
     """Train a policy. The same command continues a run that was stopped or killed."""
 

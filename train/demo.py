@@ -1,6 +1,5 @@
 """Run `interactive-nav demo`: watch a packaged policy push its way through a packaged flat, without training."""
 
-import dataclasses
 import shutil
 import sys
 from collections.abc import Sequence
@@ -17,7 +16,6 @@ SCENE, OBJECTS, EPISODE = "scenes_mjcf/drawn/flat", 10, 23
 """A flat that the policy was not trained in, and an episode in which it shoves a basket and a door."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class Demo(Command):
     """Watch a TurtleBot push its way through a flat: play one episode with a packaged policy and film it."""
 

@@ -38,7 +38,6 @@ OBSERVATIONS, ENVS = 1000, 20
 """Recorded for the comparison with JAX, and the environments that they come from."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class Export(Command):
     """Write a run's policy as an ONNX file."""
 

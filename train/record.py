@@ -1,6 +1,5 @@
 """Run `python -m train.record RUN_DIR --episode K -o out.mp4`: replay an episode of a run and draw a video of it."""
 
-import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +13,6 @@ from interactive_nav_common.errors import reports_errors
 from train.replay import OfRun
 
 
-@dataclasses.dataclass(kw_only=True)
 class Record(Picture, OfRun):
     """Make a video of an episode of a run."""
 

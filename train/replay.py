@@ -4,7 +4,6 @@ Episode K starts as row K of `python -m train.evaluate` with the same seed or fi
 their last bits with the batch size, so close calls may end otherwise; a replay carries its scores.
 """
 
-import dataclasses
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -29,7 +28,6 @@ from train.scoring.brought import named
 from train.scoring.evaluation import make_policies
 
 
-@dataclasses.dataclass(kw_only=True)
 class OfRun(Command):
     """Base of the commands that record episodes of a run."""
 
@@ -82,7 +80,6 @@ class OfRun(Command):
                 console.print(f"{path}: {played.num_steps} steps, INS_0.5 {score:.2f}")
 
 
-@dataclasses.dataclass(kw_only=True)
 class Replay(OfRun):
     """Record episodes step by step."""
 

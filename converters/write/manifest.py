@@ -7,9 +7,8 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
-from scipy import sparse
 from scipy.sparse import csgraph
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, KDTree
 
 from converters.bodies.decompose import DOOR_OVERRIDES, DecomposeConfig
 from converters.bodies.objects import PlacedObject, to_world
@@ -57,22 +56,12 @@ def navigation_complexity(free: np.ndarray, cell_m: float, radius_m: float) -> f
     mask = largest_component((clearance(free, cell_m) >= radius_m)[step // 2 :: step, step // 2 :: step])
     if not mask.any():
         return 1.0
-    height, width = mask.shape
-    number = np.full((height, width), -1)
-    number[mask] = np.arange(mask.sum())
-    rows, columns, lengths = [], [], []
-    for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        a = number[: height - dr, max(-dc, 0) : width - max(dc, 0)]
-        b = number[dr:, max(dc, 0) : width + min(dc, 0)]
-        both = (a >= 0) & (b >= 0)
-        rows.append(a[both])
-        columns.append(b[both])
-        lengths.append(np.full(int(both.sum()), np.hypot(dr, dc) * step * cell_m))
-    edges = (np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns)))
-    graph = sparse.coo_matrix(edges, (int(mask.sum()),) * 2).tocsr()
-    starts = np.random.default_rng(0).permutation(int(mask.sum()))[:STARTS]
+    places = np.argwhere(mask)
+    tree, side_m = KDTree(places), step * cell_m
+    graph = tree.sparse_distance_matrix(tree, 1.5, output_type="coo_matrix").tocsr() * side_m
+    starts = np.random.default_rng(0).permutation(len(places))[:STARTS]
     way_m = np.asarray(csgraph.dijkstra(graph, directed=False, indices=starts))
-    places = np.argwhere(mask) * step * cell_m
+    places = places * side_m
     line_m = np.linalg.norm(places[starts][:, None] - places[None], axis=2)
     far = line_m >= LEAST_APART_M
     return float((way_m[far] / line_m[far]).max()) if far.any() else 1.0

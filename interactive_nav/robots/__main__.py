@@ -1,6 +1,5 @@
 """Run `python -m interactive_nav.robots`: print the table of robots; exit with 0, or 2 for a user's error."""
 
-import dataclasses
 import sys
 from typing import Annotated
 
@@ -13,7 +12,6 @@ from interactive_nav_common.errors import reports_errors
 from interactive_nav_common.jobs.progress import SafeConsole
 
 
-@dataclasses.dataclass
 class Robots(Command):
     """Print the table of robots."""
 

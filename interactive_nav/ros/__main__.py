@@ -4,7 +4,6 @@ Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when 
 """
 
 import contextlib
-import dataclasses
 import json
 import sys
 from collections.abc import Sequence
@@ -24,7 +23,6 @@ DEFAULTS = {"observations": ("depth", "segmentation", "rgb"), "episode_steps": 1
 """Of `simulate`, where they differ from the environment's."""
 
 
-@dataclasses.dataclass(kw_only=True)
 class Simulate(Command):
     """Run a simulated robot in a scene: sensors on topics, driven by cmd_vel. The odometry begins at the robot's pose
     in the map."""
@@ -62,7 +60,6 @@ class Simulate(Command):
         return f"settings (key=default):\n{settings_help(make_config(**DEFAULTS))}"
 
 
-@dataclasses.dataclass(kw_only=True)
 class Drive(Command):
     """Drive a robot by a policy: cmd_vel from odom and the scan, contacts and cameras that the policy needs. It goes
     along plan, or to goal_pose: by the shortest path in --map, without one straight ahead, whatever stands there."""

@@ -13,7 +13,6 @@ from interactive_nav_common.config import AtLeastOne
 from interactive_nav_common.errors import ConfigError
 
 
-@dataclasses.dataclass(kw_only=True)
 class Draw(Command):
     """Draw it."""
 

@@ -3,7 +3,6 @@
 Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when stopped.
 """
 
-import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +20,6 @@ from topological_nav.__main__ import UsesNetworks
 from topological_nav.config import NavigatorConfig
 
 
-@dataclasses.dataclass(kw_only=True)
 class Navigator(UsesNetworks):
     """Run the navigator as a node of ROS 2, for a robot or a simulator."""
 

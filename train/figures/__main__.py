@@ -1,6 +1,5 @@
 """Run `python -m train.figures RESULTS_DIR -o figures/`: draw metrics, rows and recorded paths; print tables."""
 
-import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +9,6 @@ from interactive_nav_common.commands import Command, Flag, option, parse, word
 from interactive_nav_common.errors import FileError, reports_errors
 
 
-@dataclasses.dataclass(kw_only=True)
 class Draw(Command):
     """Draw what runs have written."""
 

@@ -1,7 +1,6 @@
 """Run `interactive-nav report RESULTS... -o report.html`: write one HTML file, readable offline, of rows and runs."""
 
 import base64
-import dataclasses
 import html
 import io
 import re
@@ -39,7 +38,6 @@ LARGEST_SVG = 300_000
 FILM_FRAMES = 150
 
 
-@dataclasses.dataclass(kw_only=True)
 class Report(Command):
     """Write one HTML file, readable offline, of what runs have written."""
 

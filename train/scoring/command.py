@@ -1,6 +1,5 @@
 """Describe the command line of `train.evaluate`, without what takes long to import."""
 
-import dataclasses
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +8,6 @@ from interactive_nav_common.config import AtLeastOne, Bounds, Natural
 from train.scoring import AUTO_BATCH, PLANNERS, POLICIES, SEED
 
 
-@dataclasses.dataclass
 class Evaluate(Command):
     """Play fixed episodes."""
 

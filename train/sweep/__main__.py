@@ -1,6 +1,5 @@
 """Run `python -m train.sweep`: train the runs of one YAML file and write rows of their evaluation."""
 
-import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +20,6 @@ from train.sweep.scheduler import PROGRAMS, STAGES, Machine, Programs, Scheduler
 from train.sweep.spec import SweepConfig
 
 
-@dataclasses.dataclass
 class Sweep(Command):
     """Train and evaluate every run of a sweep. The same command continues what was stopped or killed, and leaves out
     what is done."""
