@@ -210,7 +210,7 @@ class CloneConfig(Settings):
     demonstrations: str = ""
     """Parquet file of `python -m train.evaluate --demonstrations`."""
     teacher: str = ""
-    """Who labels the states that the student visits (DAgger): avoider, namo:W or follower."""
+    """Who labels the states that the student visits (DAgger): avoider, namo:W, follower, or a run folder."""
     student_share: Share = 1.0
     """Share of control steps that the student drives; the teacher drives the others."""
     buffer_steps: AtLeastOne = 100_000

@@ -50,6 +50,8 @@ def build_env(config: EnvConfig) -> Any:
 
 OF_CRITIC = ("network.critic_inputs", "network.action_features", "network.compute_dtype")
 """Settings of networks that may differ where a run starts from another one's policy."""
+OF_ACTIONS = ("env.control_mode", "env.symmetric_actions")
+"""Settings that decide what an action commands."""
 SIZES = (*WINDOW, "active_dofs")
 """Settings of MJX that `native` does not take."""
 
@@ -213,6 +215,18 @@ class FolderCallbacks:
             log.close()
 
 
+def check_alike(setting: str, folder: RunFolder, config: TrainConfig, names: Sequence[tuple[str, str]] = ()) -> None:
+    """Raise `ConfigError` where a run that `setting` names understands actions, or settings `names`, otherwise.
+
+    Each is a setting's name in `config`, and that in the run's.
+    """
+    mine, theirs = flatten(config), flatten(folder.read_config())
+    for name, there in [*((name, name) for name in OF_ACTIONS), *names]:
+        if mine[name] != theirs[there]:
+            problem = f"{setting}: {name} is {mine[name]!r}, expected {theirs[there]!r}, as in {folder.path}"
+            raise ConfigError(f"{problem}; set it so, or choose another run")
+
+
 def check_init(config: TrainConfig, env: Any) -> tuple[TrainConfig, Path]:
     """Return config and best checkpoint of the run `run.init`; raise `ConfigError` where its policy does not fit."""
     folder = RunFolder(Path(config.run.init))
@@ -220,14 +234,10 @@ def check_init(config: TrainConfig, env: Any) -> tuple[TrainConfig, Path]:
     if not {config.algorithm, old.algorithm} <= {"ppo", "clone"}:
         got = f"algorithm is {config.algorithm}, and that of {folder.path} {old.algorithm}"
         raise ConfigError(f"run.init: {got}, expected ppo or clone for both; leave it out")
-    mine, theirs = flatten(config), flatten(old)
-    names = ["env.control_mode", "env.symmetric_actions", *(name for name in mine if name.startswith("network."))]
-    pairs = [(name, name) for name in names if name not in OF_CRITIC]
+    pairs = [(name, name) for name in flatten(config) if name.startswith("network.") and name not in OF_CRITIC]
     of_both = "policy_hidden_layer_sizes", "normalize_observations"
-    for name, there in [*pairs, *((f"{config.algorithm}.{n}", f"{old.algorithm}.{n}") for n in of_both)]:
-        if mine[name] != theirs[there]:
-            problem = f"run.init: {name} is {mine[name]!r}, expected {theirs[there]!r}, as in {folder.path}"
-            raise ConfigError(f"{problem}; set it so, or choose another run")
+    pairs += [(f"{config.algorithm}.{name}", f"{old.algorithm}.{name}") for name in of_both]
+    check_alike("run.init", folder, config, pairs)
     path, meta = checkpoint.find(folder.checkpoints, "best")
     checkpoint.check_fits(meta, path, config.env, env)
     return old, path

@@ -1,6 +1,8 @@
-"""Let a planner label the states that a student visits (`clone.teacher`)."""
+"""Let a teacher, a planner or another run's policy, label the states that a student visits (`clone.teacher`)."""
 
+import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,32 +11,63 @@ import numpy as np
 from brax.envs.base import Wrapper
 from jax.experimental import io_callback
 
+from interactive_nav.config import SensorConfig
 from interactive_nav_common.errors import ConfigError
 from train.config import EnvConfig
-from train.runs.run import build_env
+from train.learners.memory import RecurrentPolicy, lost
+from train.runs.run import build_env, check_alike
+from train.runs.run_folder import RunFolder
+from train.scoring.evaluation import load_policy
 from train.scoring.policies import Planner, make_baseline
 
 Teach = Callable[[Any, jax.Array], jax.Array]
 """(states of N environments, key) -> actions [N, A] in [-1, 1]; planners run on the host, so they are not pure."""
 
 
+OF_WAYPOINTS = ("env.num_waypoints", "env.waypoint_spacing_m", "env.waypoint_style")
+"""Settings of the task that decide what a run observes."""
+
+
 class TaughtEnv(Wrapper):
     """One environment with `teach`, which returns what the teacher would do in its states."""
 
     def __init__(self, teacher: str, config: EnvConfig, build_env: Callable[[EnvConfig], Any] = build_env):
-        """Build an environment and its teacher, a planner or baseline by name."""
+        """Build an environment and its teacher: a planner or baseline by name, or a run folder."""
         super().__init__(build_env(config))
-        if teacher not in ("avoider", "follower") and not teacher.startswith("namo:"):
-            raise ConfigError(f"clone.teacher is {teacher!r}, expected avoider, namo:W or follower")
-        policy = make_baseline(teacher, self.env)
-        self.teach: Teach = _on_host(policy, self.env) if isinstance(policy, Planner) else _batched(policy)
+        self.teach: Teach
+        if teacher in ("avoider", "follower") or teacher.startswith("namo:"):
+            policy = make_baseline(teacher, self.env)
+            self.teach = _on_host(policy, self.env) if isinstance(policy, Planner) else _batched(policy)
+        elif Path(teacher).is_dir():
+            self.teach = _of_run(RunFolder(Path(teacher)), config, self.env, build_env)
+        else:
+            raise ConfigError(f"clone.teacher is {teacher!r}, expected avoider, namo:W, follower, or a run folder")
 
 
-def _batched(policy: Any) -> Teach:
+def _batched(policy: Any, see: Callable[[Any], Any] = lambda state: state.obs) -> Teach:
     def teach(state: Any, key: jax.Array) -> jax.Array:
-        return jax.vmap(policy)(state.obs, jax.random.split(key, state.done.shape[0]))
+        keys = jax.random.split(key, state.done.shape[0])
+        return jax.vmap(lambda state, key: policy(see(state), key))(state, keys)
 
     return teach
+
+
+def _of_run(folder: RunFolder, config: EnvConfig, env: Any, build_env: Callable[[EnvConfig], Any]) -> Teach:
+    """Return a run's best policy, which observes the student's world with its own sensors, without delay."""
+    run = folder.read_config()
+    sensors = {field.name: getattr(run.env, field.name) for field in dataclasses.fields(SensorConfig)}
+    world = dataclasses.replace(config, **sensors, random_sensor_delay_steps=(0, 0))
+    run = dataclasses.replace(run, env=world)
+    check_alike("clone.teacher", folder, run, [(name, name) for name in OF_WAYPOINTS])
+    seen = build_env(world)
+    policy, _ = load_policy(folder, run, seen, "best", deterministic=True)
+    if isinstance(policy, RecurrentPolicy):
+        raise lost("a teacher")
+    kept, read = ({term.key for term in getattr(each, "terms", ()) if term.start} for each in (env, seen))
+    if lacking := ", ".join(sorted(read - kept)):
+        got = f"clone.teacher: {folder.path} observes {lacking}, which the student's environment does not remember"
+        raise ConfigError(f"{got}, expected it among env.observations; add it, or choose another teacher")
+    return _batched(policy, lambda state: seen.observe(state).obs)
 
 
 def _on_host(planner: Planner, env: Any) -> Teach:

@@ -17,11 +17,13 @@ import interactive_nav
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav_common.errors import ConfigError
 from tests.train.toy_env import ToyEnv
+from tests.train.toy_pixels import SMALL, ToyPixels
 from tests.train.toy_run import build_toy, toy_config
 from train.config import CloneConfig, NetworkConfig, PPOConfig, RunConfig, SACConfig
 from train.learners.algorithms import ALGORITHMS
 from train.learners.clone import CloneData
 from train.runs import run
+from train.scoring.evaluation import load_policy
 from train.scoring.policies import Planner, make_follower
 from train.scoring.teacher import TaughtEnv
 
@@ -34,6 +36,10 @@ def taught(out_dir, name, **clone):
     settings = CloneConfig(**{**SIZES, "policy_hidden_layer_sizes": (32, 32), "buffer_steps": 4096, **clone})
     length = RunConfig(out_dir=str(out_dir), name=name, num_timesteps=16 * 256, log_every_steps=1024)
     return dataclasses.replace(config, algorithm="clone", ppo=PPOConfig(), clone=settings, run=length)
+
+
+def build_either(config):
+    return (ToyPixels if "depth" in config.observations else ToyEnv)(build_toy(config).config)
 
 
 def train_taught(config, build_env=build_toy):
@@ -67,6 +73,29 @@ def test_a_student_that_drives_agrees_with_the_teacher_where_the_other_never_was
         error[name] = float(((policy(seen, key)[0] - teacher) ** 2).mean())
     assert error["dagger"] < 0.5 * error["watched"], error
     assert error["dagger"] < 0.2 * float(np.var(teacher)), error
+
+
+def test_a_run_with_a_privileged_critic_teaches_a_student_that_sees_images(tmp_path):
+    start = toy_config(tmp_path, updates=1)
+    start = dataclasses.replace(start, network=NetworkConfig(critic_inputs="privileged"))
+    _, folder, _ = run.train_run(start, QUIET, build_env=build_toy)
+    config = taught(tmp_path, "pixels", teacher=str(folder.path), buffer_steps=512)
+    seen = dataclasses.replace(config.env, observations=("velocity", "depth", "segmentation"))
+    length = dataclasses.replace(config.run, num_timesteps=3 * 256)
+    config = dataclasses.replace(config, env=seen, network=SMALL, run=length)
+    result, _, _ = train_taught(config, build_either)
+    data: Any = result.snapshot.env_state
+    assert int(data.taken) == 3 * 256 and len(data.action) == 512  # the oldest of 768 are gone
+    env = TaughtEnv(str(folder.path), config.env, build_either)
+    state = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(1), 5))
+    policy, _ = load_policy(folder, folder.read_config(), ToyEnv(), "best", True)
+    vector = jax.vmap(ToyEnv().observe)(state).obs
+    expected = jax.vmap(policy, (0, None))(vector, jax.random.PRNGKey(3))
+    assert float(jnp.ptp(expected, 0).min()) > 0.001  # labels depend on the state
+    np.testing.assert_allclose(env.teach(state, jax.random.PRNGKey(2)), expected, atol=1e-6)
+    far = dataclasses.replace(config.env, waypoint_spacing_m=0.4)
+    with pytest.raises(ConfigError, match="clone.teacher: env.waypoint_spacing_m is 0.4, expected 0.2, as in .*toy;"):
+        TaughtEnv(str(folder.path), far, build_either)
 
 
 def test_reinforcement_goes_on_from_a_clone_with_another_critic(runs, tmp_path):
@@ -147,6 +176,6 @@ def test_settings_that_do_not_fit_are_refused(tmp_path):
         CloneConfig(teacher="follower", demonstrations="a.parquet")
     with pytest.raises(ConfigError, match="or set clone.teacher"):
         run.train_run(taught(tmp_path / "runs", "b", buffer_steps=100_000), QUIET, build_env=build_toy)
-    with pytest.raises(ConfigError, match="clone.teacher is 'nobody', expected avoider, namo:W or follower"):
+    with pytest.raises(ConfigError, match="clone.teacher is 'nobody', expected avoider, namo:W, follower, or a run"):
         train_taught(taught(tmp_path / "runs", "c", teacher="nobody"))
     assert not (tmp_path / "runs").exists()
