@@ -31,7 +31,7 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.slots import parking_spot
 from interactive_nav.scenes.world import build_world
-from interactive_nav.sensing.boxes import apply_axes, body_poses, half_sizes_m
+from interactive_nav.sensing.boxes import apply_axes, body_poses, half_sizes_m, nearest_box_m
 from interactive_nav.sensing.observation import waypoints_in_body
 from interactive_nav.sensing.sensors import Sensors
 from interactive_nav.task.dynamics import Dynamics
@@ -41,6 +41,8 @@ from interactive_nav.types import EpisodeStart, GoalField, NavInfo
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import matrix_from_quat
 
+FLOOR_M = 0.02
+"""What is lower is no obstacle, as in maps of furniture."""
 LIFT_M = 0.2
 """A base that rises this far above its standing height has left the floor (the original's early failure)."""
 
@@ -282,8 +284,10 @@ class InteractiveNav(Env):
         touches = (self.tables.mass_kg[scene, 1:] > 0) & (signals.slot_force_n > TOUCH_FORCE_N)
         hits_structure = signals.structure_force_n > TOUCH_FORCE_N
         lifted = pos_w[2] - self.robot.spawn_height_m > LIFT_M
+        near_m = nearest_box_m(self.sensors.boxes, scene, physics.qpos, pos_w[:2], (FLOOR_M, self.robot.height_m))
+        clearance_m = jnp.where(broken, 0.0, jnp.maximum(near_m - self.robot.footprint_radius_m, 0.0))
         moment = nav, physics, rotation, last, signals, rng
-        return Step(*self._constants, *moment, touches, hits_structure, lifted, broken, success)
+        return Step(*self._constants, *moment, touches, hits_structure, clearance_m, lifted, broken, success)
 
     def initial_physics(self, start: EpisodeStart) -> PhysicsState:
         """Return the physics' state that a given episode starts with."""

@@ -17,6 +17,7 @@ from interactive_nav.navigation.placement import DISTANCE_TOLERANCE_M
 from interactive_nav.physics import PhysicsState, StepSignals
 from interactive_nav.physics.base import TOUCH_FORCE_N
 from interactive_nav.reward import interactive_navigation_reward
+from interactive_nav.sensing.boxes import CLEAR_M
 from interactive_nav.sensing.observation import advance_odometry, waypoints_in_body
 from interactive_nav.sensing.sensors import TRAIL, TRAIL_STEPS, stream
 from interactive_nav.types import NavInfo, SceneTables
@@ -56,6 +57,8 @@ class Step(Moment):
     """(M,) bool: the robot touched the movable object."""
     hits_structure: jax.Array
     """[] bool: it touched a wall or another fixed part."""
+    clearance_m: jax.Array
+    """[] m from the disc of its footprint to the nearest wall or object, at most `CLEAR_M`; 0 where `broken`."""
     lifted: jax.Array
     """[] bool: its base is `LIFT_M` above its standing height."""
     broken: jax.Array
@@ -245,6 +248,16 @@ TERMS = (
     Term("lifted", "1 where the base was `LIFT_M` above its standing height.", "metric",
          lambda count, step: count > 0, lambda nav: jnp.int32(0),
          lambda count, step: count + _whole(step, step.lifted)),
+    Term("clearance_m", "Distance from the footprint to the nearest wall or object, mean of control steps, m.",
+         "metric", lambda sum_m, step: sum_m / step.nav.step_count, lambda nav: jnp.zeros(()),
+         lambda sum_m, step: sum_m + step.clearance_m),
+    Term("least_clearance_m", "The least of these distances in a control step, m.", "metric",
+         lambda least_m, step: least_m, lambda nav: jnp.float32(CLEAR_M),
+         lambda least_m, step: jnp.minimum(least_m, step.clearance_m)),
+    Term("turning_rad_per_m", "Sum of the turns of control steps over l_0, which counts as at least 1 m, rad/m.",
+         "metric", lambda turns, step: turns / jnp.maximum(step.nav.memory["robot_path_m"], 1.0),
+         lambda nav: jnp.zeros(()),
+         lambda turns, step: turns + jnp.abs(wrap_angle(step.nav.yaw_rad - step.last.yaw_rad))),
     Term("object_path_m", "(M,) l_i, m.", "memory", None,
          lambda nav: jnp.zeros(len(nav.object_pos_w)), _object_path),
     Term("object_contact_steps", "(M,) control steps in which the robot touched it.", "memory", None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import jax
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import shapely
 
 import interactive_nav
 from interactive_nav.physics import native
@@ -16,7 +18,7 @@ from interactive_nav.task.terms import EPISODE_METRICS
 from interactive_nav.types import EpisodeStart
 from tests.toys import write_room
 
-STEPS = 50
+STEPS, RADIUS_M = 50, 0.18
 STARTS = ((-1.0, 0.3, 0.0), (0.6, 0.9, 0.0), (-0.35, -0.2, -math.pi / 2), (-1.0, 1.0, 0.0))
 GOALS = ((0.8, 0.3), (-1.0, 1.0), (1.5, -1.0), (1.2, 1.0))
 # Wheels at 10 to 14 rad/s: through the block to the goal, into the wall, at the door and into the wall, freely.
@@ -69,6 +71,20 @@ def centres(model: mujoco.MjModel, bodies, qpos: np.ndarray) -> list[list[float]
     return [data.xipos[b].tolist() for b in bodies]
 
 
+def clearance(model: mujoco.MjModel, robot_bodies, qpos: np.ndarray, radius_m: float) -> float:
+    """The gap in plan between the robot's disc and the nearest of the boxes, seen from above as polygons."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    gaps, corners = [], np.array(list(itertools.product((-1, 1), repeat=3)))
+    for g in range(model.ngeom):
+        if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_BOX and model.geom_bodyid[g] not in robot_bodies:
+            outline = data.geom_xpos[g] + (corners * model.geom_size[g]) @ data.geom_xmat[g].reshape(3, 3).T
+            at = shapely.Point(data.xpos[robot_bodies[0]][:2])
+            gaps.append(shapely.MultiPoint(outline[:, :2]).convex_hull.distance(at) - radius_m)
+    return max(0.0, min(gaps))
+
+
 def oracle(model, layout, qpos, forces, i: int) -> tuple[dict[str, float], list[dict[str, float]], dict[str, list]]:
     """Scores, rewards and what is told of objects of episode i; in a convex room the goal is straight ahead."""
     bodies = [int(b) for b in layout.slot_body]
@@ -80,6 +96,9 @@ def oracle(model, layout, qpos, forces, i: int) -> tuple[dict[str, float], list[
     gaps = [math.hypot(p[0] - goal[0], p[1] - goal[1]) for p in robot]
     robot_path, force_sum, paths = 0.0, 0.0, [0.0] * len(bodies)
     touched, rewards, interactions, structure, lifted = [False] * len(bodies), [], 0, 0, False
+    clear_m, turns = [], 0.0
+    yaws = [math.atan2(2 * (q[3] * q[6] + q[4] * q[5]), 1 - 2 * (q[5] ** 2 + q[6] ** 2))
+            for q in (q[i][at : at + 7] for q in qpos)]  # fmt: skip
     contact_steps, on_objects = [0] * len(bodies), [0.0] * len(bodies)
     success, steps = False, 0
     for t in range(STEPS):
@@ -99,6 +118,8 @@ def oracle(model, layout, qpos, forces, i: int) -> tuple[dict[str, float], list[
         interactions += any(step_touch)
         structure += any(norm(s[-1]) > 1e-4 for s in substeps)
         lifted |= robot[t + 1][2] > 0.2
+        clear_m.append(clearance(model, layout.robot_bodies, qpos[t + 1][i], RADIUS_M))
+        turns += abs(math.remainder(yaws[t + 1] - yaws[t], math.tau))
         success = gaps[t + 1] < 0.333
         steps = t + 1
         rewards.append(
@@ -126,6 +147,9 @@ def oracle(model, layout, qpos, forces, i: int) -> tuple[dict[str, float], list[
         "interaction_steps": interactions,
         "structure_steps": structure,
         "lifted": lifted,
+        "clearance_m": sum(clear_m) / steps,
+        "least_clearance_m": min(clear_m),
+        "turning_rad_per_m": turns / max(robot_path, 1.0),
     }
     scores |= dict.fromkeys(
         ("nonfinite", "overflow_steps", "left_out_steps", "crowded_steps", "objects_dropped", "off_distance"), 0.0
@@ -137,6 +161,7 @@ def oracle(model, layout, qpos, forces, i: int) -> tuple[dict[str, float], list[
 @pytest.fixture(scope="module")
 def scored(played):
     env, qpos, forces, _ = played
+    assert env.robot.footprint_radius_m == RADIUS_M
     return [oracle(env.world.models[0], env.world.layout, qpos, forces, i) for i in range(len(STARTS))]
 
 

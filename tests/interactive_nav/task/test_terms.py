@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import flax.struct
 import jax
@@ -13,9 +14,11 @@ import pytest
 import interactive_nav
 from interactive_nav.interop.gym_env import InteractiveNavEnv
 from interactive_nav.pictures.replay import EpisodePlayer
+from interactive_nav.sensing.boxes import nearest_box_m
 from interactive_nav.task.rollout import HostPolicy, Recorder, episode_keys, rollout
 from interactive_nav.task.terms import EPISODE_METRICS, REWARD_TERMS, TERMS, Term
 from interactive_nav.task.wrappers import AutoResetEnv
+from interactive_nav.types import EpisodeStart
 from interactive_nav_common.errors import ConfigError
 from tests.toys import write_room
 
@@ -44,6 +47,43 @@ def test_the_benchmarks_terms_have_names_of_their_own_and_say_what_they_are():
     )
     assert REWARD_TERMS == ("reward/success", "reward/potential", "reward/interaction")
     assert all(term.doc.endswith(".") and (term.size > 0) == (term.kind == "observation") for term in TERMS)
+
+
+def test_clearance_is_the_gap_between_disc_and_nearest_box_in_the_robots_heights(env):
+    """By hand, in a room of 4 x 3 m with a cube of 0.4 m at (0, 0.3), and the small object outside."""
+    start = EpisodeStart(
+        *(jnp.int32(0), jnp.zeros(2), jnp.zeros(()), jnp.ones(2)),
+        *(jnp.zeros((1, 2)), jnp.zeros(1), jnp.zeros(1, bool)),
+    )
+    qpos = env.initial_physics(start).qpos
+
+    def near_m(x, y, low=0.02, high=0.4):
+        return float(jax.jit(lambda xy: nearest_box_m(env.sensors.boxes, jnp.int32(0), qpos, xy, (low, high)))(
+            jnp.array([x, y])))  # fmt: skip
+
+    assert near_m(-0.9, 0.3) == pytest.approx(0.7, abs=1e-5)  # to the cube's face
+    assert near_m(-0.5, -0.3) == pytest.approx(0.5, abs=1e-5)  # to its edge: 0.3 and 0.4 m away
+    assert near_m(-1.0, 1.2) == pytest.approx(0.3, abs=1e-5)  # to the upper wall
+    assert near_m(0.1, 0.3) == 0.0  # inside
+    assert near_m(-0.9, 0.3, low=0.45, high=0.6) == pytest.approx(1.1, abs=1e-5)  # above the cube: the left wall
+
+
+def test_turning_is_per_metre_of_the_path_and_clearance_a_mean(env):
+    """Two steps of 0.3 and -0.5 rad, with 0.2 and 0.1 m of room; the path is 0.4 m, which counts as 1, then 2 m."""
+    terms = {term.name: term for term in TERMS if term.kind == "metric"}
+    names = "clearance_m", "least_clearance_m", "turning_rad_per_m"
+    memory = {name: terms[name].start(None) for name in names}
+    yaw = 3.0
+    for count, (turn, clear_m) in enumerate(((0.3, 0.2), (-0.5, 0.1)), 1):
+        nav = [
+            SimpleNamespace(yaw_rad=jnp.arctan2(jnp.sin(y), jnp.cos(y)), step_count=count) for y in (yaw, yaw + turn)
+        ]
+        step = SimpleNamespace(last=nav[0], nav=nav[1], clearance_m=jnp.float32(clear_m))
+        yaw, memory = yaw + turn, {name: terms[name].updated(memory[name], step) for name in names}
+    for path_m, turning in ((0.4, 0.8), (2.0, 0.4)):
+        step.nav.memory = {"robot_path_m": jnp.float32(path_m)}
+        values = [float(terms[name].evaluate(memory[name], step)) for name in names]
+        assert values == pytest.approx([0.15, 0.1, turning], abs=1e-6)
 
 
 def test_a_batch_rewards_reports_and_observes_added_terms_and_forgets_at_a_reset(env):
