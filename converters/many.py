@@ -29,7 +29,7 @@ from converters.records.errors import StageFailed
 from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError, FileError, UserError, readable
 from interactive_nav_common.files import check_name, write_text
-from interactive_nav_common.jobs.processes import LOST, Job, Launcher, LocalLauncher, run_jobs
+from interactive_nav_common.jobs.processes import LOST, Job, Launcher, run_jobs
 from interactive_nav_common.rows import write_parquet
 from interactive_nav_common.signals import interrupts_heard
 from scenes_mjcf import sets
@@ -219,7 +219,7 @@ def make_launcher(launcher: str, address: str | None, jobs: int, count: int) -> 
         from interactive_nav_common.jobs.on_ray import RayLauncher
 
         return RayLauncher(address or "auto"), max(count, 1)
-    return LocalLauncher(jobs), jobs
+    return Launcher(jobs), jobs
 
 
 def run_commands(

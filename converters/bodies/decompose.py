@@ -18,7 +18,7 @@ from converters.geometry.boxes import Hull, convex_hull
 from converters.records.errors import CANNOT_WRITE, StageFailed
 from interactive_nav_common import files
 from interactive_nav_common.jobs.cache import MISSING, NOT_HASHED, StageCache
-from interactive_nav_common.jobs.processes import LATE, Job, LocalLauncher, our_env, run_jobs
+from interactive_nav_common.jobs.processes import LATE, Job, Launcher, our_env, run_jobs
 
 WORKER = "converters.bodies.coacd_worker"
 
@@ -91,7 +91,7 @@ def decompose_all(
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="hulls-")))
         todo = (_job(key, *meshes[name], configs[name], folder) for key, name in waiting.items())
-        running = run_jobs(LocalLauncher(max(jobs, 1)), todo, grace_s=0.0)
+        running = run_jobs(Launcher(max(jobs, 1)), todo, grace_s=0.0)
         for job, code in stack.enter_context(contextlib.closing(running)):
             key, name = job.name, waiting[job.name]
             hulls, reason, peak_mib = _result(job, code, name)

@@ -290,7 +290,7 @@ def wheeled_robot(
     )
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Row(Figures):
     """A robot of `models/wheeled.yaml`."""
 

@@ -73,8 +73,29 @@ def set_servo(
         actuator.ctrlrange = list(control_range)
 
 
-@dataclasses.dataclass(frozen=True)
-class RobotSpec:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Figures:
+    """Fields of a `RobotSpec` that tables of robots (`models/*.yaml`) have."""
+
+    body_width_m: float
+    """Success distance: the paper's 'width of the robot's body'."""
+    footprint_radius_m: float
+    """Smallest disc about the base frame that holds the body: erosion of maps, clearance of placements."""
+    height_m: float
+    """Top of the body above the floor."""
+    camera: RobotCamera
+    mass_kg: float | None = None
+    """Mass by the robot's data sheet or URDF; none: not checked against the model's."""
+    size_m: tuple[float, float, float] | None = None
+    """Length, width, height of the body at its home pose."""
+    drive_type: str = ""
+    """How it moves, in words."""
+    source: str = ""
+    """Where the figures come from."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RobotSpec(Figures):
     """A robot under one control mode: its MJCF and the figures that the task needs. Frame: x forward, y left, z up."""
 
     name: str
@@ -89,15 +110,8 @@ class RobotSpec:
     """Command at action -1, one per action, in the command's unit."""
     action_high: tuple[float, ...]
     """Command at action +1."""
-    body_width_m: float
-    """Success distance: the paper's 'width of the robot's body'."""
-    footprint_radius_m: float
-    """Smallest disc about the base frame that holds the body: erosion of maps, clearance of placements."""
-    height_m: float
-    """Top of the body above the floor."""
     spawn_height_m: float
     """Height of the base frame above the floor when the robot stands."""
-    camera: RobotCamera
     action_names: tuple[str, ...] = ()
     """What each action commands, with its unit; by default the actuators."""
     home_qpos: tuple[tuple[str, float], ...] = ()
@@ -119,14 +133,6 @@ class RobotSpec:
     """None: scripted drivers cannot drive this mode."""
     kind: str = "wheeled"
     """'wheeled', 'legged' or 'flying': which evidence applies."""
-    mass_kg: float | None = None
-    """Mass by the robot's data sheet or URDF; none: not checked against the model's."""
-    size_m: tuple[float, float, float] | None = None
-    """Length, width, height of the body at its home pose."""
-    drive_type: str = ""
-    """How it moves, in words."""
-    source: str = ""
-    """Where the figures come from."""
     reference: str = ""
     """The file, or the function of a Python file, that `get_robot` builds it from again; empty if its name suffices."""
 
@@ -167,17 +173,3 @@ class RobotSpec:
                 f"choose another of its modes: {', '.join(self.control_modes)}"
             )
         return self.action(xp.stack([linear_m_s, angular_rad_s], -1) @ xp.asarray(self.twist.matrix).T, xp)
-
-
-@dataclasses.dataclass(frozen=True)
-class Figures:
-    """Fields of a `RobotSpec` that tables of robots (`models/*.yaml`) have."""
-
-    body_width_m: float
-    footprint_radius_m: float
-    height_m: float
-    camera: RobotCamera
-    mass_kg: float
-    size_m: tuple[float, float, float]
-    drive_type: str
-    source: str

@@ -14,18 +14,13 @@ class Gpu(NamedTuple):
 
 
 def find_gpus() -> list[Gpu]:
-    """Return the NVIDIA GPUs that this process may use."""
-    return parse_gpus(gpu_listing("index,uuid,memory.total"), os.environ.get("CUDA_VISIBLE_DEVICES"))
-
-
-def gpu_listing(fields: str) -> str:
-    """Return nvidia-smi's line for each NVIDIA GPU; nothing where there are none."""
-    query = ["nvidia-smi", f"--query-gpu={fields}", "--format=csv,noheader,nounits"]
+    """Return the NVIDIA GPUs that this process may use; none where nvidia-smi is missing or fails."""
+    query = ["nvidia-smi", "--query-gpu=index,uuid,memory.total", "--format=csv,noheader,nounits"]
     try:
-        done = subprocess.run(query, capture_output=True, text=True, timeout=60)
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return done.stdout if done.returncode == 0 else ""
+        listing = subprocess.run(query, capture_output=True, text=True, timeout=60, check=True).stdout
+    except (OSError, subprocess.SubprocessError):
+        return []
+    return parse_gpus(listing, os.environ.get("CUDA_VISIBLE_DEVICES"))
 
 
 def parse_gpus(listing: str, visible: str | None) -> list[Gpu]:

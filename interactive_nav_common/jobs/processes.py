@@ -115,15 +115,16 @@ class Child:
 
 
 class Launcher:
-    """Where jobs run."""
+    """Where jobs run: processes on this machine, so many side by side."""
 
-    def __init__(self) -> None:
+    def __init__(self, side_by_side: int = 1) -> None:
+        self._side_by_side = side_by_side
         self.running: list[tuple[Any, Any, Share]] = []
         """Job, its process (a `Child`, or what has its `poll` and `send`), and its share."""
 
     def take(self, job: Any) -> Share | None:
         """Return a share for a job, beside those that run; None where there is no room now."""
-        raise NotImplementedError
+        return (None, 1.0 / self._side_by_side) if len(self.running) < self._side_by_side else None
 
     def begin(self, job: Job, share: Share) -> Any:
         """Start the process of a job in its share."""
@@ -164,17 +165,6 @@ class Launcher:
 
     def close(self) -> None:
         """Release what it holds, after the last job."""
-
-
-class LocalLauncher(Launcher):
-    """Processes on this machine, so many side by side."""
-
-    def __init__(self, side_by_side: int):
-        super().__init__()
-        self._side_by_side = side_by_side
-
-    def take(self, job: Any) -> Share | None:
-        return (None, 1.0 / self._side_by_side) if len(self.running) < self._side_by_side else None
 
 
 def run_jobs(

@@ -21,14 +21,14 @@ from converters.__main__ import main
 from converters.clock import STAGES, peak_memory_mib
 from converters.many import ROWS, convert_many, digest_of
 from converters.pipeline import ConvertConfig
-from interactive_nav_common.jobs.processes import LocalLauncher
+from interactive_nav_common.jobs.processes import Launcher
 from scenes_mjcf.schema import load_manifest
 from tests.converters.read.test_single_mesh import tall_room
 
 QUICK = ConvertConfig(jobs=2, structure_texture=64, object_texture=32)
 
 
-class Killing(LocalLauncher):
+class Killing(Launcher):
     """Runs commands; that of `killed` ends as the kernel would end it that is out of memory."""
 
     def __init__(self) -> None:

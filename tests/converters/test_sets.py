@@ -17,14 +17,14 @@ from converters.__main__ import main
 from converters.generate.homes.config import GenerationError
 from converters.generating import GenerateScenes
 from converters.recipes import load_recipes
-from interactive_nav_common.jobs.processes import Job, LocalLauncher
+from interactive_nav_common.jobs.processes import Job, Launcher
 from scenes_mjcf.schema import load_manifest, save_manifest
 from scenes_mjcf.sets import read_set, scene_digest, scene_folders
 
 SCENES = Path(__file__).parents[2] / "scenes_mjcf"
 
 
-class Copier(LocalLauncher):
+class Copier(Launcher):
     """Whose command copies scenes; 002 gives none, and whoever works on 003 with others is killed."""
 
     def __init__(self, out: Path):
@@ -87,7 +87,7 @@ def test_scenes_are_made_side_by_side_listed_and_found_by_name(tmp_path: Path, m
     out, lines, shares = tmp_path / "homes", [], []
     many.begin_set(out, "furnished", 10)
     runner = Copier(out)
-    monkeypatch.setattr(many, "LocalLauncher", lambda jobs: runner)
+    monkeypatch.setattr(many, "Launcher", lambda jobs: runner)
     wanted = GenerateScenes(out=out, jobs=2)
     failed = many.generate_scenes(wanted, lambda _, share: shares.append(share), lines.append)
     assert sorted(failed) == ["furnished_002", "furnished_003"]
@@ -132,7 +132,7 @@ def test_a_scene_that_differs_from_the_list_is_told(tmp_path: Path) -> None:
 def test_processes_that_still_run_are_ended(tmp_path: Path) -> None:
     act = "import os, sys, time; print(os.getpid(), flush=True); time.sleep(60 * (sys.argv[1] == 'slow')); sys.exit(3)"
     commands = {name: [sys.executable, "-c", act, name] for name in ("slow", "quick", "late")}
-    launcher = LocalLauncher(2)
+    launcher = Launcher(2)
     began = time.monotonic()
     with contextlib.closing(many.run_commands(commands, launcher, tmp_path, lambda *_: None, "scenes")) as results:
         name, code, printed = next(results)

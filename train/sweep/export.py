@@ -10,11 +10,11 @@ import pyarrow.compute as pc
 
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import whole_file, writing
-from interactive_nav_common.records import METRICS, PACKED_METRICS, mean_over_episodes, read_metrics, write_metrics
+from interactive_nav_common.records import PACKED_METRICS, mean_over_episodes, read_metrics, write_metrics
 from interactive_nav_common.rows import read_notes, read_rows, write_parquet
 from train.runs import STEP, checkpoint
 from train.runs.checkpoint import CheckpointError
-from train.runs.run_folder import PATHS, RunFolder, files_of_run, paths_beside
+from train.runs.run_folder import PATHS, RunFolder, paths_beside
 from train.scoring.statistics import run_means
 from train.sweep.folder import SweepFolder
 from train.sweep.spec import RunSpec
@@ -59,7 +59,6 @@ def export(folder: SweepFolder, out: Path, step: float = STEP) -> tuple[int, dic
                     shutil.copy2(source.path / name, target / name)
             lines = thinned(read_metrics(source.metrics), CURVE_LINES)
             write_metrics(target / PACKED_METRICS, lines)
-            (target / METRICS).unlink(missing_ok=True)
             shutil.rmtree(target / "checkpoints", ignore_errors=True)
         best = best_runs(folder, runs)
         for name in best.values():  # the policy of the checkpoint that was evaluated
@@ -80,12 +79,11 @@ def _merge_rows(folder: SweepFolder, out: Path) -> None:
     rows = without_train_details(rounded(read_rows(new)))
     replaced = {name for name in rows["run"].unique().to_pylist() if name}
     old = sorted(out.glob("*.parquet"))
-    superseded = {path for name in replaced for path in files_of_run(out, name)}  # of an export that did not merge
-    if set(old) - superseded:
-        kept = read_rows([path for path in old if path not in superseded])
+    if old:
+        kept = read_rows(old)
         others = pa.array([name not in replaced for name in kept["run"].to_pylist()])
         rows = pa.concat_tables([kept.filter(others), rows], promote_options="permissive")
-    requests = {note for path in {*old, *new} - superseded for note in read_notes(path).get("asked", "").splitlines()}
+    requests = {note for path in (*old, *new) for note in read_notes(path).get("asked", "").splitlines()}
     # Paths, then rows, then what is no longer wanted: rows are never without paths as new as they.
     paths = [paths_beside(path) for path in new if paths_beside(path).is_file()]
     for path in paths:

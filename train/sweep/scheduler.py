@@ -13,7 +13,7 @@ from typing import Any
 
 from interactive_nav_common.config import replace
 from interactive_nav_common.jobs.gpus import Gpu
-from interactive_nav_common.jobs.processes import LOCKED, LOST, Job, Launcher, LocalLauncher, Share, run_jobs
+from interactive_nav_common.jobs.processes import LOCKED, LOST, Job, Launcher, Share, run_jobs
 from train.sweep.folder import RunState, SweepDisplay, SweepFolder, log_tail, words_of_evaluation
 from train.sweep.spec import LaunchConfig
 
@@ -37,7 +37,7 @@ USABLE = 0.95
 """Part of a GPU's memory that runs may fill: the driver takes some."""
 
 
-class Machine(LocalLauncher):
+class Machine(Launcher):
     """Processes on this machine, each with its share of a GPU, or whole GPUs, or of the cores."""
 
     def __init__(self, gpus: list[Gpu], slots: int):

@@ -81,6 +81,16 @@ class LaunchConfig(Settings):
 
 
 @dataclasses.dataclass(frozen=True)
+class Override(Settings):
+    """What differs in some runs."""
+
+    where: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Axis -> value, or values, of the runs that it is for."""
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    launch: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
 class SweepConfig(Settings):
     """A sweep as its file says it."""
 
@@ -154,7 +164,8 @@ def expand(plain: Any, where: str, default_name: str) -> Sweep:
         if not isinstance(values, list) or not values:
             raise ConfigError(f"{where}: grid: {axis}: got {values!r}, expected a list of values")
     axes = list(config.grid)
-    overrides = [_override(entry, config, f"{where}: overrides[{i}]") for i, entry in enumerate(config.overrides)]
+    overrides = [overlay(Override(), entry, f"{where}: overrides[{i}]") for i, entry in enumerate(config.overrides)]
+    matching = [_where(entry.where, config, f"{where}: overrides[{i}]") for i, entry in enumerate(overrides)]
     skips = [_where(entry, config, f"{where}: skip[{i}]") for i, entry in enumerate(config.skip)]
     root = Path(config.out_dir) / config.name
     runs: dict[str, RunSpec] = {}
@@ -166,12 +177,11 @@ def expand(plain: Any, where: str, default_name: str) -> Sweep:
         label = f"{where}: {name}"
         train = config_io.load_config(_filled(config.preset, values, where))
         launch = config.launch
-        layers = [config.settings] + [entry["settings"] for entry in overrides if _matches(entry["where"], values)]
-        for layer in [*layers, values]:
+        chosen = [each for each, at in zip(overrides, matching, strict=True) if _matches(at, values)]
+        for layer in (config.settings, *(each.settings for each in chosen), values):
             train = config_io.from_dict(nested(layer.items(), label), train, label)
-        for entry in overrides:
-            if _matches(entry["where"], values):
-                launch = overlay(launch, entry["launch"], label, "launch.")
+        for each in chosen:
+            launch = overlay(launch, each.launch, label, "launch.")
         run = dataclasses.replace(train.run, name=name, out_dir=str(root / "runs"))
         train = config_io.with_scenes(dataclasses.replace(train, run=run))
         validate(train)
@@ -204,26 +214,12 @@ def select(sweep: Sweep, where: Sequence[str], shard: str | None) -> Sweep:
     return dataclasses.replace(sweep, runs=tuple(runs))
 
 
-def _mapping(value: Any, where: str, what: str) -> Any:
-    if not isinstance(value, Mapping):
-        raise ConfigError(f"{where}: {what}: got {value!r}, expected a mapping")
-    return value
-
-
-def _override(entry: Any, config: SweepConfig, where: str) -> dict[str, Any]:
-    keys = ("where", "settings", "launch")
-    _mapping(entry, where, "the entry")
-    for key in entry:
-        if key not in keys:
-            raise ConfigError(f"{where}: unknown key {key!r}{nearest(str(key), keys)}")
-    parts = {key: _mapping(entry.get(key) or {}, where, key) for key in keys}
-    return {**parts, "where": _where(parts["where"], config, where)}
-
-
 def _where(entry: Any, config: SweepConfig, where: str) -> dict[str, list[Any]]:
     """Return axis -> the values that match."""
     wanted = {}
-    for axis, value in _mapping(entry, where, "where").items():
+    if not isinstance(entry, Mapping):
+        raise ConfigError(f"{where}: got {entry!r}, expected a mapping")
+    for axis, value in entry.items():
         if axis not in config.grid:
             near = nearest(str(axis), list(config.grid))
             raise ConfigError(f"{where}: {axis!r} is no axis of the grid{near}; axes: {', '.join(config.grid)}")

@@ -126,7 +126,7 @@ class Legged:
         return tuple(float(joint.actfrcrange[1]) for joint in self._joints_of_file)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Row(Figures):
     """A robot of `legged.yaml`."""
 

@@ -115,6 +115,8 @@ def test_what_is_kept(swept, tmp_path, capsys):
     old = out / "rows" / "k_int0-seed0-01234567.parquet"
     elsewhere = run_rows("fetch", "sac", 1.0, 3, 0.7, (0.5, 0.5))
     write_parquet(elsewhere, out / "rows" / "elsewhere-01234567.parquet", {"asked": "there"})
+    superseded = run_rows("turtlebot", "ppo", 0.0, 0, 0.7, (0.5, 0.5))  # of an evaluation that the sweep lacks now
+    superseded = superseded.set_column(0, "run", [["k_int0-seed0"] * len(superseded)])
     never = run_rows("turtlebot", "ppo", 0.0, 9, 0.7, (0.5, 0.5))
     never = never.set_column(0, "run", [["baselines"] * len(never)])
     write_parquet(never, swept.rows / "baselines-01234567.parquet", {"asked": "here"})
@@ -123,7 +125,7 @@ def test_what_is_kept(swept, tmp_path, capsys):
     paths_beside(rows).write_bytes(b"where it went")
     for _ in range(2):  # again replaces
         old.parent.mkdir(parents=True, exist_ok=True)
-        old.write_bytes(b"of an evaluation that the sweep no longer has")
+        write_parquet(superseded, old)
         assert main([str(tmp_path / "small.yaml"), "--export", str(out)]) == 0
         printed = capsys.readouterr().out
         assert "checkpoint of k_int0-seed1" in printed and "k_int0-seed0" not in printed and "MiB" in printed
