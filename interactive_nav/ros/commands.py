@@ -4,13 +4,13 @@ import contextlib
 import os
 import shlex
 import shutil
-import subprocess
-import sys
+import signal
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 from interactive_nav_common.errors import UserError, missing, optional
-from interactive_nav_common.jobs.processes import GUARD
+from interactive_nav_common.jobs.processes import Child, Job
 
 _GRACE_S = 10.0
 """Time for a command to end by itself, and again after SIGTERM."""
@@ -35,19 +35,14 @@ def beside(command: str, stops: list[int]) -> Iterator[Callable[[], bool]]:
     if program is None:
         raise UserError(f"--run is {command!r}, expected a program that can be run, with its words")
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    guarded = [sys.executable, "-c", GUARD, program, *words[1:]]
-    process = subprocess.Popen(guarded, start_new_session=True)  # Ctrl-C is for us
+    child = Child(Job(command, (program, *words[1:]), Path(os.devnull), env={}), {}, logged=False)
     try:
-        yield lambda: bool(stops or process.poll())
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(0.0 if stops else _GRACE_S)
-        failed = process.poll()
+        yield lambda: bool(stops or child.poll())
+        failed = child.wait(0.0 if stops else _GRACE_S)
     finally:
-        if process.poll() is None:
-            process.terminate()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(_GRACE_S)
-        process.kill()
-        process.wait()  # gone before this command ends
+        child.send(signal.SIGTERM)
+        child.wait(_GRACE_S)
+        child.send(signal.SIGKILL)
+        child.wait()  # gone before this command ends
     if failed and not stops:
         raise UserError(f"{words[0]} ended with exit code {failed}; its message is above")

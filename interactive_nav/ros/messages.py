@@ -271,8 +271,10 @@ def imu_message(yaw_rad: float, angular_b: np.ndarray, head: Header) -> Imu:
 
 
 def twist_message(linear_mps: float, angular_radps: float) -> Twist:
-    """Return a velocity along x and a turn about z."""
-    return Twist(linear=Vector3(x=float(linear_mps)), angular=Vector3(z=float(angular_radps)))
+    """Return a velocity along x and a turn about z, which are finite."""
+    message = Twist(linear=Vector3(x=float(linear_mps)), angular=Vector3(z=float(angular_radps)))
+    twist_command(message)
+    return message
 
 
 def twist_command(message: Twist) -> tuple[float, float]:

@@ -11,13 +11,15 @@ import numpy as np
 
 from interactive_nav.navigation.lookup import all_free
 from interactive_nav.pictures.camera import PictureCamera
+from interactive_nav.sensing.description import describe, inputs_of
 from interactive_nav.sensing.sensors import LIDAR_NEAR_M
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.rotations import matrix_from_quat
-from scenes_mjcf.categories import SEGMENTATIONS
 
 NEEDED = ("velocity", "odometry", "lidar")
 """Observations of the environment that are sent on topics other than a camera's."""
+IMAGES = ("depth", "segmentation", "rgb")
+"""Kinds of images that topics carry."""
 Images = Mapping[str, np.ndarray]
 """By kind, such as `rgb` or `left/depth`: colours [H, W, 3] u8, depth [H, W] f32 in m, class ids [H, W] u8."""
 
@@ -101,7 +103,8 @@ class RosSensors:
 
     def __init__(self, env: Any):
         """Take an environment that velocities drive."""
-        self._env, config = env, env.config
+        self._env, config, self._origin_w = env, env.config, None
+        self._scales = {name: of["scale"] for name, of in describe(env)["inputs"].items()}
         if env.robot.twist is None:
             env.robot.drive(0.0, 0.0)  # says which modes take a velocity
         self.lidar_fov_deg, self.lidar_range_m = config.lidar_fov_deg, config.lidar_range_m
@@ -123,17 +126,16 @@ class RosSensors:
 
     def read(self, state: Any, time_s: float, force_n: float = 0.0) -> Sensed:
         """Return what the sensors measure of a state."""
-        nav, sizes, obs = state.info["nav"], self._env.sensors.sizes, state.obs
-        vector = np.asarray(obs["state"] if isinstance(obs, Mapping) else obs)
-        values: Any = dict(zip(sizes, np.split(vector, np.cumsum(list(sizes.values()))[:-1]), strict=True))
+        nav, values = state.info["nav"], inputs_of(self._env, jax.tree.map(np.asarray, state.obs))
+        images = ((name, value) for name, value in values.items() if name.rpartition("/")[2] in IMAGES)
         movable, structure = (bool(t) for t in np.asarray(nav.memory["touching"]))
         velocity = values.get("velocity", np.zeros(6))
         truth_w = np.append(np.asarray(nav.robot_pos_w)[:2], nav.yaw_rad)
         return Sensed(
             time_s=time_s,
-            images=self._images(state),
+            images={name.removeprefix("pixels/"): self._image(name, value) for name, value in images},
             scan=values.get("lidar", np.zeros(0)),
-            odometry=self._odometry(values, truth_w),
+            odometry=truth_w if self._origin_w is None else compose(self._origin_w, values["odometry"]),
             linear_b=velocity[:3],
             angular_b=velocity[3:],
             heading_rad=float(nav.yaw_rad),
@@ -143,22 +145,12 @@ class RosSensors:
             truth_w=truth_w,
         )
 
-    def _odometry(self, values: Mapping[str, np.ndarray], truth_w: np.ndarray) -> np.ndarray:
-        return truth_w
-
-    def _images(self, state: Any) -> Images:
-        config, pixels = self._env.config, "pixels/"
-        divisor = SEGMENTATIONS[config.segmentation_classes].divisor
-        factors = {"rgb": 255, "depth": np.float32(config.depth_range_m), "segmentation": divisor}
-        if not isinstance(state.obs, Mapping):
-            return {}
-        images = {name.removeprefix(pixels): np.asarray(x) for name, x in state.obs.items() if name.startswith(pixels)}
-        whole = {name: x / np.float32(255 if x.dtype == np.uint8 else 1) for name, x in images.items()}
-        scaled = {name: x * factors[kind] for name, x in whole.items() if (kind := name.rpartition("/")[2]) in factors}
-        return {
-            name: x[..., 0] if name.endswith("depth") else np.squeeze(np.round(x).astype(np.uint8))
-            for name, x in scaled.items()
-        }
+    def _image(self, name: str, value: np.ndarray) -> np.ndarray:
+        """Return an image of the observation in a message's unit and type."""
+        image = value * np.float32(self._scales[name])
+        if name.endswith("depth"):
+            return image[..., 0]
+        return np.squeeze(np.round(image * (255 if name.endswith("rgb") else 1)).astype(np.uint8))
 
 
 class RosSimulator(RosSensors):
@@ -181,7 +173,7 @@ class RosSimulator(RosSensors):
             begin = begin.replace(start_xy_w=jnp.asarray([x, y], jnp.float32), start_yaw_rad=jnp.float32(yaw))
         self._state = jax.jit(env.reset_to)(begin, jax.random.fold_in(key, 1))
         self._force_before = 0.0
-        self._origin = np.array([*begin.start_xy_w, begin.start_yaw_rad])
+        self._origin_w = np.array([*begin.start_xy_w, begin.start_yaw_rad])
         self.cameras = self.camera_poses(self._state)
         jax.block_until_ready(self._step(self._state, jnp.zeros(env.action_size)))  # compiled before it counts
 
@@ -197,15 +189,9 @@ class RosSimulator(RosSensors):
     def sense(self) -> Sensed:
         nav = self._state.info["nav"]
         force_n = float(nav.memory["force_sum_n"]) - self._force_before
-        return self.read(self._state, int(nav.step_count) * self.dt_s, force_n)
-
-    def _odometry(self, values: Mapping[str, np.ndarray], truth_w: np.ndarray) -> np.ndarray:
-        return compose(self._origin, values["odometry"])
-
-    def _images(self, state: Any) -> Images:
-        lens = self.lenses[""]
-        drawn = self._camera.frame(state, lens.width, lens.height) if self._camera else {}
-        return {**super()._images(state), **drawn}
+        now, lens = self.read(self._state, int(nav.step_count) * self.dt_s, force_n), self.lenses[""]
+        drawn = self._camera.frame(self._state, lens.width, lens.height) if self._camera else {}
+        return dataclasses.replace(now, images={**now.images, **drawn})
 
 
 def compose(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:

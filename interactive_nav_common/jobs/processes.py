@@ -66,7 +66,8 @@ class Job:
 class Child:
     """A job's process; holds its locks as long as it lives."""
 
-    def __init__(self, job: Job, env: Mapping[str, str]):
+    def __init__(self, job: Job, env: Mapping[str, str], logged: bool = True):
+        """Start it; what is not `logged` is printed where we print."""
         self._process: subprocess.Popen[bytes] | None = None
         self._until = time.monotonic() + job.timeout_s
         held: list[int] = []
@@ -77,14 +78,14 @@ class Child:
                     return
                 here.callback(os.close, descriptor)
                 held.append(descriptor)
-            log = here.enter_context(open(job.log, "ab"))
-            log.write(f"== {time.strftime('%Y-%m-%d %H:%M:%S')} {job.name}\n".encode())
-            log.flush()
+            log = here.enter_context(open(job.log, "ab", buffering=0)) if logged else None
+            if log:
+                log.write(f"== {time.strftime('%Y-%m-%d %H:%M:%S')} {job.name}\n".encode())
             self._process = subprocess.Popen(
                 [sys.executable, "-c", GUARD, *job.command],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
-                stderr=subprocess.STDOUT,
+                stderr=subprocess.STDOUT if log else None,
                 env={**os.environ, **job.env, **env},
                 pass_fds=held,
                 start_new_session=True,  # Ctrl-C is for us: the child gets it once, as SIGTERM
@@ -101,9 +102,10 @@ class Child:
             return LATE
         return code
 
-    def wait(self) -> int:
-        """Wait until it has ended; return what `poll` does."""
-        return LOCKED if self._process is None else self._process.wait()
+    def wait(self, timeout_s: float | None = None) -> int | None:
+        """Wait until it has ended, or for so long; return what `poll` does."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            return LOCKED if self._process is None else self._process.wait(timeout_s)
 
     def send(self, number: signal.Signals) -> None:
         """Ask it to save and end with SIGTERM; end it and its children with SIGKILL."""

@@ -1,15 +1,13 @@
 """Define drivers behind the navigator's node, which map an image, a heading and a time to a velocity."""
 
-import dataclasses
-import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from interactive_nav import get_robot
-from interactive_nav_common.errors import ConfigError, UserError
+from interactive_nav_common.errors import ConfigError
 from scenes_mjcf.look import Lens
 from topological_nav.config import NavigatorConfig
 from topological_nav.data.folders import lens_of
@@ -22,20 +20,13 @@ from topological_nav.navigate.navigator import Navigator, State
 from topological_nav.weights.export import Choice
 
 
-@dataclasses.dataclass(frozen=True)
-class VelocityCommand:
+class VelocityCommand(NamedTuple):
     """Hold the velocity to command until a driver's next step."""
 
     linear_mps: float
     angular_radps: float
     done: bool = False
     """The episode is over, and the robot stands still."""
-
-    def __post_init__(self) -> None:
-        if not math.isfinite(self.linear_mps + self.angular_radps):
-            raise UserError(
-                f"the driver commands {self.linear_mps} m/s and {self.angular_radps} rad/s, expected finite numbers"
-            )
 
 
 class Driver(Protocol):

@@ -3,6 +3,7 @@
 import math
 import time
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,29 +21,10 @@ _HEADING_LATE_S = 0.2
 """Wall-clock time to wait for a heading no older than an image."""
 
 
-class Headings:
-    """Hold recent headings by time; not thread-safe."""
-
-    def __init__(self, kept: int = 256):
-        self._pairs: deque[tuple[float, float]] = deque(maxlen=kept)
-
-    def add(self, time_s: float, yaw_rad: float) -> None:
-        """Add a heading; one older than the newest drops all others (the clock was set back)."""
-        if time_s < self.newest_s:
-            self._pairs.clear()
-        self._pairs.append((time_s, yaw_rad))
-
-    @property
-    def newest_s(self) -> float:
-        """Return the time of the last heading; minus infinity without one."""
-        return self._pairs[-1][0] if self._pairs else -math.inf
-
-    def at(self, time_s: float) -> float:
-        """Return the heading, rad in [-pi, pi], interpolated between two, or else the nearest one."""
-        if not self._pairs:
-            raise ValueError("no heading was added yet")
-        times, yaws = np.array(self._pairs).T
-        return math.remainder(np.interp(time_s, times, np.unwrap(yaws)), math.tau)
+def heading_at(headings: Sequence[tuple[float, float]], time_s: float) -> float:
+    """Return the heading, rad in [-pi, pi], at a time: between two of (s, rad) in order, or else the nearest one."""
+    times, yaws = np.array(headings).T
+    return math.remainder(np.interp(time_s, times, np.unwrap(yaws)), math.tau)
 
 
 class NavigatorNode(DrivingNode):
@@ -59,7 +41,8 @@ class NavigatorNode(DrivingNode):
         """Subscribe on a node of `ros_node`; the offset is the yaw of the heading's frame in the map's frame."""
         super().__init__(node, "navigator", SILENCE_S, say)
         self._driver, self._offset = driver, heading_offset_rad
-        self._headings, self._image, self._said_s = Headings(), np.zeros(0), -math.inf
+        self._headings: deque[tuple[float, float]] = deque(maxlen=256)  # s of the message, rad
+        self._image, self._said_s = np.zeros(0), -math.inf
         self._used_s = -math.inf
         self._done = node.create_publisher(Bool, ros.DONE, ros.qos(ros.DONE))
         heading = ros.HEADING_TOPICS[heading_from]
@@ -72,12 +55,12 @@ class NavigatorNode(DrivingNode):
         time_s = self._stamps.get(ros.IMAGE, -math.inf)
         if time_s <= self._used_s or (self._driver.lens is not None and not self._lenses):
             return False
-        late = math.isfinite(self._headings.newest_s) and time.monotonic() - self._came[ros.IMAGE] > _HEADING_LATE_S
-        return late or self._headings.newest_s >= time_s - 1e-6
+        late = time.monotonic() - self._came[ros.IMAGE] > _HEADING_LATE_S
+        return bool(self._headings) and (late or self._headings[-1][0] >= time_s - 1e-6)
 
     def _decide(self) -> tuple[tuple[float, float], bool]:
         time_s = self._used_s = self._stamps[ros.IMAGE]
-        heading = math.remainder(self._headings.at(time_s) + self._offset, math.tau)
+        heading = math.remainder(heading_at(self._headings, time_s) + self._offset, math.tau)
         lens = self._driver.lens
         image = self._image if lens is None else self._seen("rgb", self._image, lens)
         command = self._driver.step(image, heading, time_s)
@@ -93,6 +76,7 @@ class NavigatorNode(DrivingNode):
 
     def _forget(self) -> str:
         self._used_s = self._said_s = -math.inf
+        self._headings.clear()
         return super()._forget()
 
     def _on_image(self, message: Any) -> None:
@@ -100,4 +84,4 @@ class NavigatorNode(DrivingNode):
 
     def _on_heading(self, message: Any) -> None:
         quat = message.orientation if isinstance(message, ros.Imu) else message.pose.pose.orientation
-        self._headings.add(ros.seconds(message.header.stamp), ros.quat_yaw(quat))
+        self._headings.append((ros.seconds(message.header.stamp), ros.quat_yaw(quat)))

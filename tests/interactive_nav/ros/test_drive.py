@@ -18,7 +18,7 @@ from interactive_nav.ros import driving as shared
 from interactive_nav.ros import messages, nodes
 from interactive_nav.ros.__main__ import main
 from interactive_nav.ros.drive import DriveNode
-from interactive_nav.ros.nodes import RosError, SimulatorNode, ros_node
+from interactive_nav.ros.nodes import SimulatorNode, ros_node
 from interactive_nav.ros.pilot import Pilot, encoded, remaining, resampled, scene_path
 from interactive_nav.ros.remote import RosPolicy
 from interactive_nav.ros.simulator import Pace, Sensed
@@ -149,11 +149,12 @@ def test_limits_keep_the_curve(twist, limits, expected):
     assert pilot.decide(values()) == pytest.approx(expected)
 
 
-def test_a_velocity_that_is_not_finite_is_refused():
-    pilot = Pilot(recording(twist=(math.nan, 0.0)))
-    pilot.aim(np.array([3.0, 0.0]))
-    with pytest.raises(OnnxError, match=r"commands \[nan, 0.0\], expected finite numbers"):
-        pilot.decide(values())
+def test_a_velocity_that_is_not_finite_ends_the_node(tmp_path, quick):
+    policy = write_policy(tmp_path / "policy.onnx", gains=(math.nan, 0.0))
+    with driving(policy, Robot(), Pace(lockstep=True), silence_s=60.0) as bus:
+        publisher(bus.user, messages.GOAL, messages.PoseStamped).publish(goal(3.0, 0.0))
+        until(lambda: bus.errors)
+    assert bus.errors == ["velocity command is (nan, 0.0), expected finite numbers"]
 
 
 def test_bytes_are_rounded():
@@ -228,7 +229,7 @@ def driving(policy, robot, pace, **settings):
         def run(node):
             try:
                 node.run(lambda: bool(stops))
-            except RosError as error:
+            except UserError as error:
                 errors.append(str(error))
 
         simulator = SimulatorNode(theirs, robot, pace)

@@ -130,8 +130,9 @@ def test_velocity_commands_come_back_and_must_be_finite():
     message = messages.twist_message(0.4, -0.25)
     assert messages.twist_command(message) == (0.4, -0.25)
     message.angular.z = math.nan
-    with pytest.raises(messages.MessageError, match="expected finite numbers"):
-        messages.twist_command(message)
+    for refused in (lambda: messages.twist_command(message), lambda: messages.twist_message(math.nan, 0.0)):
+        with pytest.raises(messages.MessageError, match="expected finite numbers"):
+            refused()
 
 
 def test_the_optical_frame_looks_along_x_with_its_x_to_the_right():

@@ -1,12 +1,10 @@
 """The navigator behind the interface of a driver."""
 
-import math
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from interactive_nav_common.errors import UserError
 from scenes_mjcf.look import Lens
 from topological_nav.ros.drivers import PilotDriver, VelocityCommand
 
@@ -36,9 +34,3 @@ def test_the_navigator_is_asked_as_a_batch_of_one_and_ends_the_episode(how):
         and navigator.asked == [((1, 3, 4, 3), [0.5], [1.0 + 0.1 * k]) for k in range(3)]
         and driver.lens is lens
     )
-
-
-def test_velocities_that_are_not_finite_are_refused():
-    assert VelocityCommand(0.1, 0.2).angular_radps == 0.2
-    with pytest.raises(UserError, match="commands nan m/s"):
-        VelocityCommand(math.nan, 0.0)

@@ -17,7 +17,7 @@ from scenes_mjcf.look import Lens
 from tests.topological_nav.ros.turning import Turning
 from topological_nav.ros import nodes as navigator_nodes
 from topological_nav.ros.drivers import VelocityCommand
-from topological_nav.ros.nodes import Headings, NavigatorNode
+from topological_nav.ros.nodes import NavigatorNode, heading_at
 
 
 class Robot:
@@ -198,7 +198,7 @@ def test_pictures_have_the_drivers_lens_and_headings_are_in_the_maps_frame(bus):
 def test_a_velocity_that_is_not_finite_stops_the_robot(bus):
     said = []
     node = SimulatorNode(bus.simulator, Robot(), Pace(factor=0.0, limit_s=0.3), said.append)  # type: ignore[arg-type]
-    node._on_command(messages.twist_message(math.nan, 0.0))
+    node._on_command(messages.Twist(linear=messages.Vector3(x=math.nan)))
     assert node.run(never).path_m == 0.0
     assert said == ["simulator: velocity command is (nan, 0.0), expected finite numbers; the robot stops"]
 
@@ -226,21 +226,20 @@ def test_a_lost_camera_stops_the_robot(bus, monkeypatch):
 
 
 def test_headings_turn_the_short_way_between_two_tellings():
-    told = Headings()
-    with pytest.raises(ValueError, match="no heading"):
-        told.at(1.0)
-    told.add(1.0, math.radians(170))
-    told.add(2.0, math.radians(-170))
-    assert math.degrees(told.at(1.25)) == pytest.approx(175)
-    assert math.degrees(told.at(1.75)) == pytest.approx(-175)
-    assert math.degrees(told.at(0.0)) == pytest.approx(170) and math.degrees(told.at(9.0)) == pytest.approx(-170)
-    assert told.newest_s == 2.0
-    told.add(0.5, 0.25)  # a clock set back
-    assert told.at(2.0) == 0.25 and told.newest_s == 0.5
+    told = [(1.0, math.radians(170)), (2.0, math.radians(-170))]
+    at = [math.degrees(heading_at(told, time_s)) for time_s in (1.25, 1.75, 0.0, 9.0)]
+    assert at == pytest.approx([175, -175, 170, -170])
 
 
-def test_only_so_many_headings_are_kept():
-    told = Headings(kept=3)
-    for i in range(10):
-        told.add(float(i), 0.1 * i)
-    assert told.at(0.0) == pytest.approx(0.7)
+def test_headings_before_a_clock_that_is_set_back_do_not_count(bus):
+    said = []
+    navigator = NavigatorNode(bus.navigator, Watcher(None), say=said.append)  # type: ignore[arg-type]
+    compass = bus.simulator.create_publisher(messages.Imu, messages.HEADING, messages.qos(messages.HEADING))
+    until(lambda: compass.get_subscription_count() == 2)
+    for time_s, yaw_rad in ((5.0, 0.1), (6.0, 0.2)):
+        compass.publish(messages.imu_message(yaw_rad, np.zeros(3), messages.header(time_s, "base_link")))
+    until(lambda: len(navigator._headings) == 2)
+    for time_s in (1.0, 1.1):  # the first of them is refused
+        compass.publish(messages.imu_message(0.3, np.zeros(3), messages.header(time_s, "base_link")))
+    until(lambda: navigator._headings and navigator._headings[-1] == (pytest.approx(2.1), pytest.approx(0.3)))
+    assert len(navigator._headings) == 1 and "time jumped back from 7.000 to 2.000 s" in navigator._mistake
