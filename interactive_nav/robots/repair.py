@@ -244,17 +244,13 @@ def hold(
     parents = model.body_parentid
     held, swinging = [], []
     for joint in loose:
-        body = model.body(joint.parent.name).id
-        below = {body}
-        for other in range(body + 1, model.nbody):  # children come after their parents
-            if parents[other] in below:
-                below.add(other)
-        geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in below and model.geom_group[g] == 3]
+        body, below = model.body(joint.parent.name).id, [joint.parent, *joint.parent.find_all("body")]
+        geoms = [model.geom(g.name).id for g in joint.parent.find_all("geom") if g.group == 3]
         down_m = [np.abs(data.geom_xmat[g, 6:]) @ half_extents(model, g) for g in geoms]
         lowest = min((data.geom_xpos[g, 2] - down for g, down in zip(geoms, down_m, strict=True)), default=np.inf)
         on_floor = joint.type == hinge and not model.jnt_limited[model.joint(joint.name).id]
         on_floor = on_floor and lowest < bottom_m + FLOOR_M
-        if on_floor or any(model.body(name).id in below for name in casters):
+        if on_floor or any(part.name in casters for part in below):
             swinging.append(joint)
             continue
         held.append(joint)

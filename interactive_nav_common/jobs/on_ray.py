@@ -22,18 +22,13 @@ class Actor:
     """A worker as its launcher sees it."""
 
     def __init__(self, ray: Any, worker: Any):
-        self._ray, self._worker, self._code = ray, worker, worker.wait.remote()
+        self._ray, self._worker, self._code = ray, worker, worker.wait.remote().future()
 
     def poll(self) -> int | None:
-        ready, _ = self._ray.wait([self._code], timeout=0)
-        if not ready:
+        if not self._code.done():
             return None
-        try:
-            code = self._ray.get(self._code)
-        except self._ray.exceptions.RayError:
-            code = LOST
         self._ray.kill(self._worker)
-        return code
+        return LOST if self._code.exception() else self._code.result()
 
     def send(self, number: signal.Signals) -> None:
         self._worker.send.remote(number)

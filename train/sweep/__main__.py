@@ -24,10 +24,8 @@ class Sweep(Command):
     """Train and evaluate every run of a sweep. The same command continues what was stopped or killed, and leaves out
     what is done."""
 
-    sweep: Annotated[str | None, *word("NAME|PATH")] = None
+    sweep: Annotated[str, *word("NAME|PATH")]
     """A sweep, or a YAML file."""
-    config: Annotated[str | None, option(metavar="NAME|PATH")] = None
-    """The same, as `python -m train` takes it."""
     status: Flag = False
     """Print how far every run is, and do nothing."""
     export: Annotated[Path | None, option(metavar="DIR")] = None
@@ -55,8 +53,6 @@ class Sweep(Command):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if (self.sweep is None) == (self.config is None):
-            raise ConfigError("expected one sweep, by name or path (--help lists them)")
         if self.launcher != "ray":
             refuse_unused(self, "--ray-address", "without --launcher ray")
         if self.unfinished and self.only != "evaluate":
@@ -77,7 +73,7 @@ def main(argv: Sequence[str] | None = None, programs: Programs = PROGRAMS) -> in
     """Run a sweep; see `Outcome.exit_code`."""
     arguments = parse(Sweep, "python -m train.sweep", argv)
     console = SafeConsole()
-    sweep = spec.select(spec.load_sweep(arguments.sweep or arguments.config), arguments.where, arguments.shard)
+    sweep = spec.select(spec.load_sweep(arguments.sweep), arguments.where, arguments.shard)
     folder = SweepFolder(sweep)
     if arguments.status:
         states = [folder.state(run) for run in sweep.runs]

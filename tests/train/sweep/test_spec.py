@@ -172,7 +172,7 @@ def test_a_wrong_file_is_one_line_and_exit_2(tmp_path, capsys):
     for words, message in (
         (["kitn"], "no sweep 'kitn', did you mean 'kint'?"),
         ([str(tmp_path / "no.yaml")], "no.yaml: not readable"),
-        ([], "expected one sweep, by name or path"),
+        ([], "missing NAME|PATH"),
         (["kint", "--unfinished"], "expected --only evaluate with it"),
         (["kint", "--time-limit", "0"], "--time-limit is 0.0, expected a positive number"),
     ):
