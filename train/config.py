@@ -252,6 +252,8 @@ class RunConfig(Settings):
     """Seed of networks, environments and sampling."""
     init: str = ""
     """Run folder (ppo or clone) whose best policy a new run starts from; critic and optimiser are new."""
+    curriculum: tuple[NotNegative, NotNegative, Share] = (0.0, 0.0, 0.8)
+    """Largest path from start to goal at first (m; 0: any), that from which any is drawn, success at which it grows."""
     devices: AtLeastOne = 1
     """Devices that share environments and minibatches, with a process per GPU; ppo only."""
     num_timesteps: AtLeastOne = 20_000_000
@@ -324,6 +326,10 @@ def validate(config: TrainConfig) -> None:
     """Raise `ConfigError` where values exclude each other; what is still None is not looked at."""
     if not config.env.scenes:
         raise ConfigError("env.scenes is empty, expected at least one scene folder: env.scenes=PATH[,PATH...]")
+    least_m, (first_m, full_m, _) = config.env.min_goal_distance_m, config.run.curriculum
+    if first_m and not (least_m < first_m < full_m and config.run.devices == 1):
+        got = f"run.curriculum is {config.run.curriculum}, expected two rising distances above env.min_goal_distance_m"
+        raise ConfigError(f"{got} ({least_m}) and a success, with run.devices=1; or leave it out")
     images = any(name in config.env.observations for name in IMAGES)
     for name in ("network", *AUTO):
         section, auto = getattr(config, name), AUTO.get(name, {}).values()
@@ -340,14 +346,12 @@ def validate(config: TrainConfig) -> None:
                 problem = f"{name}.{field.name} is {value!r}, which changes nothing here"
                 raise ConfigError(f"{problem}: expected {needs}; or leave it out")
     section, remembers = getattr(config, config.algorithm), config.network.memory != "none"
-    if remembers and config.algorithm == "clone":
-        raise ConfigError(
-            f"network.memory is {config.network.memory!r} with algorithm clone, expected an algorithm that learns from "
-            "whole sequences; set network.memory=none, or algorithm=ppo, sac or ddpg"
-        )
-    if config.network.critic_inputs == "privileged" and config.algorithm != "ppo":
-        problem = f"network.critic_inputs is 'privileged' with algorithm {config.algorithm}"
-        raise ConfigError(f"{problem}, expected algorithm ppo; set network.critic_inputs=all, or algorithm=ppo")
+    for name, value, able in (("memory", "gru", ("ppo", "sac", "ddpg")), ("critic_inputs", "privileged", ("ppo",))):
+        if getattr(config.network, name) == value and config.algorithm not in able:
+            got = f"network.{name} is {value!r} with algorithm {config.algorithm}"
+            raise ConfigError(
+                f"{got}, expected algorithm {' or '.join(able)}; leave network.{name} out, or set algorithm"
+            )
     if isinstance(section, OffPolicyConfig):
         _validate_replay(config.algorithm, section, config.run.num_timesteps, remembers)
     ppo = config.ppo

@@ -6,6 +6,7 @@ parked outside and counted; without a suitable pair of start and goal, a fallbac
 
 import math
 import zlib
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -36,18 +37,18 @@ def _uniform_places(key: jax.Array, shape: tuple[int, ...], cells: jax.Array, co
 
 
 def miss_m(
-    tables: SceneTables, scene: jax.Array, start: jax.Array, goal: jax.Array, least_m: float, largest_m: float
+    tables: SceneTables, scene: jax.Array, start: jax.Array, goal: jax.Array, least_m: float, largest_m: Any
 ) -> jax.Array:
     """Return [] m by which a start and a goal (2,) miss a least planar and a largest geodesic distance, or 0."""
     miss = jnp.maximum(least_m - jnp.linalg.norm(start - goal), 0.0)
-    if math.isfinite(largest_m):
+    if isinstance(largest_m, jax.Array) or math.isfinite(largest_m):
         way_m = geodesic_at(tables, scene, goal_field(tables, scene, goal), start)
         miss += jnp.maximum(way_m - largest_m, 0.0)
     return miss
 
 
 def _draw_pair(
-    key_start: jax.Array, key_goal: jax.Array, tables: SceneTables, scene: jax.Array, least_m: float, largest_m: float
+    key_start: jax.Array, key_goal: jax.Array, tables: SceneTables, scene: jax.Array, least_m: float, largest_m: Any
 ) -> tuple[jax.Array, jax.Array]:
     """Return the first of uniform pairs of start and goal that is as far apart as required; else a fallback pair."""
 
@@ -121,17 +122,20 @@ def draw_episode(
     robot_radius_m: float,
     rules: TaskRules,
     scene: jax.Array | None = None,
+    limit_m: jax.Array | None = None,
 ) -> EpisodeStart:
     """Draw scene (if None), start, goal and small objects uniformly (paper section IV).
 
     Start and goal are the first of up to `MAX_ROUNDS` uniform pairs at the required distance, else one of
     `tables.fallback_pairs_xy_w`. Each small object, of radii [k], takes the first of `CLUTTER_CANDIDATES` uniform
-    places clear of earlier objects, the robot at the start and, with `goal_clear`, the goal.
+    places clear of earlier objects, the robot at the start and, with `goal_clear`, the goal. `limit_m` [] lowers the
+    largest distance; without a suitable pair, the fallback pair keeps the rules alone.
     """
     key_scene, key_start, key_goal, key_yaw, key_place, key_turn = jax.random.split(key, 6)
     if scene is None:
         scene = jax.random.randint(key_scene, (), 0, tables.rest_qpos.shape[0])
-    distances_m = rules.min_goal_distance_m, rules.max_goal_distance_m
+    most_m = rules.max_goal_distance_m if limit_m is None else jnp.minimum(limit_m, rules.max_goal_distance_m)
+    distances_m = rules.min_goal_distance_m, most_m
     start_xy, goal_xy = _draw_pair(key_start, key_goal, tables, scene, *distances_m)
     kept_free = [start_xy, goal_xy] if rules.goal_clear else [start_xy]
     small_xy, small_placed = place_small(key_place, tables, scene, small_radius_m, kept_free, robot_radius_m)

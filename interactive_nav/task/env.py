@@ -119,15 +119,18 @@ class InteractiveNav(Env):
         """Return the first state of a new episode; `rng`, one key, is consumed; `scene`, [] i32, is drawn if None."""
         return self.observe(self.draw(rng, scene))
 
-    def draw(self, rng: jax.Array, scene: jax.Array | None = None) -> State:
-        """Do `reset` without an observation: `obs` is empty until `observe`."""
+    def draw(self, rng: jax.Array, scene: jax.Array | None = None, **limit: jax.Array) -> State:
+        """Do `reset` without an observation: `obs` is empty until `observe`; `limit` is as in `draw_start`."""
         rng, key = jax.random.split(rng)
-        return self._begin(self.draw_start(key, scene), rng)
+        return self._begin(self.draw_start(key, scene, **limit), rng)
 
-    def draw_start(self, key: jax.Array, scene: jax.Array | None = None) -> EpisodeStart:
-        """Return what an episode starts from, as `reset` draws it: `key` is consumed, `scene` [] i32, drawn if None."""
+    def draw_start(self, key: jax.Array, scene: jax.Array | None = None, **limit: jax.Array) -> EpisodeStart:
+        """Return what an episode starts from, as `draw` draws it: `key` is consumed, `scene` [] i32, drawn if None.
+
+        `limit` may be `limit_m` [], as in `draw_episode`.
+        """
         radii_m = self._small_radius_m, self.robot.footprint_radius_m
-        return draw_episode(key, self.tables, *radii_m, self.config, scene)
+        return draw_episode(key, self.tables, *radii_m, self.config, scene, **limit)
 
     def strew(self, key: jax.Array, start: EpisodeStart) -> EpisodeStart:
         """Return one environment's given episode with its small objects drawn: clear of start, goal and each other."""

@@ -23,6 +23,7 @@ from brax.envs.base import Env, State, Wrapper
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jax.tree_util import tree_leaves_with_path
 
+from interactive_nav.task.curriculum import Curriculum
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav_common.errors import ConfigError
 
@@ -34,20 +35,21 @@ DRAW_SHARE = 16
 """New episodes are drawn for this fraction of the batch at a time."""
 
 
-def reset_all(env: InteractiveNav, keys: jax.Array, slot: jax.Array | None = None) -> State:
+def reset_all(env: InteractiveNav, keys: jax.Array, slot: jax.Array | None = None, **limit: jax.Array) -> State:
     """Return N new episodes of [N, 2] keys, consumed, each in the scene that its environment keeps, if any.
 
-    `slot` [N] i32 numbers the environments of a part of a larger batch; None: 0 to N - 1.
+    `slot` [N] i32 numbers the environments of a part of a larger batch; None: 0 to N - 1. `limit` is `limit_m` [N], or
+    empty.
     """
-    if env.config.scene_choice != "slot":
-        return jax.vmap(env.reset)(keys)
-    return jax.vmap(env.reset)(keys, (jnp.arange(keys.shape[0]) if slot is None else slot) % len(env.scenes))
+    slot = jnp.arange(keys.shape[0]) if slot is None else slot
+    kept = (slot % len(env.scenes),) if env.config.scene_choice == "slot" else ()
+    return jax.vmap(env.observe)(jax.vmap(env.draw)(keys, *kept, **limit))
 
 
-def draw_where(env: InteractiveNav, current: tuple, over: jax.Array) -> tuple:
+def draw_where(env: InteractiveNav, current: tuple, over: jax.Array, **limit: jax.Array) -> tuple:
     """Return physics, `nav` and `rng` of N environments with new episodes where `over` [N], whose `rng` is consumed.
 
-    They are drawn in small groups, as few end in one step. Environments may keep their scene.
+    They are drawn in small groups, as few end in one step. Environments may keep their scene. `limit` is as above.
     """
     n = over.shape[0]
     share = max(1, n // DRAW_SHARE)
@@ -55,9 +57,9 @@ def draw_where(env: InteractiveNav, current: tuple, over: jax.Array) -> tuple:
     def some(carry):
         current, pending = carry
         index = jnp.nonzero(pending, size=share, fill_value=n)[0]
-        nav, rng = (jax.tree.map(lambda x: x[jnp.minimum(index, n - 1)], x) for x in current[-2:])
+        nav, rng, near = jax.tree.map(lambda x: x[jnp.minimum(index, n - 1)], (*current[-2:], limit))
         kept = (nav.scene_index,) if env.config.scene_choice == "slot" else ()
-        fresh = jax.vmap(env.draw)(rng, *kept)
+        fresh = jax.vmap(env.draw)(rng, *kept, **near)
         new = (fresh.pipeline_state, fresh.info["nav"], fresh.info["rng"])
         current = jax.tree.map(lambda old, x: old.at[index].set(x, mode="drop"), current, new)
         return current, pending.at[index].set(False, mode="drop")
@@ -160,6 +162,10 @@ class AutoResetEnv(Wrapper):
 
     env: InteractiveNav
 
+    curriculum: tuple[float, float, float] | None = None
+    """First limit and last, and the success needed: see `Curriculum`, which `info["curriculum"]` then is. The score
+    `curriculum_m` is the limit that an episode was drawn under."""
+
     def __init__(self, env: Any, action_repeat: int = 1, final_obs: bool = False):
         """Wrap an environment of one episode, or a wrapper of it.
 
@@ -174,14 +180,20 @@ class AutoResetEnv(Wrapper):
 
     def reset(self, rng: jax.Array, slot: jax.Array | None = None) -> State:
         """Return N states for [N, 2] keys; `slot` as in `reset_all`."""
-        state = reset_all(self.env, rng, slot)
-        zero = jnp.zeros(rng.shape[0])
+        zero, course, limit = jnp.zeros(rng.shape[0]), {}, {}
+        scores = [*self.env.metric_names, "length", "sum_reward"]
+        if self.curriculum:
+            first, scores = zero + self.curriculum[0], [*scores, "curriculum_m"]
+            course["curriculum"] = Curriculum(first, first, zero, *self.curriculum[1:])  # type: ignore[call-arg]
+            limit["limit_m"] = first
+        state = reset_all(self.env, rng, slot, **limit)
         info = {
             **state.info,
+            **course,
             "steps": zero,
             "episode_done": zero,
             "running_reward": zero,
-            "episode_metrics": {name: zero for name in (*self.env.metric_names, "length", "sum_reward")},
+            "episode_metrics": {name: zero for name in scores},
         }
         for name, value in self.models.items():
             if slot is None and len(value) != len(rng):
@@ -208,13 +220,19 @@ class AutoResetEnv(Wrapper):
         total = state.info["running_reward"] + stepped.reward
         finished = {name: stepped.metrics[name] for name in self.env.metric_names}
         finished |= {"length": steps, "sum_reward": total}
+        course, limit = {}, {}
+        if self.curriculum:
+            finished["curriculum_m"] = state.info["curriculum"].drawn_m
+            course["curriculum"] = state.info["curriculum"].after(done, finished["success"])
+            limit["limit_m"] = course["curriculum"].allowed_m
         last = state.info["episode_metrics"]
         episode_metrics = {name: jnp.where(done, finished[name], last[name]) for name in last}
 
         moving = (stepped.pipeline_state, stepped.info["nav"], stepped.info["rng"])
-        physics, nav, rng = draw_where(self.env, moving, done)
+        physics, nav, rng = draw_where(self.env, moving, done, **limit)
         info = {
             **stepped.info,
+            **course,
             "nav": nav,
             "rng": rng,
             "steps": steps,

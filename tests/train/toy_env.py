@@ -105,9 +105,9 @@ class ToyEnv(Env):
         }
         return {name: done * score for name, score in scores.items()}
 
-    def reset(self, rng: jax.Array) -> State:
+    def reset(self, rng: jax.Array, limit_m: Any = jnp.inf) -> State:
         rng, key_distance, key_bearing, key_yaw = jax.random.split(rng, 4)
-        distance = jax.random.uniform(key_distance, (), minval=1.0, maxval=2.5)
+        distance = jax.random.uniform(key_distance, (), minval=1.0, maxval=jnp.minimum(2.5, limit_m))
         bearing, yaw = jax.random.uniform(key_bearing), jax.random.uniform(key_yaw)
         bearing = 2 * jnp.pi * bearing
         nav = ToyNav(
@@ -130,8 +130,8 @@ class ToyEnv(Env):
         info = {"nav": nav, "rng": rng, "truncation": zero, "time_out": zero}
         return State(None, self._observe(nav), zero, zero, self._metrics(nav, zero, zero), info)
 
-    def draw(self, rng: jax.Array) -> State:
-        return self.reset(rng)
+    def draw(self, rng: jax.Array, **limit: jax.Array) -> State:
+        return self.reset(rng, **limit)
 
     def observe(self, state: State) -> State:
         return state.replace(obs=self._observe(state.info["nav"]))  # type: ignore[attr-defined]

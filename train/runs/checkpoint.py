@@ -59,6 +59,8 @@ class CheckpointMeta:
     action_size: int
     began_together: int = 0
     """Env steps at which all environments last began new episodes."""
+    curriculum_m: float | None = None
+    """The limit that new episodes were drawn under (`run.curriculum`)."""
     sha256: dict[str, str] = dataclasses.field(default_factory=dict)
     """File name -> SHA-256 of its content; empty in checkpoints of earlier releases."""
     scenes: dict[str, str] = dataclasses.field(default_factory=dict)

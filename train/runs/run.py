@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
@@ -130,6 +131,12 @@ class FolderCallbacks:
         learner = checkpoint.load_learner(path, template.learner)
         env_state = checkpoint.load_env_state(path, template.env_state)
         self._began_together = meta.env_steps if env_state is None else meta.began_together
+        if env_state is None and (reached_m := meta.curriculum_m):  # from the second episodes on
+
+            def resumed(path: Any, leaf: Any) -> Any:
+                return jnp.full_like(leaf, reached_m) if ".limit_m" in jax.tree_util.keystr(path) else leaf
+
+            env_state = jax.tree.map_with_path(resumed, template.env_state)
         return Snapshot(meta.env_steps, learner, env_state)
 
     def should_stop(self) -> bool:
@@ -182,13 +189,17 @@ class FolderCallbacks:
         run = self.config.run
         limit = num_envs(self.config) * self.config.env.episode_steps
         since = snapshot.env_steps - max(run.checkpoint_every_steps, limit)
-        fair = since >= self._began_together + limit
-        lines = [line for line in self.folder.read_metrics() if fair and line["env_steps"] > since]
+        lines = [line for line in self.folder.read_metrics() if line["env_steps"] > since]
+        # Under a curriculum's limit scores are higher.
+        easy = any(line.get("episode/curriculum_m", np.inf) < 0.999 * run.curriculum[1] for line in lines)
+        fair = since >= self._began_together + limit and not easy
+        course = getattr(snapshot.env_state, "info", {}).get("curriculum")
         meta = CheckpointMeta(
             env_steps=snapshot.env_steps,
             wall_s=self._wall_s(),
-            score=mean_over_episodes(lines, f"episode/{run.best_metric}"),
+            score=mean_over_episodes(lines if fair else [], f"episode/{run.best_metric}"),
             began_together=self._began_together,
+            curriculum_m=course and float(course.limit_m[0]),
             algorithm=self.config.algorithm,
             robot=robot_name(self.config.env.robot),
             observations=self.config.env.observations,
@@ -216,10 +227,7 @@ class FolderCallbacks:
 
 
 def check_alike(setting: str, folder: RunFolder, config: TrainConfig, names: Sequence[tuple[str, str]] = ()) -> None:
-    """Raise `ConfigError` where a run that `setting` names understands actions, or settings `names`, otherwise.
-
-    Each is a setting's name in `config`, and that in the run's.
-    """
+    """Raise `ConfigError` where the run that `setting` names acts otherwise, or differs in `names`, here and there."""
     mine, theirs = flatten(config), flatten(folder.read_config())
     for name, there in [*((name, name) for name in OF_ACTIONS), *names]:
         if mine[name] != theirs[there]:
@@ -347,6 +355,7 @@ def _train_in(
 def learn(env: Any, config: TrainConfig, callbacks: Any) -> TrainResult:
     devices, privileged = devices_here(config.run.devices), config.network.critic_inputs == "privileged"
     batch = AutoResetEnv(PrivilegedEnv(env) if privileged else env)
+    batch.curriculum = config.run.curriculum if config.run.curriculum[0] else None
     return ALGORITHMS[config.algorithm].train(
         ShardedEnv(batch, devices) if len(devices) > 1 else batch, config, callbacks
     )

@@ -24,10 +24,6 @@ Teach = Callable[[Any, jax.Array], jax.Array]
 """(states of N environments, key) -> actions [N, A] in [-1, 1]; planners run on the host, so they are not pure."""
 
 
-OF_WAYPOINTS = ("env.num_waypoints", "env.waypoint_spacing_m", "env.waypoint_style")
-"""Settings of the task that decide what a run observes."""
-
-
 class TaughtEnv(Wrapper):
     """One environment with `teach`, which returns what the teacher would do in its states."""
 
@@ -58,7 +54,8 @@ def _of_run(folder: RunFolder, config: EnvConfig, env: Any, build_env: Callable[
     sensors = {field.name: getattr(run.env, field.name) for field in dataclasses.fields(SensorConfig)}
     world = dataclasses.replace(config, **sensors, random_sensor_delay_steps=(0, 0))
     run = dataclasses.replace(run, env=world)
-    check_alike("clone.teacher", folder, run, [(name, name) for name in OF_WAYPOINTS])
+    of_waypoints = "env.num_waypoints", "env.waypoint_spacing_m", "env.waypoint_style"
+    check_alike("clone.teacher", folder, run, [(name, name) for name in of_waypoints])
     seen = build_env(world)
     policy, _ = load_policy(folder, run, seen, "best", deterministic=True)
     if isinstance(policy, RecurrentPolicy):

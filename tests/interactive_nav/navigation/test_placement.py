@@ -175,6 +175,15 @@ def test_a_largest_distance_holds(built):
         c, r = np.floor((drawn.start_xy_w[i] - origin) / tables.fine_m).astype(int)
         assert distances[r, c] <= 2.0 * 1.02 + 0.05
     assert np.linalg.norm(drawn.start_xy_w - drawn.goal_xy_w, axis=-1).min() >= 1.0
+    # A limit that is given with the key is the same as one in the settings, and an infinite one is none.
+    rules, keys = TaskRules(), jax.random.split(jax.random.PRNGKey(1), 200)
+
+    def limited(key, **limit):
+        return draw_episode(key, tables, jnp.zeros(0), world.robot.footprint_radius_m, rules, **limit)
+
+    for limit_m, expected in ((2.0, drawn), (jnp.inf, jax.jit(jax.vmap(limited))(keys))):
+        got = jax.jit(jax.vmap(limited))(keys, limit_m=jnp.full(200, limit_m))
+        jax.tree.map(np.testing.assert_array_equal, got, expected)
 
 
 def draw_pairs(tables, count, least_m, largest_m):
