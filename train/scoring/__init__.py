@@ -2,7 +2,7 @@
 
 LEARNED = "learned"
 POLICIES = (LEARNED, "random", "follower")
-"""The policy of a run, and `policies.BASELINES`."""
+"""The policy of a run, and baselines of `policies.make_baseline`."""
 PLANNERS = ("avoider", "namo:W")
 SEED = 1_000_000
 """Of the fixed episodes where none is given."""

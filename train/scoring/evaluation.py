@@ -93,15 +93,13 @@ def load_policy(
     learner = checkpoint.load_learner(path, algorithm.template(env, config))
     remembers = config.network.memory != "none"
 
-    def act(learner: Any, observation: Any, key: jax.Array) -> jax.Array:
-        return algorithm.policy(env, config, learner, deterministic)(observation, key)[0]
-
-    def act_with_memory(learner: Any, *inputs: Any) -> Any:
-        return algorithm.make_agent(env, config).recurrent_policy(learner, deterministic)(*inputs)
+    def act(learner: Any, *inputs: Any) -> Any:
+        if remembers:
+            return algorithm.make_agent(env, config).recurrent_policy(learner, deterministic)(*inputs)
+        return algorithm.policy(env, config, learner, deterministic)(*inputs)[0]
 
     kind = (config.algorithm, config.network, getattr(config, config.algorithm), deterministic)
-    made = act_with_memory if remembers else act
-    made = made if cached is None else cached.setdefault(kind, made)
+    made = act if cached is None else cached.setdefault(kind, act)
     if remembers:
         return RecurrentPolicy(learner, made, config.network.memory_size), meta
     return jax.tree_util.Partial(made, learner), meta

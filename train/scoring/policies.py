@@ -10,7 +10,7 @@ against detours (`interactive_nav.navigation.ways`).
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -161,16 +161,11 @@ class Planner(HostPolicy):
         return velocity_towards(self._env.robot.twist, float(bearing), PLAN_CRUISE_M_S, PLAN_ALIGNED_RAD, np)
 
 
-BASELINES: dict[str, Callable[[Any], PolicyFn]] = {"random": make_random, "follower": make_follower}
-"""Planners on the host; W is the weight of pushing against detour, 0 to 1."""
-
-
 def make_baseline(name: str, env: Any) -> PolicyFn | Planner:
-    """Build a policy or planner that never learns, by name: random, follower, avoider or namo:W."""
-    if name in BASELINES:
-        return BASELINES[name](env)
-    if name == "avoider":
-        return Planner(env, None)
+    """Build a policy or planner that never learns, by name: random, follower, avoider or namo:W (W as in `Planner`)."""
+    plain = {"random": make_random, "follower": make_follower, "avoider": lambda env: Planner(env, None)}
+    if name in plain:
+        return plain[name](env)
     kind, _, weight = name.partition(":")
     if kind == "namo":
         try:
