@@ -349,9 +349,7 @@ def validate(config: TrainConfig) -> None:
     for name, value, able in (("memory", "gru", ("ppo", "sac", "ddpg")), ("critic_inputs", "privileged", ("ppo",))):
         if getattr(config.network, name) == value and config.algorithm not in able:
             got = f"network.{name} is {value!r} with algorithm {config.algorithm}"
-            raise ConfigError(
-                f"{got}, expected algorithm {' or '.join(able)}; leave network.{name} out, or set algorithm"
-            )
+            raise ConfigError(f"{got}, expected algorithm {' or '.join(able)}; change one of the two")
     if isinstance(section, OffPolicyConfig):
         _validate_replay(config.algorithm, section, config.run.num_timesteps, remembers)
     ppo = config.ppo

@@ -135,8 +135,7 @@ def draw_episode(
     if scene is None:
         scene = jax.random.randint(key_scene, (), 0, tables.rest_qpos.shape[0])
     most_m = rules.max_goal_distance_m if limit_m is None else jnp.minimum(limit_m, rules.max_goal_distance_m)
-    distances_m = rules.min_goal_distance_m, most_m
-    start_xy, goal_xy = _draw_pair(key_start, key_goal, tables, scene, *distances_m)
+    start_xy, goal_xy = _draw_pair(key_start, key_goal, tables, scene, rules.min_goal_distance_m, most_m)
     kept_free = [start_xy, goal_xy] if rules.goal_clear else [start_xy]
     small_xy, small_placed = place_small(key_place, tables, scene, small_radius_m, kept_free, robot_radius_m)
     turn = jax.random.uniform(key_turn, small_radius_m.shape, minval=-jnp.pi, maxval=jnp.pi)

@@ -125,10 +125,7 @@ class InteractiveNav(Env):
         return self._begin(self.draw_start(key, scene, **limit), rng)
 
     def draw_start(self, key: jax.Array, scene: jax.Array | None = None, **limit: jax.Array) -> EpisodeStart:
-        """Return what an episode starts from, as `draw` draws it: `key` is consumed, `scene` [] i32, drawn if None.
-
-        `limit` may be `limit_m` [], as in `draw_episode`.
-        """
+        """Return an episode's start; `key` is consumed, `scene` [] i32 drawn if None, `limit` may hold `limit_m` []."""
         radii_m = self._small_radius_m, self.robot.footprint_radius_m
         return draw_episode(key, self.tables, *radii_m, self.config, scene, **limit)
 

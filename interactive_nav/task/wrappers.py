@@ -38,8 +38,7 @@ DRAW_SHARE = 16
 def reset_all(env: InteractiveNav, keys: jax.Array, slot: jax.Array | None = None, **limit: jax.Array) -> State:
     """Return N new episodes of [N, 2] keys, consumed, each in the scene that its environment keeps, if any.
 
-    `slot` [N] i32 numbers the environments of a part of a larger batch; None: 0 to N - 1. `limit` is `limit_m` [N], or
-    empty.
+    `slot` [N] i32 numbers environments of a part of a larger batch; None: 0 to N - 1. `limit` may hold `limit_m` [N].
     """
     slot = jnp.arange(keys.shape[0]) if slot is None else slot
     kept = (slot % len(env.scenes),) if env.config.scene_choice == "slot" else ()
@@ -67,20 +66,21 @@ def draw_where(env: InteractiveNav, current: tuple, over: jax.Array, **limit: ja
     return jax.lax.while_loop(lambda carry: carry[1].any(), some, (current, over))[0]
 
 
-def _where(mask: jax.Array, new: Any, old: Any) -> Any:
+def where_rows(mask: jax.Array, new: Any, old: Any) -> Any:
+    """Return `new` where `mask` [N], else `old`: pytrees of [N, ...]."""
     return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)
 
 
 def reset_where(env: InteractiveNav, state: Any, keys: jax.Array, mask: jax.Array) -> Any:
     """Start new episodes where `mask`."""
     info = state.info
-    physics, nav, rng = draw_where(env, (state.pipeline_state, info["nav"], _where(mask, keys, info["rng"])), mask)
+    physics, nav, rng = draw_where(env, (state.pipeline_state, info["nav"], where_rows(mask, keys, info["rng"])), mask)
     of_step = (state.reward, state.done, state.metrics, info["truncation"], info["time_out"])
     reward, done, metrics, truncation, time_out = jax.tree.map(lambda x: jnp.where(mask, 0.0, x), of_step)
     info = {**info, "nav": nav, "rng": rng, "truncation": truncation, "time_out": time_out}
     new = state.replace(pipeline_state=physics, reward=reward, done=done, metrics=metrics, info=info)
     new = jax.vmap(env.observe)(new)
-    return new.replace(obs=_where(mask, new.obs, state.obs))
+    return new.replace(obs=where_rows(mask, new.obs, state.obs))
 
 
 def step_all(

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 from brax.envs import Env
 from brax.training import types
 
+from interactive_nav.task.wrappers import where_rows
 from interactive_nav_common.errors import ConfigError
 from train.config import OffPolicyConfig
 from train.learners import memory, networks
@@ -224,10 +225,7 @@ def collect(
         ended = done > 0
         if kept:
             after = after.replace(info=after.info | {"policy": memory.forget(new, ended)})
-        noise = jax.tree.map(
-            lambda x, start: jnp.where(ended.reshape(-1, *[1] * (x.ndim - 1)), start, x), noise, agent.init_noise()
-        )
-        return OffPolicyData(after, replay, noise), collected
+        return OffPolicyData(after, replay, where_rows(ended, agent.init_noise(), noise)), collected
 
     return jax.lax.scan(step, data, jax.random.split(key, agent.config.steps_per_update))
 

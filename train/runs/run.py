@@ -131,12 +131,11 @@ class FolderCallbacks:
         learner = checkpoint.load_learner(path, template.learner)
         env_state = checkpoint.load_env_state(path, template.env_state)
         self._began_together = meta.env_steps if env_state is None else meta.began_together
-        if env_state is None and (reached_m := meta.curriculum_m):  # from the second episodes on
-
-            def resumed(path: Any, leaf: Any) -> Any:
-                return jnp.full_like(leaf, reached_m) if ".limit_m" in jax.tree_util.keystr(path) else leaf
-
-            env_state = jax.tree.map_with_path(resumed, template.env_state)
+        if env_state is None and (reached_m := meta.curriculum_m):  # for what follows the first new episodes
+            env_state = jax.tree.map_with_path(
+                lambda path, x: jnp.full_like(x, reached_m) if ".limit_m" in jax.tree_util.keystr(path) else x,
+                template.env_state,
+            )
         return Snapshot(meta.env_steps, learner, env_state)
 
     def should_stop(self) -> bool:

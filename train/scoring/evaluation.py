@@ -29,12 +29,9 @@ from train.scoring import AUTO_BATCH, LEARNED
 from train.scoring.brought import BroughtPolicy
 from train.scoring.driver import Driver
 from train.scoring.policies import make_baseline
-from train.scoring.rows import Paths, PlayedEpisodes, episode_table
+from train.scoring.rows import OF_TRAINING, Paths, PlayedEpisodes, episode_table
 
-OF_LEARNED = (
-    *("algorithm", "seed", "checkpoint_steps", "deterministic"),
-    *("train_env_steps", "train_wall_s", "train_device", "train_commit"),
-)
+OF_LEARNED = ("algorithm", "seed", "deterministic", *OF_TRAINING)
 """Columns that are empty for a policy that never learned."""
 
 
@@ -100,9 +97,8 @@ def load_policy(
 
     kind = (config.algorithm, config.network, getattr(config, config.algorithm), deterministic)
     made = act if cached is None else cached.setdefault(kind, act)
-    if remembers:
-        return RecurrentPolicy(learner, made, config.network.memory_size), meta
-    return jax.tree_util.Partial(made, learner), meta
+    size = config.network.memory_size
+    return RecurrentPolicy(learner, made, size) if remembers else jax.tree_util.Partial(made, learner), meta
 
 
 def make_policies(

@@ -19,13 +19,13 @@ SCORES = {"success": "success", "path_efficiency": "P_eff", "effort_efficiency":
 
 
 _NEW = ("clearance_m", "least_clearance_m", "turning_rad_per_m")
-_OF_TRAINING = ("train_device", "train_commit", "train_env_steps", "checkpoint_steps", "train_wall_s")
+OF_TRAINING = ("train_device", "train_commit", "train_env_steps", "checkpoint_steps", "train_wall_s")
 COLUMNS = Columns(
-    text=("run", "robot", "policy", "scene", "split", "algorithm", "device", *_OF_TRAINING[:2]),
-    whole=("episode", "seed", "evaluation_seed", *_OF_TRAINING[2:4]),
-    numbers=("k_int", *SCORES, "kinematic_effort", "dynamic_effort", "structure_steps", *_NEW, *_OF_TRAINING[4:]),
-    may_be_empty=("algorithm", "seed", "k_int", *_OF_TRAINING),
-    may_be_missing=("device", "evaluation_seed", "structure_steps", *_NEW, *_OF_TRAINING),
+    text=("run", "robot", "policy", "scene", "split", "algorithm", "device", *OF_TRAINING[:2]),
+    whole=("episode", "seed", "evaluation_seed", *OF_TRAINING[2:4]),
+    numbers=("k_int", *SCORES, "kinematic_effort", "dynamic_effort", "structure_steps", *_NEW, *OF_TRAINING[4:]),
+    may_be_empty=("algorithm", "seed", "k_int", *OF_TRAINING),
+    may_be_missing=("device", "evaluation_seed", "structure_steps", *_NEW, *OF_TRAINING),
 )
 TYPES: dict[str, pa.DataType] = {
     **dict.fromkeys((*COLUMNS.text, "backend", "commit", "versions"), pa.string()),
@@ -80,7 +80,7 @@ def check_rows(rows: pa.Table, path: Path) -> None:
     if 2 * len(needed & set(rows.column_names)) < len(needed):
         return
     COLUMNS.check(rows, path)
-    dataclasses.replace(COLUMNS, may_be_empty=_OF_TRAINING).check(rows.filter(pc.field("policy") == "learned"), path)
+    dataclasses.replace(COLUMNS, may_be_empty=OF_TRAINING).check(rows.filter(pc.field("policy") == "learned"), path)
     if "by_category" in rows.column_names and not rows["by_category"].type.equals(BY_CATEGORY):
         raise FileError(f"{path}: column 'by_category' holds {rows['by_category'].type}, expected {BY_CATEGORY}")
 

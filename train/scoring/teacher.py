@@ -30,10 +30,9 @@ class TaughtEnv(Wrapper):
     def __init__(self, teacher: str, config: EnvConfig, build_env: Callable[[EnvConfig], Any] = build_env):
         """Build an environment and its teacher: a planner or baseline by name, or a run folder."""
         super().__init__(build_env(config))
-        self.teach: Teach
         if teacher in ("avoider", "follower") or teacher.startswith("namo:"):
             policy = make_baseline(teacher, self.env)
-            self.teach = _on_host(policy, self.env) if isinstance(policy, Planner) else _batched(policy)
+            self.teach: Teach = _on_host(policy, self.env) if isinstance(policy, Planner) else _batched(policy)
         elif Path(teacher).is_dir():
             self.teach = _of_run(RunFolder(Path(teacher)), config, self.env, build_env)
         else:

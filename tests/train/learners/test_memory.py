@@ -249,7 +249,7 @@ def test_it_is_refused_where_nothing_keeps_memory(run, tmp_path):
     with pytest.raises(ConfigError, match="played as an ONNX file"):
         export.main.__wrapped__([str(folder.path), "-o", str(tmp_path / "policy.onnx")], build_env=build_toy)
     with pytest.raises(
-        ConfigError, match="memory is 'gru' with algorithm clone, expected algorithm ppo or sac or ddpg; leave"
+        ConfigError, match="memory is 'gru' with algorithm clone, expected algorithm ppo or sac or ddpg; change"
     ):
         resolve(TrainConfig(toy_config(tmp_path).env, "clone", GRU), "native")
     for algorithm in ("sac", "ddpg"):
