@@ -1,7 +1,6 @@
 """Convert raw folders, and generate sets of scenes, in parallel and resumably, on one machine or several.
 
-Each source, or batch of up to `TOGETHER` scenes, has a process. If a process is killed, only its current scene is lost;
-another process continues the batch.
+Each source and each scene has a process: if it is killed, no other is lost.
 """
 
 import contextlib
@@ -24,7 +23,7 @@ from converters.clock import STAGES, Report, peak_memory_mib
 from converters.generate.homes.config import GenerationError
 from converters.pipeline import ConvertConfig, Converted, convert_building
 from converters.read.source import root_of
-from converters.recipes import KEPT, PASSED, Recipes, chosen, load_recipes, make_scenes, parse_recipes
+from converters.recipes import Recipes, chosen, load_recipes, make_scenes, parse_recipes
 from converters.records.errors import StageFailed
 from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError, FileError, UserError, readable
@@ -164,10 +163,6 @@ SEEDS = 100_000
 TEST_SHARE = 0.2
 CONVERSION = {"structure_faces": 16000, "object_faces": 3000, "structure_texture": 1024, "object_texture": 256}
 """How large meshes and textures are."""
-TOGETHER = 3
-"""Most scenes that a process generates one after the other: it imports libraries and reads furniture once."""
-REFUSED = "converters generate-scenes: "
-"""What an error begins with, of a process that generates one scene."""
 GRACE_S = 10.0
 """A process that is not wanted any more has this long to end itself."""
 
@@ -245,27 +240,16 @@ def generate_scenes(wanted: Any, report: Report, log: Callable[[str], None]) -> 
     recipes = load_recipes(path)
     todo = chosen(recipes, wanted.out, wanted.only, wanted.overwrite, log)
     if len(todo) > 1 and (wanted.jobs > 1 or wanted.launcher == "ray"):
-        launcher, at_once = make_launcher(wanted.launcher, wanted.ray_address, wanted.jobs, len(todo))
+        launcher, _ = make_launcher(wanted.launcher, wanted.ray_address, wanted.jobs, len(todo))
         words = [sys.executable, "-m", "converters", "generate-scenes", str(wanted.out), "--recipes", str(path)]
         words += ["--jobs", "1", *(["--overwrite"] if wanted.overwrite else []), "--only"]
-        size = min(TOGETHER, -(-len(todo) // at_once))
-        left, failed = [[r.name for r in todo[k : k + size]] for k in range(0, len(todo), size)], []
-        while left:
-            commands, left = {" ".join(names): [*words, *names] for names in left}, []
-            with contextlib.closing(
-                run_commands(commands, launcher, wanted.out, report, "groups of scenes")
-            ) as results:
-                for names, code, printed in results:
-                    rest = names.split()
-                    for line in (line.removeprefix(REFUSED) for line in printed.splitlines()):
-                        if (name := line.partition(":")[0]) in rest:
-                            rest.remove(name)
-                            failed += [name] if code and not line.endswith((PASSED, KEPT)) else []
-                            log(line)
-                    if rest:  # its process ended while it worked on the first of these
-                        failed.append(rest[0])
-                        log(f"{rest[0]}: exit code {code}, {printed.strip()[-200:]}")
-                        left += [rest[1:]] if rest[1:] else []
+        commands, failed = {recipe.name: [*words, recipe.name] for recipe in todo}, []
+        with contextlib.closing(run_commands(commands, launcher, wanted.out, report, "scenes")) as results:
+            for name, code, printed in results:
+                lines = [line.removeprefix("error: ") for line in printed.splitlines()]
+                killed = f"{name}: exit code {code}, {printed.strip()[-200:]}"
+                log(next((line for line in lines if line.startswith(f"{name}: ")), killed))
+                failed += [name] if code else []
     else:
         gates = make_scenes(todo, recipes.conversion, wanted.out, wanted.overwrite, wanted.jobs, report, log)
         failed = [name for name, failing in gates.items() if failing]

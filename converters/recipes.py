@@ -34,8 +34,8 @@ T = TypeVar("T")
 _CONVERSION = ("structure_faces", "object_faces", "structure_texture", "object_texture", "seed")
 MOST_SEEDS, NEXT_SEED = 5, 1_000_000
 """Seeds that a home's recipe stands for, and between them: of six one gives no plan that meets its shares."""
-PASSED, KEPT = "every gate passes", "is there, kept"
-"""Ends of the lines about scenes that are as they should be."""
+KEPT = "is there, kept"
+"""End of the line about a scene that exists."""
 GENERATE, CONVERT = 0.55, 0.35
 """Shares of one scene's time, hulls cached, the rest is drawing: weights of the progress bar."""
 
@@ -248,6 +248,6 @@ def make_scenes(
             failed[recipe.name] = ["none"]
             log(f"{recipe.name}: {str(error).removeprefix(f'{recipe.name}: ')}")
             continue
-        verdict = f"gates that fail: {', '.join(failed[recipe.name])}" if failed[recipe.name] else PASSED
+        verdict = f"gates that fail: {', '.join(failed[recipe.name])}" if failed[recipe.name] else "every gate passes"
         log(f"{recipe.name}: {recipe.split}, {seed}, {verdict}")
     return failed

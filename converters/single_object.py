@@ -21,16 +21,14 @@ from converters.check.gates import collide_with, physical_values
 from converters.check.settle import settle
 from converters.generating import ObjectConfig
 from converters.geometry.boxes import Hull, convex_hull, fit_box
-from converters.geometry.faces import merge_vertices, simplify_to
+from converters.geometry.faces import merge_vertices
 from converters.read.files import SourceFolder
-from converters.read.meshes import clean_surface, colours_of_faces, read_surface
-from converters.read.obj import TexturedMesh
+from converters.read.meshes import clean_surface, read_surface
 from converters.read.urdf import RigidObject, read_urdf
 from converters.records.errors import SceneRejected
-from converters.records.raw import VisualMesh
 from converters.write.emit import SceneParts, build_spec, write_scene
 from converters.write.manifest import PACKAGES
-from converters.write.texture import as_it_is, bake_object, textured_cloud
+from converters.write.texture import NO_CLOUD, draw_objects
 from interactive_nav_common.files import whole_folder
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, matrix_from_quat
 from scenes_mjcf.categories import TABLE
@@ -73,17 +71,6 @@ def _level_feet(points: np.ndarray, foot_m: float) -> Hull:
     return dataclasses.replace(hull, vertices=hull.vertices - [0.0, 0.0, min(float(hull.vertices[:, 2].min()), 0.0)])
 
 
-def _visual(surface: TexturedMesh, where: str, source: SourceFolder) -> VisualMesh:
-    """Return the surface (body frame) as it is where it is small, else simplified with a new texture."""
-    mesh = clean_surface(source, where, surface)
-    small = as_it_is(surface, FACES, TEXELS)
-    if small is not None:
-        return small
-    # Points twice as dense as the texels of the picture.
-    cloud = textured_cloud(surface, max(float(np.ptp(mesh[0], axis=0).max()) / TEXELS, 1e-4))
-    return bake_object(*mesh, cloud, simplify_to(*mesh[:2], FACES), TEXELS)[0]
-
-
 def convert_object(
     path: Path,
     target: Path,
@@ -116,13 +103,14 @@ def convert_object(
         base = np.array([*(low + high)[:2] / 2, min(float(h.vertices[:, 2].min()) for h in hulls)])
         hulls = tuple(_level_feet(h.vertices - base, FOOT_SHARE * float(high[2] - low[2])) for h in hulls)
         surface = dataclasses.replace(item.surface, vertices=item.surface.vertices - base)
-        visual = _visual(surface, path.name, source)
         mass_kg, mass_source = _given(config.mass_kg, item.mass_kg, "density")
         friction, friction_source = _given(config.friction, item.friction, "category")
         physical = physical_properties(category, hulls, mass_kg, friction)
-        mesh = surface.vertices, surface.faces, colours_of_faces(surface)
+        mesh = clean_surface(source, path.name, surface)
         boxes = tuple(fit_box(h, 0.0) for h in hulls)
-        placed = PlacedObject(target.name, category, item.name, *mesh, hulls, boxes)
+        placed = PlacedObject(target.name, category, item.name, *mesh, hulls, boxes, surface_b=surface)
+        # Points twice as dense as the texels of the picture.
+        (drawn,) = draw_objects([placed], [NO_CLOUD], FACES, TEXELS, least_m=1e-4)
         parts = settle(SceneParts(placed.name, (placed,), (physical,), ())).parts
         about = {
             "source_name": item.name,
@@ -141,7 +129,7 @@ def convert_object(
             "size_m": [round(float(v), 4) for v in high - low],
             "rest": _rest(parts),
         }
-        _write(dataclasses.replace(parts, object_visuals=(visual,)), about, folder)
+        _write(dataclasses.replace(parts, object_visuals=(drawn.mesh,)), about, folder)
     return about
 
 

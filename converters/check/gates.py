@@ -7,8 +7,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import shapely
 from scipy import ndimage
-from scipy.spatial import ConvexHull, KDTree, QhullError
+from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.distance import pdist
 
 from converters.check.opening import blocked_fronts, held_bodies
@@ -119,14 +120,8 @@ def _largest_piece(maps: SceneMaps) -> tuple[np.ndarray, np.ndarray]:
 def free_space_values(maps: SceneMaps) -> dict[str, float]:
     """Return traversable area (m2), its share that the disc covers in one piece, and the piece's farthest pair (m)."""
     piece, distance = _largest_piece(maps)
-    cells = np.argwhere(piece).astype(float)
-    farthest = 0.0
-    if len(cells) > 1:
-        try:
-            cells = cells[ConvexHull(cells).vertices]
-        except QhullError:
-            cells = cells[[0, -1]]  # one straight line of cells, sorted along it
-        farthest = float(pdist(cells).max()) * maps.resolution_m
+    outline = shapely.get_coordinates(shapely.MultiPoint(np.argwhere(piece)).convex_hull)
+    farthest = float(pdist(outline).max(initial=0.0)) * maps.resolution_m
     # The erosion rounds up to whole cells: a disc that touches a wall has its middle up to a cell nearer to it.
     covered = maps.traversable & (distance <= ROBOT_RADIUS_M + maps.resolution_m)
     return {

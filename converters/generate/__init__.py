@@ -13,15 +13,15 @@ from converters.generate.homes.space import floor_maps
 from converters.generate.models.cad import CLOTH, LOOKS, cad_model
 from converters.generate.surface.modelled import model_building
 from converters.generate.surface.scan import Scan, scan_building
-from converters.generate.surface.texture import Atlas, make_atlas
+from converters.generate.surface.texture import make_atlas
 from converters.generate.surface.write import LICENCE, annotate_items, write_cad, write_json, write_png, write_scan
 from converters.library.store import attribution, read_index
-from converters.records.raw import ATTRIBUTION, WINDOWS
+from converters.records.raw import ATTRIBUTION, WINDOWS, VisualMesh
 from interactive_nav_common.files import part_folder, publish, write_text
 
 __all__ = ["Building", "GenerationError", "HomeConfig", "design_building", "generate_building"]
 
-GENERATOR_VERSION = 7
+GENERATOR_VERSION = 8
 """Raised whenever the same seed would give other bytes."""
 
 
@@ -54,7 +54,7 @@ def design_building(seed: int, config: HomeConfig | None = None) -> Building:
         raise GenerationError(f"seed {seed}: {error}") from error
 
 
-def render_building(building: Building, seed: int, config: HomeConfig, progress: Report) -> tuple[Scan, Atlas]:
+def render_building(building: Building, seed: int, config: HomeConfig, progress: Report) -> tuple[Scan, VisualMesh]:
     """Scan and paint a building; without artefacts its exact structure."""
     streams = _streams(seed)
     if config.artefacts == "none":
@@ -89,7 +89,7 @@ def generate_building(
     report("done", 1.0)
 
 
-def _write(folder: Path, building: Building, scan: Scan, atlas: Atlas, seed: int, cfg: HomeConfig) -> None:
+def _write(folder: Path, building: Building, scan: Scan, atlas: VisualMesh, seed: int, cfg: HomeConfig) -> None:
     write_scan(folder, scan, atlas, building.floor_height_m)
     (folder / "floors.txt").write_text(f"{building.floor_height_m}\n", encoding="ascii")
     if building.plan.windows:

@@ -13,6 +13,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from converters.geometry.boxes import convex_pieces
+from converters.geometry.faces import compacted
 from converters.read.files import SourceFolder, read_json, read_mesh, read_obj
 from converters.read.meshes import clean_surface
 from converters.read.obj import GREY, TexturedMesh, join_textures, read_painted_obj, texels
@@ -170,8 +171,7 @@ def read_cad(source: SourceFolder, synset: str, cad_id: str) -> CadModel:
         colours[image == k] = texels(texture, uv[image == k].mean(axis=1))
     # By material, the last first: decompositions depend on the order of the faces, and stored ones have this.
     order = np.argsort(-image, kind="stable")
-    used, faces = np.unique(mesh.faces[order], return_inverse=True)
-    skin = TexturedMesh(mesh.vertices[used], faces.reshape(-1, 3))
+    skin = TexturedMesh(*compacted(mesh.vertices, mesh.faces[order]))
     vertices, faces, colours = clean_surface(source, relative, skin, colours[order])
     pieces, collision = None, f"cad/{synset}/{cad_id}/models/{COLLISION}"
     if source.has(collision):

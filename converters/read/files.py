@@ -217,7 +217,9 @@ def read_obj(path: Path) -> ObjMesh:
     positions: list[str] = []
     tints: dict[int, list[str]] = {}
     uvs: list[str] = []
-    corners: list[str] = []
+    corners: list[int] = []
+    uv_corners: list[int] = []
+    has_uv = False
     sizes: list[int] = []
     material: list[tuple[int, int]] = []
     names: dict[str, int] = {}
@@ -244,9 +246,11 @@ def read_obj(path: Path) -> ObjMesh:
                     continue  # an edge: it has no surface, and other programs pass over it
                 if len(words) < 3:
                     raise SceneRejected(f"{path}:{number}: a face has {len(words)} corners, expected at least 3")
-                if "-" in line:
-                    words = [_from_the_end(w, len(positions) // 3, len(uvs) // 2) for w in words]
-                corners.extend(words)
+                for at, named, *_ in ((*word.split("/"), "") for word in words):
+                    corners.append(_index(at, len(positions) // 3))
+                    # A corner without one takes the first, which is correct for faces of plain colour.
+                    uv_corners.append(_index(named, len(uvs) // 2) if named else 1)
+                    has_uv = has_uv or bool(named)
                 sizes.append(len(words))
                 material.append((current, group))
             elif key in tables:
@@ -256,7 +260,7 @@ def read_obj(path: Path) -> ObjMesh:
                 unused[key[:20]] += 1
         vertices = np.array(positions, float).reshape(-1, 3)
         uv = np.array(uvs, float).reshape(-1, 2)
-        index_of, uv_index = _corner_indices(corners)
+        index_of, uv_index = np.array(corners, np.int64), np.array(uv_corners, np.int64)
     except (ValueError, OverflowError) as error:
         raise SceneRejected(f"{path}: not readable as OBJ ({error}{_comma(str(error))}); export it again") from error
     count = np.array(sizes, np.int64)
@@ -267,7 +271,7 @@ def read_obj(path: Path) -> ObjMesh:
     _unfold(vertices, index_of - 1, corner, face)
     of = np.array(material, np.int64)[face].T
     corner_uv = None
-    if uv_index is not None and len(uv):
+    if has_uv and len(uv):
         if uv_index.min() < 1 or uv_index.max() > len(uv):
             raise SceneRejected(
                 f"{path}: a face names texture coordinate {int(uv_index.max())} of {len(uv)}; fetch the file again"
@@ -288,24 +292,10 @@ def _comma(text: str) -> str:
     return hint * bool(re.search(r"\d,\d", text))
 
 
-def _from_the_end(word: str, n_vertices: int, n_uv: int) -> str:
-    """Return an OBJ corner whose negative indices (-1 is the last one so far) are positive."""
-    parts = (word.split("/") + [""])[:2]
-    counts = (n_vertices, n_uv)
-    return "/".join(str(counts[k] + 1 + int(p)) if p.startswith("-") else p for k, p in enumerate(parts) if p or k == 0)
-
-
-def _corner_indices(corners: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return (c,) vertex and (c,) texture indices, from 1; None if no corner has a texture coordinate.
-
-    Corners without one take the first, which is correct for faces of plain colour.
-    """
-    if not corners:
-        return np.zeros(0, np.int64), None
-    split = [(c.split("/") + [""])[:2] for c in corners]
-    index = np.array([s[0] for s in split], np.int64)
-    has_uv = any(s[1] for s in split)
-    return index, np.array([s[1] or "1" for s in split], np.int64) if has_uv else None
+def _index(text: str, count: int) -> int:
+    """Return an index from 1; negative ones count from the end of what there is so far, -1 being the last."""
+    value = int(text)
+    return value + count + 1 if value < 0 else value
 
 
 def _unfold(vertices: np.ndarray, index: np.ndarray, corner: np.ndarray, face: np.ndarray) -> None:

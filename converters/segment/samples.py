@@ -54,7 +54,7 @@ def building_surface(seed: int, tier: str, split: str) -> tuple[Surface, np.ndar
     scan, atlas = render_building(building, seed, config, lambda stage, share: None)
     labels = scan.labels.astype(int)
     labels[np.isin(labels, OTHER)] = 40
-    surfaces = [sample_surface(TexturedMesh(scan.vertices, scan.faces, atlas.uv[atlas.face_uv], atlas.image))]
+    surfaces = [sample_surface(TexturedMesh(scan.vertices, scan.faces, atlas.uv[atlas.uv_faces], atlas.image))]
     classes = [classes_of(labels)[scan.faces[surfaces[0].face, 0]]]
     for item in building.items if config.artefacts == "none" else ():
         category = item.model.category

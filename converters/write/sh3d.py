@@ -24,7 +24,7 @@ from converters.read.homes.sh3d_models import HULLS, PANE, PANES
 from converters.records.errors import SceneRejected
 from converters.records.raw import ATTRIBUTION, ColourCloud, TexturedMesh
 from converters.write.sh3d_rooms import SIDE_M, Wall, gap_around, half_wall, merged_walls, rooms_of, wall_between
-from converters.write.texture import textured_cloud
+from converters.write.texture import NO_CLOUD, textured_cloud
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, matrix_from_quat, yaw_from_quat, yaw_matrix
@@ -160,7 +160,7 @@ class _Export:
             mesh = read_obj(self.folder / self.spec.meshdir / self.spec.mesh(geom.meshname).file)
             surface = TexturedMesh(mesh.vertices, mesh.faces, mesh.corner_uv, read_image(self._image(geom), "RGB"))
             return textured_cloud(surface, APART_M)
-        return ColourCloud(*(np.zeros((0, 3)),) * 3)
+        return NO_CLOUD
 
     def _image(self, geom: Any) -> Path:
         look = self.spec.material(geom.material).textures[mujoco.mjtTextureRole.mjTEXROLE_RGB]

@@ -29,6 +29,7 @@ LEVELS = 63
 """Steps of each channel, few enough for a small PNG."""
 APART = 4
 """Texels between charts of all but small images: what lies between shows the nearer one, so none bleeds."""
+NO_CLOUD = ColourCloud(*(np.zeros((0, 3)),) * 3)
 PLAIN, MARGIN = 8, 4
 """Levels of a channel that a face of one colour may differ by; texels that are kept around what is looked up."""
 
@@ -53,7 +54,7 @@ def colour_cloud(
 def textured_cloud(mesh: TexturedMesh, spacing_m: float) -> ColourCloud:
     """Sample coloured points of a whole surface with an image; none without one."""
     if mesh.texture is None:
-        return ColourCloud(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
+        return NO_CLOUD
     return colour_cloud(mesh, mesh.vertices, np.arange(len(mesh.faces)), spacing_m)
 
 
@@ -77,18 +78,6 @@ def box_pixels(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return box, low[box] + np.stack([step % wide, step // wide], axis=1)
 
 
-def barycentric(corners: np.ndarray, points: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (n,) weights of the second and third corner of triangles (n, 3, 2) at points (n, 2), and their validity.
-
-    Where twice the area is at most `least`, the weights are invalid, and `least` replaces it in the division.
-    """
-    (ax, ay), (bx, by), (cx, cy) = (corners[:, k].T for k in range(3))
-    (px, py), d = (points - corners[:, 0]).T, (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-    good = np.abs(d) > least
-    d = np.where(good, d, least)
-    return (px * (cy - ay) - py * (cx - ax)) / d, ((bx - ax) * py - (by - ay) * px) / d, good
-
-
 def texel_surface(
     vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, uv_faces: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -99,7 +88,11 @@ def texel_surface(
     high = np.clip(np.ceil(corners.max(axis=1)).astype(int), low + 1, size)
     face, at = box_pixels(low, high)
     column, row = at.T
-    v, w, good = barycentric(corners[face], np.stack([column + 0.5, row + 0.5], axis=1), 1e-12)
+    (ax, ay), (bx, by), (cx, cy) = (corners[face, k].T for k in range(3))
+    px, py, twice = column + 0.5 - ax, row + 0.5 - ay, (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+    good = np.abs(twice) > 1e-12
+    area = np.where(good, twice, 1e-12)
+    v, w = (px * (cy - ay) - py * (cx - ax)) / area, ((bx - ax) * py - (by - ay) * px) / area
     slack = 0.02
     inside = good & (v >= -slack) & (w >= -slack) & (v + w <= 1 + slack)
     face, v, w = face[inside], v[inside], w[inside]
@@ -277,11 +270,11 @@ def as_it_is(mesh: TexturedMesh, most_faces: int, size: int) -> VisualMesh | Non
 
 
 def draw_objects(
-    objects: Sequence[PlacedObject], clouds: Sequence[ColourCloud], most_faces: int, size: int
+    objects: Sequence[PlacedObject], clouds: Sequence[ColourCloud], most_faces: int, size: int, least_m: float = 1e-3
 ) -> list[Drawn]:
     """Draw objects of one model and size (`size`: the texture's, pixels), simplified once by error, then by number.
 
-    Objects take the scan's colours if it shows them, otherwise the model's.
+    Objects take the scan's colours if it shows them, otherwise the model's, by points at least `least_m` apart.
     """
     first, unscanned = objects[0], None
     surface, mesh = first.surface_b, (first.vertices_b, first.faces)
@@ -301,7 +294,7 @@ def draw_objects(
             done.append(Drawn(*bake_object(*mesh, first.face_colours, cloud_b, low, size), *loss))
             continue
         if unscanned is None:
-            spacing_m = max(float(np.ptp(first.vertices_b, axis=0).max()) / size, 1e-3)
+            spacing_m = max(float(np.ptp(first.vertices_b, axis=0).max()) / size, least_m)
             cloud_b = cloud if surface is None else textured_cloud(surface, spacing_m)
             unscanned = Drawn(bake_object(*mesh, first.face_colours, cloud_b, low, size)[0], 0.0, *loss)
         done.append(unscanned)

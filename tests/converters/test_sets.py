@@ -25,26 +25,23 @@ SCENES = Path(__file__).parents[2] / "scenes_mjcf"
 
 
 class Copier(Launcher):
-    """Whose command copies scenes; 002 gives none, and whoever works on 003 with others is killed."""
+    """Whose command copies its scene; 002 gives none, and whoever works on 003 is killed."""
 
     def __init__(self, out: Path):
         super().__init__(2)
         self.out, self.commands, self.closed = out, [], 0
 
     def start(self, job: Job) -> str | None:
-        names, said = job.name.split(), []
-        for name in names:
-            if name.endswith("003") and len(names) > 1:
-                break
-            said.append(f"{name}: no room" if name.endswith("002") else f"{name}: train, seed 1, every gate passes")
-        code = 3 if len(said) < len(names) else 1 if any(line.endswith("no room") for line in said) else 0
-        act = f"import os; print({chr(10).join(said)!r}, flush=True); os._exit({code})"
+        said, code = {
+            "furnished_002": (f"error: {job.name}: no room", 2),
+            "furnished_003": (f"1/1 {job.name}: drawing", 3),
+        }.get(job.name, (f"{job.name}: train, seed 1, every gate passes", 0))
+        act = f"import os; print({said!r}, flush=True); os._exit({code})"
         begun = super().start(dataclasses.replace(job, command=(sys.executable, "-c", act)))
         if begun is not None:
             self.commands.append(list(job.command))
-            for line in said:
-                if line.endswith("passes"):
-                    shutil.copytree(SCENES / "apartment_0", self.out / line.partition(":")[0])
+            if not code:
+                shutil.copytree(SCENES / "apartment_0", self.out / job.name)
         return begun
 
     def close(self) -> None:
@@ -91,10 +88,10 @@ def test_scenes_are_made_side_by_side_listed_and_found_by_name(tmp_path: Path, m
     wanted = GenerateScenes(out=out, jobs=2)
     failed = many.generate_scenes(wanted, lambda _, share: shares.append(share), lines.append)
     assert sorted(failed) == ["furnished_002", "furnished_003"]
-    groups = [command[command.index("--only") + 1 :] for command in runner.commands]
+    made = [command[command.index("--only") + 1 :] for command in runner.commands]
     names = [f"furnished_{k:03d}" for k in range(10)]
-    assert groups == [names[:3], names[3:6], names[6:9], names[9:], names[4:6]]  # 003 cost its process; others got one
-    assert runner.closed == 2 and shares[-1] == 1.0
+    assert made == [[name] for name in names]
+    assert runner.closed == 1 and shares[-1] == 1.0
     assert runner.commands[0][:4] == [sys.executable, "-m", "converters", "generate-scenes"]
     assert "furnished_002: no room" in lines and "furnished_003: exit code 3, " in "\n".join(lines)
     assert not (out / "set.json").exists()

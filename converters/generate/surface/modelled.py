@@ -17,7 +17,7 @@ from converters.generate.surface.decor import decor
 from converters.generate.surface.finishes import FRAMES, RUGS, Finish, finishes, framed
 from converters.generate.surface.scan import NYU40, Scan, building_solids, fuse, solid_from_box
 from converters.generate.surface.sides import CLOTHS, ENTRANCES, FLOOR_M, PICTURE, Side
-from converters.generate.surface.texture import Atlas, Chart, assemble, piece_charts, plain, polygon
+from converters.generate.surface.texture import Chart, assemble, piece_charts, plain, polygon
 from converters.records.raw import CEILING, FLOOR, WALL, VisualMesh
 from converters.write.light import VOXEL_M, Daylight, Space
 from converters.write.texture import share_plain
@@ -196,7 +196,7 @@ def _built_in(items: Sequence[Instance]) -> list[Chart]:
 
 def model_building(
     plan: Plan, items: Sequence[Instance], uses: Sequence[str], rng: np.random.Generator, palette: Sequence[str] = ()
-) -> tuple[Scan, Atlas]:
+) -> tuple[Scan, VisualMesh]:
     """Model and paint the structure, with textiles of a `palette`; faces of two labels share no vertex."""
     shades = np.array([MATERIALS[name] for name in palette])
     # As many as without a palette: pictures, which collide, are drawn from the same stream.

@@ -4,6 +4,7 @@ A place is (along, out, z): metres along the wall, out of its face into the room
 """
 
 import dataclasses
+import itertools
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -92,12 +93,8 @@ class Side:
         for name, (k, end) in faces.items():
             if name in skip:
                 continue
-            i, j = (d for d in range(3) if d != k)
-            corners = []
-            for a, b in ((0, 0), (1, 0), (1, 1), (0, 1)):
-                place = [0.0] * 3
-                place[k], place[i], place[j] = ranges[k][end], ranges[i][a], ranges[j][b]
-                corners.append(self.at(*place))
+            quad = list(itertools.product(*((r[end],) if d == k else r for d, r in enumerate(ranges))))
+            corners = [self.at(*quad[n]) for n in (0, 2, 3, 1)]
             middle = self.at(*(sum(r) / 2 for r in ranges))
             towards = np.mean(corners, axis=0) - middle
             charts.append(polygon(corners, towards, label, paint, texels_per_m, lit_as=self.inward if thin else None))

@@ -1,17 +1,16 @@
-"""Unwrap a scan into a texture atlas of charts, packed into rows and painted procedurally.
+"""Paint scans and modelled structures procedurally, by the place of each texel in the building.
 
-Each chart is a connected patch of faces of similar direction, projected along an axis, so that each texel has a place
-in the building and patterns continue across charts. Faces are one-sided, counter-clockwise from their visible side.
+Patterns thus continue across the charts of a scan's atlas and across the patches of a structure, which are packed into
+rows. Faces are one-sided, counter-clockwise from their visible side.
 """
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageDraw
-from scipy import sparse
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import cKDTree
 
@@ -20,48 +19,14 @@ from converters.generate.models.cad import CadModel
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.finishes import Colouring, finishes
 from converters.generate.surface.scan import Scan, smooth_noise
-from converters.geometry.faces import compacted, face_vectors, stacked, unit_normals
-from converters.records.raw import TexturedMesh
-from converters.write.texture import LEVELS, barycentric, textured_cloud
-from interactive_nav_common.grids import nearest_cell
+from converters.geometry.faces import compacted, face_areas, face_vectors, stacked, unit_normals
+from converters.records.raw import TexturedMesh, VisualMesh
+from converters.write.texture import LEVELS, fill_image, texel_surface, textured_cloud, unwrap
 
-PAD = 2
-"""Texels between charts."""
+FILLED = 0.6
+"""Share of a scan's image that its charts fill, about."""
 MODEL_SPACING_M = 0.01
 """Between coloured points of a library model."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Atlas:
-    """Hold UVs and the image they look up."""
-
-    uv: np.ndarray
-    """(k, 2) float64 in 0..1, origin at the lower left (OBJ's convention)."""
-    face_uv: np.ndarray
-    """(m, 3) int64 into `uv`."""
-    image: np.ndarray
-    """(size, size, 3) uint8, top row first."""
-
-
-def face_axes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return (m,) 0..5: +x, -x, +y, -y, +z, -z, the axis that each face's normal is closest to."""
-    normals = face_vectors(vertices, faces)
-    axis = np.abs(normals).argmax(axis=1)
-    return 2 * axis + (normals[np.arange(len(faces)), axis] < 0)
-
-
-def charts_of(faces: np.ndarray, axes: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return the number of connected patches of faces with the same axis, and (m,) the patch of each face."""
-    m = len(faces)
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    owner = np.tile(np.arange(m), 3)
-    order = np.lexsort(edges.T[::-1])
-    edges, owner = edges[order], owner[order]
-    same = (edges[1:] == edges[:-1]).all(axis=1) & (axes[owner[1:]] == axes[owner[:-1]])
-    pairs = owner[:-1][same], owner[1:][same]
-    graph = sparse.coo_matrix((np.ones(same.sum(), bool), pairs), shape=(m, m))
-    n, chart = sparse.csgraph.connected_components(graph, directed=False)
-    return int(n), chart
 
 
 def pack_rows(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
@@ -75,44 +40,6 @@ def pack_rows(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
         corner[k] = x, y
         x, row = x + w, max(row, h)
     return corner, y + row
-
-
-def unwrap(vertices: np.ndarray, faces: np.ndarray, texels_per_m: float) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return uv (k, 2) in texels, face_uv (m, 3), and the side of the square sheet, a power of two."""
-    axes = face_axes(vertices, faces)
-    n, chart = charts_of(faces, axes)
-    # One UV per (vertex, chart).
-    keys = faces.astype(np.int64) * n + chart[:, None]
-    ids, face_uv = np.unique(keys, return_inverse=True)
-    face_uv = face_uv.reshape(-1, 3)
-    vertex, of_chart = ids // n, ids % n
-    plane = np.array([(1, 2), (0, 2), (0, 1)])
-    chart_axis = np.zeros(n, int)
-    chart_axis[chart] = axes // 2
-    flat = np.take_along_axis(vertices[vertex], plane[chart_axis[of_chart]], axis=1)
-    low = np.full((n, 2), np.inf)
-    high = np.full((n, 2), -np.inf)
-    np.minimum.at(low, of_chart, flat)
-    np.maximum.at(high, of_chart, flat)
-    for _ in range(20):
-        sizes = np.ceil((high - low) * texels_per_m).astype(int) + 1 + 2 * PAD
-        side = 2 ** int(np.ceil(np.log2(np.sqrt(sizes.prod(axis=1).sum()) * 0.94)))
-        corner, used = pack_rows(sizes, side)
-        if used <= side and sizes[:, 0].max() <= side:
-            break
-        texels_per_m *= 0.95
-    else:
-        raise AssertionError("charts do not fit")
-    uv = corner[of_chart] + PAD + 0.5 + (flat - low[of_chart]) * texels_per_m
-    return uv, face_uv, side
-
-
-def texel_positions(uv: np.ndarray, face_uv: np.ndarray, scan: Scan, ids: np.ndarray, texels: np.ndarray) -> np.ndarray:
-    """Return the (n, 3) place in the building of each texel, by barycentric coordinates clamped to the face."""
-    wb, wc, _ = barycentric(uv[face_uv[ids]], texels, 1e-9)
-    w = np.clip(np.stack([1 - wb - wc, wb, wc], axis=1), 0, 1)
-    w /= np.maximum(w.sum(axis=1, keepdims=True), 1e-9)
-    return np.einsum("nk,nkd->nd", w, scan.vertices[scan.faces[ids]])
 
 
 def _light(points: np.ndarray, normals: np.ndarray, lamp: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -189,21 +116,15 @@ def paint(
 
 def make_atlas(
     scan: Scan, rooms: Sequence[Rect], uses: Sequence[str], texels_per_m: float, rng: np.random.Generator
-) -> Atlas:
+) -> VisualMesh:
     """Unwrap and paint a scan; the rooms' `uses` are as `finishes` takes them."""
-    uv, face_uv, side = unwrap(scan.vertices, scan.faces, texels_per_m)
-    sheet = Image.new("I", (side, side), 0)
-    draw = ImageDraw.Draw(sheet)
-    for k, polygon in enumerate((uv[face_uv] - 0.5).reshape(-1, 6).tolist(), 1):
-        draw.polygon(polygon, fill=k)
-    ids = np.array(sheet)  # of the face that each texel shows, row 0 at v = 0; the nearest face where none does
-    faces_at = (ids[tuple(nearest_cell(ids != 0))] - 1).ravel()
-    rows, columns = np.divmod(np.arange(side * side), side)
-    points = texel_positions(uv, face_uv, scan, faces_at, np.stack([columns + 0.5, rows + 0.5], axis=1))
-    shade = paint(scan, rooms, uses, points, faces_at, rng)
+    area_m2 = float(face_areas(scan.vertices, scan.faces).sum())
+    side = math.ceil(texels_per_m * math.sqrt(area_m2 / FILLED))
+    uv, uv_faces = unwrap(scan.vertices, scan.faces, side)
+    texel, points, ids = texel_surface(scan.vertices, scan.faces, uv, uv_faces, side)
     # Six bits a channel and no noise per texel: the PNG stays small.
-    colour = np.round(np.round(shade * 63) * (255 / 63)).astype(np.uint8)
-    return Atlas(uv / side, face_uv, colour.reshape(side, side, 3)[::-1])
+    colours = np.round(paint(scan, rooms, uses, points, ids, rng) * LEVELS) * (255 / LEVELS)
+    return VisualMesh(scan.vertices, scan.faces, uv, uv_faces, fill_image(texel, colours, side))
 
 
 SHEETS = (1024, 1536, 2048)
@@ -283,10 +204,12 @@ def polygon(points: Iterable[Iterable[float]], towards: Iterable[float], *about:
 
 
 def piece_charts(vertices: np.ndarray, faces: np.ndarray, label: int, material: str) -> list[Chart]:
-    """Cut a mesh of one material into patches of faces that look mostly along one axis; glass keeps its colour."""
-    n, chart = charts_of(faces, face_axes(vertices, faces))
+    """Cut a convex mesh of one material into patches that look mostly along one axis; glass keeps its colour."""
+    normals = face_vectors(vertices, faces)
+    axis = np.abs(normals).argmax(axis=1)
+    way = np.where(np.take_along_axis(normals, axis[:, None], axis=1)[:, 0] < 0, -1 - axis, axis)
     about = label, plain(MATERIALS[material]), 50.0, material == "glass"
-    return [Chart(*compacted(vertices, faces[chart == k]), *about) for k in range(n)]
+    return [Chart(*compacted(vertices, faces[way == k]), *about) for k in dict.fromkeys(way.tolist())]
 
 
 def _lit(charts: list[Chart], light: Light) -> list[np.ndarray]:
@@ -331,7 +254,7 @@ def _packed(charts: list[Chart]) -> tuple[int, float, list[np.ndarray], np.ndarr
         finer *= 0.95
 
 
-def assemble(charts: list[Chart], light: Light) -> tuple[Scan, Atlas]:
+def assemble(charts: list[Chart], light: Light) -> tuple[Scan, VisualMesh]:
     """Join patches into one mesh, no vertex in two of them, and paint its sheet, whose side is one of `SHEETS`."""
     first: dict[int, int] = {}
     sheet_of = [first.setdefault(id(c.paint) if c.uv is not None else -1 - k, k) for k, c in enumerate(charts)]
@@ -358,4 +281,4 @@ def assemble(charts: list[Chart], light: Light) -> tuple[Scan, Atlas]:
     labels = np.repeat([c.label for c in charts], [len(c.vertices) for c in charts]).astype(np.uint8)
     colour = np.round(np.round(np.clip(sheet, 0, 1), 6) * LEVELS) * (255 / LEVELS)
     image = np.round(colour).astype(np.uint8)[::-1]
-    return Scan(vertices, faces, labels), Atlas(uv / side, uv_faces, image)
+    return Scan(vertices, faces, labels), VisualMesh(vertices, faces, uv / side, uv_faces, image)

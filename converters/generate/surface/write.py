@@ -3,9 +3,7 @@
 The scan is z up; the annotations' world is y up (the scan's `trs` turns -90 degrees about x and centres it).
 """
 
-import io
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,7 @@ from converters.generate.homes.config import HomeConfig
 from converters.generate.models.cad import CadModel, Instance
 from converters.generate.models.parts import MATERIALS
 from converters.generate.surface.scan import Scan
-from converters.generate.surface.texture import Atlas
+from converters.records.raw import VisualMesh
 
 LICENCE = """CC0 1.0 Universal
 
@@ -37,15 +35,6 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
     Image.fromarray(pixels).save(path, compress_level=3)  # half as large again as at best, in a tenth of the time
 
 
-def write_npz(path: Path, packing: int = zipfile.ZIP_DEFLATED, /, **arrays: np.ndarray) -> None:
-    """Write arrays as `np.savez_compressed` does, with a fixed time stamp inside."""
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, array in arrays.items():
-            buffer = io.BytesIO()
-            np.lib.format.write_array(buffer, array, allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), buffer.getvalue(), packing)
-
-
 def _write_textured(path: Path, lines: str, corners: np.ndarray, material: str) -> None:
     """Write an OBJ file of the lines before its faces and of their corners (m, 3, 2), and its MTL beside it."""
     faces = _rows("f %d/%d %d/%d %d/%d\n", (corners + 1).reshape(-1, 6))
@@ -53,16 +42,16 @@ def _write_textured(path: Path, lines: str, corners: np.ndarray, material: str) 
     path.with_suffix(".mtl").write_text(material, "ascii")
 
 
-def write_scan(folder: Path, scan: Scan, atlas: Atlas, floor_height_m: float) -> None:
+def write_scan(folder: Path, scan: Scan, atlas: VisualMesh, floor_height_m: float) -> None:
     """Write `mesh_z_up.obj`, its MTL, texture and labels; raise the mesh to the scan's floor height."""
     lines = _rows("v %.4f %.4f %.4f\n", scan.vertices + [0.0, 0.0, floor_height_m])
     lines += _rows("vt %.5f %.5f\n", atlas.uv) + "usemtl scan\n"
-    corners = np.stack([scan.faces, atlas.face_uv], axis=2)
+    corners = np.stack([scan.faces, atlas.uv_faces], axis=2)
     material = "newmtl scan\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd mesh_z_up_texture.png\n"
     _write_textured(folder / "mesh_z_up.obj", lines, corners, material)
     write_png(folder / "mesh_z_up_texture.png", atlas.image)
     bare = {} if scan.solids else {"furnished": np.array(False)}
-    write_npz(folder / "mesh_z_up.labels.npz", label=scan.labels, **bare)
+    np.savez_compressed(folder / "mesh_z_up.labels.npz", label=scan.labels, **bare)
 
 
 def write_cad(library: Path, model: CadModel) -> None:

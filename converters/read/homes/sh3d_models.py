@@ -22,7 +22,7 @@ from converters.read.files import SourceFolder, read_image, read_obj
 from converters.read.homes.parts import HomePart
 from converters.read.homes.sh3d_archive import called, colour, metres, model_path, number, parsed
 from converters.read.meshes import read_surface
-from converters.read.obj import GREYS, TexturedMesh, distinct, join_textures, read_painted_obj
+from converters.read.obj import GREYS, TexturedMesh, join_textures, read_painted_obj
 from converters.read.urdf import joined, placed, solid
 from converters.records.errors import EXTENT_M, GEOMS, SceneRejected, check_count
 from converters.records.raw import ScannedHinge
@@ -302,43 +302,27 @@ def _by_place(model: DrawnModel, element: ElementTree.Element, faces: np.ndarray
     return np.take_along_axis(corners, pair[:, None, :].repeat(3, axis=1), axis=2) / size
 
 
-@dataclasses.dataclass
-class Sheet:
-    """Collect triangles with their images."""
-
-    corners: list[np.ndarray] = dataclasses.field(default_factory=list)
-    """(3, 3) each."""
-    uv: list[np.ndarray] = dataclasses.field(default_factory=list)
-    look: list[np.ndarray] = dataclasses.field(default_factory=list)
+class Sheet(list[TexturedMesh]):
+    """Collect flat patches with their images."""
 
     def add(self, region: Any, place: Callable[[np.ndarray], np.ndarray], look: Look, turned: bool = False) -> None:
         """Add a flat region with holes; `place` turns its points (n, 2) into (n, 3)."""
         image, size = look
         for tile, low in _tiles(region, size):
-            for flat in triangulated(tile):
-                flat = flat[::-1] if turned else flat
-                self.corners.append(place(flat))
-                self.uv.append(np.zeros((3, 2)) if size is None else np.clip((flat - low) / size, 0, 1))
-                self.look.append(image)
+            flat = triangulated(tile)[:, :: -1 if turned else 1].reshape(-1, 2)
+            uv = 0 * flat if size is None else np.clip((flat - low) / size, 0, 1)
+            faces = np.arange(len(flat)).reshape(-1, 3)
+            self.append(TexturedMesh(place(flat), faces, uv.reshape(-1, 3, 2), image))
 
     def quad(self, corners: np.ndarray, look: Look) -> None:
         """Add a plain patch, (4, 3) corners counter-clockwise."""
-        image = mean_colour(look[0])
-        for some in ((0, 1, 2), (0, 2, 3)):
-            self.corners.append(corners[list(some)])
-            self.uv.append(np.zeros((3, 2)))
-            self.look.append(image)
+        faces = np.array([(0, 1, 2), (0, 2, 3)])
+        self.append(TexturedMesh(corners, faces, np.zeros((2, 3, 2)), mean_colour(look[0])))
 
     def part(self, name: str) -> HomePart | None:
         """Return all of it as a built-in part; None of nothing."""
-        if not self.corners:
-            return None
-        mesh = TexturedMesh(
-            np.vstack(self.corners),
-            np.arange(3 * len(self.corners)).reshape(-1, 3),
-            *join_textures(np.array(self.uv), *distinct(self.look)),
-        )
-        return HomePart(name, np.eye(4), mesh, None, True, held=True)
+        mesh = joined(self)
+        return None if mesh is None else HomePart(name, np.eye(4), mesh, None, True, held=True)
 
 
 def _tiles(region: Any, size: np.ndarray | None) -> Iterator[tuple[Any, np.ndarray]]:

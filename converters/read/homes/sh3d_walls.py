@@ -302,9 +302,8 @@ def level_parts(
             cut = opening.within(wall) if abs(opening.bottom_m - floor_m) < SILL_M else None
             if cut is not None:
                 run = shapely.get_coordinates(cut)[:, 0]
-                corners = wall.ends[0] + np.outer(np.array([run.min(), run.max(), run.max(), run.min()]), wall.along)
-                across = np.outer([1, 1, -1, -1], wall.left * wall.thickness_m / 2)
-                sill = shapely.difference(shapely.Polygon(corners + across), taken)
+                through = shapely.LineString(wall.ends[0] + np.outer([run.min(), run.max()], wall.along))
+                sill = shapely.difference(through.buffer(wall.thickness_m / 2, cap_style="flat"), taken)
                 nearest = min(floors, key=lambda room: shapely.distance(room.plan, sill) if sill.area else 0.0)
                 assert nearest.floor is not None
                 sheet.add(sill, level(floor_m), fitted(nearest.floor, float(shapely.area(sill))))
@@ -321,11 +320,8 @@ def opening_of(element: ElementTree.Element, base_m: float) -> Opening:
     thick, off = number(element, "wallThickness", 1.0), number(element, "wallDistance", 0.0)
     centre = point(element)
     middle = centre + back * depth * (0.5 - off - thick / 2)
-    reach = back * (depth * thick / 2 + 0.01)
-    side = along * width / 2
-    footprint = shapely.Polygon(
-        [middle - side - reach, middle + side - reach, middle + side + reach, middle - side + reach]
-    )
+    run = shapely.LineString(middle + np.outer([-1, 1], along * width / 2))
+    footprint = run.buffer(depth * thick / 2 + 0.01, cap_style="flat")
     bottom = base_m + number(element, "elevation", 0.0) / 100
     shape = outline(element.get("cutOutShape"))
     if shape is not None and element.get("modelMirrored") == "true":

@@ -19,8 +19,8 @@ from converters.generate.models.cad import Instance
 from converters.generate.surface.modelled import model_building, space_of
 from converters.generate.surface.scan import NYU40, Scan
 from converters.generate.surface.sides import FLOOR_M, OTHER, entrance_place, sides_of
-from converters.generate.surface.texture import Atlas, assemble, polygon
-from converters.generate.surface.write import annotate_items, write_npz, write_scan
+from converters.generate.surface.texture import assemble, polygon
+from converters.generate.surface.write import annotate_items, write_scan
 from converters.pipeline import ConvertConfig, _structure_visual
 from converters.read.gibson import read_gibson
 from converters.recipes import building_of
@@ -40,7 +40,7 @@ def home() -> Building:
 
 
 @functools.cache
-def made() -> tuple[Scan, Atlas]:
+def made() -> tuple[Scan, VisualMesh]:
     return render_building(home(), SEED, CONFIG, lambda stage, share: None)
 
 
@@ -69,7 +69,7 @@ def test_artefacts_are_a_checked_setting_of_homes_that_recipes_reach():
             building_of("cluttered", {"artefacts": wrong}, "train", "here")
     with pytest.raises(ConfigError, match="did you mean 'phone'"):
         home_config("furnished", {"artefacts": "phon"})
-    assert GENERATOR_VERSION == 7
+    assert GENERATOR_VERSION == 8
 
 
 def test_floors_and_ceilings_are_the_plans_and_look_into_the_rooms():
@@ -155,7 +155,7 @@ def test_every_patch_has_texels_of_its_own_and_the_sheet_stays_small():
     scan, atlas = made()
     side = len(atlas.image)
     assert atlas.uv.min() >= 0 and atlas.uv.max() <= 1 and side <= 2048
-    uv = atlas.uv[atlas.face_uv]
+    uv = atlas.uv[atlas.uv_faces]
     texels = np.abs(np.linalg.det(uv[:, 1:] - uv[:, :1])) * side**2
     length = np.linalg.norm(normals(scan), axis=1)
     floor = scan.labels[scan.faces[:, 0]] == FLOOR
@@ -186,7 +186,7 @@ def test_corners_are_darker_than_the_middle_and_walls_cast_shadows():
     assert seen[0] == 1 and seen[1] == 0
 
 
-def _texel(atlas: Atlas, uv: np.ndarray) -> np.ndarray:
+def _texel(atlas: VisualMesh, uv: np.ndarray) -> np.ndarray:
     side = len(atlas.image)
     column, row = (uv * side).astype(int)
     return atlas.image[side - 1 - row, column].astype(int)
@@ -266,7 +266,7 @@ def test_the_folder_says_that_it_shows_no_furniture_and_is_drawn_as_it_is(tmp_pa
     height = drawn.vertices[drawn.faces][:, :, 2]
     assert height[scan.labels[scan.faces[:, 0]] == FLOOR] == pytest.approx(FLOOR_M, abs=1e-9) and FLOOR_M > 0.001
     for value, told in ((np.array([1.0]), "float64"), (np.array([True, False]), "(2,)")):
-        write_npz(tmp_path / "mesh_z_up.labels.npz", label=scan.labels, furnished=value)
+        np.savez_compressed(tmp_path / "mesh_z_up.labels.npz", label=scan.labels, furnished=value)
         with pytest.raises(SceneRejected, match=rf"furnished is .*{re.escape(told)}.*expected one true or false"):
             read_gibson(tmp_path)
 

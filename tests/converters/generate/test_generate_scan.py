@@ -11,14 +11,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import converters.generate as generate
 from converters.generate import Building, GenerationError, design_building, generate_building
 from converters.generate.homes.config import home_config
+from converters.generate.surface import texture
 from converters.generate.surface.scan import (
     NYU40,
+    Scan,
     Solid,
     building_solids,
     fuse,
@@ -265,6 +268,24 @@ def test_texture_shows_wood_or_tiles_on_floors_and_light_walls(raw):
     walls, floors = (colour[pure & (label[:, 0] == NYU40[c])].mean(axis=0) for c in ("wall", "floor"))
     assert walls.min() > 150 and walls.mean() > floors.mean()  # light paint over darker floors
     assert colour[pure].std(axis=0).min() > 20
+
+
+def test_each_face_shows_the_colour_of_its_place(monkeypatch):
+    """A box room, seen from inside, whose colours say where they are; also what a chart's last texel shows."""
+    size = np.array([2.0, 3.0, 2.5])
+    room = trimesh.creation.box(extents=size).subdivide_to_size(0.3)
+    vertices, faces = np.asarray(room.vertices), np.asarray(room.faces)[:, ::-1]
+    monkeypatch.setattr(texture, "paint", lambda scan, rooms, uses, points, ids, rng: points / size + 0.5)
+    scan = Scan(vertices, faces, np.zeros(len(vertices), np.uint8))
+    atlas = texture.make_atlas(scan, (), (), 40.0, np.random.default_rng(0))
+    side = len(atlas.image)
+    # 37 m2 at 40 texels a metre, of an image that is filled to six tenths
+    assert atlas.image.shape == (315, 315, 3) and (atlas.faces == faces).all()
+    for weights in ([1 / 3, 1 / 3, 1 / 3], [0.96, 0.02, 0.02]):
+        uv, places = (np.einsum("k,fkd->fd", weights, of) for of in (atlas.uv[atlas.uv_faces], vertices[faces]))
+        shown = atlas.image[((1 - uv[:, 1]) * side).astype(int), (uv[:, 0] * side).astype(int)] / 255
+        off_m = np.abs((shown - 0.5) * size - places)
+        assert off_m.max() < 0.5 * size.max() / 63 + 1.5 / 40  # half a level of 64, and a texel and a half
 
 
 def digests(folder: Path) -> dict[str, str]:
