@@ -19,6 +19,7 @@ from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.records import PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_rows, where
 from topological_nav.evaluate.scores import differences, markdown, summary, text
+from topological_nav.tables import tables as topological_tables
 from train.figures import tables
 from train.runs.run import config_to_play
 from train.runs.run_folder import RunFolder
@@ -186,6 +187,31 @@ def test_the_table_of_navigators_in_furnished_homes_is_that_of_its_rows():
     before = ours.to_pandas().query("device != 'NVIDIA H200'").set_index(["scene", "episode"])["success"]
     shared = before.index.intersection(again.index)
     assert len(shared) == 108 and (before[shared] == again.loc[shared, "success"]).all()
+
+
+def test_the_reports_tables_are_those_of_what_is_kept():
+    kept, page = ROOT / "results" / "topological" / "report", (ROOT / "docs" / "topological-report.md").read_text()
+    assert topological_tables(kept).split("\n## ", 1)[1] in page
+    # By hand: 481 episodes in ten homes, each on the dense and the sparse map and by the baseline.
+    learned = read_rows([kept / "evaluation-policy" / "rows" / "h200.parquet"])
+    rows = where(learned, contender="dense").to_pandas()
+    of_baseline = read_rows([kept / "evaluation" / "rows" / "h200.parquet"]).to_pandas()
+    assert (len(learned), len(of_baseline)) == (962, 481)
+    assert rows["success"].sum() == 169
+    means = [round(float(part.groupby("scene")["success"].mean().mean()), 2) for part in (rows, of_baseline)]
+    assert means == [0.36, 0.30]
+    gain = next(row for row in differences(learned) if row[:2] == ("dense minus sparse map", "success"))
+    assert f"{gain[2].with_ends(2)} in success" in page
+    assert round(rows["localisations"].mean(), 1) == 2.4
+    lost = rows.query("success == 0")
+    assert [round(float(lost[name].mean()), 1) for name in ("path_m", "shortest_m")] == [22.5, 9.1]
+    assert round(lost["contact_runs"].sum() / lost["runs"].sum(), 2) == 0.61
+    # AlexNet and ResNet-18 on images of three homes that neither has seen.
+    right = {run: json.loads((kept / run / "results.json").read_text())["confusion"] for run in ("alexnet", "passages")}
+    assert {run: sum(row[k] for k, row in enumerate(table)) for run, table in right.items()} == {
+        "alexnet": 1768,
+        "passages": 1376,
+    }
 
 
 def test_the_topological_results_name_their_preset_and_no_folder_of_a_machine():
