@@ -46,20 +46,21 @@ def hall_world(robot: RobotSpec, folder: Path) -> World:
     return build_world(robot, (hall(folder),), NavConfig.of(num_objects=0))
 
 
-def move(world: World, commands: np.ndarray, backend: str = "native") -> Motion:
+def move(world: World, commands: np.ndarray, backend: str = "native", raised_m: float = 0.0) -> Motion:
     """Runs the robot from its home pose.
 
     Args:
         world: see `hall_world`.
         commands: [T, N, A], in the commands' units, of T control steps and N runs side by side.
         backend: of the physics.
+        raised_m: of the home pose, in which feet just touch the floor.
     """
     physics = make_physics(world, NavConfig.of(backend=backend, num_objects=0))
     steps, runs, _ = commands.shape
     layout = world.layout
     qpos = np.repeat(world.rest_qpos[:1], runs, 0)
     own = slice(layout.robot_qpos, layout.robot_qpos + layout.robot_nq)
-    qpos[:, own][:, :7] = [0, 0, world.robot.spawn_height_m, 1, 0, 0, 0]
+    qpos[:, own][:, :7] = [0, 0, world.robot.spawn_height_m + raised_m, 1, 0, 0, 0]
     still = jnp.zeros((runs, world.models[0].nv), jnp.float32)
     state = PhysicsState(jnp.asarray(qpos, jnp.float32), still, still)
     step = jax.jit(jax.vmap(physics.step))

@@ -207,9 +207,10 @@ def test_it_stands_walks_a_metre_stops_and_turns(name, folder):
 def test_mjx_walks_the_ant_alike(folder):
     world = hall_world(get_robot("ant", "twist"), folder)
     commands = schedule((0.4, 0.2, 0.3))[:, None]
-    native, jax_ = (move(world, commands, backend) for backend in ("native", "jax"))
+    # Feet that just touch are in contact or not by a rounding error of 1e-8 m.
+    native, jax_ = (move(world, commands, backend, raised_m=-1e-3) for backend in ("native", "jax"))
     assert np.abs(native.qpos[-1] - native.qpos[0])[0, 7:].max() > 0.1
-    np.testing.assert_allclose(jax_.qpos, native.qpos, atol=0.02)
+    np.testing.assert_allclose(jax_.qpos, native.qpos, atol=1e-4)
 
 
 @pytest.mark.parametrize("axis", [0, 1])
