@@ -218,7 +218,7 @@ def passage_configurations(
     with claimed(out, {"task": "transfer", **to_dict(config), **about}):
         network, tx = trained.network, optax.adam(config.fine_tune_learning_rate)
         shape = (trained.about["data"]["height"], trained.about["data"]["width"])
-        fresh = learning.make_learner(network, shape, tx, config.seed)
+        fresh = learning.Learner.start(learning.initial(learning.variable_shapes(network, shape), config.seed), tx)
         epoch = learning.labelled_epoch(
             network, tx, config.fine_tune_batch, 0.0, config.fine_tune_augment, learned.scored
         )

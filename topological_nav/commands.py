@@ -21,7 +21,6 @@ from topological_nav import config as configs
 from topological_nav.config import ADAPTED, DATASET, DRIVES, PASSAGE_POLICY, RUNS, MapConfig
 from topological_nav.data.dataset import load_rooms, make_dataset, read_header
 from topological_nav.data.domains import AdaptConfig
-from topological_nav.data.folders import folder_bytes
 from topological_nav.data.photographs import import_photographs, unpack_bag
 from topological_nav.drives.dagger import simulate_driven
 from topological_nav.drives.dataset import draw_drives, simulate_drives, summary
@@ -244,7 +243,8 @@ def _photographs(arguments: Any) -> None:
 
 
 def _size_line(out: Path, images: int, config: configs.CameraConfig) -> str:
-    return f"{out}: {images:,} images of {config.width} x {config.height}, {folder_bytes(out) / 2**20:.1f} MiB"
+    size = sum(path.stat().st_size for path in out.rglob("*.npz"))
+    return f"{out}: {images:,} images of {config.width} x {config.height}, {size / 2**20:.1f} MiB"
 
 
 def _drives(arguments: Any) -> None:

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from interactive_nav.physics import resolve_backend
 from interactive_nav.pictures.scene_model import CUT_WALLS, ROBOT, ROBOT_SOLIDS, SCENE, THINGS, SceneModel, clear_way
-from interactive_nav.sensing.base import FAR_M, lambert
+from interactive_nav.sensing.base import FAR_M, lit
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.rotations import yaw_from_quat
 from scenes_mjcf.categories import SEGMENTATIONS, TABLE, MaskClasses
@@ -158,7 +158,7 @@ def by_rays(model: SceneModel, pose: CameraPose, lens: Lens, groups: Sequence[in
     forward, right_w, up_w = pose.axes_w.T
     base = np.where(met[..., None], model.colour[geom], np.array(SKY_COLOUR, np.float32))
     return {
-        "rgb": lambert(base, faces, forward, met, np),
+        "rgb": np.round(255.0 * lit(base, faces, forward, met, np)).astype(np.uint8),
         "normals": np.stack([faces @ right_w, faces @ up_w, -(faces @ forward)], -1).astype(np.float32),
         "depth": np.where(met, depth, 0.0).astype(np.float32),
         "segmentation": np.where(met, model.class_id[geom], 0).astype(np.uint8),

@@ -66,11 +66,6 @@ def lit(base: Any, normal_w: Any, forward_w: Any, met: Any, xp: Any, sun_w: Any 
     return base * xp.where(met, xp.minimum(0.45 + 0.4 * sun + 0.25 * lamp, 1.0), 1.0)[..., None]
 
 
-def lambert(base: Any, normal_w: Any, forward_w: Any, met: Any, xp: Any) -> Any:
-    """Return `lit` as u8."""
-    return xp.round(255.0 * lit(base, normal_w, forward_w, met, xp)).astype(xp.uint8)
-
-
 class Renderer(abc.ABC):
     """Draws N environments at once through one lens."""
 

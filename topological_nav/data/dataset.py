@@ -320,16 +320,10 @@ def free_lengths(space: FreeSpace, xy_w: np.ndarray, heading_rad: np.ndarray, co
 
 def logits_at(logits: np.ndarray, lengths_m: Sequence[float], ahead_m: np.ndarray | float) -> np.ndarray:
     """Interpolate logits [n, L] of lengths [L] at others (clipped): [n] or [n, M], or one for all, which gives [n]."""
-    given = np.asarray(lengths_m, float)
     ahead = np.asarray(ahead_m, float)
     ahead = np.broadcast_to(ahead, (len(logits), *ahead.shape[1:]))
-    if len(given) == 1:
-        return np.broadcast_to(logits.reshape(-1, *[1] * (ahead.ndim - 1)), ahead.shape).astype(float)
-    x = np.clip(ahead, given[0], given[-1])
-    right = np.clip(np.searchsorted(given, x), 1, len(given) - 1)
-    share = (x - given[right - 1]) / (given[right] - given[right - 1])
-    rows = np.arange(len(logits)).reshape(-1, *[1] * (ahead.ndim - 1))
-    return (1.0 - share) * logits[rows, right - 1] + share * logits[rows, right]
+    rows = [np.interp(lengths, lengths_m, row) for lengths, row in zip(ahead, logits, strict=True)]
+    return np.reshape(rows, ahead.shape)
 
 
 def balanced(rows: np.ndarray, labels: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -139,11 +139,6 @@ def _write(path: Path, sheets: list[np.ndarray], quality: int, name: str, count:
     return name, count
 
 
-def folder_bytes(folder: Path) -> int:
-    """Return the bytes of a folder's arrays and images."""
-    return sum(path.stat().st_size for path in Path(folder).rglob("*.npz"))
-
-
 COLUMNS = 18
 """Images per row of a sheet."""
 Result = TypeVar("Result")

@@ -52,7 +52,7 @@ from topological_nav.learn.training import Networks, load_networks
 from topological_nav.maps.build import NetworkSight, Sight, TrueSight, drawn_for, renderer_of, true_map
 from topological_nav.maps.graph import TopologicalMap, load_map
 from topological_nav.navigate.navigator import Navigator
-from topological_nav.scenes.rendering import CONTROL, Camera, make_env, pose_camera, scene_camera
+from topological_nav.scenes.rendering import CONTROL, Camera, make_env, scene_camera
 from topological_nav.scenes.space import FreeSpace, free_space, scene_rooms
 from train.runs import checkpoint
 from train.runs.run_folder import RunFolder
@@ -153,7 +153,7 @@ class ContestScene:
     def camera(self) -> Camera:
         """Return the camera for the navigator's sight."""
         if self.networks is None:
-            return pose_camera
+            return lambda xy_w, yaw_rad, _=None: np.column_stack([xy_w, yaw_rad])  # what `TrueSight` looks at
         world = self.player.env.world
         plain = scene_camera(renderer_of(self.scene, self.drawn, world.small_objects), self.robot, world)
         domain = preset(self.contest.domain)

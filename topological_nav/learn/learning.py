@@ -51,12 +51,6 @@ Epoch = Callable[[Learner, jax.Array, Any, jax.Array], tuple[Learner, dict[str, 
 """(learner, images, labels, key) -> learner and means over the epoch; compiled. Labels may be a tree of arrays."""
 
 
-def make_learner(
-    module: nn.Module, image_shape: tuple[int, int], tx: optax.GradientTransformation, seed: int
-) -> Learner:
-    return Learner.start(initial(variable_shapes(module, image_shape), seed), tx)
-
-
 def variable_shapes(module: nn.Module, image_shape: tuple[int, int]) -> dict[str, Any]:
     """Return the shapes of a module's `params` and `batch_stats` without computing them."""
     key, image = jax.random.PRNGKey(0), jax.ShapeDtypeStruct((1, *image_shape, 3), jnp.uint8)

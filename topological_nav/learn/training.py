@@ -110,7 +110,8 @@ def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host:
     with claimed(out, {"task": task, "dataset": header, **to_dict(config)}):
         outputs, tx = len(work.lengths_m or work.rooms.names), optax.adam(config.learning_rate)
         network = Network(task, config.network, config.width, config.hidden, outputs, config.first_stage)
-        learner = learning.make_learner(network, (data.height, data.width), tx, config.seed)
+        shapes = learning.variable_shapes(network, (data.height, data.width))
+        learner = learning.Learner.start(learning.initial(shapes, config.seed), tx)
         if config.init != "scratch":
             donor = load_trained(Path(config.init))
             about = f"it is {donor.about['backbone']} of width {donor.about['width']}"

@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -83,8 +82,8 @@ class TopologicalMap:
 
     @functools.cached_property
     def weight(self) -> np.ndarray:
-        """Return the edges' weights [E]: -log p plus `metre_cost` per metre."""
-        return np.array([edge_weight(p) for p in self.p.tolist()]) + self.metre_cost * self.length_m
+        """Return the edges' weights [E]: -log p, p at least `LEAST_P` from 0 and 1, plus `metre_cost` per metre."""
+        return -np.log(np.clip(self.p.astype(float), LEAST_P, 1.0 - LEAST_P)) + self.metre_cost * self.length_m
 
     def next_edge(self, start: int, goal: int, penalty: np.ndarray | None = None) -> int:
         """Return the first edge of the cheapest path with weights plus `penalty` [E]; -1 if there is none."""
@@ -133,11 +132,6 @@ def parts_of(edges: np.ndarray, count: int, both_ways: bool = False) -> list[lis
     _, label = connected_components(joined, directed=both_ways, connection="strong")
     parts = [np.flatnonzero(label == k).tolist() for k in np.unique(label)]
     return sorted(parts, key=lambda part: (-len(part), part))
-
-
-def edge_weight(p: float) -> float:
-    """Return -log p, with p at least `LEAST_P` from 0 and 1."""
-    return -math.log(min(max(p, LEAST_P), 1.0 - LEAST_P))
 
 
 def near_pairs(xy_w: np.ndarray, edge_m: float) -> np.ndarray:
@@ -247,12 +241,6 @@ def place_nodes(
     return joined, lacking
 
 
-def free_edges(space: FreeSpace, xy_w: np.ndarray, edge_m: float, margin_m: float, points: int) -> np.ndarray:
-    """Return the pairs [E, 2] of `near_pairs` with a free path."""
-    edges = near_pairs(xy_w, edge_m)
-    return edges[space.segment_free(xy_w[edges[:, 0]], xy_w[edges[:, 1]], points, margin_m)]
-
-
 def _covering(places: np.ndarray, radius_m: float, step_m: float) -> np.ndarray:
     """Choose places greedily from [n, 2], most uncovered neighbours first, so that one is within the radius of each."""
     # One place in each square of two cells is enough to choose from.
@@ -279,7 +267,8 @@ def _joined(space: FreeSpace, xy: np.ndarray, edge_m: float, margin_m: float, po
     lattice = grid_graph(free, cost, space.resolution_m, MOVES_4)
     centres = cell_centres(np.ones_like(free), space.resolution_m, space.origin_w)
     while True:
-        parts = parts_of(free_edges(space, xy, edge_m, margin_m, points), len(xy))
+        edges = near_pairs(xy, edge_m)
+        parts = parts_of(edges[space.segment_free(*xy[edges.T], points, margin_m)], len(xy))
         column, row = space.inner_cells(xy).T
         at = np.where(free[row, column], np.ravel_multi_index((row, column), free.shape), -1)
         for part in parts[1:]:

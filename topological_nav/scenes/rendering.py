@@ -262,8 +262,3 @@ def scene_camera(renderer: SceneRenderer, robot: RobotSpec, world: World) -> Cam
         return renderer.draw(camera_pose(robot, xy, yaw, np.zeros(len(xy))), bodies)
 
     return images
-
-
-def pose_camera(xy_w: np.ndarray, yaw_rad: np.ndarray, _: np.ndarray | None = None) -> np.ndarray:
-    """Return poses [n, 3], which are the images of `maps.build.TrueSight`."""
-    return np.concatenate([np.asarray(xy_w, float), np.asarray(yaw_rad, float)[:, None]], -1)

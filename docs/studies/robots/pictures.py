@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from interactive_nav.robots import get_robot
 from interactive_nav.robots.build import stand
 from interactive_nav.robots.spec import RobotSpec
-from interactive_nav.sensing.base import lambert
+from interactive_nav.sensing.base import lit
 from interactive_nav_common.errors import UserError
 from scenes_mjcf.look import CameraPose, GlPainter, Lens, look_along, trace
 
@@ -97,7 +97,7 @@ def _with_rays(model: mujoco.MjModel, data: mujoco.MjData, pose: CameraPose, len
     _, geom, _, normal = trace(model, data, pose, lens, [0])
     met = geom >= 0
     base = np.where(met[..., None], model.geom_rgba[geom, :3], 1.0)
-    return lambert(base, normal * met[..., None], pose.axes_w[:, 0], met, np)
+    return np.round(255.0 * lit(base, normal * met[..., None], pose.axes_w[:, 0], met, np)).astype(np.uint8)
 
 
 def picture(robot: RobotSpec, renderer: str = "auto", to_scale: bool = False) -> np.ndarray:

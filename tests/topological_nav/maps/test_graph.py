@@ -61,9 +61,10 @@ def test_the_way_most_likely_free_is_taken():
 
 
 def test_certain_edges_stay_finite_and_cost_something():
-    assert graph.edge_weight(0.0) == pytest.approx(-math.log(1e-6))
-    assert 0.0 < graph.edge_weight(1.0) < 1e-5
-    assert graph.edge_weight(0.5) == pytest.approx(math.log(2))
+    # Edges are 0-1, 0-2, 1-0, 1-2, 2-0 and 2-1.
+    none, half, certain, *_ = hand_map({(0, 1): 0.0, (0, 2): 0.5, (1, 0): 1.0}).weight
+    assert none == pytest.approx(-math.log(1e-6)) and half == pytest.approx(math.log(2))
+    assert 0.0 < certain < 1e-5
 
 
 def test_no_way_and_no_node_are_refused():
@@ -138,7 +139,8 @@ def parts(space, xy) -> int:
     """Parts that free edges join."""
     import networkx as nx
 
-    made = nx.Graph(graph.free_edges(space, xy, 2.5, 0.225, 50).tolist())
+    edges = graph.near_pairs(xy, 2.5)
+    made = nx.Graph(edges[space.segment_free(xy[edges[:, 0]], xy[edges[:, 1]], 50, 0.225)].tolist())
     made.add_nodes_from(range(len(xy)))
     return nx.number_connected_components(made)
 
