@@ -21,8 +21,8 @@ from benchmarks.steps_per_second import timed
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.rows import markdown
+from topological_nav.data.folders import renderer_of
 from topological_nav.learn.training import Networks, Trained, load_networks
-from topological_nav.maps.build import renderer_of
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.space import free_space
 from topological_nav.weights.export import packaged_weights

@@ -106,6 +106,11 @@ def lens_of(config: CameraConfig, robot: RobotSpec) -> Lens:
     return Lens(config.width, config.height, config.fov_deg or robot.camera.fov_deg)
 
 
+def renderer_of(scene: Scene, data: CameraConfig, small: Sequence[SmallObject] = ()) -> SceneRenderer:
+    """Return a renderer of a scene, and small objects, with a folder's settings."""
+    return SceneRenderer(scene, lens_of(data, get_robot(data.robot)), data.supersample, data.engine, small)
+
+
 def draw_missing(
     scenes: Iterable[tuple[str, Callable[[], Scene], Iterable[tuple[Path, list[CameraPose], Bodies | None]]]],
     total: int,
@@ -114,11 +119,10 @@ def draw_missing(
     small: Sequence[SmallObject] = (),
 ) -> None:
     """Render the files of images that do not exist yet; a file's bodies are where its small objects lie."""
-    how = lens_of(config, get_robot(config.robot)), config.supersample, config.engine, small
 
     def missing() -> Iterator[Callable[[], tuple[str, int]]]:
         for name, load, files in scenes:
-            renderer = functools.cache(lambda load=load: SceneRenderer(load(), *how))
+            renderer = functools.cache(lambda load=load: renderer_of(load(), config, small))
             for path, poses, bodies in files:
                 ends, sheets = np.cumsum([len(pose.pos_w) for pose in poses]), []
                 if not path.is_file():  # drawn together, in full batches

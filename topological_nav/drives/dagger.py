@@ -13,11 +13,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from interactive_nav import get_robot
 from interactive_nav.task.rollout import HostPolicy
 from interactive_nav_common.jobs.progress import Progress
 from topological_nav.config import DriveConfig, NavigatorConfig
-from topological_nav.data.folders import lens_of, load_scenes
+from topological_nav.data.folders import load_scenes, renderer_of
 from topological_nav.drives.dataset import DRIVES, Drives, simulate_drives
 from topological_nav.drives.driving import LocalPolicy, load_policy, need_camera
 from topological_nav.drives.expert import CONTROL_S, Expert
@@ -71,7 +70,6 @@ def simulate_driven(
     driver = load_policy(config.driver)
     need_camera(out, DRIVES.describe(config, []), driver.networks)
     config = dataclasses.replace(config, driver=driver.about["digest"])
-    lens, scenes = lens_of(config, get_robot(config.robot)), load_scenes(scene_folders, config.engine)
-    renderers = [SceneRenderer(scene, lens, config.supersample, config.engine) for scene in scenes]
+    renderers = [renderer_of(scene, config) for scene in load_scenes(scene_folders, config.engine)]
     pupil = functools.partial(Pupil, driver=driver, renderers=renderers)
     return simulate_drives(scene_folders, out, config, progress, pupil)

@@ -34,7 +34,7 @@ from interactive_nav_common.untrusted.reading import read_npz
 from interactive_nav_common.versions import versions
 from topological_nav.config import PASSAGE_POLICY, DataConfig, EvaluationConfig, MapConfig
 from topological_nav.data.domains import as_seen_from, preset
-from topological_nav.data.folders import lens_of
+from topological_nav.data.folders import lens_of, renderer_of
 from topological_nav.drives.driving import local_policy
 from topological_nav.evaluate.evaluation import (
     ActionPlayer,
@@ -49,7 +49,7 @@ from topological_nav.evaluate.evaluation import (
 )
 from topological_nav.gap import GapConfig
 from topological_nav.learn.training import Networks, load_networks
-from topological_nav.maps.build import NetworkSight, Sight, TrueSight, drawn_for, renderer_of, true_map
+from topological_nav.maps.build import NetworkSight, Sight, TrueSight, drawn_for, true_map
 from topological_nav.maps.graph import TopologicalMap, load_map
 from topological_nav.navigate.navigator import Navigator
 from topological_nav.scenes.rendering import CONTROL, Camera, make_env, scene_camera

@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,7 +19,6 @@ import numpy as np
 
 from interactive_nav import get_robot, load_scene
 from interactive_nav.robots import RobotSpec
-from interactive_nav.scenes.objects import SmallObject
 from interactive_nav.scenes.scene import Scene
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import ConfigError, FileError
@@ -27,7 +26,7 @@ from interactive_nav_common.files import whole_file
 from interactive_nav_common.jobs.progress import Progress
 from topological_nav.config import DataConfig, MapConfig
 from topological_nav.data.dataset import headings
-from topological_nav.data.folders import lens_of
+from topological_nav.data.folders import renderer_of
 from topological_nav.learn.learning import DESCRIPTION
 from topological_nav.learn.networks import nearest_turn, squares_between
 from topological_nav.learn.training import Networks, Trained, load_networks
@@ -285,11 +284,6 @@ def drawn_for(data: DataConfig, supersample: int | None) -> DataConfig:
         most = CPU_SUPERSAMPLE if jax.default_backend() == "cpu" else data.supersample
         supersample = min(data.supersample, most)
     return dataclasses.replace(data, supersample=supersample)
-
-
-def renderer_of(scene: Scene, data: DataConfig, small: Sequence[SmallObject] = ()) -> SceneRenderer:
-    """Return a renderer of a scene, and small objects, with a dataset's settings."""
-    return SceneRenderer(scene, lens_of(data, get_robot(data.robot)), data.supersample, data.engine, small)
 
 
 class Pictures:

@@ -17,9 +17,10 @@ from interactive_nav_common.errors import FileError
 from topological_nav.__main__ import main
 from topological_nav.config import RUNS, DataConfig
 from topological_nav.data.dataset import draw_passages
+from topological_nav.data.folders import renderer_of
 from topological_nav.drives.driving import load_policy
 from topological_nav.learn.training import load_networks
-from topological_nav.maps.build import drawn_for, renderer_of
+from topological_nav.maps.build import drawn_for
 from topological_nav.maps.graph import load_map, save_map
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.space import find_rooms, free_space, recorded_rooms
