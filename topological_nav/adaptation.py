@@ -56,20 +56,6 @@ ROOMS_STREAM, PASSAGES_STREAM = 1, 2
 """Random streams of target images."""
 
 
-class Critic(nn.Module):
-    """Classify embeddings by two layers with leaky ReLU; the output is positive for the source."""
-
-    hidden: int
-
-    @nn.compact
-    def __call__(self, embeddings: jax.Array) -> jax.Array:
-        """Map [N, D] to [N] logits."""
-        x = embeddings
-        for _ in range(2):
-            x = nn.leaky_relu(nn.Dense(self.hidden)(x))
-        return nn.Dense(1)(x)[:, 0]
-
-
 @flax.struct.dataclass
 class Adapting(learning.Learner):
     """Add a critic to the state of the target's network, whose heads remain the source's."""
@@ -86,9 +72,10 @@ def embed_training(network: Network, variables: Any, images: jax.Array) -> tuple
     return embeddings, new.get("batch_stats", variables["batch_stats"])  # type: ignore[union-attr,return-value]
 
 
-def make_adapting(variables: dict[str, Any], size: int, config: AdaptConfig) -> tuple[Adapting, Critic]:
-    """Return a target extractor equal to the source's, and a fresh critic."""
-    critic = Critic(config.hidden)
+def make_adapting(variables: dict[str, Any], size: int, config: AdaptConfig) -> tuple[Adapting, nn.Sequential]:
+    """Return a target extractor equal to the source's, and a fresh critic, positive [N, 1] for the source."""
+    hidden, act = config.hidden, nn.leaky_relu
+    critic = nn.Sequential([nn.Dense(hidden), act, nn.Dense(hidden), act, nn.Dense(1)])
     shapes = jax.eval_shape(critic.init, jax.random.PRNGKey(0), jax.ShapeDtypeStruct((1, size), jnp.float32))
     weights = learning.initial(shapes, config.seed)["params"]
     # Copies: an epoch gives its argument's memory away, and the source's network is still needed.
@@ -97,7 +84,7 @@ def make_adapting(variables: dict[str, Any], size: int, config: AdaptConfig) -> 
     return Adapting(params, stats, tx.init(params), weights, critic_tx.init(weights)), critic
 
 
-def adversarial_epoch(network: Network, critic: Critic, config: AdaptConfig):
+def adversarial_epoch(network: Network, critic: nn.Sequential, config: AdaptConfig):
     """Build an epoch that updates the critic, then the extractor, for each batch of target images.
 
     The source's embeddings [S, D] replace labels. Means are the extractor's `loss`, `critic_loss` and `critic_accuracy`
