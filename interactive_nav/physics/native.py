@@ -8,6 +8,7 @@ import copy
 import dataclasses
 import functools
 import threading
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -20,7 +21,7 @@ from interactive_nav.config import NavConfig
 from interactive_nav.physics import base
 from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces
 from interactive_nav.scenes.contacts import from_sensors, sensor_addresses
-from interactive_nav.scenes.slots import find_slots
+from interactive_nav.scenes.slots import Slot, find_slots
 from interactive_nav.scenes.world import World, build_spec
 
 _W = mujoco.mjtWarning
@@ -28,14 +29,13 @@ _ENGINE_FAILURES = [w.value for w in (_W.mjWARN_BADQPOS, _W.mjWARN_BADQVEL, _W.m
 _OVERFLOWS = [_W.mjWARN_CONTACTFULL.value, _W.mjWARN_CNSTRFULL.value]
 
 
-def with_feet_apart(world: World, scene: int, config: NavConfig) -> mujoco.MjModel:
+def with_feet_apart(world: World, slots: Sequence[Slot], scene: int, config: NavConfig) -> mujoco.MjModel:
     """Return a scene's model that steps bit for bit as the world's does, and faster.
 
     The broadphase measures every geom of colliding bodies, and most are feet. Here they are on separate bodies that
     collide with nothing, and explicit pairs let them touch the floor.
     """
     # Taking the feet out of the world's spec takes six times as long: MuJoCo lists all elements again for each.
-    slots = find_slots(world.scenes, world.small_objects)
     spec, names = build_spec(world.robot, scene, world.scenes, slots, config, feet=False), [slot.name for slot in slots]
     floor = spec.geom("floor")
     for name in names:
@@ -82,7 +82,8 @@ class NativePhysics(Physics):
         self._contacts = sensor_addresses(world.models[0]) if config.needs_contacts else None
         self._slots = world.layout.num_slots
         self._robot, self._layout = world.robot, world.layout
-        self._models = tuple(with_feet_apart(world, scene, config) for scene in range(len(world.scenes)))
+        slots = find_slots(world.scenes, world.small_objects)
+        self._models = tuple(with_feet_apart(world, slots, scene, config) for scene in range(len(world.scenes)))
         self._iterations = int(world.models[0].opt.iterations)
         for model in self._models:
             # A failed state must show, not be silently replaced by the model's default.

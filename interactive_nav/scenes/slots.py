@@ -1,6 +1,7 @@
 """Locate bodies in the state vectors, and build the tables of what each slot of a scene holds."""
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Sequence
 from typing import Any
@@ -35,6 +36,16 @@ class Slot:
     """small, free, hinge or slide."""
     bodies: tuple[Body | None, ...]
     """[S] what each scene has there; None: nothing."""
+
+    @functools.cached_property
+    def n_boxes(self) -> int:
+        """Return the largest number of boxes of a scene's body."""
+        return max(len(body.boxes) for body in self.bodies if body is not None)
+
+    @functools.cached_property
+    def any_floats(self) -> bool:
+        """Return whether gravity leaves out what some scene has there, or the place of what it lacks."""
+        return any(body is None or bool(body.joint and body.joint.balanced) for body in self.bodies)
 
 
 def find_slots(scenes: Sequence[Scene], small: Sequence[SmallObject]) -> list[Slot]:

@@ -222,11 +222,10 @@ def build_spec(
         if isinstance(body, SmallObject):
             _add_small(spec, slot.name, body, i, collision, feet)
             continue
-        n_boxes = max(len(m.boxes) for m in slot.bodies if m is not None)
         # The tiny value keeps the models' structure equal.
-        floats = [m is None or bool(m.joint and m.joint.balanced) for m in slot.bodies]
-        gravcomp = _FLOATS if floats[index] else 1e-9 if any(floats) else 0.0
-        _add_movable(spec, slot.name, body or _nothing(i, slot.kind), n_boxes, collision, gravcomp, feet)
+        floats = body is None or (body.joint and body.joint.balanced)
+        gravcomp = _FLOATS if floats else 1e-9 if slot.any_floats else 0.0
+        _add_movable(spec, slot.name, body or _nothing(i, slot.kind), slot.n_boxes, collision, gravcomp, feet)
     named, most = [(slot.name, slot.kind) for slot in slots], max(len(s.walls) for s in scenes)
     _finish(spec, robot, scenes[index].walls, most, named, config)
     return spec

@@ -7,6 +7,7 @@ from interactive_nav.config import NavConfig
 from interactive_nav.physics.native import with_feet_apart
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import load_scene
+from interactive_nav.scenes.slots import find_slots
 from interactive_nav.scenes.world import build_world
 from tests.toys import write_room
 
@@ -18,9 +19,10 @@ def test_feet_on_bodies_of_their_own_change_nothing(tmp_path):
     config = NavConfig.of(num_objects=2)
     world = build_world(get_robot("turtlebot"), tuple(scenes), config)
     names = [world.models[0].body(body).name for body in world.layout.slot_body]
+    slots = find_slots(world.scenes, world.small_objects)
     for scene, spec in enumerate(world.specs):
         told = {}
-        for name, model in (("plain", spec.compile()), ("apart", with_feet_apart(world, scene, config))):
+        for name, model in (("plain", spec.compile()), ("apart", with_feet_apart(world, slots, scene, config))):
             feet = [model.body(b).name.endswith("_feet") for b in range(model.nbody)]
             assert sum(feet) == len(names) * (name == "apart") and not model.body_contype[feet].any()
             model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
