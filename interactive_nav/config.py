@@ -31,6 +31,9 @@ class TaskRules(Settings):
     """What an action commands: a control mode of the robot; `native` is the original benchmark's."""
     symmetric_actions: bool = False
     """Action 0 commands nothing; the original's ranges are lopsided (TurtleBot's wheels: -12.5 to 25 rad/s)."""
+    hook_force_n: NotNegative = 0.0
+    """Largest force, N, of a hook at a wheeled robot's front (100 pulls doors and chairs): one more action, above 0 to
+    couple to what stands within 0.1 m, below 0 to let go. 0: no hook."""
     num_objects: Natural = 10
     """Small objects strewn about at random each episode."""
     small_objects: Literal["train", "test"] = "train"
@@ -108,6 +111,9 @@ class TaskRules(Settings):
                 f"small_objects is {self.small_objects!r}, expected train, its default: with objects there are no "
                 "built-in models to choose from"
             )
+        if self.hook_force_n and self.needs_contacts:
+            got = f"hook_force_n is {self.hook_force_n}, expected 0 with options that look at single contacts"
+            raise ConfigError(f"{got} (interaction_with, force_part, force_sum); leave these at their defaults")
         if not 0 <= self.min_goal_distance_m < self.max_goal_distance_m:
             raise ConfigError(
                 f"min_goal_distance_m is {self.min_goal_distance_m!r}, expected 0 or more and less than "

@@ -36,6 +36,26 @@ def yaw_from_quat(quat: Array) -> Array:
     return xp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
+def apply_axes(axes: Array, vector: Array) -> Array:
+    """Return [..., 3, 3] times [..., 3]: a sum, as GPUs may round a matmul to TF32."""
+    return (axes * vector[..., None, :]).sum(-1)
+
+
+def compose(first: Array, second: Array) -> Array:
+    """Return [..., 3, 3] times [..., 3, 3]."""
+    return (first[..., :, :, None] * second[..., None, :, :]).sum(-2)
+
+
+def swing(axis: Array, anchor_m: Array, angle_rad: Array) -> tuple[Array, Array]:
+    """Return a hinged body's frame in its rest frame: place [..., 3], m, and axes [..., 3, 3].
+
+    `axis` (a unit) and `anchor_m`, [..., 3], are in its frame; `angle_rad` is [...].
+    """
+    half, xp = 0.5 * angle_rad[..., None], namespace(angle_rad)
+    turned = matrix_from_quat(xp.concatenate([xp.cos(half), xp.sin(half) * axis], -1))
+    return anchor_m - apply_axes(turned, anchor_m), turned
+
+
 def rotate(quat: Array, vector: Array) -> Array:
     """Return vectors [..., 3] of a body with unit quaternion [..., 4] in the world frame."""
     xp = namespace(quat, vector)

@@ -71,6 +71,8 @@ class PhysicsState:
     """[] i32 since the episode began: the environment's clock, which backends leave out."""
     change: ModelChange | None = None
     """Of the model, for the next control step, which backends leave out too."""
+    hook: Any = None
+    """[8] f32 as `hook.NONE`, or None."""
 
 
 @flax.struct.dataclass

@@ -19,7 +19,8 @@ from mujoco import mjx
 
 from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, make_scaling, summarise_forces, uncommitted
-from interactive_nav.physics.nearness import Measured
+from interactive_nav.physics.hook import Hook
+from interactive_nav.physics.nearness import FAR_M, Measured
 from interactive_nav.physics.warp_callbacks import keep_collector_out
 from interactive_nav.physics.window import PhysicsWindow
 from interactive_nav.scenes.contacts import from_sensors, part_of_contacts, rolling_geoms, sensor_addresses
@@ -55,6 +56,7 @@ class MjxPhysics(Physics):
         layout = self.window.layout
         self._sensors = layout.force_sensors[:, None] + np.arange(3)
         self._config = config
+        self._hook = Hook(world, config) if config.hook_force_n else None
 
     def _host_model(self) -> mujoco.MjModel:
         return self.window.model
@@ -76,13 +78,20 @@ class MjxPhysics(Physics):
         """Run all substeps of a control step of one environment; return the last data, the forces [substeps, M + 1, 3]
         on slots and structure with what `from_sensors` gives of each substep, or None, and Warp's OverflowType bits."""
 
+    def _pulls(self, data: mjx.Data) -> jax.Array:
+        """Return the hook's force on each slot and the structure, [M + 1, 3]."""
+        return jnp.pad(data.xfrc_applied[self.window.layout.slot_body, :3], ((0, 1), (0, 0)))
+
     def _controlled(self, data: mjx.Data, command: jax.Array, time_s: jax.Array) -> mjx.Data:
         robot = self.window.layout.robot_state(data.qpos, data.qvel, time_s)
         ctrl = self._world.robot.controls(command, robot, jnp)
         return data.replace(ctrl=jnp.asarray(ctrl, jnp.float32))
 
     def _step_one(self, template: mjx.Data, measured: Measured, scene, state: PhysicsState, command, time_s):
-        window = self.window
+        window, hook = self.window, state.hook
+        if hook is not None:  # What is held comes first, and is awake.
+            held = jnp.arange(len(measured[0])) == hook[0]
+            measured = jnp.where(held, -FAR_M, measured[0]), *measured[1:]
         chosen, walls, missed = window.select(measured)
         fields = window.fields(scene, chosen, walls)
         if state.change is not None:
@@ -97,9 +106,13 @@ class MjxPhysics(Physics):
         data = self._controlled(data, command, time_s)
 
         def control(data, k):
-            if not self._world.robot.control_every_substep:
-                return data
-            return self._controlled(data, command, time_s + k * self.mj_model.opt.timestep)
+            if self._world.robot.control_every_substep:
+                data = self._controlled(data, command, time_s + k * self.mj_model.opt.timestep)
+            if self._hook and hook is not None:
+                place = jnp.where(hook[0] < 0, -1, window.places(chosen)[hook[0].astype(jnp.int32)])
+                states = data.qpos, data.qvel, data.xfrc_applied
+                data = data.replace(xfrc_applied=self._hook.applied(scene, hook, window.layout, place, *states))
+            return data
 
         data, (forces, contacts), failures = self._substep_all(model, data, control)
         out = window.leave(state, PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), chosen)
@@ -187,8 +200,8 @@ class WarpPhysics(MjxPhysics):
         # Unrolled: Warp's data mixes arrays with and without an environment axis, which a scan's carry cannot.
         collected, listed, failures = [], [], jnp.asarray(0, jnp.int32)
         for k in range(self._substeps):
-            data = _engine_step(model, control(data, k) if k else data)
-            collected.append(data.sensordata[self._sensors])
+            data = _engine_step(model, control(data, k) if k or self._hook else data)
+            collected.append(data.sensordata[self._sensors] + self._pulls(data))
             if self._contacts is not None:
                 listed.append(from_sensors(data.sensordata, self._contacts, self._config.force_part, jnp))
             failures |= data._impl.overflow
@@ -230,7 +243,7 @@ class JaxPhysics(MjxPhysics):
         """Return from MJX-JAX's contacts the robot's net force [M + 1, 3] on each slot and the structure, world frame;
         and, where an option asks, what `from_sensors` gives on the other backends."""
         contact, efc = data._impl.contact, data._impl.efc_force
-        out = jnp.zeros((len(self._sensors), 3))
+        out = self._pulls(data)
         dims, address = np.asarray(contact.dim), np.asarray(contact.efc_address)
         slot, rolls = jnp.asarray(self._slot_of_geom), jnp.asarray(self._rolls)
         sums = (jnp.zeros(3), jnp.zeros(()), jnp.zeros(())) if self._config.needs_contacts else None

@@ -20,6 +20,7 @@ from mujoco.batch import Batch
 from interactive_nav.config import NavConfig
 from interactive_nav.physics import base
 from interactive_nav.physics.base import Physics, PhysicsState, StepSignals, summarise_forces
+from interactive_nav.physics.hook import NONE, Hook
 from interactive_nav.scenes.contacts import from_sensors, sensor_addresses
 from interactive_nav.scenes.slots import Slot, find_slots
 from interactive_nav.scenes.world import World, build_spec
@@ -67,6 +68,7 @@ class _Pool:
         self.qpos = np.full((size, models[0].nq), np.nan, np.float32)
         self.qvel = np.full((size, models[0].nv), np.nan, np.float32)
         self.state_qpos, self.state_qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self.applied = self.batch.bind("xfrc_applied")
         self.state_warm, self.state_ctrl = self.batch.bind("qacc_warmstart"), self.batch.bind("ctrl")
 
 
@@ -91,6 +93,7 @@ class NativePhysics(Physics):
             if self._config.sleep:
                 model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
         self._scaled = base.make_scaling(self._models[0], world.layout)
+        self._hook = Hook(world, config) if config.hook_force_n else None
         self._pools: dict[int, list[_Pool]] = {}
         self._lock = threading.Lock()
 
@@ -111,12 +114,15 @@ class NativePhysics(Physics):
         if state.change is not None:
             scales = state.change.mass_scale, state.change.friction_scale
             columns += tuple(jnp.ones((n, 1)) if scale is None else scale[:, None] for scale in scales)
+        columns = columns if state.hook is None else (state.hook, *columns)
         packed = jnp.concatenate([jnp.asarray(x, jnp.float32) for x in columns], 1)
-        step = functools.partial(self._step_host, state.change is not None)
+        step = functools.partial(self._step_host, state.change is not None, state.hook is not None)
         return jax.pure_callback(step, shapes, packed, vmap_method="sequential")
 
-    def _step_host(self, is_scaled: bool, packed):
-        packed, scale = np.asarray(packed), np.ones(2)
+    def _step_host(self, is_scaled: bool, has_hook: bool, packed):
+        packed, scale, hook = np.asarray(packed), np.ones(2), None
+        if has_hook:
+            hook, packed = np.split(packed, [len(NONE)], 1)
         if is_scaled:
             packed, scale = packed[:, :-2], packed[:, -2:]
         qpos, qvel, warm, rest = np.split(packed, np.cumsum([self.nq, self.nv, self.nv]), 1)
@@ -124,7 +130,7 @@ class NativePhysics(Physics):
         pool = self._take_pool(qpos)
         try:
             self._set_models(pool, scene, np.broadcast_to(scale, (len(packed), 2)))
-            return self._step_pool(pool, PhysicsState(qpos, qvel, warm), command, time_s)
+            return self._step_pool(pool, PhysicsState(qpos, qvel, warm, hook=hook), command, time_s, scene)
         finally:
             with self._lock:
                 self._pools[len(packed)].append(pool)
@@ -154,7 +160,7 @@ class NativePhysics(Physics):
             pool.qpos[changed] = np.nan
             pool.scene, pool.scale = scene.copy(), scale.copy()
 
-    def _step_pool(self, pool: _Pool, state: PhysicsState, command, time_s):
+    def _step_pool(self, pool: _Pool, state: PhysicsState, command, time_s, scene):
         batch, qpos, qvel = pool.batch, state.qpos, state.qvel
         finite = np.asarray(np.isfinite(qpos).all(1) & np.isfinite(qvel).all(1))
         resumed = np.equal(qpos, pool.qpos).all(1) & np.equal(qvel, pool.qvel).all(1)
@@ -165,7 +171,7 @@ class NativePhysics(Physics):
             pool.state_qpos[good], pool.state_qvel[good] = qpos[good], qvel[good]
             pool.state_warm[good] = np.asarray(state.qacc_warmstart)[good]
         batch.warning[:] = 0
-        sensed, iterations = self._advance(pool, command, time_s)
+        sensed, iterations = self._advance(pool, command, time_s, scene, state.hook)
         raised = batch.warning[:, :, 1] > 0
         new_qpos, new_qvel = pool.state_qpos.astype(np.float32), pool.state_qvel.astype(np.float32)
         finite &= np.isfinite(new_qpos).all(1) & np.isfinite(new_qvel).all(1)
@@ -188,18 +194,25 @@ class NativePhysics(Physics):
             ),
         )
 
-    def _advance(self, pool: _Pool, command: np.ndarray, time_s: np.ndarray) -> tuple[Any, Any]:
-        """Run the substeps and return sensor readings [N, substeps, ...] and the most solver iterations [N]."""
-        rounds = self._config.substeps if self._robot.control_every_substep else 1
+    def _advance(self, pool: _Pool, command, time_s, scene, hook: np.ndarray | None) -> tuple[Any, Any]:
+        """Run the substeps and return sensor readings [N, substeps, ...], in which the hook's force counts like a
+        contact's, and the most solver iterations [N]."""
+        rounds = self._config.substeps if self._robot.control_every_substep or hook is not None else 1
         sensed, iterations = [], np.zeros(len(command), np.int64)
         for k in range(rounds):
             now_s = time_s + k * self._models[0].opt.timestep
             robot = self._layout.robot_state(pool.state_qpos, pool.state_qvel, now_s)
-            pool.state_ctrl[:] = np.nan_to_num(self._robot.controls(command, robot, np))
+            if k == 0 or self._robot.control_every_substep:
+                pool.state_ctrl[:] = np.nan_to_num(self._robot.controls(command, robot, np))
+            if self._hook and hook is not None:
+                place, states = hook[:, 0].astype(int), (pool.state_qpos, pool.state_qvel, pool.applied)
+                pool.applied[:] = self._hook.applied(scene, hook, self._layout, place, *states)
             record = pool.batch.rollout(
                 self._config.substeps // rounds, record=("sensordata", "solver_niter", "nisland")
             )
             sensed.append(record["sensordata"])
+            if hook is not None:
+                sensed[-1][:, :1, self._sensors[:-1]] += pool.applied[:, None, self._layout.slot_body, :3]
             niter = record["solver_niter"]
             # Without islands the engine reports one solve; what lies beyond the last island is stale.
             islands = np.maximum(record["nisland"].reshape(niter.shape[0], niter.shape[1], 1), 1)

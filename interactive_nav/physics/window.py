@@ -216,7 +216,7 @@ class PhysicsWindow:
         slots = [jnp.asarray(group.slots)[i] for group, i in zip(self.groups, chosen, strict=True)]
         return jnp.concatenate([*slots, jnp.asarray([self.world.layout.num_slots])])
 
-    def _places(self, chosen: tuple[jax.Array, ...]) -> jax.Array:
+    def places(self, chosen: tuple[jax.Array, ...]) -> jax.Array:
         """Return where in the window the world's slots and, last, the robot are, [M + 1]; -1 for what is outside."""
         inside, outside = self._inside(chosen), jnp.full(self.world.layout.num_slots + 1, -1)
         return outside.at[inside].set(jnp.arange(len(inside)), unique_indices=True)
@@ -228,14 +228,14 @@ class PhysicsWindow:
 
     def leave(self, state: PhysicsState, inner: PhysicsState, chosen: tuple[jax.Array, ...]) -> PhysicsState:
         """Return the world's new state: what is outside of the window stays, at rest."""
-        places, (worlds, mine) = self._places(chosen), self._owners
+        places, (worlds, mine) = self.places(chosen), self._owners
         (q, v), (has_q, has_v) = _addresses(mine, worlds, places), (places[owner] >= 0 for _, owner, _ in worlds)
         qvel, warm = (jnp.where(has_v, x[v], 0.0) for x in (inner.qvel, inner.qacc_warmstart))
         return PhysicsState(jnp.where(has_q, inner.qpos[q], state.qpos), qvel, warm)
 
     def spread_forces(self, forces: jax.Array, chosen: tuple[jax.Array, ...]) -> jax.Array:
         """Spread [..., window slots + 1, 3] forces to [..., world slots + 1, 3], the structure last; 0 elsewhere."""
-        places = self._places(chosen)
+        places = self.places(chosen)
         return jnp.where(places[:, None] >= 0, forces[..., places, :], 0.0)
 
 

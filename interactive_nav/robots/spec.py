@@ -145,6 +145,21 @@ class RobotSpec(Figures):
         largest = tuple(max(abs(a), abs(b)) for a, b in zip(self.action_low, self.action_high, strict=True))
         return dataclasses.replace(self, action_low=tuple(-x for x in largest), action_high=largest)
 
+    def hooked(self) -> RobotSpec:
+        """Return a wheeled robot with one more command, its hook's: positive couples, negative lets go, 0 neither."""
+        if self.kind != "wheeled":
+            raise ConfigError(
+                f"hook_force_n with robot '{self.name}' ({self.kind}), expected 0; only wheeled ones hook"
+            )
+        return dataclasses.replace(
+            self,
+            action_low=(*self.action_low, -1.0),
+            action_high=(*self.action_high, 1.0),
+            action_names=(*(self.action_names or self.actuators), "hook"),
+            control=lambda command, state, xp: self.controls(command[..., :-1], state, xp),
+            twist=self.twist and dataclasses.replace(self.twist, matrix=(*self.twist.matrix, (0.0, 0.0))),
+        )
+
     def command(self, action, xp=np):
         """Map actions [..., A] in [-1, 1] (clipped) affinely to commands [..., A]."""
         low, high = self._command_range(action, xp)

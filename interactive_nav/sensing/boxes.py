@@ -17,7 +17,7 @@ import numpy as np
 from interactive_nav.scenes.objects import VISUAL_GROUP
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import World
-from interactive_nav_common.rotations import Array, matrix_from_quat
+from interactive_nav_common.rotations import apply_axes, compose, matrix_from_quat, swing
 from scenes_mjcf.categories import SEGMENTATIONS, MaskClasses, class_id
 from scenes_mjcf.look import SKY_COLOUR, geom_colour
 
@@ -202,26 +202,6 @@ def half_sizes_m(boxes: BoxTables) -> jax.Array:
     return jnp.asarray(np.stack(of_slot, 1) if of_slot else np.zeros((len(rows), 0, 3)), jnp.float32)
 
 
-def apply_axes(axes: jax.Array, vector: jax.Array) -> jax.Array:
-    """Return [..., 3, 3] times [..., 3]; a sum of products, because GPUs may round a matmul's factors to TF32."""
-    return (axes * vector[..., None, :]).sum(-1)
-
-
-def compose(first: jax.Array, second: jax.Array) -> jax.Array:
-    """Return [..., 3, 3] times [..., 3, 3], in full float32."""
-    return (first[..., :, :, None] * second[..., None, :, :]).sum(-2)
-
-
-def swing(axis: Array, anchor_m: Array, angle_rad: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return a hinged body's frame in its rest frame: place [..., 3], m, and axes as columns [..., 3, 3].
-
-    The unit `axis` [..., 3] and `anchor_m` [..., 3] are in the body's frame; `angle_rad` is [...].
-    """
-    half = 0.5 * angle_rad[..., None]
-    turned = matrix_from_quat(jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], -1))
-    return anchor_m - apply_axes(turned, anchor_m), turned
-
-
 def body_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return world frames of the bodies, for scenes [...] i32 and qpos [..., nq].
 
@@ -255,10 +235,10 @@ def box_poses(tables: BoxTables, scene: jax.Array, qpos: jax.Array) -> tuple[jax
     return pos + apply_axes(axes, tables.pos_b[scene]), compose(axes, tables.axes_b[scene])
 
 
-def nearest_box_m(
-    tables: BoxTables, scene: jax.Array, qpos: jax.Array, xy_w: jax.Array, heights_m: tuple[float, float]
+def box_gaps_m2(
+    tables: BoxTables, scene: jax.Array, qpos: jax.Array, xy_w: jax.Array, heights_m: tuple[Any, Any]
 ) -> jax.Array:
-    """Return [] m: how far an upright line at (2,), m, is from the nearest box between two heights; at most `CLEAR_M`.
+    """Return [B] m^2: how far an upright line at (2,), m, is from each box; `CLEAR_M**2` if none is between heights.
 
     The distance is taken from the line's point at the height of the box's centre, so it is horizontal unless the box
     is tilted.
@@ -278,7 +258,7 @@ def nearest_box_m(
     in_body = [dot(axes[:, j], line) - offset[j] for j in range(3)]
     outside = [jnp.maximum(jnp.abs(dot(box_axes[:, j], in_body)) - half[j], 0.0) for j in range(3)]
     counts = (half[0] >= 0) & (middle - reach < high) & (middle + reach > low)
-    return jnp.sqrt(jnp.where(counts, dot(outside, outside), CLEAR_M**2).min(initial=CLEAR_M**2))
+    return jnp.where(counts, dot(outside, outside), CLEAR_M**2)
 
 
 def slab(eye: jax.Array, half: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -27,16 +27,17 @@ from interactive_nav.navigation.placement import draw_episode, place_small
 from interactive_nav.navigation.tables import build_tables, furniture_map, rest_poses, round_tables
 from interactive_nav.physics import PhysicsState, StepSignals, make_physics
 from interactive_nav.physics.base import TOUCH_FORCE_N
+from interactive_nav.physics.hook import COUPLING_M, NONE, Hook
 from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.slots import parking_spot
 from interactive_nav.scenes.world import build_world
-from interactive_nav.sensing.boxes import apply_axes, body_poses, half_sizes_m, nearest_box_m
+from interactive_nav.sensing.boxes import CLEAR_M, apply_axes, body_poses, box_gaps_m2, half_sizes_m
 from interactive_nav.sensing.observation import waypoints_in_body
 from interactive_nav.sensing.sensors import Sensors
 from interactive_nav.task.dynamics import Dynamics
 from interactive_nav.task.privileged import PRIVILEGED_SIZE, privileged_state
-from interactive_nav.task.terms import TERMS, Moment, Step, Term
+from interactive_nav.task.terms import HOOK_TERMS, TERMS, Moment, Step, Term
 from interactive_nav.types import EpisodeStart, GoalField, NavInfo
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import matrix_from_quat
@@ -63,6 +64,7 @@ class InteractiveNav(Env):
     def __init__(self, robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig, terms: Sequence[Term] = ()):
         """Build models, tables and physics of loaded scenes, with added `terms`; raise what `make` does."""
         robot = robot.symmetric() if config.symmetric_actions else robot
+        robot = robot.hooked() if config.hook_force_n else robot
         self.robot, self.scenes, self.config = robot, scenes, config
         self.world = build_world(robot, scenes, config)
         self.tables = build_tables(self.world, config)
@@ -70,7 +72,8 @@ class InteractiveNav(Env):
         self._round = round_tables(self.world, self.tables, config, limit) if limit else None
         self.physics = make_physics(self.world, config)
         self.dynamics = Dynamics(config, robot)
-        observed = config.observations
+        self.hook = Hook(self.world, config) if config.hook_force_n else None
+        terms, observed = (*terms, *(HOOK_TERMS if self.hook else ())), config.observations
         self.terms = (*(t for t in TERMS if t.kind != "observation" or t.name in observed), *terms)
         keys = [t.key for t in self.terms]
         repeated = [key for key in keys if keys.count(key) > 1]
@@ -230,7 +233,9 @@ class InteractiveNav(Env):
         time_s = nav.step_count * self.config.control_dt_s
         nav, command, change = self.dynamics.execute(nav, command, state.info.get("model"))
         before = before.replace(change=change)  # pyright: ignore[reportAttributeAccessIssue]
+        before = self._grip(self.hook, nav, before, command[-1]) if self.hook else before
         physics, signals = self.physics.step(nav.scene_index, before, command, time_s)
+        physics = self.hook.held(nav.scene_index, before.hook, physics) if self.hook else physics
         step = self._measure(nav, physics, signals, state.info["rng"])
         nav = step.nav
         physics = physics.replace(control_steps=nav.step_count)  # pyright: ignore[reportAttributeAccessIssue]
@@ -284,10 +289,21 @@ class InteractiveNav(Env):
         touches = (self.tables.mass_kg[scene, 1:] > 0) & (signals.slot_force_n > TOUCH_FORCE_N)
         hits_structure = signals.structure_force_n > TOUCH_FORCE_N
         lifted = pos_w[2] - self.robot.spawn_height_m > LIFT_M
-        near_m = nearest_box_m(self.sensors.boxes, scene, physics.qpos, pos_w[:2], (FLOOR_M, self.robot.height_m))
+        gaps_m2 = box_gaps_m2(self.sensors.boxes, scene, physics.qpos, pos_w[:2], (FLOOR_M, self.robot.height_m))
+        near_m = jnp.sqrt(gaps_m2.min(initial=CLEAR_M**2))
         clearance_m = jnp.where(broken, 0.0, jnp.maximum(near_m - self.robot.footprint_radius_m, 0.0))
         moment = nav, physics, rotation, last, signals, rng
         return Step(*self._constants, *moment, touches, hits_structure, clearance_m, lifted, broken, success)
+
+    def _grip(self, hook: Hook, nav: NavInfo, physics: PhysicsState, wish: jax.Array) -> PhysicsState:
+        """Return the physics with what the hook holds after its command [], see `Hook.grip`."""
+        scene, boxes, scale = nav.scene_index, self.sensors.boxes, 1.0
+        x, y, z = hook.point_w(physics)
+        gaps_m2 = box_gaps_m2(boxes, scene, physics.qpos, jnp.stack([x, y]), (z - COUPLING_M, z + COUPLING_M))
+        gaps_m2 = jnp.where(boxes.body < self.world.layout.num_slots, gaps_m2, CLEAR_M**2)
+        if nav.dynamics is not None:
+            scale = nav.dynamics.drawn.get("random_mass", scale)
+        return hook.grip(scene, physics, wish, jnp.asarray(boxes.body)[jnp.argmin(gaps_m2)], gaps_m2.min(), scale)
 
     def initial_physics(self, start: EpisodeStart) -> PhysicsState:
         """Return the physics' state that a given episode starts with."""
@@ -303,7 +319,8 @@ class InteractiveNav(Env):
             address = layout.slot_qpos[: self._num_small, None] + np.arange(7)
             qpos = qpos.at[address].set(jnp.stack(columns, -1))
         still = jnp.zeros(self.physics.nv, jnp.float32)
-        return PhysicsState(qpos=qpos, qvel=still, qacc_warmstart=still, control_steps=jnp.zeros((), jnp.int32))
+        hook, zero = jnp.asarray(NONE) if self.hook else None, jnp.zeros((), jnp.int32)
+        return PhysicsState(qpos=qpos, qvel=still, qacc_warmstart=still, control_steps=zero, hook=hook)
 
     def _robot_pose(self, physics: PhysicsState) -> tuple[jax.Array, jax.Array]:
         at = self.world.layout.robot_qpos

@@ -16,6 +16,7 @@ from interactive_nav.config import NavConfig
 from interactive_nav.navigation.placement import DISTANCE_TOLERANCE_M
 from interactive_nav.physics import PhysicsState, StepSignals
 from interactive_nav.physics.base import TOUCH_FORCE_N
+from interactive_nav.physics.hook import TORN
 from interactive_nav.reward import interactive_navigation_reward
 from interactive_nav.sensing.boxes import CLEAR_M
 from interactive_nav.sensing.observation import advance_odometry, waypoints_in_body
@@ -277,5 +278,15 @@ TERMS = (
          lambda nav: jnp.tile(nav.robot_pos_w[:2], (max(TRAIL) + 1, 1)), _trail, 2 * len(TRAIL)),
 )  # fmt: skip
 """The benchmark's terms, metrics in the order of the columns of rows."""
+HOOK_TERMS = (
+    Term("hook", "1 if it holds something, and x, y, z of the coupled point, robot frame, m; else 0.", "observation",
+         lambda _, at: jnp.where(
+             at.physics.hook[0] >= 0,
+             jnp.append(1.0, (at.physics.hook[5:] - at.nav.robot_pos_w) @ at.rotation), 0.0), size=4),
+    _count("hook_steps", "After which the hook held something.", lambda step: _whole(step, step.physics.hook[0] >= 0)),
+    _count("hook_torn", "In which what the hook held was torn away.",
+           lambda step: _whole(step, step.physics.hook[0] == TORN)),
+)  # fmt: skip
+"""The terms of a robot with a hook."""
 EPISODE_METRICS = tuple(term.key for term in TERMS if term.kind == "metric")
 REWARD_TERMS = tuple(term.key for term in TERMS if term.kind == "reward")

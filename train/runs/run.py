@@ -51,7 +51,7 @@ def build_env(config: EnvConfig) -> Any:
 
 OF_CRITIC = ("network.critic_inputs", "network.action_features", "network.compute_dtype")
 """Settings of networks that may differ where a run starts from another one's policy."""
-OF_ACTIONS = ("env.control_mode", "env.symmetric_actions")
+OF_ACTIONS = ("env.control_mode", "env.symmetric_actions", "env.hook_force_n")
 """Settings that decide what an action commands."""
 SIZES = (*WINDOW, "active_dofs")
 """Settings of MJX that `native` does not take."""

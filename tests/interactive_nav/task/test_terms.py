@@ -14,7 +14,7 @@ import pytest
 import interactive_nav
 from interactive_nav.interop.gym_env import InteractiveNavEnv
 from interactive_nav.pictures.replay import EpisodePlayer
-from interactive_nav.sensing.boxes import nearest_box_m
+from interactive_nav.sensing.boxes import box_gaps_m2
 from interactive_nav.task.rollout import HostPolicy, Recorder, episode_keys, rollout
 from interactive_nav.task.terms import EPISODE_METRICS, REWARD_TERMS, TERMS, Term
 from interactive_nav.task.wrappers import AutoResetEnv
@@ -58,8 +58,9 @@ def test_clearance_is_the_gap_between_disc_and_nearest_box_in_the_robots_heights
     qpos = env.initial_physics(start).qpos
 
     def near_m(x, y, low=0.02, high=0.4):
-        return float(jax.jit(lambda xy: nearest_box_m(env.sensors.boxes, jnp.int32(0), qpos, xy, (low, high)))(
-            jnp.array([x, y])))  # fmt: skip
+        heights_m = low, high
+        gaps_m2 = jax.jit(lambda xy: box_gaps_m2(env.sensors.boxes, jnp.int32(0), qpos, xy, heights_m))
+        return float(jnp.sqrt(gaps_m2(jnp.array([x, y])).min()))
 
     assert near_m(-0.9, 0.3) == pytest.approx(0.7, abs=1e-5)  # to the cube's face
     assert near_m(-0.5, -0.3) == pytest.approx(0.5, abs=1e-5)  # to its edge: 0.3 and 0.4 m away

@@ -1,0 +1,143 @@
+"""Pull what stands before a wheeled robot by a hook: a spring and a damper of limited force, on any backend.
+
+The hook is a point at the robot's front. It couples to a point that is fixed in a body's frame, and in every physics
+substep pulls the two together. Functions take NumPy or JAX arrays and leading axes as the caller has them.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+
+from interactive_nav.config import NavConfig
+from interactive_nav.physics.base import PhysicsState
+from interactive_nav.scenes.slots import Layout
+from interactive_nav.scenes.world import World
+from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.rotations import Array, apply_axes, compose, matrix_from_quat, namespace, swing
+
+COUPLING_M = 0.1
+"""The hook couples to what is this near to it, in the plane and in height."""
+TORN = -2
+"""In place of a slot: what the hook held was torn away in the last control step."""
+NONE = np.array([-1, 0, 0, 0, 1, 0, 0, 0], np.float32)
+"""`PhysicsState.hook` of a hook that holds nothing: the slot that it holds; the coupled point in the body's frame, m;
+the inverse of the mass that a force between the two acts on, 1/kg; where the coupled point is, m."""
+TORN_M = 0.2
+"""A body whose coupled point is farther than this from the hook is torn away."""
+HEIGHT_M = 0.15
+"""The hook's height above the floor: a bumper's."""
+_STIFFNESS, _DAMPING = 0.25, 1.0
+"""Shares of the force that would undo the stretch, and stop its growth, within one substep. This is critical damping,
+and stable: semi-implicit steps are where stiffness + 2 damping < 4."""
+_Motion = tuple[Array, Array, Array, Array]
+"""A body's place [..., 3], axes [..., 3, 3] and velocity [..., 3] in the world, its turning rate [..., 3] in itself."""
+
+
+def spring_force(stretch_m: Array, speed_m_s: Array, mobility: Array, step_s: float, most_n: float) -> Array:
+    """Return the force [..., 3], N, at most `most_n`, on what is pulled along `stretch_m` [..., 3], 0 beyond `TORN_M`.
+
+    `speed_m_s` [..., 3] is how the stretch grows. With `mobility` [...], 1/kg, the inverse of the reduced mass, light
+    and heavy bodies follow in the same time.
+    """
+    xp = namespace(stretch_m, mobility)
+    wanted = (_STIFFNESS * stretch_m / step_s**2 + _DAMPING * speed_m_s / step_s) / mobility[..., None]
+    share = most_n / xp.maximum(xp.sqrt((wanted**2).sum(-1)), most_n)
+    near = (stretch_m**2).sum(-1) <= TORN_M**2
+    return xp.where(near[..., None], wanted * share[..., None], 0.0)
+
+
+def _point(motion: _Motion, point_b: Array) -> tuple[Array, Array]:
+    """Return where a point [..., 3] of a body is, m, and its velocity, m/s, in the world frame."""
+    (place, axes, velocity, spin), xp = motion, namespace(motion[0])
+    return place + apply_axes(axes, point_b), velocity + apply_axes(axes, xp.cross(spin, point_b))
+
+
+class Hook:
+    """The hook of a world's robot, and what bodies oppose to it."""
+
+    def __init__(self, world: World, config: NavConfig):
+        slots, robot, self.layout = world.slots, world.robot, world.layout
+        self._most_n, self._step_s = config.hook_force_n, config.sim_dt_s
+        self._held, self._slides = slots.held[:, None], slots.slides[:, None]
+        if not slots.occupied.any():
+            raise ConfigError(f"hook_force_n is {self._most_n}, expected 0 in scenes where nothing moves")
+        length_m = robot.size_m[0] if robot.size_m else 2 * robot.footprint_radius_m
+        self.point_b = np.array([length_m / 2, 0.0, HEIGHT_M - robot.spawn_height_m], np.float32)
+        # A disc that is pulled sideways at its rim.
+        self._mobility = 3.0 / world.robot_mass_kg
+        com, axis, anchor = slots.com_b_m, slots.axis_b, slots.anchor_b_m
+        inverse = np.stack([model.body_invweight0[self.layout.slot_body] for model in world.models])
+        # Means of three directions, of which a hinge or a slide has one. Twice the mean is at least 2/3 of the largest.
+        hinge, slides = self._held & ~self._slides, self._slides
+        along = axis * ((com - anchor) * axis).sum(-1, keepdims=True)
+        pivot, shift = np.where(self._held, anchor + along, com), np.where(slides, 3.0, ~hinge)[:, 0]
+        tables = slots.pos_w_m, slots.axes_w, axis, anchor, com, pivot
+        tables += shift * inverse[..., 0], np.where(hinge, 3.0, 2.0)[:, 0] * inverse[..., 1]
+        self._tables = tuple(table.astype(np.float32) for table in tables)
+        self._com_b = np.float32(world.models[0].body_ipos[self.layout.robot_bodies[0]])
+
+    def _motions(
+        self, scene: Array, slot: Array, layout: Layout, place: Array, qpos: Array, qvel: Array
+    ) -> tuple[_Motion, _Motion]:
+        """Return how a slot's body, whose joint `layout` has at `place` [...] in the states, and the base move."""
+        xp, robot = namespace(qpos), layout.robot_state(qpos, qvel, 0.0)
+        numbers = (qpos, layout.slot_qpos, 7), (qvel, layout.slot_qvel, 6)
+        at = [(x, xp.asarray(first)[place][..., None] + xp.arange(n)) for x, first, n in numbers]
+        q, v = (xp.take_along_axis(x, xp.minimum(i, x.shape[-1] - 1), -1) for x, i in at)
+        rest, axes, axis, anchor, *_ = (xp.asarray(table)[scene, slot] for table in self._tables)
+        held, slides = (xp.asarray(t)[slot] for t in (self._held, self._slides))
+        arm, turned = swing(axis, anchor, xp.where(slides[..., 0], 0.0, q[..., 0]))
+        hung = rest + apply_axes(axes, arm + xp.where(slides, axis * q[..., :1], 0.0))
+        swung, rate = compose(axes, turned), axis * v[..., :1]
+        drift = apply_axes(swung, xp.where(slides, rate, -xp.cross(rate, anchor)))
+        free = q[..., :3], matrix_from_quat(q[..., 3:]), v[..., :3], v[..., 3:]
+        tied = hung, swung, drift, xp.where(slides, 0.0, rate)
+        body = zip((held, held[..., None], held, held), tied, free, strict=True)
+        base = robot.qpos[..., :3], matrix_from_quat(robot.qpos[..., 3:7]), robot.qvel[..., :3], robot.qvel[..., 3:6]
+        return tuple(xp.where(*parts) for parts in body), base
+
+    def point_w(self, state: PhysicsState) -> Array:
+        """Return where the hook is, [3], m."""
+        pose = self.layout.robot_state(state.qpos, state.qvel, 0.0).qpos[:7]
+        return pose[:3] + apply_axes(matrix_from_quat(pose[3:]), self.point_b)
+
+    def grip(
+        self, scene: Array, state: PhysicsState, wish: Array, slot: Array, gap_m2: Array, mass_scale: Array | float
+    ) -> PhysicsState:
+        """Return one environment's state after a command `wish` []: above 0 an empty hook couples to the nearest slot
+        if that is within reach, below 0 it lets go. The body's mass is `mass_scale` times its scene's."""
+        (place, axes, *_), _ = self._motions(scene, slot, self.layout, slot, state.qpos, state.qvel)
+        here_w = self.point_w(state)
+        point_b = apply_axes(axes.swapaxes(-1, -2), here_w - place)
+        pivot, shift, turn = (jnp.asarray(table)[scene, slot] for table in self._tables[-3:])
+        mobility = self._mobility + (shift + turn * ((point_b - pivot) ** 2).sum()) / mass_scale
+        coupled = jnp.concatenate([slot[None].astype(np.float32), point_b, mobility[None], here_w])
+        free = jnp.where((wish > 0) & (gap_m2 <= COUPLING_M**2), coupled, NONE)
+        return state.replace(hook=jnp.where((wish < 0) | (state.hook[0] < 0), free, state.hook))
+
+    def held(self, scene: Array, hook: Array, state: PhysicsState) -> PhysicsState:
+        """Return a new state with what the hook still holds after a control step."""
+        slot = hook[0].astype(np.int32)
+        body, base = self._motions(scene, slot, self.layout, slot, state.qpos, state.qvel)
+        there_w = _point(body, hook[1:4])[0]
+        torn = (slot >= 0) & ~(((there_w - _point(base, self.point_b)[0]) ** 2).sum() <= TORN_M**2)
+        return state.replace(hook=hook.at[0].set(jnp.where(torn, TORN, hook[0])).at[5:].set(there_w))
+
+    def applied(
+        self, scene: Array, hook: Array, layout: Layout, place: Array, qpos: Array, qvel: Array, old: Array
+    ) -> Array:
+        """Return MuJoCo's `xfrc_applied` [..., bodies, 6] like `old`: force and torque about the centre of mass.
+
+        `layout` and `place` [...] locate the held slot in the states; a negative place is none.
+        """
+        xp, slot = namespace(qpos), hook[..., 0].astype(np.int32)
+        motions = self._motions(scene, slot, layout, place, qpos, qvel)
+        coms = xp.asarray(self._tables[4])[scene, slot], xp.asarray(self._com_b)
+        (there_w, theirs), (here_w, mine) = map(_point, motions, (hook[..., 1:4], xp.asarray(self.point_b)))
+        force = spring_force(here_w - there_w, mine - theirs, hook[..., 4], self._step_s, self._most_n)
+        force = xp.where((place >= 0)[..., None], force, 0.0)
+        out, bodies = xp.zeros_like(old), (xp.asarray(layout.slot_body)[place][..., None], layout.robot_bodies[:1])
+        for point, motion, com, body in zip((there_w, here_w), motions, coms, bodies, strict=True):
+            wrench = xp.concatenate([force, xp.cross(point - _point(motion, com)[0], force)], -1)
+            mine = xp.arange(old.shape[-2]) == body
+            out, force = out + mine[..., None] * xp.nan_to_num(wrench)[..., None, :], -force
+        return out
