@@ -80,6 +80,8 @@ class MjxPhysics(Physics):
 
     def _pulls(self, data: mjx.Data) -> jax.Array:
         """Return the hook's force on each slot and the structure, [M + 1, 3]."""
+        if self._hook is None:
+            return jnp.zeros((len(self._sensors), 3))
         return jnp.pad(data.xfrc_applied[self.window.layout.slot_body, :3], ((0, 1), (0, 0)))
 
     def _controlled(self, data: mjx.Data, command: jax.Array, time_s: jax.Array) -> mjx.Data:

@@ -50,8 +50,8 @@ def write_scan(folder: Path, scan: Scan, atlas: VisualMesh, floor_height_m: floa
     material = "newmtl scan\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd mesh_z_up_texture.png\n"
     _write_textured(folder / "mesh_z_up.obj", lines, corners, material)
     write_png(folder / "mesh_z_up_texture.png", atlas.image)
-    bare = {} if scan.solids else {"furnished": np.array(False)}
-    np.savez_compressed(folder / "mesh_z_up.labels.npz", label=scan.labels, **bare)
+    arrays: dict[str, Any] = {"label": scan.labels} if scan.solids else {"label": scan.labels, "furnished": False}
+    np.savez_compressed(folder / "mesh_z_up.labels.npz", **arrays)
 
 
 def write_cad(library: Path, model: CadModel) -> None:

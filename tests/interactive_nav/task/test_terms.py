@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from types import SimpleNamespace
+from typing import Any
 
 import flax.struct
 import jax
@@ -71,7 +72,7 @@ def test_clearance_is_the_gap_between_disc_and_nearest_box_in_the_robots_heights
 
 def test_turning_is_per_metre_of_the_path_and_clearance_a_mean(env):
     """Two steps of 0.3 and -0.5 rad, with 0.2 and 0.1 m of room; the path is 0.4 m, which counts as 1, then 2 m."""
-    terms = {term.name: term for term in TERMS if term.kind == "metric"}
+    terms: dict[str, Any] = {term.name: term for term in TERMS if term.kind == "metric"}
     names = "clearance_m", "least_clearance_m", "turning_rad_per_m"
     memory = {name: terms[name].start(None) for name in names}
     yaw = 3.0

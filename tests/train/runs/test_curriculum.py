@@ -83,6 +83,10 @@ def test_without_a_curriculum_a_batch_is_what_it_was(room):
     jax.tree.map(np.testing.assert_array_equal, (state.obs, state.info["nav"]), (plain.obs, plain.info["nav"]))
 
 
+def limit_m(result) -> float:
+    return float(result.snapshot.env_state.info["curriculum"].limit_m[0])
+
+
 def with_course(config, course):
     return dataclasses.replace(config, run=dataclasses.replace(config.run, curriculum=course))
 
@@ -93,7 +97,7 @@ def test_a_run_goes_on_from_its_limit_and_scores_checkpoints_of_all_distances_on
 ):
     config = with_course(toy_config(tmp_path, updates=8, env_state_limit_mb=0.0), (1.2, 2.0, needed))
     result, folder, _ = train_run(config, QUIET, build_env=build_toy)
-    assert float(result.snapshot.env_state.info["curriculum"].limit_m[0]) == pytest.approx(reached_m)
+    assert limit_m(result) == pytest.approx(reached_m)
     last = checkpoint.list_checkpoints(folder.checkpoints)[-1]
     assert last.curriculum_m == pytest.approx(reached_m) and (last.score is not None) == scored
     assert folder.read_metrics()[-1]["episode/curriculum_m"] == pytest.approx(reached_m, rel=0.2)
@@ -102,7 +106,7 @@ def test_a_run_goes_on_from_its_limit_and_scores_checkpoints_of_all_distances_on
     longer = dataclasses.replace(config, run=dataclasses.replace(config.run, num_timesteps=10 * 256))
     result, _, _ = train_run(longer, QUIET, build_env=build_toy)
     assert result.snapshot.env_steps == 10 * 256
-    assert float(result.snapshot.env_state.info["curriculum"].limit_m[0]) == pytest.approx(reached_m)
+    assert limit_m(result) == pytest.approx(reached_m)
 
 
 @pytest.mark.parametrize("course", [(0.9, 3.0, 0.8), (3.0, 2.0, 0.8)])
