@@ -1,6 +1,7 @@
 """The hook: its force by hand, its kinematics against C MuJoCo, and robots that pull boxes and a door."""
 
 import dataclasses
+import importlib.util
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from interactive_nav.types import EpisodeStart
 from interactive_nav_common.errors import ConfigError
 from tests.toys import write_room
 
+HAS_WARP = importlib.util.find_spec("warp") is not None
 FRICTION, MOST_N = 0.5, 100.0
 SETTINGS = {"num_objects": 0, "control_mode": "twist", "hook_force_n": MOST_N}
 FRONT_M, GAP_M, LEAF_M = 0.2865, 0.05, 0.7
@@ -169,8 +171,11 @@ def test_a_door_that_opens_towards_the_robot_is_pulled_open(make_env):
     assert float(state.info["nav"].memory["object_path_m"][0]) > 0.3  # the kinematic effort has it
 
 
-def test_mjx_pulls_as_c_mujoco_does(make_env):
-    envs = [make_env(backend=backend, solver_iterations=100) for backend in ("native", "jax")]
+@pytest.mark.parametrize(
+    "backend", ["jax", pytest.param("warp", marks=pytest.mark.skipif(not HAS_WARP, reason="no warp-lang"))]
+)
+def test_mjx_pulls_as_c_mujoco_does(make_env, backend):
+    envs = [make_env(backend=name, solver_iterations=100) for name in ("native", backend)]
     steps = [jax.jit(env.step) for env in envs]
     # In a turn the box rocks from edge to edge, where small differences grow.
     for turn_rad_s, atol in ((0.0, 1e-4), (0.1, 5e-3)):
