@@ -28,6 +28,9 @@ SIGHT_STEP_CELLS = 2.0
 """Fine cells between samples of a line of sight inside jit. What is blocked for the robot's centre is at least a
 robot wide, so nothing is stepped over; a corner clipped between two samples is cut by centimetres at most."""
 
+LOW_M = 0.02
+"""Robots pass over parts of furniture that are lower than this."""
+
 
 def furniture_map(scene: Scene, poses: dict[str, tuple[np.ndarray, np.ndarray]], height_m: float) -> np.ndarray:
     """Return [rows, columns] bool: cells of the scene's map over which furniture stands below a height."""
@@ -45,7 +48,7 @@ def _covered(maps: SceneMaps, boxes: np.ndarray, height_m: float) -> np.ndarray:
     rows, columns = maps.traversable.shape
     x = maps.origin_w[0] + (np.arange(columns) + 0.5) * maps.resolution_m
     y = maps.origin_w[1] + (np.arange(rows) + 0.5) * maps.resolution_m
-    z = np.arange(0.02, height_m, 0.03)
+    z = np.arange(LOW_M, height_m, 0.03)
     covered = np.zeros((rows, columns), bool)
     for row in boxes:
         body = matrix_from_quat(row[3:7])

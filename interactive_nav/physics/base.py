@@ -72,7 +72,7 @@ class PhysicsState:
     change: ModelChange | None = None
     """Of the model, for the next control step, which backends leave out too."""
     hook: Any = None
-    """[8] f32 as `hook.NONE`, or None."""
+    """[8] f32, laid out as `hook.NONE`; None without a hook."""
 
 
 @flax.struct.dataclass
@@ -108,6 +108,8 @@ class Physics(abc.ABC):
     nv: int
     reports_convergence = True
     """Whether `StepSignals.unconverged` is reported."""
+    hook: Any = None
+    """The robot's `Hook`, if it has one."""
 
     @abc.abstractmethod
     def step_batch(

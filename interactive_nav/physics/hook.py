@@ -1,7 +1,7 @@
 """Pull what stands before a wheeled robot by a hook: a spring and a damper of limited force, on any backend.
 
 The hook is a point at the robot's front. It couples to a point that is fixed in a body's frame, and in every physics
-substep pulls the two together. Functions take NumPy or JAX arrays and leading axes as the caller has them.
+substep pulls the two together. Functions take NumPy or JAX arrays with any leading axes.
 """
 
 import jax.numpy as jnp
@@ -15,12 +15,12 @@ from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import Array, apply_axes, compose, matrix_from_quat, namespace, swing
 
 COUPLING_M = 0.1
-"""The hook couples to what is this near to it, in the plane and in height."""
+"""The hook couples to bodies within this distance, in the plane and in height."""
 TORN = -2
-"""In place of a slot: what the hook held was torn away in the last control step."""
+"""Stands for a slot after a body was torn away in the last control step."""
 NONE = np.array([-1, 0, 0, 0, 1, 0, 0, 0], np.float32)
-"""`PhysicsState.hook` of a hook that holds nothing: the slot that it holds; the coupled point in the body's frame, m;
-the inverse of the mass that a force between the two acts on, 1/kg; where the coupled point is, m."""
+"""`PhysicsState.hook` of a hook that holds nothing. Its numbers are the slot; the coupled point in the body's frame, m;
+the inverse of the reduced mass of robot and body, 1/kg; and the coupled point in the world frame, m."""
 TORN_M = 0.2
 """A body whose coupled point is farther than this from the hook is torn away."""
 HEIGHT_M = 0.15
@@ -29,14 +29,14 @@ _STIFFNESS, _DAMPING = 0.25, 1.0
 """Shares of the force that would undo the stretch, and stop its growth, within one substep. This is critical damping,
 and stable: semi-implicit steps are where stiffness + 2 damping < 4."""
 _Motion = tuple[Array, Array, Array, Array]
-"""A body's place [..., 3], axes [..., 3, 3] and velocity [..., 3] in the world, its turning rate [..., 3] in itself."""
+"""A body's position [..., 3], axes [..., 3, 3] and velocity [..., 3], world frame, and angular velocity, body frame."""
 
 
 def spring_force(stretch_m: Array, speed_m_s: Array, mobility: Array, step_s: float, most_n: float) -> Array:
-    """Return the force [..., 3], N, at most `most_n`, on what is pulled along `stretch_m` [..., 3], 0 beyond `TORN_M`.
+    """Return the force [..., 3], N, along `stretch_m` [..., 3], of norm at most `most_n`, and 0 beyond `TORN_M`.
 
-    `speed_m_s` [..., 3] is how the stretch grows. With `mobility` [...], 1/kg, the inverse of the reduced mass, light
-    and heavy bodies follow in the same time.
+    `speed_m_s` [..., 3] is the rate at which the stretch grows. With `mobility` [...], 1/kg, the inverse of the reduced
+    mass, light and heavy bodies follow in the same time.
     """
     xp = namespace(stretch_m, mobility)
     wanted = (_STIFFNESS * stretch_m / step_s**2 + _DAMPING * speed_m_s / step_s) / mobility[..., None]
@@ -52,7 +52,7 @@ def _point(motion: _Motion, point_b: Array) -> tuple[Array, Array]:
 
 
 class Hook:
-    """The hook of a world's robot, and what bodies oppose to it."""
+    """Couples a world's robot to movable bodies, and computes the forces between them."""
 
     def __init__(self, world: World, config: NavConfig):
         slots, robot, self.layout = world.slots, world.robot, world.layout
@@ -78,7 +78,7 @@ class Hook:
     def _motions(
         self, scene: Array, slot: Array, layout: Layout, place: Array, qpos: Array, qvel: Array
     ) -> tuple[_Motion, _Motion]:
-        """Return how a slot's body, whose joint `layout` has at `place` [...] in the states, and the base move."""
+        """Return the motions of a slot's body, which `layout` has at `place` [...] in the states, and of the base."""
         xp, robot = namespace(qpos), layout.robot_state(qpos, qvel, 0.0)
         numbers = (qpos, layout.slot_qpos, 7), (qvel, layout.slot_qvel, 6)
         at = [(x, xp.asarray(first)[place][..., None] + xp.arange(n)) for x, first, n in numbers]

@@ -56,7 +56,7 @@ class MjxPhysics(Physics):
         layout = self.window.layout
         self._sensors = layout.force_sensors[:, None] + np.arange(3)
         self._config = config
-        self._hook = Hook(world, config) if config.hook_force_n else None
+        self.hook = Hook(world, config) if config.hook_force_n else None
 
     def _host_model(self) -> mujoco.MjModel:
         return self.window.model
@@ -80,7 +80,7 @@ class MjxPhysics(Physics):
 
     def _pulls(self, data: mjx.Data) -> jax.Array:
         """Return the hook's force on each slot and the structure, [M + 1, 3]."""
-        if self._hook is None:
+        if self.hook is None:
             return jnp.zeros((len(self._sensors), 3))
         return jnp.pad(data.xfrc_applied[self.window.layout.slot_body, :3], ((0, 1), (0, 0)))
 
@@ -110,10 +110,10 @@ class MjxPhysics(Physics):
         def control(data, k):
             if self._world.robot.control_every_substep:
                 data = self._controlled(data, command, time_s + k * self.mj_model.opt.timestep)
-            if self._hook and hook is not None:
+            if self.hook and hook is not None:
                 place = jnp.where(hook[0] < 0, -1, window.places(chosen)[hook[0].astype(jnp.int32)])
                 states = data.qpos, data.qvel, data.xfrc_applied
-                data = data.replace(xfrc_applied=self._hook.applied(scene, hook, window.layout, place, *states))
+                data = data.replace(xfrc_applied=self.hook.applied(scene, hook, window.layout, place, *states))
             return data
 
         data, (forces, contacts), failures = self._substep_all(model, data, control)
@@ -202,7 +202,7 @@ class WarpPhysics(MjxPhysics):
         # Unrolled: Warp's data mixes arrays with and without an environment axis, which a scan's carry cannot.
         collected, listed, failures = [], [], jnp.asarray(0, jnp.int32)
         for k in range(self._substeps):
-            data = _engine_step(model, control(data, k) if k or self._hook else data)
+            data = _engine_step(model, control(data, k) if k or self.hook else data)
             collected.append(data.sensordata[self._sensors] + self._pulls(data))
             if self._contacts is not None:
                 listed.append(from_sensors(data.sensordata, self._contacts, self._config.force_part, jnp))

@@ -93,7 +93,7 @@ class NativePhysics(Physics):
             if self._config.sleep:
                 model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
         self._scaled = base.make_scaling(self._models[0], world.layout)
-        self._hook = Hook(world, config) if config.hook_force_n else None
+        self.hook = Hook(world, config) if config.hook_force_n else None
         self._pools: dict[int, list[_Pool]] = {}
         self._lock = threading.Lock()
 
@@ -204,9 +204,9 @@ class NativePhysics(Physics):
             robot = self._layout.robot_state(pool.state_qpos, pool.state_qvel, now_s)
             if k == 0 or self._robot.control_every_substep:
                 pool.state_ctrl[:] = np.nan_to_num(self._robot.controls(command, robot, np))
-            if self._hook and hook is not None:
+            if self.hook and hook is not None:
                 place, states = hook[:, 0].astype(int), (pool.state_qpos, pool.state_qvel, pool.applied)
-                pool.applied[:] = self._hook.applied(scene, hook, self._layout, place, *states)
+                pool.applied[:] = self.hook.applied(scene, hook, self._layout, place, *states)
             record = pool.batch.rollout(
                 self._config.substeps // rounds, record=("sensordata", "solver_niter", "nisland")
             )

@@ -1,6 +1,6 @@
 """Build a robot that `make` accepts from a user's MJCF or URDF and a few facts (see `docs/add-a-robot.md`).
 
-What the facts leave out is read off the file's shapes. `repair.py` adds what physics needs, each with a warning.
+Missing facts are inferred from the file's shapes. `repair.py` adds what physics needs, with a warning for each change.
 Refused are colliding meshes, links without inertia or shape, and joints of arms without torque limits. Control modes
 come from `build.py`.
 """
@@ -32,7 +32,7 @@ _FASTEST_M_S, _DEFAULT_M_S = 3.0, 1.0
 
 @dataclasses.dataclass(frozen=True)
 class Facts(Settings):
-    """What `from_file` need not read off a wheeled robot's file; `porter.yaml` beside `porter.urdf` has these keys."""
+    """Describe a wheeled robot beyond its file; the keys of `porter.yaml` beside `porter.urdf`, all optional."""
 
     name: str | None = None
     """By default the file's."""

@@ -149,7 +149,7 @@ class RobotSpec(Figures):
         """Return a wheeled robot with one more command, its hook's: positive couples, negative lets go, 0 neither."""
         if self.kind != "wheeled":
             raise ConfigError(
-                f"hook_force_n with robot '{self.name}' ({self.kind}), expected 0; only wheeled ones hook"
+                f"hook_force_n is set, expected 0 with robot '{self.name}' ({self.kind}): only wheeled ones have a hook"
             )
         return dataclasses.replace(
             self,

@@ -44,7 +44,7 @@ class Slot:
 
     @functools.cached_property
     def any_floats(self) -> bool:
-        """Return whether gravity leaves out what some scene has there, or the place of what it lacks."""
+        """Return whether some scene has nothing there, or a body that gravity does not move."""
         return any(body is None or bool(body.joint and body.joint.balanced) for body in self.bodies)
 
 

@@ -10,7 +10,7 @@ GROWTH = 1.5
 
 @flax.struct.dataclass
 class Curriculum:
-    """How far N environments have come: [N] each, as the rest of a batch's state, but for two settings."""
+    """Hold the progress of N environments as arrays [N], like the rest of a batch's state, and two settings."""
 
     limit_m: jax.Array
     """Largest length of the path from start to goal of new episodes, the same for all."""

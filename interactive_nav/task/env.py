@@ -24,7 +24,7 @@ from interactive_nav.navigation.lookup import (
     waypoints_at,
 )
 from interactive_nav.navigation.placement import draw_episode, place_small
-from interactive_nav.navigation.tables import build_tables, furniture_map, rest_poses, round_tables
+from interactive_nav.navigation.tables import LOW_M, build_tables, furniture_map, rest_poses, round_tables
 from interactive_nav.physics import PhysicsState, StepSignals, make_physics
 from interactive_nav.physics.base import TOUCH_FORCE_N
 from interactive_nav.physics.hook import COUPLING_M, NONE, Hook
@@ -42,8 +42,6 @@ from interactive_nav.types import EpisodeStart, GoalField, NavInfo
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import matrix_from_quat
 
-FLOOR_M = 0.02
-"""What is lower is no obstacle, as in maps of furniture."""
 LIFT_M = 0.2
 """A base that rises this far above its standing height has left the floor (the original's early failure)."""
 
@@ -72,7 +70,7 @@ class InteractiveNav(Env):
         self._round = round_tables(self.world, self.tables, config, limit) if limit else None
         self.physics = make_physics(self.world, config)
         self.dynamics = Dynamics(config, robot)
-        self.hook = Hook(self.world, config) if config.hook_force_n else None
+        self.hook: Hook | None = self.physics.hook
         terms, observed = (*terms, *(HOOK_TERMS if self.hook else ())), config.observations
         self.terms = (*(t for t in TERMS if t.kind != "observation" or t.name in observed), *terms)
         keys = [t.key for t in self.terms]
@@ -289,14 +287,14 @@ class InteractiveNav(Env):
         touches = (self.tables.mass_kg[scene, 1:] > 0) & (signals.slot_force_n > TOUCH_FORCE_N)
         hits_structure = signals.structure_force_n > TOUCH_FORCE_N
         lifted = pos_w[2] - self.robot.spawn_height_m > LIFT_M
-        gaps_m2 = box_gaps_m2(self.sensors.boxes, scene, physics.qpos, pos_w[:2], (FLOOR_M, self.robot.height_m))
+        gaps_m2 = box_gaps_m2(self.sensors.boxes, scene, physics.qpos, pos_w[:2], (LOW_M, self.robot.height_m))
         near_m = jnp.sqrt(gaps_m2.min(initial=CLEAR_M**2))
         clearance_m = jnp.where(broken, 0.0, jnp.maximum(near_m - self.robot.footprint_radius_m, 0.0))
         moment = nav, physics, rotation, last, signals, rng
         return Step(*self._constants, *moment, touches, hits_structure, clearance_m, lifted, broken, success)
 
     def _grip(self, hook: Hook, nav: NavInfo, physics: PhysicsState, wish: jax.Array) -> PhysicsState:
-        """Return the physics with what the hook holds after its command [], see `Hook.grip`."""
+        """Return the physics state after the hook's command `wish` []; see `Hook.grip`."""
         scene, boxes, scale = nav.scene_index, self.sensors.boxes, 1.0
         x, y, z = hook.point_w(physics)
         gaps_m2 = box_gaps_m2(boxes, scene, physics.qpos, jnp.stack([x, y]), (z - COUPLING_M, z + COUPLING_M))

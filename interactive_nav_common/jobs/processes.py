@@ -67,7 +67,7 @@ class Child:
     """A job's process; holds its locks as long as it lives."""
 
     def __init__(self, job: Job, env: Mapping[str, str], logged: bool = True):
-        """Start it; what is not `logged` is printed where we print."""
+        """Start the process; unless `logged`, it shares our input and output."""
         self._process: subprocess.Popen[bytes] | None = None
         self._until = time.monotonic() + job.timeout_s
         held: list[int] = []
@@ -83,7 +83,7 @@ class Child:
                 log.write(f"== {time.strftime('%Y-%m-%d %H:%M:%S')} {job.name}\n".encode())
             self._process = subprocess.Popen(
                 [sys.executable, "-c", GUARD, *job.command],
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.DEVNULL if log else None,
                 stdout=log,
                 stderr=subprocess.STDOUT if log else None,
                 env={**os.environ, **job.env, **env},
@@ -103,7 +103,7 @@ class Child:
         return code
 
     def wait(self, timeout_s: float | None = None) -> int | None:
-        """Wait until it has ended, or for so long; return what `poll` does."""
+        """Wait for its end, at most `timeout_s`; return what `poll` does."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             return LOCKED if self._process is None else self._process.wait(timeout_s)
 
@@ -117,7 +117,7 @@ class Child:
 
 
 class Launcher:
-    """Where jobs run: processes on this machine, so many side by side."""
+    """Run jobs as processes on this machine, `side_by_side` of them at a time."""
 
     def __init__(self, side_by_side: int = 1) -> None:
         self._side_by_side = side_by_side

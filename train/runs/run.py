@@ -226,7 +226,7 @@ class FolderCallbacks:
 
 
 def check_alike(setting: str, folder: RunFolder, config: TrainConfig, names: Sequence[tuple[str, str]] = ()) -> None:
-    """Raise `ConfigError` where the run that `setting` names acts otherwise, or differs in `names`, here and there."""
+    """Raise `ConfigError` if the run that `setting` names commands other actions, or differs in a pair of `names`."""
     mine, theirs = flatten(config), flatten(folder.read_config())
     for name, there in [*((name, name) for name in OF_ACTIONS), *names]:
         if mine[name] != theirs[there]:

@@ -18,14 +18,14 @@ from interactive_nav_common.statistics import RESAMPLES, over_episodes
 SCORES = {"success": "success", "path_efficiency": "P_eff", "effort_efficiency": "E_eff", "ins_0.5": "INS_0.5"}
 
 
-_NEW = ("clearance_m", "least_clearance_m", "turning_rad_per_m")
+_OF_MOTION = ("clearance_m", "least_clearance_m", "turning_rad_per_m")
 OF_TRAINING = ("train_device", "train_commit", "train_env_steps", "checkpoint_steps", "train_wall_s")
 COLUMNS = Columns(
     text=("run", "robot", "policy", "scene", "split", "algorithm", "device", *OF_TRAINING[:2]),
     whole=("episode", "seed", "evaluation_seed", *OF_TRAINING[2:4]),
-    numbers=("k_int", *SCORES, "kinematic_effort", "dynamic_effort", "structure_steps", *_NEW, *OF_TRAINING[4:]),
+    numbers=("k_int", *SCORES, "kinematic_effort", "dynamic_effort", "structure_steps", *_OF_MOTION, *OF_TRAINING[4:]),
     may_be_empty=("algorithm", "seed", "k_int", *OF_TRAINING),
-    may_be_missing=("device", "evaluation_seed", "structure_steps", *_NEW, *OF_TRAINING),
+    may_be_missing=("device", "evaluation_seed", "structure_steps", *_OF_MOTION, *OF_TRAINING),
 )
 TYPES: dict[str, pa.DataType] = {
     **dict.fromkeys((*COLUMNS.text, "backend", "commit", "versions"), pa.string()),
