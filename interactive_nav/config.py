@@ -86,8 +86,10 @@ class TaskRules(Settings):
     """Geodesic distance from the robot's position, or quantised: from the centre of its cell."""
     potential_round: Positive | None = None
     """A help in training: the potential's way also goes round furniture, where it stood at the start, whose friction
-    exceeds this share of the robot's weight (1: what planners hold for stuck), if there is such a way. Waypoints and
-    scores know nothing of it."""
+    exceeds this share of the robot's weight (1: what planners hold for stuck), if there is such a way. Scores know
+    nothing of it, nor do waypoints without waypoints_round."""
+    waypoints_round: bool = False
+    """Waypoints go round the furniture of potential_round, too, as if it stood on the robot's map."""
     scene_choice: Literal["episode", "slot"] = "episode"
     """Each episode draws a scene, or each environment of a batch keeps one (slot; `AutoResetEnv`)."""
     goal_clear: bool = True
@@ -97,7 +99,10 @@ class TaskRules(Settings):
     bootstrap_at_time_limit: bool = True
     """The time limit is a truncation, at which learners bootstrap; else it looks like any other end."""
 
-    IDLE = (("small_objects objects", "num_objects above 0", lambda c: c.num_objects > 0),)
+    IDLE = (
+        ("small_objects objects", "num_objects above 0", lambda c: c.num_objects > 0),
+        ("waypoints_round", "potential_round", lambda c: c.potential_round is not None),
+    )
 
     def __post_init__(self) -> None:
         if isinstance(self.objects, (str, Path)):

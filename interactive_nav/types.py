@@ -86,6 +86,9 @@ class EpisodeDynamics:
     seen: Any
 
 
+Detour = tuple[GoalField, jax.Array] | None
+
+
 @flax.struct.dataclass
 class NavInfo:
     """The task's memory of one episode."""
@@ -117,7 +120,7 @@ class NavInfo:
     """[] i32 control steps done."""
     memory: dict[str, Any]
     """The memory of each term, by its key (`interactive_nav.task.terms`)."""
-    round_field: tuple[GoalField, jax.Array] | None = None
+    round_field: Detour = None
     """With `potential_round`: what the geodesic round heavy furniture needs to know, and [] bool whether it counts."""
     dynamics: EpisodeDynamics | None = None
     """With random dynamics."""

@@ -38,7 +38,7 @@ from interactive_nav.sensing.sensors import Sensors
 from interactive_nav.task.dynamics import Dynamics
 from interactive_nav.task.privileged import PRIVILEGED_SIZE, privileged_state
 from interactive_nav.task.terms import HOOK_TERMS, TERMS, Moment, Step, Term
-from interactive_nav.types import EpisodeStart, GoalField, NavInfo
+from interactive_nav.types import Detour, EpisodeStart, GoalField, NavInfo
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import matrix_from_quat
 
@@ -147,7 +147,6 @@ class InteractiveNav(Env):
         pos_w, rotation = self._robot_pose(physics)
         scene = start.scene_index
         goal = goal_field(self.tables, scene, start.goal_xy_w)
-        waypoints_b = self._waypoints(scene, goal, pos_w, rotation)
         if self._round:
             ends = jnp.stack([start.start_xy_w, start.goal_xy_w])
             detour = goal_field(self._round, scene, start.goal_xy_w), all_free(self._round, scene, ends)
@@ -159,7 +158,7 @@ class InteractiveNav(Env):
             goal_xy_w=start.goal_xy_w,
             goal_field=goal,
             start_xy_w=start.start_xy_w,
-            waypoints_b=waypoints_b,
+            waypoints_b=self._waypoints(scene, goal, detour, pos_w, rotation),
             shortest_path_m=geodesic_at(self.tables, scene, goal, pos_w[:2]),
             objects_dropped=jnp.sum(~start.small_placed).astype(jnp.int32),
             round_field=detour,
@@ -275,7 +274,7 @@ class InteractiveNav(Env):
         nav = last.replace(
             robot_pos_w=pos_w,
             yaw_rad=jnp.where(broken, last.yaw_rad, _yaw(rotation)),
-            waypoints_b=self._waypoints(scene, last.goal_field, pos_w, rotation),
+            waypoints_b=self._waypoints(scene, last.goal_field, last.round_field, pos_w, rotation),
             object_pos_w=jnp.where(broken, last.object_pos_w, self._object_positions(scene, physics)),
             geodesic_m=self._geodesic(scene, last.goal_field, last.round_field, pos_w),
             step_count=last.step_count + 1,
@@ -329,9 +328,7 @@ class InteractiveNav(Env):
         pos_w, axes_w = body_poses(self.sensors.boxes, scene, physics.qpos)
         return pos_w[:-1] + apply_axes(axes_w[:-1], self.tables.com_m[scene])
 
-    def _geodesic(
-        self, scene: jax.Array, goal: GoalField, detour: tuple[GoalField, jax.Array] | None, pos_w: jax.Array
-    ) -> jax.Array:
+    def _geodesic(self, scene: jax.Array, goal: GoalField, detour: Detour, pos_w: jax.Array) -> jax.Array:
         """Return [] m: the distance from which the potential follows."""
         xy = pos_w[:2]
         if self.config.potential == "quantised":
@@ -341,10 +338,15 @@ class InteractiveNav(Env):
             return plain_m
         return jnp.where(detour[1], geodesic_at(self._round, scene, detour[0], xy), plain_m)
 
-    def _waypoints(self, scene: jax.Array, goal: GoalField, pos_w: jax.Array, rotation: jax.Array) -> jax.Array:
+    def _waypoints(
+        self, scene: jax.Array, goal: GoalField, detour: Detour, pos_w: jax.Array, rotation: jax.Array
+    ) -> jax.Array:
         config = self.config
         points_at = grid_waypoints_at if config.waypoint_style == "grid" else waypoints_at
-        world = points_at(self.tables, scene, goal, pos_w[:2], config.num_waypoints, config.waypoint_spacing_m)
+        ahead = pos_w[:2], config.num_waypoints, config.waypoint_spacing_m
+        world = points_at(self.tables, scene, goal, *ahead)
+        if self._round and detour and config.waypoints_round:
+            world = jnp.where(detour[1], points_at(self._round, scene, detour[0], *ahead), world)
         return waypoints_in_body(world, pos_w, rotation)
 
 

@@ -325,12 +325,23 @@ def test_the_potential_goes_round_what_is_heavy_where_there_is_a_way(pushed, pap
     rewards = np.array([np.asarray(s.metrics["reward/potential"])[0] for s in states[1:]])
     np.testing.assert_allclose(rewards, -np.diff(value(states, "geodesic_m")), atol=1e-5)
 
+    led = play(make(pushed, potential_round=0.05, waypoints_round=True), [AHEAD] * 3)
+    radius_m, begin = env.robot.footprint_radius_m, np.asarray(led[0].info["nav"].waypoints_b)[0] + [-0.7, 0.0]
+    assert (np.abs(begin).max(-1) > 0.2 + radius_m / math.sqrt(2) - 0.05).all()  # a disc there leaves the block alone
+    assert np.linalg.norm(np.diff(begin, axis=0), axis=-1).sum() == pytest.approx(9 * 0.2, abs=0.05)
+    np.testing.assert_allclose(value(led, "geodesic_m")[0], value(states, "geodesic_m")[0])
+    assert np.abs(value(led, "waypoints_b") - value(paper, "waypoints_b")[:4]).max() > 0.3
+    with pytest.raises(ConfigError, match="waypoints_round"):
+        make(pushed, waypoints_round=True)
+
     light = play(make(pushed, potential_round=0.2), [])
     np.testing.assert_allclose(value(light, "geodesic_m"), 2.3, atol=1e-3)
     row = tuple(("basket", 0.0, y, MASS_KG, FRICTION) for y in (-1.2, -0.8, -0.4, 0.0, 0.4, 0.8, 1.2))
-    closed = play(make(write_room(tmp_path / "closed", (4.0, 3.0), row), potential_round=0.05), [])
+    shut = write_room(tmp_path / "closed", (4.0, 3.0), row)
+    closed = play(make(shut, potential_round=0.05, waypoints_round=True), [])
     assert not closed[0].info["nav"].round_field[1].any()
     np.testing.assert_allclose(value(closed, "geodesic_m"), 2.3, atol=1e-3)
+    np.testing.assert_allclose(value(closed, "waypoints_b")[0, :, 1], 0.0, atol=1e-3)
 
 
 def test_each_slot_keeps_its_scene(pushed, room):
