@@ -86,6 +86,8 @@ class PPOConfig(Settings):
     """Passes over the collected data."""
     learning_rate: Positive = 3e-4
     """Adam's step size."""
+    final_learning_rate: NotNegative | None = None
+    """Adam's step size at run.num_timesteps, which it approaches in equal steps; none: it stays the same."""
     discounting: Share = 0.99
     """Discount of one control step."""
     gae_lambda: Share = 0.95

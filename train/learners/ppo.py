@@ -15,6 +15,7 @@ it needs `truncation` = 0, takes V before the cut for V after it, and multiplies
 
 import dataclasses
 import functools
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -73,6 +74,8 @@ class PPOParts:
     memory_size: int = 0
     groups: int = 1
     """Equal groups of environments, within which sequences are shuffled: one for each device."""
+    learning_rate: optax.Schedule | None = None
+    """Adam's step size by its count; none: `config.learning_rate`."""
 
     @property
     def steps_per_update(self) -> int:
@@ -124,9 +127,14 @@ def make_agent(env: Any, config: TrainConfig) -> PPOParts:
     layers = c.policy_hidden_layer_sizes, c.value_hidden_layer_sizes
     n = env.privileged_size if network.critic_inputs == "privileged" else 0
     built = nets.make_ppo_networks(network, size, env.action_size, *layers, c.normalize_observations, n)
-    optimizer = optax.chain(optax.clip_by_global_norm(c.max_grad_norm), optax.adam(c.learning_rate))
     shared = network.share_encoder and isinstance(built.policy_network, nets.Split)
-    return PPOParts(c, built, optimizer, size, shared, network.memory_size, config.run.devices)
+    parts = PPOParts(c, built, optax.identity(), size, shared, network.memory_size, config.run.devices)
+    rate, end = None, c.final_learning_rate
+    if end is not None:
+        updates = math.ceil(config.run.num_timesteps / parts.steps_per_update)
+        rate = optax.linear_schedule(c.learning_rate, end, updates * c.num_updates_per_batch * (c.num_minibatches or 1))
+    optimizer = optax.chain(optax.clip_by_global_norm(c.max_grad_norm), optax.adam(rate or c.learning_rate))
+    return dataclasses.replace(parts, optimizer=optimizer, learning_rate=rate)
 
 
 def policy_part(learner: Mapping[str, Any]) -> dict[str, Any]:
@@ -266,7 +274,9 @@ def update(parts: PPOParts, env: Env, state: PPOState, env_state: Any) -> tuple[
     env_state, data, sums = collect(parts, env, state, env_state, key_unroll)
     statistics = nets.update_normalizer(state.normalizer_params, data.observation)
     optimizer_state, params, losses = learn(parts, state, data, statistics, key_sgd)
-    means = {"learning_rate": jnp.asarray(parts.config.learning_rate), "reward_per_step": jnp.mean(data.reward)}
+    rate: Any = parts.learning_rate(state.optimizer_state[1][0].count) if parts.learning_rate else None  # type: ignore[index]
+    rate = jnp.asarray(parts.config.learning_rate if rate is None else rate)
+    means = {"learning_rate": rate, "reward_per_step": jnp.mean(data.reward)}
     losses = jax.tree.map(jnp.mean, losses) | means
     new_state = PPOState(optimizer_state=optimizer_state, params=params, normalizer_params=statistics, key=key_next)
     finite = all_finite((losses, params, statistics.mean, statistics.std))

@@ -108,6 +108,22 @@ def test_updates_equal_those_of_brax():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-5), mine, theirs)
 
 
+def test_the_step_size_falls_in_equal_steps_to_its_final_value():
+    def trained(**settings: Any) -> tuple[list[float], Any]:
+        result = ALGORITHMS["ppo"].train(batched(), make_config(3, **settings), recorder := Recorder())
+        return [metrics["loss/learning_rate"] for _, metrics in recorder.logs], result.snapshot.learner.params
+
+    rates, falling = trained(learning_rate=6e-4, final_learning_rate=0.0)
+    # An update takes four steps of Adam (two passes over two minibatches), and there are three updates.
+    np.testing.assert_allclose(rates, [6e-4, 6e-4 * 8 / 12, 6e-4 * 4 / 12], rtol=1e-5)
+    level, same = trained(learning_rate=6e-4, final_learning_rate=6e-4)
+    np.testing.assert_allclose(level, 6e-4, rtol=1e-5)
+    constant = trained(learning_rate=6e-4)[1]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-7), same, constant)
+    away = jax.tree.map(lambda a, b: np.abs(a - b).max(), falling, constant)
+    assert max(jax.tree.leaves(away)) > 1e-4
+
+
 def test_time_limit_bootstraps_once():
     """GAE by hand: T = 2, discount 0.5, lambda 1, rewards 1, values 10 then 20; step two hits the limit.
 
