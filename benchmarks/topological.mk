@@ -1,4 +1,4 @@
-# Topological navigation, everything that docs/topological.md reports at one size, as a graph of its commands:
+# Topological navigation, everything that docs/topological-results.md reports at one size, as a graph of its commands:
 #
 #   make -f benchmarks/topological.mk -j 8 RUNS=runs/topological-full            on a GPU machine (SIZE=full)
 #   make -f benchmarks/topological.mk -j 2 SIZE=cpu RUNS=runs/topological-cpu    on two CPU cores
@@ -80,7 +80,7 @@ else ifeq ($(SIZE),report)
   LEARNED = dense,sparse
   BASELINE = --contenders dense$(if $(PPO),$(comma)ppo)
 else ifeq ($(SIZE),homes)
-  # 40 furnished and cluttered homes and the eight early ones to learn from, ten others to test: see docs/topological-results.md.
+  # 40 furnished and cluttered homes and the eight early ones to learn from, ten others to test: see docs/topological-homes.md.
   SCENES = runs/homes/scenes
   number = $(foreach tier,furnished cluttered,$(foreach n,$(1),$(tier)_0$(n)))
   TESTS = $(call number,20 21 22 23 24)
