@@ -9,6 +9,7 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet
 import pytest
 from rich.console import Console
@@ -18,6 +19,7 @@ from interactive_nav.config import WINDOW
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.records import PACKED_METRICS, read_metrics
 from interactive_nav_common.rows import read_rows, where
+from interactive_nav_common.statistics import estimate
 from topological_nav.evaluate.scores import differences, markdown, summary, text
 from topological_nav.tables import tables as topological_tables
 from train.figures import tables
@@ -182,6 +184,28 @@ def test_the_table_of_navigators_in_furnished_homes_is_that_of_its_rows():
     assert (won.loc[[f"ladder-{row}" for row in range(9)], "success_count"] == 120).all()
     assert won.loc["ladder-3", "success_sum"] - won.loc["ladder-2", "success_sum"] == 31
     assert sum(where(rows, variant="objects-30")["contact"].to_pylist()) == 71
+    # The prices on the page, over the episodes of both rows, home by home.
+    episodes = rows.to_pandas().set_index(["scene", "episode"])
+
+    def price(one: str, other: str, column: str) -> list[float]:
+        one, other = (episodes[episodes["variant"] == name][column] for name in (one, other))
+        change = estimate((one - other).dropna().groupby("scene").mean())
+        return [change.mean, change.low, change.high]
+
+    for one, other, column, expected in [
+        ("hard-push", "hard", "duration_s", [-27, -47, -8]),
+        ("hard-push", "hard", "success", [0.025, 0.000, 0.051]),
+        ("metres-0", "evaluation-policy", "duration_s", [44, 14, 75]),
+        ("metres-0", "evaluation-policy", "spl", [-0.12, -0.18, -0.06]),
+        ("metres-0", "evaluation-policy", "success", [-0.04, -0.09, 0.01]),
+        ("hard-metres-0", "hard", "duration_s", [48, 14, 82]),
+        ("hard-metres-0", "hard", "spl", [-0.16, -0.24, -0.07]),
+        ("hard-metres-0", "hard", "success", [-0.05, -0.11, 0.01]),
+    ]:
+        places = 0 if column == "duration_s" else 3 if one == "hard-push" else 2
+        np.testing.assert_allclose(np.round(price(one, other, column), places), expected, atol=1e-9)
+    first = episodes[episodes.index.get_level_values("episode") < 12].groupby("variant")["contact_s"].mean()
+    assert (round(first["hard"], 1), round(first["hard-push"], 1)) == (7.2, 9.4)
     # Played again on an H200, ours wins the same ones of 108 episodes.
     before = ours.to_pandas().query("device != 'NVIDIA H200'").set_index(["scene", "episode"])["success"]
     shared = before.index.intersection(again.index)
