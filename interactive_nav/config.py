@@ -43,6 +43,9 @@ class TaskRules(Settings):
     the built-in ones, in turn until there are num_objects."""
     k_int: NotNegative = 0.1
     """Interaction penalty per control step in which the robot touches a movable object."""
+    k_effort: NotNegative = 0.0
+    """A help in training: penalty per metre of moved objects' mass over the robot's, and per second of force over its
+    weight, as E_eff sums them (0.5 to 1 weighs effort about as INS_0.5 does)."""
     success_reward: float = 10.0
     """Reward of reaching the goal."""
     episode_steps: AtLeastOne = 1000
