@@ -1,4 +1,4 @@
-"""The committed results: complete, traceable, small, and what docs/results.md says of them."""
+"""The committed results: complete, traceable, small, and what the results pages say of them."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_longer_runs_in_cluttered_homes_played_the_same_episodes_and_score_as_th
         if part["run"] not in halfway:
             summary = json.loads((kept / "runs" / part["run"] / "summary.json").read_text())
             assert summary["completed"] and summary["env_steps"] >= part["checkpoint_steps"]
-    page = (ROOT / "docs" / "results.md").read_text()
+    page = (ROOT / "docs" / "results-planners.md").read_text()
     assert len(scores) == 17 and len(scores.pop(("longer-k_int1-fetch", "test", 13107200))) == 2
     for group in scores.values():
         assert len(group) == 3 and f"{sum(group) / 3:.3f}" in page
