@@ -32,7 +32,7 @@ from train.runs.run_folder import RunFolder
 
 LEARNER, ENV_STATE, META = "learner.msgpack", "env_state.npz", "meta.json"
 POLICY = "policy.safetensors"
-"""Holds the policy alone: it acts nearly as the original (docs/results-sparse.md says how nearly) and cannot be trained."""
+"""Holds the policy alone: it acts nearly as the original (see docs/results-sparse.md) and cannot be trained."""
 SHOWN = ("algorithm", "robot", "observations", "observation_size", "action_size", "env_steps")
 """Fields of `CheckpointMeta` that a policy's file repeats."""
 
