@@ -5,11 +5,11 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 import fast_simplification
+import igl
 import numpy as np
 import shapely
 import trimesh
 from scipy import sparse
-from scipy.spatial import KDTree
 
 from converters.records.errors import SAMPLES, check_count
 
@@ -218,8 +218,6 @@ MOST_M, LEAST_AREA = 0.01, 0.97
 """How far a surface may be simplified."""
 LOOSER, ROUNDS = 1.6, 3
 """A mesh with too many faces is simplified again with an error larger by this factor, at most so many times."""
-SPREAD, NEAREST, WORST = 6000, 8, 200
-"""Samples of a mesh, about, that a distance is sought at; how many of them; distances that are computed exactly."""
 RIM_ROUNDS = 5
 """Tries to meet a number of faces where faces on rims count too."""
 LOSS_M = 0.03
@@ -230,37 +228,10 @@ SMALL_M = 0.6
 """Longest side of a thing that may be drawn as its hull."""
 
 
-class Surface:
-    """Measure distances to a triangle mesh."""
-
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
-        """Take vertices (n, 3) m and faces (m, 3)."""
-        self._mesh = vertices, faces
-        self._spacing_m = max(float(np.sqrt(2 * face_areas(vertices, faces).sum() / SPREAD)), 1e-4)
-        samples, self._face = sample_faces(vertices, faces, self._spacing_m)
-        self._tree = KDTree(samples, balanced_tree=False)  # as exact, and sooner built
-
-    def distance(self, points: np.ndarray) -> np.ndarray:
-        """Return (n,) distances of points, m, to the nearest faces, too large by at most the samples' spacing."""
-        vertices, faces = self._mesh
-        index = self._tree.query(points, k=min(NEAREST, self._tree.n))[1].reshape(len(points), -1)
-        corners = vertices[faces[self._face[index]]].reshape(-1, 3, 3)
-        near = trimesh.triangles.closest_point(corners, np.repeat(points, index.shape[1], axis=0))
-        return np.linalg.norm(near.reshape(*index.shape, 3) - points[:, None], axis=2).min(axis=1)
-
-    def farthest(self, points: np.ndarray, most_m: float = 0.0) -> float:
-        """Return the largest distance of points, m; exact where it is beyond `most_m`."""
-        # None is farther than its nearest sample, nor nearer by more than the spacing: which can be the farthest?
-        above = np.asarray(self._tree.query(points)[0])
-        if above.max() <= most_m:
-            return float(above.max())
-        points = points[above > max(most_m, float(above.max()) - self._spacing_m)]
-        about = self.distance(points)
-        beyond = np.argsort(-about)[:WORST]
-        if about[beyond[0]] <= most_m:
-            return float(about[beyond[0]])
-        mesh = trimesh.Trimesh(*self._mesh, process=False)
-        return float(trimesh.proximity.closest_point(mesh, points[beyond])[1].max())
+def distances(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return (n,) distances of points to the nearest faces of a mesh, m."""
+    mesh = np.ascontiguousarray(vertices, float), np.ascontiguousarray(faces, np.int64)
+    return np.sqrt(igl.point_mesh_squared_distance(np.ascontiguousarray(points, float), *mesh)[0])
 
 
 def _simplified(vertices: np.ndarray, faces: np.ndarray, most_m: float, least: float) -> tuple[np.ndarray, np.ndarray]:
@@ -268,7 +239,7 @@ def _simplified(vertices: np.ndarray, faces: np.ndarray, most_m: float, least: f
     area = float(face_areas(vertices, faces).sum())
     points = np.vstack([vertices, sample_faces(vertices, faces, max(np.sqrt(2 * area / PART_SAMPLES), 1e-4))[0]])
     points = points[:: max(len(points) // (2 * PART_SAMPLES), 1)]
-    best, surface = (vertices, faces), Surface(vertices, faces)
+    best = vertices, faces
     low, high = 0, len(faces)
     while high - low > max(4, high // 12):
         target = (low + high) // 2
@@ -278,8 +249,8 @@ def _simplified(vertices: np.ndarray, faces: np.ndarray, most_m: float, least: f
         if (
             0 < reached < len(best[1])
             and face_areas(*tried).sum() >= least * area
-            and Surface(*tried).farthest(points, most_m) <= most_m
-            and surface.farthest(tried[0], most_m) <= most_m
+            and distances(points, *tried).max() <= most_m
+            and distances(tried[0], vertices, faces).max() <= most_m
         ):
             best, high = tried, target
         else:
@@ -311,7 +282,8 @@ def surface_loss(
 ) -> tuple[float, float]:
     """Return the share of a mesh's area that a simplified one has, and how far the mesh lies from it at most, m."""
     kept = face_areas(low_vertices, low_faces).sum() / face_areas(vertices, faces).sum()
-    return float(kept), Surface(low_vertices, low_faces).farthest(sample_faces(vertices, faces, LOSS_M)[0])
+    points = sample_faces(vertices, faces, LOSS_M)[0]
+    return float(kept), float(distances(points, low_vertices, low_faces).max())
 
 
 def simplify_open(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> tuple[np.ndarray, np.ndarray]:

@@ -16,6 +16,7 @@ from urllib.parse import unquote_to_bytes
 import numpy as np
 import trimesh
 from PIL import Image
+from trimesh.visual.color import linear_to_srgb, srgb_to_linear
 
 from converters.read.files import SourceFolder, check_mesh
 from converters.read.obj import join_textures, read_texture, textured_by_face, use_named, wrapped
@@ -61,20 +62,12 @@ def read_gltf(source: SourceFolder, path: Path) -> list[TexturedMesh]:
     return meshes
 
 
-def linear(srgb: np.ndarray) -> np.ndarray:
-    """Return linear light of sRGB values, both 0 to 1."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-
-
 def to_srgb(light: np.ndarray) -> np.ndarray:
     """Return sRGB bytes of linear light; what is brighter than white is white."""
-    light = np.clip(light, 0.0, 1.0)
-    return np.round(255 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)).astype(
-        np.uint8
-    )
+    return np.round(255 * linear_to_srgb(np.clip(light, 0.0, 1.0))).astype(np.uint8)
 
 
-BYTES = linear(np.arange(256) / 255)
+BYTES = srgb_to_linear(np.arange(256) / 255)
 
 
 class _File:
@@ -239,7 +232,7 @@ class _File:
         return [self._paint(vertices, faces, layers or [_Layer(np.ones(3))], light, attributes)]
 
     def _light(self, colours: np.ndarray) -> np.ndarray:
-        return linear(np.clip(colours, 0.0, 1.0)) if self.srgb else colours
+        return srgb_to_linear(np.clip(colours, 0.0, 1.0)) if self.srgb else colours
 
     def _layers(self, material: Any) -> list[_Layer]:
         """Return what a material reflects of white light, and what it emits."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from converters.geometry.faces import Surface, simplify_open, simplify_parts, surface_loss
+from converters.geometry.faces import distances, simplify_open, simplify_parts, surface_loss
 
 
 def wall() -> tuple[np.ndarray, np.ndarray]:
@@ -27,9 +27,9 @@ def test_a_windows_rim_stays_where_it_was(most):
     low = simplify_open(vertices, faces, most)
     assert 0 < len(low[1]) <= 1.05 * most
     used = vertices[np.unique(faces)]
-    assert Surface(*low).distance(used).max() < 0.012
+    assert distances(used, *low).max() < 0.012
     # Nothing reaches over the window: its area is what it was.
-    assert Surface(vertices, faces).distance(low[0]).max() < 0.012
+    assert distances(low[0], vertices, faces).max() < 0.012
     a, b, c = low[0][low[1]].transpose(1, 0, 2)
     assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(4 * 2.5 - 1.5 * 1.1, abs=0.05)
 
@@ -47,7 +47,7 @@ def test_no_corner_of_a_level_surface_flies_away():
     vertices, faces = plate()
     for most in (2700, 1500, 300):
         low = simplify_open(vertices, faces, most)
-        assert np.abs(low[0]).max() < 1 and Surface(vertices, faces).distance(low[0]).max() < 1e-3
+        assert np.abs(low[0]).max() < 1 and distances(low[0], vertices, faces).max() < 1e-3
 
 
 def test_a_replayed_simplification_puts_corners_elsewhere():
@@ -63,16 +63,13 @@ def test_few_faces_stay():
     assert len(simplify_open(vertices, faces, len(faces))[1]) == len(faces)
 
 
-def test_the_farthest_point_is_the_one_that_all_exact_distances_name():
+def test_distances_to_a_mesh_are_exact():
     ball = trimesh.creation.icosphere(2, 0.5)
     vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
     points = np.random.default_rng(3).uniform(-0.7, 0.7, (3000, 3))
     exact = trimesh.proximity.closest_point(ball, points)[1]
-    surface = Surface(vertices, faces)
-    assert surface.farthest(points) == pytest.approx(exact.max(), abs=1e-12)
-    assert surface.farthest(points, 0.1) == pytest.approx(exact.max(), abs=1e-12)
-    assert exact.max() <= surface.farthest(points, 1.0) <= 1.0
-    assert surface.farthest(vertices, 0.01) <= 0.01
+    np.testing.assert_allclose(distances(points, vertices, faces), exact, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(distances(vertices, vertices, faces), 0.0, atol=1e-12)
 
 
 def test_what_plain_parts_leave_goes_to_fine_ones():

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 import yaml
 
-from converters.geometry.faces import Surface, loose_parts, simplify_within
+from converters.geometry.faces import distances, loose_parts, simplify_within
 from converters.library.build import (
     MOST_FACES,
     SELECTION,
@@ -94,8 +94,8 @@ def test_simplification_keeps_every_part_within_its_error():
     vertices, faces = box_of_boxes()
     low, kept = simplify_within(vertices, faces, 0.01)
     assert len(kept) < len(faces) / 8 and len(np.unique(loose_parts(low, kept))) == 2
-    assert Surface(low, kept).distance(vertices).max() <= 0.0101
-    assert Surface(vertices, faces).distance(low).max() <= 0.0101
+    assert distances(vertices, low, kept).max() <= 0.0101
+    assert distances(low, vertices, faces).max() <= 0.0101
 
 
 def test_a_piece_takes_its_catalogues_size():
