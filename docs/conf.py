@@ -11,6 +11,9 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphin
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = "interactive-nav"
+html_theme_options = {
+    "light_css_variables": {"sidebar-item-spacing-vertical": "0.1rem", "sidebar-item-line-height": "1.1rem"}
+}
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 autodoc_member_order = "bysource"
