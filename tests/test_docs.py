@@ -174,10 +174,11 @@ def test_links_lead_to_files(page):
     assert [link for link in links if not (page.parent / link).exists()] == []
 
 
-def test_pages_that_the_readme_names_are_links():
+def test_the_readme_links_every_page():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     named = re.findall(r"(\[)?`((?:docs|benchmarks)/[\w./-]+\.md|CITATION\.cff)`(\]\(\S+?\))?", text)
-    assert len(named) > 12 and [name for first, name, link in named if (first, link) != ("[", f"]({name})")] == []
+    assert [name for first, name, link in named if (first, link) != ("[", f"]({name})")] == []
+    assert {str(p.relative_to(ROOT)) for p in PAGES[1:]} <= set(re.findall(r"\]\((docs/[\w-]+\.md)", text))
 
 
 def test_nobody_is_sent_to_an_address_that_does_not_exist():
