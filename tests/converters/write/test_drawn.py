@@ -11,7 +11,7 @@ import trimesh
 from PIL import Image
 
 from converters.bodies.objects import PlacedObject
-from converters.geometry.faces import Surface, sample_faces, simplify_to, surface_loss
+from converters.geometry.faces import distances, sample_faces, simplify_to, surface_loss
 from converters.records.raw import ColourCloud, TexturedMesh
 from converters.write.texture import as_it_is, as_png, draw_objects
 
@@ -71,7 +71,7 @@ def test_a_large_surface_stays_within_a_centimetre_and_keeps_its_own_colours() -
     (drawn,) = draw_objects([placed(surface)], [NOTHING], 3000, 64)
     assert 100 < len(drawn.mesh.faces) < 0.4 * len(surface.faces) and len(surface.faces) > 3000
     assert drawn.kept_share >= 0.97 and drawn.off_m <= 0.01
-    assert Surface(drawn.mesh.vertices, drawn.mesh.faces).distance(surface.vertices[::7]).max() <= 0.011
+    assert distances(surface.vertices[::7], drawn.mesh.vertices, drawn.mesh.faces).max() <= 0.011
     red = drawn.mesh.image[..., 0] > 150
     assert 0.2 < red.mean() < 0.9
 
