@@ -185,7 +185,7 @@ def simulation(
 ) -> dict[str, Any]:
     """Rate of random driving: chunks of steps, each one compiled scan; the first chunk is not counted.
 
-    `part` leaves things out: `physics` steps the backend alone, `task` adds scores and rewards, `observed` adds the
+    `part` selects what runs: `physics` steps the backend alone, `task` adds scores and rewards, `observed` adds the
     observation, `simulation` adds new episodes. `make_s` builds the environment, `reset_s` compiles and draws the first
     episodes; `tables_mb` of homes are on the device, and the process has held at most `host_mib`.
     """

@@ -22,4 +22,4 @@ autodoc_mock_imports = ["rsl_rl", "skrl", "stable_baselines3", "tensordict", "to
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 suppress_warnings = ["ref.python"]
-"""Fields of the same name in two records are told apart by where they stand."""
+"""Fields of the same name in two records are distinguished by their place."""

@@ -30,7 +30,7 @@ class CameraView(Settings):
 
 @dataclasses.dataclass(frozen=True)
 class CameraNoise(Settings):
-    """Errors of cameras, drawn anew each step; 0: none. Formulas and sources: `docs/sensors.md`."""
+    """Errors of cameras, drawn in each step; 0: none. Formulas and sources: `docs/sensors.md`."""
 
     rgb_exposure: NotNegative = 0.0
     """Standard deviation of a frame's exposure, stops: its colours times 2 to that power, cut at 1."""

@@ -88,11 +88,11 @@ class TaskRules(Settings):
     potential: Literal["continuous", "quantised"] = "continuous"
     """Geodesic distance from the robot's position, or quantised: from the centre of its cell."""
     potential_round: Positive | None = None
-    """A help in training: the potential's way also goes round furniture, where it stood at the start, whose friction
-    exceeds this share of the robot's weight (1: what planners hold for stuck), if there is such a way. Scores know
-    nothing of it, nor do waypoints without waypoints_round."""
+    """For training: the potential's path also avoids furniture, where it stood at the start, whose friction exceeds
+    this share of the robot's weight (1: too heavy to push), if such a path exists. Scores do not use this path;
+    waypoints do with waypoints_round."""
     waypoints_round: bool = False
-    """Waypoints go round the furniture of potential_round, too, as if it stood on the robot's map."""
+    """Waypoints also avoid the furniture of potential_round, as if it stood on the robot's map."""
     scene_choice: Literal["episode", "slot"] = "episode"
     """Each episode draws a scene, or each environment of a batch keeps one (slot; `AutoResetEnv`)."""
     goal_clear: bool = True

@@ -83,7 +83,7 @@ def place_discs(scene: Scene, radii_m: Sequence[float], height_m: float, rng: np
             free = free[np.linalg.norm(free - xy, axis=-1) > radius + other + GAP_M]
         if not len(free):
             raise ViewError(
-                f"{scene.name}: no free place for thing {k} of radius {radius:.2f} m; ask for fewer --objects"
+                f"{scene.name}: no free place for object {k} of radius {radius:.2f} m; ask for fewer --objects"
             )
         places.append(free[rng.integers(len(free))])
     return np.array(places).reshape(-1, 2)

@@ -86,7 +86,7 @@ def stop_signals(second_ends: bool = True) -> Iterator[list[int]]:
 
 @contextlib.contextmanager
 def signals_wait() -> Iterator[None]:
-    """Hold back `STOPS`; one that came is raised at the end.
+    """Delay `STOPS`; one that came is raised at the end.
 
     By handlers and not by a mask, which would hold for this thread only: libraries run others.
     """

@@ -17,7 +17,7 @@ from interactive_nav_common.records import read_packaged
 Rgb = tuple[float, float, float]
 Range = tuple[float, float]
 MaskClasses = Literal[4, 5, "all"]
-"""How masks tell things apart: 4 or 5 classes of furniture, or `all`, every category for itself."""
+"""How masks distinguish objects: 4 or 5 classes of furniture, or `all`, every category for itself."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Material:
     """Of the *decomposed hulls*, which enclose air between legs and in padding: lower than the material's
     own."""
     mass_range_kg: tuple[float, float]
-    """What the real thing weighs; density x volume is clipped to it (hull volume varies with the
+    """Weight of real ones; density x volume is clipped to it (hull volume varies with the
     decomposition)."""
     friction: float
     """Sliding coefficient against the floor."""
@@ -45,7 +45,7 @@ class Category:
     """Class in segmentation images, as Interactive Gibson's code has it (reference benchmark, section 1.4); several
     where models of the category differ in it, the usual one first."""
     own_segmentation_id: int | None = None
-    """Class where the paper's five classes of furniture are told apart; None: the same."""
+    """Class with the paper's five classes of furniture; None: the same."""
     is_object: bool = True
     """A scene may hold objects of it; else it is built in, part of the structure."""
 
@@ -62,7 +62,7 @@ class Category:
     sizes_m: tuple[Range, Range] | None = None
     """Usual ranges of the longer horizontal side and of the height; None: it is not looked for in scans."""
     longest: float | None = None
-    """Greatest usual ratio of the sides, of things that stand in rows: a row of chairs is no chair."""
+    """Greatest usual ratio of the sides, of objects in rows: a row of chairs is no chair."""
     most_m: Range | None = None
     """Greatest horizontal side and height of the largest of its kind: what is larger is something else, whatever its
     name; None: any size."""

@@ -164,7 +164,7 @@ def _take_faces(mesh: mujoco.MjsMesh, model: mujoco.MjModel, uv: np.ndarray, cho
 def look_along(pos_w: Any, forward_w: Any) -> CameraPose:
     """Return a camera without roll: its right is horizontal, as if the world's z were up.
 
-    NumPy's arrays stay NumPy's: JAX would compile each operation anew for every number of cameras.
+    NumPy's arrays stay NumPy's: JAX would compile each operation again for every number of cameras.
 
     Args:
         pos_w: [..., 3] m.

@@ -205,8 +205,8 @@ class Store:
         """Return the session that the folder holds, or what `begin` returns."""
         path = self.folder / SESSION
         self._read = {name: self._digest(name) for name in (SESSION, ANNOTATION)}
-        given = Reader(FileError, "remove it to begin anew").json(path, absent={})
-        session = Reader(FileError, "remove it to begin anew").record(given, Session, str(path)) if given else None
+        given = Reader(FileError, "remove it to start again").json(path, absent={})
+        session = Reader(FileError, "remove it to start again").record(given, Session, str(path)) if given else None
         if self._read[ANNOTATION] not in ("", *(session.wrote_sha256 if session else ())):
             raise FileError(
                 f"{self.folder / ANNOTATION}: was not written by this session, expected none or its own; "

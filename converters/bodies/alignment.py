@@ -20,7 +20,7 @@ PAIRS_PER_OUTLIER = 8
 OUTLIER_P = 1e-3
 """Chance of throwing out a sound pair, all pairs taken together, where errors are Gaussian."""
 MAX_SUBSETS = 3000
-"""Up to so many ways to leave pairs out are all tried; beyond, `RANDOM_STARTS` random ones are refined."""
+"""Up to so many choices of pairs to leave out are all tried; of more, `RANDOM_STARTS` random ones are refined."""
 RANDOM_STARTS = 200
 
 SYMMETRY_PERIOD_RAD = {
@@ -76,7 +76,7 @@ def _check_spread(points: np.ndarray) -> None:
     if across[1] / math.sqrt(len(points)) < MIN_SPREAD * largest:
         raise AlignmentError(
             f"the keypoints lie in one upright plane (along {np.round(directions[0], 2).tolist()} seen from above): "
-            "the horizontal scales and the yaw cannot be told apart; choose points off that plane"
+            "the horizontal scales and the yaw cannot be distinguished; choose points off that plane"
         )
 
 

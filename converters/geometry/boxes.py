@@ -33,7 +33,7 @@ SLIVER_SHARE = 0.1
 CONVEX_SHARE = 0.9
 """A piece that fills this share of its convex hull counts as convex."""
 TURNS = np.round(Rotation.create_group("O").as_matrix())
-"""(24, 3, 3) all ways to name and direct the three axes of a right-handed frame."""
+"""(24, 3, 3) all choices of names and directions for the three axes of a right-handed frame."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -225,7 +225,7 @@ LOSS_M = 0.03
 LEAST_FACES = 24
 """Of a part, however many there are."""
 SMALL_M = 0.6
-"""Longest side of a thing that may be drawn as its hull."""
+"""Longest side of an object that may be drawn as its hull."""
 
 
 def distances(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -21,9 +21,9 @@ from scenes_mjcf.categories import TABLE
 MIN_VOXELS = 60
 """A component of 0.05 m2 of surface; what is smaller and lies on no other is noise."""
 STACKED_SHARE = 0.5
-"""Components of one class are one thing when their footprints share this much of the smaller."""
+"""Components of one class are one object when their footprints share this much of the smaller."""
 SAME_BOX_SHARE = 0.5
-"""Instances of two classes are one thing when their boxes share this much of the smaller."""
+"""Instances of two classes are one object when their boxes share this much of the smaller."""
 SIZES_M = {c.name: c.sizes_m for c in TABLE if c.sizes_m is not None}
 """Of the categories that are looked for."""
 LABEL_CATEGORIES = {c.labels[0]: c.name for c in sorted(TABLE, key=lambda c: c.labels) if c.name in SIZES_M}
@@ -32,11 +32,11 @@ LONGEST = {c.name: c.longest for c in TABLE if c.longest is not None}
 FLAT = ("door",)
 """A line from above, whose breadth says nothing."""
 NECK_SHARE = 0.6
-"""Where a footprint is narrower than this share of the narrower side's width, two things touch."""
+"""Where a footprint is narrower than this share of the narrower side's width, two objects touch."""
 CORE_CELLS, LEVELS = 2.0, 64
 """Distance to the outline from which on cells are inner ones; heights at which it is looked for necks."""
 PART_SHARE = 0.7
-"""A part of a piece is a thing from this share of the class's least usual width on."""
+"""A part of a piece is an object from this share of the class's least usual width on."""
 TOPS_M = {c.name: c.top_m for c in TABLE if c.top_m is not None}
 RECTANGULAR = 0.9
 """Least share of its smallest rectangle that a rectangular top fills as scanned; a round one fills 0.785."""
@@ -134,13 +134,13 @@ def merge(pieces: list[Piece], same: Any) -> list[Piece]:
 
 
 def stacked(one: Piece, other: Piece) -> bool:
-    """Return whether two pieces of one class stand above each other: they are one thing."""
+    """Return whether two pieces of one class stand above each other: they are one object."""
     a, b = _footprint(one.voxels), _footprint(other.voxels)
     return len(a & b) > STACKED_SHARE * min(len(a), len(b))
 
 
 def same_box(one: Piece, other: Piece) -> bool:
-    """Return whether two pieces of different classes fill the same box: they are one thing."""
+    """Return whether two pieces of different classes fill the same box: they are one object."""
     if one.label == other.label:
         return False  # joined, or split, already
     low = np.maximum(one.voxels.min(axis=0), other.voxels.min(axis=0))
@@ -186,7 +186,7 @@ def part_by_number(piece: Piece, chosen: Sequence[int], of_point: np.ndarray) ->
 
 
 def split_at_necks(piece: Piece) -> list[Piece]:
-    """Split a piece into things that touch where its footprint is narrow."""
+    """Split a piece into objects that touch where its footprint is narrow."""
     category = LABEL_CATEGORIES[piece.label]
     if category in FLAT:
         return [piece]
@@ -203,7 +203,7 @@ def split_at_necks(piece: Piece) -> list[Piece]:
 
 
 def split_row(piece: Piece) -> list[Piece]:
-    """Split a piece that is too long for one thing into equal lengths, as many as have the usual shape."""
+    """Split a piece that is too long for one object into equal lengths, as many as have the usual shape."""
     category = LABEL_CATEGORIES[piece.label]
     if category not in LONGEST:
         return [piece]

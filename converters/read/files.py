@@ -91,7 +91,7 @@ class SourceFolder:
             self.warnings.append(message)
 
     def note_counts(self, where: str, counts: Mapping[str, int], times: str = " x ") -> None:
-        """Record how often there is each thing that is not read or not used."""
+        """Record the count of each kind of content that is not read or not used."""
         for what, count in sorted(counts.items()):
             self.note(f"{where} {count}{times}{what}")
 

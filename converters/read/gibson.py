@@ -65,7 +65,7 @@ def read_gibson(root: Path, strict: bool = False) -> RawScene:
         mesh, labels = labelled(mesh, read_labels(source.use(LABELS, "")), root / LABELS)
     check_upright(str(root / MESH), mesh.vertices, mesh.faces, labels, heights[0])
     if labels is None:
-        source.note(f"{LABELS} is absent: floor, walls and ceiling are told by shape")
+        source.note(f"{LABELS} is absent: floor, walls and ceiling are labelled by shape")
         mesh = with_split_corners(mesh)
         labels = label_storeys(mesh.vertices, mesh.faces, heights)
     cads, annotations = {}, ()

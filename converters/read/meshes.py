@@ -184,7 +184,9 @@ def read_single_mesh(
     else:
         mesh = surfaces.with_split_corners(surfaces.welded(mesh))
         labels = surfaces.label_storeys(mesh.vertices, mesh.faces, (floor_m,))
-        source.note(f"{path.name}: has no labels: floor, walls and ceiling are told by shape, all else is part of them")
+        source.note(
+            f"{path.name}: has no labels: floor, walls and ceiling are labelled by shape, and the rest belongs to them"
+        )
     licence = "unknown: a mesh file says none"
     return source.scene("mesh", obj.scan_of(mesh, labels), name=path.stem, floor_height_m=floor_m, licence=licence)
 

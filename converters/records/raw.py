@@ -32,7 +32,7 @@ def category_of_id(synset: str, where: str, classes: Mapping[str, str] = SYNSETS
 # NYU40 ids used by the stages (Gupta et al. 2013, the 40-class mapping that ScanNet labels with).
 UNLABELLED, WALL, FLOOR, CEILING, WINDOW, DOOR = 0, 1, 2, 22, 9, 8
 OTHER_PROP = 40
-"""NYU40 id of small things; where a structure without furniture has them, they stand on it, in no robot's way."""
+"""NYU40 id of small objects; where a structure without furniture has them, they stand on it, in no robot's way."""
 STRUCTURE_LABELS = (WALL, FLOOR, DOOR, WINDOW, 11, 13, 16, 19, CEILING, 28, 30, 38)
 """Wall, floor, door, window, picture, blinds, curtain, mirror, ceiling, shower curtain, whiteboard, otherstructure."""
 SMALL_LABELS = (UNLABELLED, 18, 20, 21, 23, 26, 27, 29, 35, 37, 40)

@@ -110,7 +110,7 @@ NEAR_LABEL_M = 0.15
 NEAR_OTHER_M = 0.04
 """Any furniture face this close is the object's, whatever its label."""
 LYING_ABOVE_M = 0.30
-"""Small things (bags, pillows) on an object go with it up to this height above it."""
+"""Small objects (bags, pillows) on another go with it up to this height above it."""
 FLOOR_CLEARANCE_M = 0.10
 """A floor label higher than this is a mislabelled leg."""
 DEBRIS_AREA_M2 = 0.02

@@ -25,7 +25,7 @@ from interactive_nav_common.rotations import yaw_matrix
 
 RESOLUTION_M = 0.05
 BAND_M = (0.02, 1.2)
-"""Heights at which a robot meets things."""
+"""Heights at which a robot meets obstacles."""
 NOISE_M = 0.08
 """Reconstructed floors wave by a few centimetres: what is lower than this is floor, not obstacle."""
 CLOSE_CELLS = 2

@@ -18,7 +18,7 @@ AMBIENT, LAMP, DAY = (np.array(c) for c in ([0.65, 0.65, 0.66], [0.32, 0.30, 0.2
 REACH_M = 7.0
 """How far a lamp or window shines."""
 BRIGHT = 0.8
-"""From here on more light makes things less and less brighter."""
+"""From here on, more light adds less and less brightness."""
 SHADE_M = 0.2
 """Around a lamp, what is its own shade and hides nothing."""
 LIGHT_M = 0.1

@@ -23,7 +23,7 @@ from scenes_mjcf.schema import SceneManifest, SceneMaps, SceneObject
 
 NAVIGATION_CELL_M = 0.1
 STARTS = 32
-"""Places from which ways to all others are looked at."""
+"""Places from which paths to all others are measured."""
 LEAST_APART_M = 1.0
 """Two places closer than this are no pair: a thin wall between them makes the ratio as large as one likes."""
 

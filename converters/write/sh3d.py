@@ -150,7 +150,7 @@ class _Export:
         ElementTree.indent(self.root)
         self.files["Home.xml"] = ElementTree.tostring(self.root, "utf-8", xml_declaration=True)
         count = (
-            f"{len(self.walls)} walls, {len(rooms)} rooms, {doors} doors, {len(sites)} windows, {pieces} other things"
+            f"{len(self.walls)} walls, {len(rooms)} rooms, {doors} doors, {len(sites)} windows, {pieces} other objects"
         )
         return [count, *lines]
 

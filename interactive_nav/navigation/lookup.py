@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from interactive_nav.types import GoalField, SceneTables
 
 _LIFT = 1.0 + 1e-4
-"""Going straight wins over going round a corner that lies on the line."""
+"""The straight path wins over one around a corner that lies on the line."""
 
 
 def _cell(tables: SceneTables, scene: jax.Array, xy: jax.Array) -> tuple[jax.Array, jax.Array]:

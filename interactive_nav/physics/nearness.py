@@ -29,7 +29,7 @@ _COASTING_M_S = 0.005
 _TIPPING_M_S2 = 1.0
 """Or rad/s2, of free bodies: what tips or falls stands still where it turns round, but is not at rest."""
 _PUSH_M = 0.3
-"""What is this near to the robot's footprint may be pushed before the window is chosen anew."""
+"""Objects this near to the robot's footprint may be pushed before the window is chosen again."""
 _PUSHED = 4
 """Objects that walls are measured against: the nearest that move or may be pushed."""
 _MOVERS = 2

@@ -119,7 +119,7 @@ class RobotSpec(Figures):
     rolling_bodies: tuple[str, ...] = ()
     """Wheels and casters: bodies whose contacts the original's code did not count."""
     root_link_kg: float = 0.0
-    """Mass of the original URDF's root link, which one of its ways to score leaves out; 0: a massless footprint."""
+    """Mass of the original URDF's root link, which one of its scores leaves out; 0: a massless footprint."""
     control_mode: str = "native"
     control_modes: tuple[str, ...] = ("native",)
     """Modes that `get_robot(name, mode)` answers."""

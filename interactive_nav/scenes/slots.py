@@ -65,7 +65,7 @@ def bodies_by_name(scene: Scene, small: Sequence[SmallObject]) -> dict[str, Body
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Where things are in the models' state vectors; the same for every scene of a world."""
+    """Addresses in the models' state vectors; the same for every scene of a world."""
 
     robot_qpos: int
     """Address of the robot's free joint in qpos (7 numbers)."""

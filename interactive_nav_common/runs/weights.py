@@ -106,7 +106,7 @@ def write_weights(path: Path, tensors: Tensors, about: Mapping[str, Any]) -> dic
 
 
 def read_weights(path: Path, kind: type[UserError], remedy: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return the tensors of a file and what it says about them; what cannot be used becomes one line of `kind`."""
+    """Return the tensors of a file and its header; raise `kind` with one line if the file cannot be used."""
     with readable(path, kind, remedy, " as safetensors"):
         size = path.stat().st_size
         if size > reading.MOST_ARRAYS:

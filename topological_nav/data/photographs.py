@@ -107,7 +107,7 @@ def import_photographs(folder: Path, out: Path, config: DataConfig, scene: Path 
     left_out = ", ".join(names[k] for k in np.flatnonzero(lacking)) or "none"
     return (
         f"{name}: {len(whole)} places in {len(called)} rooms ({', '.join(called)}), {len(kept)} of {len(judged)} "
-        f"labelled passages (as many free as blocked), {len(hand)} ways by hand; places that lack headings: {left_out}"
+        f"labelled passages (as many free as blocked), {len(hand)} paths by hand; places that lack headings: {left_out}"
     )
 
 

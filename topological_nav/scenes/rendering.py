@@ -65,7 +65,7 @@ def camera_pose(robot: RobotSpec, xy_w: np.ndarray, heading_rad: np.ndarray, pit
 def need_engine(engine: str) -> None:
     """Raise if an engine of images or physics is not installed, before any work is done."""
     if engine == "warp":
-        note = "; networks see by the engine that they learned from, what is drawn anew can have engine=gl"
+        note = "; networks need the engine that they learned from; new pictures can have engine=gl"
         optional("warp", missing("engine=warp", "warp-lang", "warp", note))
 
 

@@ -19,7 +19,7 @@ MOVED_M = 0.02
 TITLE_WIDTH = 40
 """Characters of a line above a panel."""
 LINES = ("-", (0, (4, 1.5)), (0, (1, 1)), "-.")
-"""Of the first, second, ... policy: without colour, too, they can be told apart."""
+"""Line styles of the first, second, ... policy, which distinguish them without colour."""
 
 
 def trajectories(paths: Mapping[str, np.ndarray], most: int = 6, episodes: Sequence[int] | None = None) -> Figure:

@@ -156,7 +156,7 @@ def sections(rows: pa.Table, split: str | None) -> list[tuple[str, str, str]]:
         (
             "Where touching is needed",
             "All scenes and algorithms, the episodes of which it is known: their file says so, or the avoider played "
-            "them too. It knows where everything stands and touches nothing; where it does not arrive, it found no way "
+            "them too. It knows all poses and touches nothing; where it does not reach the goal, no path was "
             "wide enough.",
             need_lines(rows),
         ),

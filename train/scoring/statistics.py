@@ -204,17 +204,17 @@ def _of_objects(means: Sequence[RunMean]) -> Iterator[Finding]:
     """Compare what is pushed and what is avoided; nothing where rows have no categories."""
     if not any(run.objects for run in means):
         return
-    claim = "Depending on the penalty a TurtleBot avoids large, medium or small things"
+    claim = "Depending on the penalty a TurtleBot avoids large, medium or small objects"
     free = [run for run in means if (run.robot, run.k_int) == ("turtlebot", 0.0)]
     share = [
         [np.mean([run.of_objects("touched", kinds) for run in free if run.seed == seed]) for seed in seeds]
         for seeds in [sorted({run.seed for run in free})]
         for kinds in (LARGE, SMALL)
     ]
-    what = "turtlebot: share of large less share of small things that are touched, k_int = 0, mean over algorithms"
+    what = "turtlebot: share of large less share of small objects that are touched, k_int = 0, mean over algorithms"
     yield _tested(claim, what, "lower", welch(*map(np.asarray, share)) if free else None)
     for kinds, name, high, low in ((MEDIUM, "medium", 0.1, 0.0), (SMALL, "small", 1.0, 0.1)):
-        what = f"turtlebot: share of {name} things that are touched, k_int = {high:g} minus {low:g}"
+        what = f"turtlebot: share of {name} objects that are touched, k_int = {high:g} minus {low:g}"
         test = contrast(
             means, "k_int", high, low, lambda run, kinds=kinds: run.of_objects("touched", kinds), robot="turtlebot"
         )

@@ -47,7 +47,7 @@ def export(folder: SweepFolder, out: Path, step: float = STEP) -> tuple[int, dic
     runs = [run for run in folder.sweep.runs if (folder.runs / run.name / "metrics.jsonl").is_file()]
     if not runs:
         raise FileError(
-            f"{folder.root}: no run of the sweep has begun there; begin with the same command without --export"
+            f"{folder.root}: no run of the sweep has started there; start it with the same command without --export"
         )
     with writing(out, "make room"):
         _merge_rows(folder, out / "rows")

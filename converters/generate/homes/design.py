@@ -62,7 +62,7 @@ class Passages:
         """Id of a piece -> whether it bars a passage as the furniture stands; others were not looked at."""
 
     def measured(self) -> tuple[dict[str, Shares], dict[str, np.ndarray]]:
-        """Return by robot the shares of pairs between which it must push, and the clearance (m), as things stand."""
+        """Return by robot the shares of pairs between which it must push, and the clearance (m), as furnished now."""
         room_m = {robot: clearance(self.home.floor.free(robot), CELL_M) for robot in self.ways}
         shares = {
             robot: Shares(*(way.must_push_share(room_m[robot]) for way in ways)) for robot, ways in self.ways.items()

@@ -62,7 +62,7 @@ class Home:
         return self.cfg.robot_radius_m + 0.02
 
     def fresh(self) -> Models:
-        """Return the models, without those that stand in the home as often as people have the same thing."""
+        """Return the models, without those that stand in the home as often as people own the same object."""
         models = (s.item.model for s in self.floor.standing)
         often = Counter(m.name for m in models if m.category not in IN_ROWS)
         self.models.spent = {name for name, count in often.items() if count >= ALIKE}

@@ -307,7 +307,7 @@ class Instance:
     position: np.ndarray
     """(3,) of the CAD origin; z above the floor."""
     hinge: ScannedHinge | None = None
-    """What a door leaf or front opens on, CAD frame; a slide's range is in m all the same."""
+    """What a door leaf or front opens on, CAD frame; a slide's range is in m nevertheless."""
 
     @functools.cached_property
     def matrix(self) -> np.ndarray:

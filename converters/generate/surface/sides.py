@@ -23,7 +23,7 @@ WHITE = np.array([0.95, 0.95, 0.94])
 CASING_M, PROUD_M = 0.07, 0.015
 """Width of the board around a doorway, and how far it stands out."""
 FLOOR_M = 0.004
-"""Floors are drawn a little above the plane that things stand on, or the two would flicker."""
+"""Floors are drawn a little above the plane on which objects stand, or the two would flicker."""
 CLOTHS = np.array([[0.86, 0.83, 0.76], [0.62, 0.66, 0.70], [0.70, 0.58, 0.48], [0.55, 0.60, 0.52], [0.80, 0.72, 0.66]])
 ENTRANCES = np.array([[0.36, 0.22, 0.15], [0.88, 0.88, 0.86], [0.24, 0.33, 0.36], [0.55, 0.38, 0.24]])
 

@@ -158,7 +158,7 @@ class Chart:
     uv_faces: np.ndarray | None = None
     """(m, 3) into `uv`; None: as `faces`."""
     lit_as: np.ndarray | None = None
-    """(3,) normal that light falls on instead of the patch's: of thin things at a wall, whose edges are not dark."""
+    """(3,) normal that light falls on instead of the patch's: of thin objects at a wall, whose edges are not dark."""
 
     @functools.cached_property
     def frame(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

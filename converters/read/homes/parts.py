@@ -138,9 +138,9 @@ def home(source: SourceFolder, layout: str, parts: list[HomePart], floors_m: tup
     stay = [p.name for p, m, by in zip(parts, moves, carried, strict=True) if not (p.static or m) and by is None]
     if stay:
         names = ", ".join(sorted(stay)[:5])
-        source.note(f"{len(stay)} loose things stand on no furniture that moves, and stay: {names}")
+        source.note(f"{len(stay)} loose objects stand on no furniture that moves, and stay fixed: {names}")
     if riders := sum(by is not None for by in carried):
-        source.note(f"{riders} things stand on furniture and move with it")
+        source.note(f"{riders} objects stand on furniture and move with it")
     return source.scene(
         layout,
         scan_of(mesh, labels),

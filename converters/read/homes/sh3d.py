@@ -57,7 +57,7 @@ LOW_TABLE_M = 0.5
 OURS = "interactive_nav#"
 """Ids of drawings that `converters.write.sh3d` makes: their ids name categories."""
 BLOCKS = ("texturablebox", "texturablecylinder", "texturabletriangle", "texturablesphere", "texturablecone")
-"""Ids, less what stands before #, of shapes that people build all kinds of things from."""
+"""Ids, less what stands before #, of shapes from which people build all kinds of objects."""
 _TABLES: dict[str, dict[str, Any]] = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, dict[str, Any]])
 FOREIGN = dict(sorted(((w, c) for c, words in _TABLES["words"].items() for w in words), key=lambda p: -len(p[0])))
 

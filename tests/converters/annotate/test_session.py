@@ -156,7 +156,7 @@ def test_files_of_others_are_refused(read, tmp_path):
 @pytest.mark.parametrize(
     ("mended", "message"),
     [
-        (lambda s: "{", "not readable as JSON .* remove it to begin anew"),
+        (lambda s: "{", "not readable as JSON .* remove it to start again"),
         (lambda s: json.dumps(s | {"colour": 1}), "unknown key 'colour'"),
         (lambda s: json.dumps(s | {"scan_sha256": "0"}), "is of scan scene_tiny with other vertices than scene_tiny"),
         (lambda s: json.dumps(s | {"at": 7}), "at is 7, expected an index of 2 items"),

@@ -64,7 +64,7 @@ def test_a_tilted_scan_in_centimetres_becomes_the_scene_of_the_right_one(room, t
     assert all(g.passed for g in (*right.gates, *tilted.gates))
     assert tilted.manifest.floor_area_m2 == pytest.approx(right.manifest.floor_area_m2, rel=0.1)
     words = " ".join(tilted.manifest.warnings)
-    assert "turned by 117" in words and "taken to be in cm" in words and "told by shape" in words
+    assert "turned by 117" in words and "taken to be in cm" in words and "labelled by shape" in words
     assert "turned" not in " ".join(right.manifest.warnings)
     told: list[str] = []
     convert_building(

@@ -97,7 +97,7 @@ def test_structure_alone(gibson_raw, tmp_path, hull_cache):
     manifest = load_manifest(tmp_path / "bare")
     assert manifest.objects == () and all(g.passed for g in converted.gates)
     assert "alignments.json is absent: structure only, all furniture stays part of it" in manifest.warnings
-    assert "mesh_z_up.labels.npz is absent: floor, walls and ceiling are told by shape" in manifest.warnings
+    assert "mesh_z_up.labels.npz is absent: floor, walls and ceiling are labelled by shape" in manifest.warnings
     area = load_maps(tmp_path / "bare").traversable.sum() * 0.05**2
     table, basket = 1.0 * 0.6, 0.3 * 0.3
     # Table legs and basket bar their cells; under the table top (0.6 m high) nothing stands either way.

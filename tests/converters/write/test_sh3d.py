@@ -35,7 +35,7 @@ def drawing(tmp_path_factory) -> Path:
     """A committed home with two doors, drawn."""
     path = tmp_path_factory.mktemp("drawn") / "apartment.sh3d"
     told = export_sh3d(HOME, path)
-    assert told[0] == "36 walls, 4 rooms, 2 doors, 0 windows, 7 other things"
+    assert told[0] == "36 walls, 4 rooms, 2 doors, 0 windows, 7 other objects"
     return path
 
 

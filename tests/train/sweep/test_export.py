@@ -155,7 +155,7 @@ def test_what_is_kept(swept, tmp_path, capsys):
 
 def test_a_sweep_that_never_began_exports_nothing(tmp_path, capsys):
     assert main([str(write_sweep(tmp_path)), "--export", str(tmp_path / "results")]) == 2
-    assert "no run of the sweep has begun there" in capsys.readouterr().err and not (tmp_path / "results").exists()
+    assert "no run of the sweep has started there" in capsys.readouterr().err and not (tmp_path / "results").exists()
 
 
 def test_rows_that_are_kept_are_never_without_their_paths(swept, tmp_path, monkeypatch):
