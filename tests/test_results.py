@@ -188,8 +188,8 @@ def test_the_table_of_navigators_in_furnished_homes_is_that_of_its_rows():
     episodes = rows.to_pandas().set_index(["scene", "episode"])
 
     def price(one: str, other: str, column: str) -> list[float]:
-        one, other = (episodes[episodes["variant"] == name][column] for name in (one, other))
-        change = estimate((one - other).dropna().groupby("scene").mean())
+        mine, theirs = (episodes[episodes["variant"] == name][column] for name in (one, other))
+        change = estimate((mine - theirs).dropna().groupby("scene").mean())
         return [change.mean, change.low, change.high]
 
     for one, other, column, expected in [
