@@ -232,11 +232,12 @@ def part_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
     if target.exists() and not target.is_dir():
         raise FileError(f"{target}: is a file, expected a folder to write; give another place")
     part = target.parent / f".{target.name}.part-{os.getpid()}-{secrets.token_hex(4)}"
-    with writing(target, "give another place"):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        part.mkdir()
-        lock = take_lock(part)
+    lock = None
     try:
+        with writing(target, "give another place"):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            part.mkdir()
+            lock = take_lock(part)
         yield part
     finally:
         shutil.rmtree(part, ignore_errors=True)

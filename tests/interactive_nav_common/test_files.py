@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from interactive_nav_common import files
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import (
     append_text,
@@ -175,6 +176,17 @@ def test_what_a_killed_writer_left_goes_and_what_runs_stays(tmp_path):
     (tmp_path / ".made.old-7").mkdir()
     remove_stale(target)  # killed between two renames: the older one is put back
     assert [p.name for p in tmp_path.iterdir()] == ["made"]
+
+
+def test_a_signal_while_a_folder_is_locked_leaves_nothing(tmp_path, monkeypatch):
+    def stopped(path):
+        assert path.is_dir()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(files, "take_lock", stopped)
+    with pytest.raises(KeyboardInterrupt), part_folder(tmp_path / "made"):
+        pass
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_second_writer_of_a_new_folder_is_told_at_once(tmp_path):
