@@ -44,8 +44,8 @@ class TaskRules(Settings):
     k_int: NotNegative = 0.1
     """Interaction penalty per control step in which the robot touches a movable object."""
     k_effort: NotNegative = 0.0
-    """A help in training: penalty per metre of moved objects' mass over the robot's, and per second of force over its
-    weight, as E_eff sums them (0.5 to 1 weighs effort about as INS_0.5 does)."""
+    """For training: penalty per metre that objects move, times their mass over the robot's, and per second of contact
+    force, times the force over the robot's weight, as E_eff sums them."""
     success_reward: float = 10.0
     """Reward of reaching the goal."""
     episode_steps: AtLeastOne = 1000

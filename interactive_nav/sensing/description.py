@@ -74,6 +74,9 @@ def describe(env: Any) -> dict[str, Any]:
     }
     if "waypoints" in about["inputs"]:
         about["inputs"]["waypoints"]["spacing_m"] = config.waypoint_spacing_m
+        if config.waypoints_round:
+            heavy = f"furniture whose friction exceeds {config.potential_round:g} of the robot's weight"
+            about["inputs"]["waypoints"]["avoids"] = heavy
     if "lidar" in about["inputs"]:
         fields = ("lidar_rays", "lidar_fov_deg", "lidar_range_m", "lidar_pos_m")
         about["lidar"] = {name: getattr(config, name) for name in fields}

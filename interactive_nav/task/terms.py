@@ -194,7 +194,7 @@ def _dynamic_effort(memory: Any, step: Step) -> jax.Array:
 
 
 def _effort(memory: Any, step: Step) -> jax.Array:
-    """Return -k_effort times what the control step adds to the sums of both efforts, in m and s of the robot's own."""
+    """Return [] -k_effort times the control step's part of both effort sums, divided by the robot's mass and weight."""
     config, robot_kg = step.config, step.score_mass_kg
     moved_m = step.nav.memory["object_path_m"] - step.last.memory["object_path_m"]
     force_s = jnp.where(step.broken, 0.0, step.signals.force_n) * config.control_dt_s / config.score_gravity_m_s2

@@ -52,8 +52,9 @@ def _of_run(folder: RunFolder, config: EnvConfig, env: Any, build_env: Callable[
     run = folder.read_config()
     sensors = {field.name: getattr(run.env, field.name) for field in dataclasses.fields(SensorConfig)}
     world = dataclasses.replace(config, **sensors, random_sensor_delay_steps=(0, 0))
+    of_waypoints = ["env.num_waypoints", "env.waypoint_spacing_m", "env.waypoint_style", "env.waypoints_round"]
+    of_waypoints += ["env.potential_round"] if run.env.waypoints_round else []
     run = dataclasses.replace(run, env=world)
-    of_waypoints = "env.num_waypoints", "env.waypoint_spacing_m", "env.waypoint_style"
     check_alike("clone.teacher", folder, run, [(name, name) for name in of_waypoints])
     seen = build_env(world)
     policy, _ = load_policy(folder, run, seen, "best", deterministic=True)

@@ -14,6 +14,7 @@ import pytest
 import interactive_nav
 from interactive_nav.config import ORIGINAL_CODE, make_config
 from interactive_nav.scenes.contacts import from_sensors, rolling_geoms, sensor_addresses
+from interactive_nav.sensing.description import describe
 from interactive_nav.task.terms import SETTLE_STEPS
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import EpisodeStart
@@ -325,7 +326,11 @@ def test_the_potential_goes_round_what_is_heavy_where_there_is_a_way(pushed, pap
     rewards = np.array([np.asarray(s.metrics["reward/potential"])[0] for s in states[1:]])
     np.testing.assert_allclose(rewards, -np.diff(value(states, "geodesic_m")), atol=1e-5)
 
-    led = play(make(pushed, potential_round=0.05, waypoints_round=True), [AHEAD] * 3)
+    guided = make(pushed, potential_round=0.05, waypoints_round=True)
+    led = play(guided, [AHEAD] * 3)
+    heavy = "furniture whose friction exceeds 0.05 of the robot's weight"
+    assert describe(guided)["inputs"]["waypoints"]["avoids"] == heavy
+    assert "avoids" not in describe(env)["inputs"]["waypoints"]
     radius_m, begin = env.robot.footprint_radius_m, np.asarray(led[0].info["nav"].waypoints_b)[0] + [-0.7, 0.0]
     assert (np.abs(begin).max(-1) > 0.2 + radius_m / math.sqrt(2) - 0.05).all()  # a disc there leaves the block alone
     assert np.linalg.norm(np.diff(begin, axis=0), axis=-1).sum() == pytest.approx(9 * 0.2, abs=0.05)

@@ -93,6 +93,9 @@ def test_a_run_with_a_privileged_critic_teaches_a_student_that_sees_images(tmp_p
     expected = jax.vmap(policy, (0, None))(vector, jax.random.PRNGKey(3))
     assert float(jnp.ptp(expected, 0).min()) > 0.001  # labels depend on the state
     np.testing.assert_allclose(env.teach(state, jax.random.PRNGKey(2)), expected, atol=1e-6)
+    led = dataclasses.replace(config.env, waypoints_round=True, potential_round=1.0)
+    with pytest.raises(ConfigError, match="clone.teacher: env.waypoints_round is True, expected False, as in .*toy;"):
+        TaughtEnv(str(folder.path), led, build_either)
     far = dataclasses.replace(config.env, waypoint_spacing_m=0.4)
     with pytest.raises(ConfigError, match="clone.teacher: env.waypoint_spacing_m is 0.4, expected 0.2, as in .*toy;"):
         TaughtEnv(str(folder.path), far, build_either)
