@@ -309,7 +309,7 @@ def test_drawers_lids_and_fitted_furniture_stay_and_it_is_said(tmp_path):
         near = raw.scan.vertices[(np.abs(raw.scan.vertices - middle) <= half + 1e-6).all(1)]
         assert np.ptp(near[:, :2], axis=0).min() > 1.9 * half  # spheres, and the box that slides, are there
     told = " ".join(raw.warnings)
-    for words in ("'drawer_box' stands", "'inner_box' stands", "1 x light: d", "stay: kettle"):
+    for words in ("'drawer_box' stands", "'inner_box' stands", "1 x light: d", "stay fixed: kettle"):
         assert words in told
 
 
