@@ -38,7 +38,7 @@ class Estimate:
 
 
 def estimate(values: Iterable[float]) -> Estimate:
-    """Return the mean and its 95 % interval by Student's t: what three seeds support, wide as it is."""
+    """Return the mean and its 95 % interval by Student's t, for differences: see `over_runs` for scores."""
     x = np.asarray(list(values), float)
     if len(x) < 2:
         return Estimate(float(x.mean()) if len(x) else math.nan, math.nan, math.nan, len(x))
@@ -58,6 +58,12 @@ def over_episodes(name: str, values: np.ndarray) -> Estimate:
         how: Any = {"n_resamples": RESAMPLES, "confidence_level": CONFIDENCE, "method": "percentile"}
         result = stats.bootstrap((values,), np.mean, rng=np.random.default_rng(0), **how).confidence_interval
     return Estimate(mean, float(result.low), float(result.high), len(values))
+
+
+def over_runs(values: Iterable[float]) -> Estimate:
+    """Return the mean of runs' or homes' scores and its bootstrap interval over them: of three, lowest to highest."""
+    x = np.asarray(list(values), float)
+    return over_episodes("mean", x) if len(x) > 1 else estimate(x)
 
 
 def paired_difference(left: Iterable[float], right: Iterable[float]) -> Estimate:

@@ -99,9 +99,21 @@ with_python = [
 ]
 
 
+def unprinted(text: str, printed: str) -> list[str]:
+    """Lines of a page's tables of scores (a robot, then a policy) that its code did not print."""
+    lines = (line for line in text.splitlines() if re.match(r"\| (TurtleBot|Fetch), .*\d\.\d{3}", line))
+    return [line for line in lines if line not in printed.splitlines()]
+
+
 @pytest.mark.parametrize("page", with_python)
-def test_python_of_a_page_runs(page):
-    assert run_page(page, page.read_text(encoding="utf-8")) > 0
+def test_python_of_a_page_runs(page, capsys):
+    text = page.read_text(encoding="utf-8")
+    assert run_page(page, text) > 0
+    if page.name in ("results.md", "results-cluttered.md", "results-planners.md"):
+        printed = capsys.readouterr().out
+        assert unprinted(text, printed) == [] and "\n| Fetch, `random` |" in text
+        wrong = text.replace("| Fetch, `random` | ", "| Fetch, `random` | 1", 1)
+        assert len(unprinted(wrong, printed)) == 1
 
 
 def test_a_page_with_a_wrong_line_fails():

@@ -143,6 +143,9 @@ def test_the_topological_tables_are_those_of_their_rows(size, rows):
         assert (size == "cpu" and who == "expert") or all(score in told for score in (success, spl, rc)), who
     if (size, rows) == ("full", "rows"):
         assert [line for line in lines if line.startswith("| dense |") and line not in told] == []
+    if (size, rows) == ("full", "rows-policy"):
+        homes = [" | ".join(line.split(" | ")[1:8]) for line in lines if line.startswith("| dense |")]
+        assert len(homes) == 13 and [home for home in homes if f"| {home} |" not in told] == []
 
 
 @pytest.mark.parametrize(

@@ -260,13 +260,17 @@ def test_tables_say_what_the_rows_say(results, capsys):
     lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in printed.splitlines() if line[:1] == "|"]
     found = {tuple(line[:4]): line[4:] for line in lines}
     assert found["TurtleBot", "SAC", "0.1", "unseen"] == [
-        *("3", "60", "0.950 ± 0.000", "0.830 ± 0.025", "0.699 ± 0.025", "0.764 ± 0.025"),
+        *("3", "60", "0.950 [0.950, 0.950]", "0.830 [0.820, 0.840]", "0.699 [0.689, 0.709]", "0.764 [0.754, 0.775]"),
     ]
     assert found["TurtleBot", "namo:0.5", "unseen", "20"][1].startswith("0.800 [")
     assert [line for line in lines if line[0] == "turtlebot-sac-k_int1-seed2"] == [
         ["turtlebot-sac-k_int1-seed2", "2,000", "1,000", "1.5", "toy", "0123456789", "toy"]
     ]
     assert "SAC is best overall" in printed and "Welch" in printed
+    assert cli.main([str(results), "--table", "policies-that-never-learned"]) == 0
+    assert (one := capsys.readouterr().out) in printed and one.count("##") == 1 and "namo" in one
+    assert cli.main([str(results), "--table", "x"]) == 2
+    assert "have scores" in capsys.readouterr().err
 
 
 def test_tables_of_policies_that_never_learned_alone(tmp_path, capsys):

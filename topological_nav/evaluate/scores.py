@@ -2,7 +2,7 @@
 
 RC is the share of successes with a contact; AADC is the seconds in contact of a success, where a run with a contact
 counts fully (5 s); `duration` is over successes too, AD over all episodes (simulated). Intervals in a scene are
-Wilson's for shares and bootstrap for means; those over scenes are Student's.
+Wilson's for shares and bootstrap for means; those over scenes are bootstrap, and Student's for differences.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ from rich.table import Table
 
 from interactive_nav_common import rows as tables
 from interactive_nav_common.rows import where
-from interactive_nav_common.statistics import Contrast, Estimate, estimate, over_episodes, welch
+from interactive_nav_common.statistics import Contrast, Estimate, estimate, over_episodes, over_runs, welch
 
 SCORES = {
     "success": "success",
@@ -69,7 +69,7 @@ def summary(rows: pa.Table) -> list[Line]:
             lines.append(Line(contender, scene, len(part), {name: score(part, name) for name in SCORES}))
         for group, split in (("seen", "train"), ("unseen", "test"), ("all", None)) if len(scenes) > 1 else ():
             if len(part := where(played, split=split)):
-                means = {name: estimate(by_scene(part, name).values()) for name in SCORES}
+                means = {name: over_runs(by_scene(part, name).values()) for name in SCORES}
                 lines.append(Line(contender, group, len(part), means))
     return lines
 
@@ -87,7 +87,7 @@ def differences(rows: pa.Table) -> list[tuple[str, str, Estimate | Contrast]]:
             unseen, seen = (
                 [*by_scene(where(rows, contender=contender, split=x), name).values()] for x in ("test", "train")
             )
-            if unseen and seen:
+            if min(len(unseen), len(seen)) > 2:  # an interval of two homes says nothing
                 results.append((f"{contender}: unseen minus seen", name, welch(np.array(unseen), np.array(seen))))
     return results
 

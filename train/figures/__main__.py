@@ -22,6 +22,8 @@ class Draw(Command):
     """Scenes of a sweep's figures; auto takes test where there are rows of them."""
     tables: Flag = False
     """Print Markdown tables of a sweep instead of drawing."""
+    table: Annotated[str | None, option(metavar="NAME")] = None
+    """Print only the table with this heading: `scores`, `runs`, `the-paper-s-claims` and so on."""
 
 
 @reports_errors("train.figures")
@@ -32,14 +34,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     from train.figures.tables import document
 
     split = None if arguments.split == "all" else arguments.split
-    if arguments.tables:
+    if arguments.tables or arguments.table is not None:
         rows = Results(arguments.results).rows
         if not set(rows.column_names) >= SWEPT:
             raise FileError(
                 f"{arguments.results}: no rows of policies; evaluate some first (python -m train.sweep FILE "
                 "--only evaluate, or python -m train.evaluate)"
             )
-        print(document(rows, chosen_split(rows, split)), end="")
+        print(document(rows, chosen_split(rows, split), arguments.table), end="")
         return 0
     drawn = False
     for name, draw in figures_of(arguments.results, split):

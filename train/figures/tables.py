@@ -1,14 +1,16 @@
 """Write Markdown tables of scores, claims and provenance of the rows of a sweep."""
 
 import dataclasses
+import re
 from collections.abc import Iterable
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from interactive_nav_common.errors import FileError
 from interactive_nav_common.rows import markdown, where
-from interactive_nav_common.statistics import estimate, over_episodes
+from interactive_nav_common.statistics import over_episodes, over_runs
 from train.figures import style
 from train.scoring.rows import SCORES
 from train.scoring.statistics import Finding, cells, claims, learned_rows, objects_moved, run_means
@@ -18,11 +20,11 @@ COLUMNS = ("success", "P_eff = SPL = INS_1", "E_eff = INS_0", "INS_0.5")
 
 
 def score_cells(rows: pa.Table) -> str:
-    """Return the scores of every cell on seen and unseen scenes: mean over seeds and half of the 95 % t interval."""
+    """Return the scores of every cell on seen and unseen scenes: mean over seeds and its 95 % interval."""
     lines = []
     for split, name in SPLITS.items():
         for (robot, algorithm, k_int), runs in cells(run_means(rows, split)).items():
-            scores = [estimate(run.scores[score] for run in runs) for score in SCORES]
+            scores = [over_runs(run.scores[score] for run in runs).with_ends() for score in SCORES]
             episodes = sum(run.episodes for run in runs)
             cell = (style.robot_name(robot), algorithm.upper(), f"{k_int:g}", name)
             lines.append((*cell, len(runs), f"{episodes:,}", *scores))
@@ -135,21 +137,21 @@ def sections(rows: pa.Table, split: str | None) -> list[tuple[str, str, str]]:
     every = [
         (
             "Scores",
-            "Mean over runs ± half of the 95 % t interval over seeds; a run's score is the mean over its fixed "
-            "episodes.",
+            "Mean over runs [95 % bootstrap interval; of three runs, lowest and highest]; a run's score is the mean "
+            "over its episodes.",
             score_cells(rows) if learned else "",
         ),
         (
             "The paper's claims",
             f"On {shown} scenes unless the line says otherwise. Two-sided Welch t tests over seeds, each seed's score "
-            "the mean over the settings that both sides have; level 5 %, not corrected for the number of tests. "
-            "Cells with fewer runs than others are not compared. "
-            "`undecided` says that these runs cannot tell, not that there is no difference.",
+            "the mean over the settings of both sides; level 5 %, not corrected for the number of tests. "
+            "Cells with fewer runs are not compared. "
+            "`undecided`: these runs cannot tell.",
             claim_lines(claims(rows, split)) if learned else "",
         ),
         (
             "Effort without walls",
-            "The same comparisons over the episodes that touched no wall. The dynamic term of E_eff counts forces on "
+            "The same over the episodes that touched no wall. The dynamic term of E_eff counts forces on "
             "walls, the penalty counts movable objects only. Which episodes these are depends on the policy.",
             effort_lines(rows, split) if learned else "",
         ),
@@ -166,13 +168,17 @@ def sections(rows: pa.Table, split: str | None) -> list[tuple[str, str, str]]:
             "far each of them was moved on average, in centimetres of its centre's path.",
             category_lines(rows, split),
         ),
-        ("Policies that never learned", "Mean over episodes [95 % interval].", baselines(rows)),
+        ("Policies that never learned", "Mean over episodes [Wilson's or bootstrap's 95 % interval].", baselines(rows)),
         ("Runs", "", provenance(rows)),
     ]
     return [section for section in every if section[2]]
 
 
-def document(rows: pa.Table, split: str | None) -> str:
-    """Return all tables as one document in Markdown."""
-    parts = (part for heading, *text in sections(rows, split) for part in (f"## {heading}", *text) if part)
+def document(rows: pa.Table, split: str | None, name: str | None = None) -> str:
+    """Return all tables as one document in Markdown, or only the one whose heading has this name, as in its anchor."""
+    named = {re.sub(r"\W+", "-", section[0].lower()): section for section in sections(rows, split)}
+    if name not in {None, *named}:
+        raise FileError(f"--table {name}: no such table; these rows have {', '.join(named)}")
+    shown = (section for key, section in named.items() if name in {None, key})
+    parts = (part for heading, *text in shown for part in (f"## {heading}", *text) if part)
     return "\n\n".join(part.rstrip() for part in parts) + "\n"

@@ -3,7 +3,8 @@
 `python -m docs.studies.homes.navigator collect RUNS -o ROWS` rows of `benchmarks/topological.mk SIZE=homes` as one file
 `python -m docs.studies.homes.navigator tables ROWS` its tables, as Markdown
 
-Means and 95 % intervals (Student's) are over homes. A difference compares the same episodes of two variants.
+Means and 95 % intervals are over homes: bootstrap for scores, Student's for differences. A difference compares
+the same episodes of two variants.
 """
 
 import argparse
@@ -15,7 +16,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from interactive_nav_common.rows import markdown, read_rows, where, write_parquet
-from interactive_nav_common.statistics import estimate
+from interactive_nav_common.statistics import estimate, over_runs
 
 LADDER = {
     "ladder-0": "the report's navigator",
@@ -104,7 +105,7 @@ def table(rows: pa.Table, variants: dict[str, str]) -> str:
             continue
         mine = scores(part)
         cells = [
-            estimate(v[name].mean() for v in mine.values() if len(v[name]))
+            over_runs(v[name].mean() for v in mine.values() if len(v[name]))
             for name in ("600", "175", "spl", "contact", "ad")
         ]
         change = ""

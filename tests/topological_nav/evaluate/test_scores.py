@@ -107,8 +107,8 @@ def test_the_summary_has_scenes_and_means_over_them():
         *(("sparse", g) for g in ("cedar", "alder", "seen", "all")),
     ]
     seen = lines["dense", "seen"].scores["success"]
-    # Two scenes: t of one degree of freedom is 12.706, the standard error 0.125.
-    assert (seen.mean, seen.high - seen.mean) == pytest.approx((0.875, 12.7062 * 0.125), abs=1e-3)
+    # Bootstrap of two scenes: one of four resamples holds the lower one twice, so the interval spans both.
+    assert (seen.mean, seen.low, seen.high) == pytest.approx((0.875, 0.75, 1.0))
     assert lines["dense", "unseen"].scores["success"].mean == 0.5 and math.isnan(
         lines["dense", "unseen"].scores["spl"].low
     )
@@ -122,9 +122,17 @@ def test_differences_pair_what_both_played():
     gap = found["dense minus sparse map", "success"]
     assert gap.mean == pytest.approx(0.5) and gap.runs == 2  # 0.75 - 0.25 and 1 - 0.5; willow has one side only
     assert found["dense minus sparse map", "spl"].mean == pytest.approx(0.25)
-    unseen = found["dense: unseen minus seen", "success"]
-    assert unseen.difference == pytest.approx(0.5 - 0.875)
-    assert ("sparse: unseen minus seen", "success") not in found
+    assert not [what for what, _ in found if "unseen" in what]  # of one unseen scene there is no interval
+
+
+def test_unseen_scenes_are_compared_where_each_side_has_three():
+    parts = [
+        table(scene=f"{split}{k}", split=split, shortest=[4.0], success=[won], path_m=[8.0])
+        for split, values in (("test", (False, True, True)), ("train", (True, True, False, True)))
+        for k, won in enumerate(values)
+    ]
+    found = {(what, name): result for what, name, result in scores.differences(pa.concat_tables(parts))}
+    assert found["dense: unseen minus seen", "success"].difference == pytest.approx(2 / 3 - 3 / 4)
 
 
 def test_tables_say_the_same_on_paper():

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.compute
 import pytest
 
-from interactive_nav_common.statistics import correlation, estimate, p_text, paired_difference, welch
+from interactive_nav_common.statistics import correlation, estimate, over_runs, p_text, paired_difference, welch
 from tests.train.synthetic import K_INTS, baseline_rows, paper_like, run_rows
 from train.scoring.rows import BY_CATEGORY
 from train.scoring.statistics import LARGE, MEDIUM, SMALL, claims, contrast, run_means, train_test_contrast
@@ -77,6 +77,11 @@ def test_seen_against_unseen():
     assert test.p_value == pytest.approx(1.0 - t / math.sqrt(t * t + 2.0), abs=1e-6)
     only_train = [table.filter(pa.compute.equal(table["split"], "train")) for table in tables]
     assert train_test_contrast(pa.concat_tables(only_train)) == ([], None)
+
+
+def test_intervals_of_runs():
+    e = over_runs([0.587, 0.033, 0.55])  # lowest thrice: 3.7 %
+    assert (e.low, e.high) == (0.033, 0.587) and str(over_runs([0.5])) == "0.500"
 
 
 def test_paired_differences_by_hand():
