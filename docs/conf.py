@@ -11,8 +11,17 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphin
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = "interactive-nav"
+html_static_path = ["site.css", "site.js"]
+html_css_files = ["site.css"]
+html_js_files = [("site.js", {"defer": "defer"})]
+html_show_copyright = False
 html_theme_options = {
-    "light_css_variables": {"sidebar-item-spacing-vertical": "0.1rem", "sidebar-item-line-height": "1.1rem"}
+    "light_css_variables": {
+        "sidebar-caption-space-above": "0.5rem",
+        "sidebar-item-line-height": "1.1rem",
+        "sidebar-item-spacing-vertical": "0",
+        "sidebar-tree-space-above": "0.75rem",
+    }
 }
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3

@@ -119,8 +119,9 @@ def svg(graph: Graph) -> str:
     wide, high = size.split()
     return "\n".join(
         [
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {size}" font-family="Helvetica, Arial, sans-serif">',
-            f'<rect width="{wide}" height="{high}" fill="#ffffff"/>',
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {size}" font-family="sans-serif" font-size="13">',
+            f'<rect width="{wide}" height="{high}" fill="#fff"/>',
+            "<style>.room { fill: #e6f1f8; stroke: #0072b2 }</style>",
             *shapes,
             "</svg>",
             "",
@@ -135,7 +136,7 @@ def _draw_package(shapes: list[str], graph: Graph, package: str, x: int, y: int)
     below = [other for other in PACKAGES if other in outside]
     shapes.append(f'<text x="{x}" y="{y + 26}" font-size="16" font-weight="bold">{package}</text>')
     for text in textwrap.wrap("builds on " + (", ".join(below) or "no other package"), 54):
-        shapes.append(f'<text x="{x}" y="{y + 43}" font-size="12" fill="#444444">{text}</text>')
+        shapes.append(f'<text x="{x}" y="{y + 43}" font-size="12" fill="#444">{text}</text>')
         y += 15
     y += 37
     level = levels({room: graph[room] & rooms for room in rooms})
@@ -146,12 +147,8 @@ def _draw_package(shapes: list[str], graph: Graph, package: str, x: int, y: int)
             wide = round(LETTER * len(name)) + 12
             if right + wide > x + WIDE - 16:
                 right, y = x + 16, y + HIGH + 2
-            shapes.append(
-                f'<rect x="{right}" y="{y}" width="{wide}" height="{HIGH}" rx="4" fill="#e6f1f8" stroke="#0072b2"/>'
-            )
-            shapes.append(
-                f'<text x="{right + wide // 2}" y="{y + 15}" font-size="13" text-anchor="middle">{name}</text>'
-            )
+            shapes.append(f'<rect x="{right}" y="{y}" width="{wide}" height="{HIGH}" rx="4" class="room"/>')
+            shapes.append(f'<text x="{right + wide // 2}" y="{y + 15}" text-anchor="middle">{name}</text>')
             right += wide + 6
         y += HIGH + 6
     return y + 6

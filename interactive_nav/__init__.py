@@ -1,4 +1,4 @@
-"""Build a batched Brax environment for interactive navigation on MuJoCo MJX from scene folders.
+"""Build a batched Brax environment for interactive navigation on MuJoCo MJX from scene folders::
 
     env = interactive_nav.make("turtlebot", scenes=["scenes_mjcf/apartment_0"])
     state = jax.jit(jax.vmap(env.reset))(keys)

@@ -1,4 +1,4 @@
-"""Offer the environment to those who do not use JAX, with Gymnasium's API on NumPy arrays.
+"""Offer the environment to those who do not use JAX, with Gymnasium's API on NumPy arrays::
 
     import gymnasium
     import interactive_nav.interop.gym_env  # registers the ids

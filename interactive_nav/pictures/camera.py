@@ -1,4 +1,4 @@
-"""Draw pictures for people: of an environment's state, or of a scene whose bodies are put where one wants them.
+"""Draw pictures for people: of an environment's state, or of a scene whose bodies are put where one wants them::
 
     frame = PictureCamera(env).frame(state, 640, 480, streams=("rgb", "normals"), view="follow")
 

@@ -104,8 +104,8 @@ def floor_plan(axis: Axes, space: FreeSpace) -> None:
     (left, bottom), (right, top) = free.min(0) - 0.4, free.max(0) + 0.4
     axis.set(xlim=(left, right), ylim=(bottom - 0.6, top), aspect="equal", xticks=[], yticks=[])
     axis.spines[:].set_visible(False)
-    axis.plot([left, left + 2.0], [bottom - 0.3] * 2, color="k", linewidth=2, solid_capstyle="butt")
-    axis.text(left + 2.15, bottom - 0.3, "2 m", va="center", fontsize=8)
+    axis.plot([left + 0.2, left + 2.2], [bottom - 0.3] * 2, color="k", linewidth=2, solid_capstyle="butt")
+    axis.text(left + 2.35, bottom - 0.3, "2 m", va="center", fontsize=8)
 
 
 def room_points(axis: Axes, points_w: np.ndarray, labels: np.ndarray, **style: Any) -> None:

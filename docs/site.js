@@ -1,0 +1,11 @@
+// Give each block of code a button that copies it.
+for (const code of document.querySelectorAll("div:not(.highlight-text) > .highlight")) {
+  const button = document.createElement("button");
+  button.className = "copy";
+  button.textContent = "Copy";
+  button.onclick = async () => {
+    await navigator.clipboard.writeText(code.querySelector("pre").textContent);
+    button.textContent = "Copied";
+  };
+  code.append(button);
+}
