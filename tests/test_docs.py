@@ -9,13 +9,16 @@ from __future__ import annotations
 import contextlib
 import importlib
 import importlib.util
+import inspect
 import io
 import itertools
 import re
 import shlex
+import sys
 import traceback
 from pathlib import Path
 from typing import NamedTuple
+from unittest.mock import patch
 
 import pytest
 from markdown_it import MarkdownIt
@@ -26,6 +29,7 @@ from interactive_nav.config import make_config
 ROOT = Path(__file__).parents[1]
 README_WORDS = 700
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
+GUIDES = [ROOT / name for name in ("CONTRIBUTING.md", "benchmarks/README.md", "scenes_mjcf/README.md")]
 NOT_RUN = re.compile(r"<!--\s*not run:\s*(.+?)\s*-->", re.DOTALL)
 HOUSE = ("interactive_nav", "train", "converters", "topological_nav", "benchmarks", "docs")
 
@@ -39,10 +43,10 @@ class Block(NamedTuple):
 
 
 def blocks(text: str) -> list[Block]:
-    """Fenced blocks of a Markdown text."""
+    """Fenced and indented blocks of a Markdown text."""
     found, reason = [], ""
     for token in MarkdownIt().parse(text):
-        if token.type == "fence":
+        if token.type in ("fence", "code_block"):
             assert token.map is not None
             found.append(Block(token.info.strip(), token.content, token.map[0] + 1, reason))
         match = NOT_RUN.search(token.content) if token.type == "html_block" else None
@@ -137,8 +141,9 @@ def help_of(module: str, words: list[str]) -> str:
     main = importlib.import_module(name).main
     sub = list(itertools.takewhile(lambda word: re.fullmatch(r"[a-z][a-z-]*", word), words[:2]))  # or a place it takes
     out = io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
-        main([*sub, "--help"])
+    argv = [module, *sub, "--help"]
+    with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit), patch.object(sys, "argv", argv):
+        main(*([argv[1:]] if inspect.signature(main).parameters else []))
     return out.getvalue()
 
 
@@ -154,7 +159,7 @@ def unknown_flags(text: str) -> list[str]:
     return wrong
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+@pytest.mark.parametrize("page", [*PAGES, *GUIDES], ids=lambda p: str(p.relative_to(ROOT)))
 def test_commands_of_a_page_exist(page):
     assert unknown_flags(page.read_text(encoding="utf-8")) == []
 
@@ -165,6 +170,32 @@ def test_an_unknown_flag_is_found():
     wheel = "```sh\nuvx --from x interactive-nav preview alder -o a.png  # --as\ninteractive-nav train --confg a\n```\n"
     assert commands(wheel)[0] == ("converters", ["preview", "alder", "-o", "a.png"])
     assert unknown_flags(wheel) == ["train --confg"]
+    assert unknown_flags("Indented:\n\n    python -m train --confg a\n") == ["train --confg"]
+
+
+def shared_runs(text: str) -> list[str]:
+    """Run folders that two different commands of a page would train into: the second one is refused."""
+    runs: dict[str, list[str]] = {}
+    wrong = []
+    for module, words in commands(text):
+        if module == "train" and "--config" in words and "--print-config" not in words:
+            told = dict(word.split("=", 1) for word in words if "=" in word)
+            config = words[words.index("--config") + 1]
+            run = told.get("run.name") or f"{config}-seed{told.get('run.seed', '0')}"
+            wrong += [run] if runs.setdefault(run, words) != words else []
+    return wrong
+
+
+@pytest.mark.parametrize("page", [*PAGES, *GUIDES], ids=lambda p: str(p.relative_to(ROOT)))
+def test_runs_of_a_page_have_folders_of_their_own(page):
+    assert shared_runs(page.read_text(encoding="utf-8")) == []
+
+
+def test_a_shared_run_folder_is_found():
+    demo = "```sh\npython -m train --config demo\n```\n"
+    assert shared_runs(demo + demo) == []
+    assert shared_runs(demo + demo.replace("demo", "demo env.k_int=1")) == ["demo-seed0"]
+    assert shared_runs(demo + demo.replace("demo", "demo env.k_int=1 run.name=a")) == []
 
 
 def options(text: str) -> list[tuple[str, str]]:
@@ -206,7 +237,7 @@ FOREIGN = {"benchmarks/kitchen"}
 """In the repository of `mujoco_warp`."""
 PROSE = [
     *PAGES,
-    *(ROOT / name for name in ("CONTRIBUTING.md", "benchmarks/README.md", "scenes_mjcf/README.md")),
+    *GUIDES,
     *sorted(p for room in ROOMS if room != "tests" for p in ROOT.glob(f"{room}/**/*.py")),
 ]
 
