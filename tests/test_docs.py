@@ -151,10 +151,10 @@ def unknown_flags(text: str) -> list[str]:
     """'module --flag' for every flag in a page's commands that the program's help does not name."""
     wrong, helps = [], {}
     for module, words in commands(text):
-        key = (module, *words[:2])
-        if key not in helps:
-            helps[key] = help_of(module, words)
         flags = [w.partition("=")[0] for w in words if re.match(r"--?[a-z]", w)]
+        key = (module, *words[:2])
+        if flags and key not in helps:  # a study without flags would run
+            helps[key] = help_of(module, words)
         wrong += [f"{module} {flag}" for flag in flags if not re.search(rf"(?<![\w-]){flag}(?![\w-])", helps[key])]
     return wrong
 
