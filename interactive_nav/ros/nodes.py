@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -23,6 +24,8 @@ COMMAND_HOLDS_S = 0.5
 """A velocity command is driven for this long; then the robot stops, as mobile bases do."""
 PATIENCE_S = 180.0
 """Wall-clock time to wait for other nodes."""
+_ACKNOWLEDGED_S = 5.0
+"""For readers to acknowledge a node's last messages."""
 _DELIVERY_S = 1.0
 """For messages that other threads of DDS still send before a node ends, and for news of its subscriptions."""
 AGAIN_S = 2.0
@@ -53,8 +56,10 @@ def ros_node(name: str) -> Iterator[Node]:
     thread.start()
     try:
         yield node
+    finally:  # `sys.exit` within the block ends up here, too
+        for publisher in node.publishers:
+            publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGED_S))
         time.sleep(_DELIVERY_S)
-    finally:
         executor.shutdown()
         thread.join(5.0)
         node.destroy_node()
@@ -75,8 +80,10 @@ class SimulatorNode:
         self._command, self._commands, self._done = (0.0, 0.0), 0, False
         self._out: dict[str, Any] = {}
         self._moment: dict[str, Any] = {}
-        for name, heard in ((ros.COMMAND, self._on_command), (ros.DONE, self._on_done)):
+        self._heard = [
             node.create_subscription(ros.TOPICS[name], name, heard, ros.qos(name, reading=True))
+            for name, heard in ((ros.COMMAND, self._on_command), (ros.DONE, self._on_done))
+        ]
 
     def run(self, stop: Stop) -> Tally:
         """Simulate until the navigator is done, the limit is reached or `stop` returns True."""
@@ -164,7 +171,8 @@ class SimulatorNode:
             count = {name: out.get_subscription_count() for name, out in self._out.items()}
             out = [name for name in ros.FROM_ROBOT if recorded and not count[name]]
             out += [] if max(count[name] for name in read) > recorded else [" or ".join(read)]
-            return out if self._node.count_publishers(ros.COMMAND) else [*out, ros.COMMAND]
+            # Matched, not only announced: a command from a publisher that is not matched yet would be lost.
+            return out if self._heard[0].get_publisher_count() else [*out, ros.COMMAND]
 
         wait_for(
             self._news,
