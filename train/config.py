@@ -359,13 +359,12 @@ def validate(config: TrainConfig) -> None:
     ppo = config.ppo
     if config.run.devices > 1:
         _validate_devices(config.algorithm, ppo, config.run.devices)
-    if ppo.num_envs and ppo.batch_size and ppo.num_minibatches:
-        collected = ppo.batch_size * ppo.num_minibatches
-        if collected % ppo.num_envs:
-            raise ConfigError(
-                f"ppo.batch_size * ppo.num_minibatches is {collected} sequences, expected a multiple of "
-                f"ppo.num_envs ({ppo.num_envs}); change one of the three"
-            )
+    collected = (ppo.batch_size or 0) * (ppo.num_minibatches or 0)
+    if ppo.num_envs and collected % ppo.num_envs:
+        raise ConfigError(
+            f"ppo.batch_size * ppo.num_minibatches is {collected} sequences, expected a multiple of "
+            f"ppo.num_envs ({ppo.num_envs}); change one of the three"
+        )
 
 
 def _validate_devices(name: str, ppo: PPOConfig, devices: int) -> None:
@@ -390,8 +389,7 @@ def _validate_replay(name: str, config: OffPolicyConfig, num_timesteps: int, rem
         raise ConfigError(f"{got} ({num_timesteps}): nothing would be learned")
     if not (config.num_envs and config.min_replay_size and config.max_replay_size and config.steps_per_update):
         return
-    slots = config.replay_slots
-    sampled = config.younger_slots(remembers) + 1
+    slots, sampled = config.replay_slots, config.younger_slots(remembers) + 1
     least = max(sampled, config.steps_per_update, -(-config.min_replay_size // config.num_envs))
     if slots < least:
         raise ConfigError(
