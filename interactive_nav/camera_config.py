@@ -51,9 +51,9 @@ class CameraNoise(Settings):
     depth_edge_m: NotNegative = 0.0
     """Depth reads 0 where a pixel beside is nearer by more than this."""
     depth_min_m: NotNegative = 0.0
-    """What is nearer reads 0."""
+    """Nearer surfaces read 0."""
     depth_max_m: NotNegative = 0.0
-    """What is farther reads 0; 0: no limit."""
+    """Farther surfaces read 0; 0: no limit."""
     frame_dropout: Share = 0.0
     """Share of a camera's frames that are lost: all its images are 0."""
 

@@ -37,7 +37,7 @@ class TaskRules(Settings):
     num_objects: Natural = 10
     """Small objects strewn about at random each episode."""
     small_objects: Literal["train", "test"] = "train"
-    """Whose models the small objects are: train, or test, which no training episode shows."""
+    """Set of the small objects' models: train, or test (in no training episode)."""
     objects: tuple[str, ...] = ()
     """Folders of `python -m converters object`, relative to the current folder: they are the small objects in place of
     the built-in ones, in turn until there are num_objects."""
@@ -301,9 +301,9 @@ class RandomDynamics(Settings):
     random_wheel_slip: tuple[Share, Share] = (0.0, 0.0)
     """Share of their speed that the wheels of a side lose, by episode and side: low,high."""
     random_motor_delay_steps: tuple[_Steps, _Steps] = (0, 0)
-    """Control steps from an action to its execution, by episode: low,high. Until the first, commands are 0."""
+    """Control steps from an action to its execution, by episode: low,high. Before that, commands are 0."""
     random_sensor_delay_steps: tuple[_Steps, _Steps] = (0, 0)
-    """Age of observations in control steps, by episode: low,high. Until then they stay the first."""
+    """Age of observations in control steps, by episode: low,high. The first one repeats at the start."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -39,7 +39,7 @@ class Sweep(Command):
     redo: Flag = False
     """Evaluate again what is evaluated."""
     unfinished: Flag = False
-    """Evaluate unfinished runs too, as far as they are."""
+    """Also evaluate unfinished runs."""
     time_limit: Annotated[Positive | None, option(metavar="SECONDS")] = None
     """Then stop all runs, with their checkpoints."""
     where: Annotated[Repeated, option(metavar="KEY=VALUE[,VALUE]")] = ()
