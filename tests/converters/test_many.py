@@ -112,6 +112,7 @@ def test_the_digest_is_of_options_and_inputs(gibson_raw):
     assert first != digest_of(gibson_raw, QUICK)
 
 
+@pytest.mark.heavy
 def test_a_file_that_the_source_names_is_one_of_its_inputs(tmp_path):
     tall_room().export(tmp_path / "room.obj")
     text = (tmp_path / "room.obj").read_text()

@@ -92,6 +92,7 @@ def test_networks_of_different_cameras_are_refused(made, capsys):
     assert "learned from images with width = 32, the detector 128" in capsys.readouterr().err
 
 
+@pytest.mark.heavy
 def test_the_navigator_drives_by_a_map_that_was_explored(made, tmp_path, capsys):
     runs = ["--localiser", str(made.rooms), "--detector", str(made.passages)]
     assert main(["explore", str(made.scene), *runs, "-o", str(tmp_path), *WORDS, "limit_s=60", "passable=0.05"]) == 0

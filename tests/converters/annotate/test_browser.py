@@ -168,6 +168,7 @@ def test_six_pairs_in_the_real_room_give_the_peoples_alignment(sample_data, tmp_
         assert moved_m < 0.1 and math.degrees(turned) < 5
 
 
+@pytest.mark.heavy
 def test_a_browser_that_goes_away_loses_nothing(scan2cad_raw, tmp_path):
     with opened(scan2cad_raw, tmp_path / "mine") as (page, address):
         with tab(address, tmp_path / "one") as browser:

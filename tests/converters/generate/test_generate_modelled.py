@@ -72,6 +72,7 @@ def test_artefacts_are_a_checked_setting_of_homes_that_recipes_reach():
     assert GENERATOR_VERSION == 8
 
 
+@pytest.mark.heavy
 def test_floors_and_ceilings_are_the_plans_and_look_into_the_rooms():
     plan = home().plan
     rooms = sum(r.area_m2 for r in plan.rooms)

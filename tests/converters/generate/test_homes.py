@@ -155,6 +155,7 @@ KEPT = {
 """Category of what people leave about -> the rooms in which they do."""
 
 
+@pytest.mark.heavy
 def test_what_is_moved_into_passages_stays_in_rooms_that_have_such_things():
     adjusted = [furnished(seed, "cluttered") for seed in range(20, 24)]
     standing = [(home.uses[s.room], s.item.model.category) for home in adjusted for s in home.floor.standing]

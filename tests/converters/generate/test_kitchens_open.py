@@ -110,7 +110,7 @@ def room(b: Building, item: Instance, more: tuple[PlanBox, ...] = ()) -> mujoco.
 @pytest.mark.parametrize(
     ("seed", "tier", "wardrobes"),
     [
-        (720_003, "furnished", 4),
+        pytest.param(720_003, "furnished", 4, marks=pytest.mark.heavy),
         (720_007, "furnished", 3),
         pytest.param(720_007, "cluttered", 5, marks=pytest.mark.slow),
     ],

@@ -198,6 +198,7 @@ def test_furniture_outside_is_left_out(released):
         read_interactive_gibson(released, strict=True)
 
 
+@pytest.mark.heavy
 @pytest.mark.data
 def test_original_objects_in_a_released_building(released, original, sample_data, tmp_path, hull_cache):
     """Files of the release itself: URDFs of four of its small objects, with their collision meshes, as furniture."""

@@ -127,6 +127,7 @@ def test_a_few_steps_learn_one_sample_by_heart_and_weights_keep_it(tmp_path):
     assert score_crops(kept, variables["params"], [stair()], TINY) == {"wall": 1.0, "floor": 1.0}
 
 
+@pytest.mark.heavy
 def test_crops_of_a_scanned_home_are_seen_in_part():
     surface, classes = building_surface(3, "sparse", "train")
     assert {NAMES[k] for k in np.unique(classes)} >= {"wall", "floor", "sofa", "door"}

@@ -182,7 +182,7 @@ def test_the_force_on_a_pushed_block_on_native(world, native):
     assert_options_order_as_they_must(world, native)
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_the_force_on_a_pushed_block_on_jax(world, mjx_jax):
     assert_force_is_what_pushing_takes(world, mjx_jax)
     assert_options_order_as_they_must(world, mjx_jax)

@@ -62,7 +62,7 @@ def test_a_drawer_and_a_flap_are_read_as_they_are_written(world):
     assert float(jnp.abs(shut.qpos[world.layout.slot_qpos]).max()) < 1e-3, "a flap that is shut stays so"
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("backend", [pytest.param(b, marks=[pytest.mark.heavy] * (b == "jax")) for b in BACKENDS])
 def test_a_robot_shuts_an_open_drawer(world, backend):
     """It drives 0.4 m/s; the drawer's front is 0.4 m before it and goes 0.3 m."""
     config = NavConfig.of(backend=backend, num_objects=0, solver_iterations=100)
@@ -80,6 +80,7 @@ def test_a_robot_shuts_an_open_drawer(world, backend):
     assert float(jnp.abs(states.qpos[0, jnp.asarray(others)]).max()) < 1e-2, "the rest stays shut"
 
 
+@pytest.mark.heavy
 def test_backends_agree_on_a_drawer_that_is_let_go(world):
     """Pushed at 0.5 m/s it comes to rest by its damping alone, as C MuJoCo has it."""
     state, slots = _start(world, 0.0)

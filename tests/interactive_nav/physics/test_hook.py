@@ -172,7 +172,11 @@ def test_a_door_that_opens_towards_the_robot_is_pulled_open(make_env):
 
 
 @pytest.mark.parametrize(
-    "backend", ["jax", pytest.param("warp", marks=pytest.mark.skipif(not HAS_WARP, reason="no warp-lang"))]
+    "backend",
+    [
+        pytest.param("jax", marks=pytest.mark.heavy),
+        pytest.param("warp", marks=pytest.mark.skipif(not HAS_WARP, reason="no warp-lang")),
+    ],
 )
 def test_mjx_pulls_as_c_mujoco_does(make_env, backend):
     envs = [make_env(backend=name, solver_iterations=100) for name in ("native", backend)]

@@ -106,7 +106,7 @@ def driven(step, world, table_rad_s: float = 0.0) -> tuple[np.ndarray, list]:
     return np.stack(out), all_signals
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 @pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="needs the package warp-lang")
 def test_a_chain_of_pushes_is_c_mujocos(world):
     configs = [dataclasses.replace(ALL, backend="native"), dataclasses.replace(ALL, backend="warp", active_dofs=20)]

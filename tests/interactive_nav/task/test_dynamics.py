@@ -98,6 +98,7 @@ def test_latency_shows_the_observation_of_some_steps_ago(make, plain):
     assert not np.array_equal(expected[3], expected[4])
 
 
+@pytest.mark.heavy
 def test_latency_starts_again_with_each_episode(make):
     """An episode of 4 steps in batches that reset themselves, in `AutoResetEnv` and with Gymnasium's masks."""
     settings = {"episode_steps": 4, "random_sensor_delay_steps": (1, 2), "random_motor_delay_steps": (0, 2)}
@@ -130,6 +131,7 @@ def test_latency_sees_the_steps_within_a_held_action(make):
         np.testing.assert_allclose(state.obs, once[k].obs, atol=1e-5)
 
 
+@pytest.mark.heavy
 def test_an_episode_draws_the_same_whatever_else_is_drawn(make):
     ranges = {name: (low, low + 2 if name.endswith("steps") else low + 0.5) for name, low in NEUTRAL.items()}
     draw = {

@@ -110,6 +110,7 @@ def test_a_batch_rewards_reports_and_observes_added_terms_and_forgets_at_a_reset
     assert (np.asarray(end.info["nav"].memory["farthest_m"]) == 0).all()
 
 
+@pytest.mark.heavy
 def test_gymnasium_replays_and_rollouts_report_them(env):
     def forwards(obs, key):
         return jnp.full(2, 0.6)

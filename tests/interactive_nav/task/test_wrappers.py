@@ -172,7 +172,7 @@ def test_wrappers_that_would_be_passed_over_are_refused(env, auto):
 @pytest.mark.parametrize(
     "wrap",
     [
-        pytest.param(interactive_nav.wrap_for_brax_training, id="ours"),
+        pytest.param(interactive_nav.wrap_for_brax_training, id="ours", marks=pytest.mark.heavy),
         pytest.param(None, id="brax", marks=pytest.mark.heavy),  # its wrappers begin again: see above
     ],
 )

@@ -98,6 +98,7 @@ def test_a_drive_ends_where_it_touches_and_is_kept_until_then(painted, tmp_path)
     assert row["contact_s"] == pytest.approx(0.1 * row["touched"])
 
 
+@pytest.mark.heavy
 def test_the_share_of_steps_is_the_experts_whatever_the_batch(painted, own, tmp_path):
     config = dataclasses.replace(CONFIG, expert_share=0.5)
     drives = simulated(painted, tmp_path / "a", config, Constant(0.0))

@@ -42,6 +42,7 @@ def run(frames, tmp_path_factory):
     return out
 
 
+@pytest.mark.heavy
 def test_all_images_and_their_mirrors_are_embedded(frames, driven):
     width = sum(network.embed(np.zeros((1, 32, 32, 3), np.uint8)).shape[1] for network in frames.networks)
     count = len(frames.drives.command)

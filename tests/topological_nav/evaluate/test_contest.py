@@ -83,6 +83,7 @@ def watched(contest):
     return venue, navigator.policy, steps, played
 
 
+@pytest.mark.heavy
 def test_a_trained_policy_starts_every_run_with_a_fresh_memory_and_keeps_it_within(watched):
     _, policy, steps, played = watched
     started = [steps[i][3] - 1 for i in range(len(steps)) if steps[i][2].run_started[0]]
@@ -146,6 +147,7 @@ def words_of(contest):
     ]
 
 
+@pytest.mark.heavy
 def test_rows_say_which_policy_drove_and_by_what_it_saw(contest, tmp_path, capsys):
     words = ["evaluate", str(contest.scenes[0]), "--contenders", "dense", "-o", str(tmp_path), *words_of(contest)]
     assert main([*words, *WORDS]) == 0

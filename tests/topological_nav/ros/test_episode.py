@@ -102,7 +102,7 @@ def test_pictures_scans_and_clock_hold_what_was_sensed(episode):
     assert [at for at, _ in read[messages.IMAGE]] == pytest.approx(stamps, abs=0.101)
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_a_failed_node_is_in_the_exit_code(tmp_path):
     words = words_of(tmp_path, "-m topological_nav.ros --map x.npz passable=5")
     ran = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
@@ -112,7 +112,7 @@ def test_a_failed_node_is_in_the_exit_code(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.heavy), signal.SIGTERM])
 def test_a_stop_is_in_the_exit_code_and_ends_both_nodes(number, tmp_path):
     begun = subprocess.Popen(words_of(tmp_path, "-c 'import time; time.sleep(600)'"), cwd=tmp_path)
     children = Path(f"/proc/{begun.pid}/task/{begun.pid}/children")

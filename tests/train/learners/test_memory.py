@@ -188,7 +188,7 @@ SAC = dataclasses.replace(SAC, min_replay_size=500, max_replay_size=1024)
 SAC = dataclasses.replace(SAC, policy_hidden_layer_sizes=(16,), q_hidden_layer_sizes=(16,))
 
 
-@pytest.fixture(scope="module", params=["ppo", "sac"])
+@pytest.fixture(scope="module", params=["ppo", pytest.param("sac", marks=pytest.mark.heavy)])
 def run(request, tmp_path_factory) -> Any:
     """A run folder that was stopped after two updates and continued to four, and one that was not."""
     quiet, out = Console(file=io.StringIO()), tmp_path_factory.mktemp("memory")

@@ -189,7 +189,7 @@ def test_a_gradient_step_trains_every_layer(collected):
         assert min(jax.tree.leaves(moved)) > 0
 
 
-@both
+@pytest.mark.parametrize("algorithm", [pytest.param("sac", marks=pytest.mark.heavy), "ddpg"])
 def test_resumed_run_equals_uninterrupted_one(algorithm):
     """Six updates, against two more from the snapshot after four, with its replay and memory."""
     train, config, recorder = ALGORITHMS[algorithm].train, with_memory(algorithm, 6), Recorder()
@@ -229,7 +229,7 @@ NOISY: dict[str, Any] = {
 @pytest.mark.parametrize(
     ("algorithm", "network", "low", "high"),
     [
-        ("sac", GRU, 0.9, 1.0),
+        pytest.param("sac", GRU, 0.9, 1.0, marks=pytest.mark.heavy),
         ("sac", NetworkConfig(), 0.44, 0.56),
         pytest.param("ddpg", dataclasses.replace(GRU, share_encoder=True), 0.65, 1.0, marks=pytest.mark.heavy),
     ],

@@ -68,7 +68,7 @@ def test_the_same_policy_starts_with_either_critic():
     jax.tree.map(np.testing.assert_array_equal, *policies)
 
 
-@pytest.mark.parametrize("network", [VECTOR, MEMORY], ids=["vector", "memory"])
+@pytest.mark.parametrize("network", [VECTOR, pytest.param(MEMORY, marks=pytest.mark.heavy)], ids=["vector", "memory"])
 def test_a_run_learns_values_and_plays_without_the_true_state(network, tmp_path):
     config = dataclasses.replace(toy_config(tmp_path, updates=6), network=network)
     result, folder, _ = train_run(config, Console(file=io.StringIO()), build_env=build_toy)

@@ -55,6 +55,7 @@ def runs(tmp_path_factory):
     return {c.run.name: (c, *train_taught(c)[:2]) for c in configs}
 
 
+@pytest.mark.heavy
 def test_a_student_that_drives_agrees_with_the_teacher_where_the_other_never_was(runs):
     """States of a random driver: it turns away from the goal, which the follower never does."""
     env = ToyEnv()
@@ -75,6 +76,7 @@ def test_a_student_that_drives_agrees_with_the_teacher_where_the_other_never_was
     assert error["dagger"] < 0.2 * float(np.var(teacher)), error
 
 
+@pytest.mark.heavy
 def test_a_run_with_a_privileged_critic_teaches_a_student_that_sees_images(tmp_path):
     start = toy_config(tmp_path, updates=1)
     start = dataclasses.replace(start, network=NetworkConfig(critic_inputs="privileged"))

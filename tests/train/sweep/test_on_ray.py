@@ -53,6 +53,7 @@ def at_root(monkeypatch):
     monkeypatch.chdir(ROOT)
 
 
+@pytest.mark.heavy
 def test_runs_use_both_nodes_fail_alone_and_are_tried_again(cluster, tmp_path, monkeypatch):
     import ray
 

@@ -368,6 +368,7 @@ def test_what_is_neither_done_nor_worked_on_is_no_success(tmp_path):
     assert Outcome((done, failed), None, False, 0).exit_code("unfinished") == 1
 
 
+@pytest.mark.heavy
 def test_two_identical_sweeps_share_the_work(tmp_path):
     """Both begin in an empty folder at the same time: every run is trained once, and both end well."""
     path = write_sweep(tmp_path)
