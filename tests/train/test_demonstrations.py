@@ -102,6 +102,7 @@ def clone_config(path, out_dir):
     return dataclasses.replace(config, algorithm="clone", ppo=PPOConfig(), clone=clone, run=run)
 
 
+@pytest.mark.heavy
 def test_a_clone_of_an_expert_reaches_what_the_expert_reaches(recorded, tmp_path):
     result, folder, _ = train_run(clone_config(recorded[0], tmp_path), Console(file=io.StringIO()), build_env=build_toy)
     assert result.completed

@@ -122,6 +122,7 @@ def test_latency_starts_again_with_each_episode(make):
     np.testing.assert_array_equal(new.obs[1], states[3].obs[1])
 
 
+@pytest.mark.heavy
 def test_latency_sees_the_steps_within_a_held_action(make):
     env = make(random_sensor_delay_steps=(1, 1))
     once, twice = played(env, 4), AutoResetEnv(env, action_repeat=2)

@@ -102,6 +102,7 @@ def test_objects_out_of_reach_and_broken_states_are_zeros(env, state):
     assert not env.privileged(broken).any()
 
 
+@pytest.mark.heavy
 def test_a_batch_carries_it_beside_what_the_policy_sees(env):
     batch = AutoResetEnv(PrivilegedEnv(env))
     assert batch.observation_size == {"state": 29, PRIVILEGED: PRIVILEGED_SIZE}

@@ -104,31 +104,6 @@ class _Batch(Wrapper):
     step = functools.partialmethod(lambda self, *args: jax.vmap(self.env.step)(*args))  # type: ignore[assignment]
 
 
-def test_a_timed_out_episode_starts_again_from_its_state_as_often_as_asked_and_is_scored_once(env, auto):
-    """Six steps straight ahead reach no goal: every episode runs out of time."""
-    batch = AutoResetEnv(env)
-    batch.retry = 1.0
-    states = played(batch, 3 * LIMIT)
-    for end in (LIMIT, 2 * LIMIT, 3 * LIMIT):
-        state, first = states[end], states[0]
-        assert (state.info["time_out"] == 1).all() and (state.info["episode_done"] == (end == LIMIT)).all()
-        assert (state.info["drawn_from"][1] == end // LIMIT).all()
-        begun = [(x.obs, x.pipeline_state.qpos, x.info["nav"].goal_xy_w, x.info["rng"]) for x in (state, first)]
-        jax.tree.map(np.testing.assert_array_equal, *begun)
-    np.testing.assert_array_equal(states[4].obs, auto[4].obs)  # as without, until the first episode ends
-    batch.retry, many = 0.5, 256
-    step, state = jax.jit(batch.step), jax.jit(batch.reset)(keys(1, many))
-    tries = []
-    for k in range(1, 4 * LIMIT + 1):
-        last, state = state, step(state, jnp.full((many, 2), 0.6))
-        if k % LIMIT == 0:
-            counted = np.asarray(state.info["episode_done"])
-            np.testing.assert_array_equal(counted, last.info["drawn_from"][1] == 0)
-            tries.append(np.asarray(state.info["drawn_from"][1]))
-    assert all(abs((new == old + 1).mean() - 0.5) < 0.16 for old, new in zip([0, *tries], tries, strict=False))  # 5 sd
-    assert all(((new == old + 1) | (new == 0)).all() for old, new in zip([0, *tries], tries, strict=False))
-
-
 def test_an_action_can_be_held_for_several_steps(env, auto):
     once, twice = auto, played(wrap_for_brax_training(env, 1000, action_repeat=2), 2, auto[0])
     for k in (1, 2):

@@ -108,6 +108,7 @@ def test_updates_equal_those_of_brax():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-5), mine, theirs)
 
 
+@pytest.mark.heavy
 def test_the_step_size_falls_in_equal_steps_to_its_final_value():
     def trained(**settings: Any) -> tuple[list[float], Any]:
         result = ALGORITHMS["ppo"].train(batched(), make_config(3, **settings), recorder := Recorder())
