@@ -144,7 +144,7 @@ def _draw_package(shapes: list[str], graph: Graph, package: str, x: int, y: int)
         right = x
         for room in sorted(room for room in rooms if level[room] == step):
             name = room.partition(".")[2]
-            wide = round(LETTER * len(name)) + 12
+            wide = round(LETTER * len(name)) + 18
             if right + wide > x + WIDE - 16:
                 right, y = x + 16, y + HIGH + 2
             shapes.append(f'<rect x="{right}" y="{y}" width="{wide}" height="{HIGH}" rx="4" class="room"/>')

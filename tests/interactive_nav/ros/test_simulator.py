@@ -1,10 +1,13 @@
 """A TurtleBot and a TTbot in a bare toy room of 6 x 4 m: pictures, scans, odometry and touches by hand."""
 
 import math
+import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rclpy.publisher import Publisher
+from std_msgs.msg import Bool
 
 import interactive_nav
 from interactive_nav.ros import nodes
@@ -129,3 +132,21 @@ def test_a_moment_that_nobody_answers_is_sent_again(monkeypatch):
     simulator._send({"clock": "tick", "image": image})
     assert simulator.answer(0, lambda: len(sent) >= 4) == (0.0, 0.0)
     assert sent == ["tick", image, image, image]
+
+
+def test_the_last_messages_have_time_whichever_way_a_node_ends(monkeypatch):
+    """All publishers share five seconds: here the first one's reader takes four of them, and the clock stands then."""
+    asked, slept, clock = [], [], [10.0]
+
+    def acknowledged(_, timeout):
+        asked.append(timeout.nanoseconds / 1e9)
+        clock[0] = 14.0
+
+    monkeypatch.setattr(Publisher, "wait_for_all_acked", acknowledged)
+    monkeypatch.setattr(nodes, "time", SimpleNamespace(monotonic=lambda: clock[0], sleep=slept.append))
+    with pytest.raises(SystemExit), nodes.ros_node("ends") as node:
+        for topic in ("one", "two"):
+            node.create_publisher(Bool, topic, 1)
+        sys.exit(3)
+    assert len(asked) >= 2 and asked == [5.0] + [1.0] * (len(asked) - 1)
+    assert slept == [1.0]
