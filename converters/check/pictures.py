@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw
 from scipy.ndimage import map_coordinates
 from scipy.spatial import ConvexHull
 from trimesh.intersections import slice_faces_plane
+from trimesh.triangles import nondegenerate
 
 from converters.generate.models.cad import LIBRARY, cad_model, tints
 from converters.generate.models.parts import MATERIALS
@@ -80,9 +81,10 @@ class Picture:
         faces = np.arange(len(points)).reshape(-1, 3)
         if one_sided:
             faces = faces[(unit_normals(points, faces) * (eye - points[::3])).sum(axis=1) > 0]
-        points, faces, uv = slice_faces_plane(points, faces, axes_w[:, 0], eye + NEAREST_M * axes_w[:, 0], uv)
-        if np.isfinite(below_m):
-            points, faces, uv = slice_faces_plane(points, faces, np.array([0, 0, -1]), np.array([0, 0, below_m]), uv)
+        cuts = [(axes_w[:, 0], eye + NEAREST_M * axes_w[:, 0]), (np.array([0, 0, -1]), np.array([0, 0, below_m]))]
+        for normal, at in cuts if np.isfinite(below_m) else cuts[:1]:
+            faces = faces[nondegenerate(points[faces], height=1e-6)]  # cutting a thinner one would make its uv NaN
+            points, faces, uv = slice_faces_plane(points, faces, normal, at, uv)
         if not len(faces):
             return
         depth, x, y = np.moveaxis((points[faces] - eye) @ axes_w, -1, 0)

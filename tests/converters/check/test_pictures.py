@@ -85,6 +85,18 @@ def test_a_face_seen_from_behind_is_left_out_where_sides_matter_and_none_above_t
         assert (hue(picture.image) == "r").sum() == count
 
 
+@pytest.mark.parametrize("width_m", [0.0, 1e-9, 1e-7])
+def test_the_cut_leaves_out_slivers_which_have_no_texture_coordinates(width_m):
+    """The walls are 200 pixels below the cut, with a sliver along the diagonal or without one."""
+    whole = wall(2.0, 1.0, plain(RED))
+    vertices = np.vstack([whole.vertices, whole.vertices[2] + [width_m, 0, 0]])
+    faces = np.vstack([whole.faces, [0, 2, 4]])
+    uv = np.concatenate([whole.corner_uv, np.zeros((1, 3, 2))])
+    picture = Picture(*ahead((40, 40), 20.0))
+    picture.draw(TexturedMesh(vertices, faces, uv, whole.texture), below_m=0.0)
+    assert (hue(picture.image) == "r").sum() == 200
+
+
 def test_a_floor_that_passes_under_the_eye_fills_the_lower_half():
     corners = np.array([[-50.0, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]])
     floor = dataclasses.replace(wall(0.0, 1.0, plain(RED)), vertices=corners)
