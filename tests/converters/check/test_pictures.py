@@ -8,6 +8,7 @@ import math
 import mujoco
 import numpy as np
 import pytest
+from trimesh.intersections import slice_faces_plane
 
 from converters.check.pictures import Picture, _taken, at_eye_height, from_the_south, world_surfaces
 from converters.records.raw import TexturedMesh
@@ -95,6 +96,14 @@ def test_the_cut_leaves_out_slivers_which_have_no_texture_coordinates(width_m):
     picture = Picture(*ahead((40, 40), 20.0))
     picture.draw(TexturedMesh(vertices, faces, uv, whole.texture), below_m=0.0)
     assert (hue(picture.image) == "r").sum() == 200
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_trimesh_still_cuts_slivers_into_nan():
+    """When this fails (trimesh's issue 1889), `nondegenerate` in `Picture.draw` can go."""
+    corners = np.array([[-1.0, 0, -1], [1, 0, 1], [1 + 1e-9, 0, 1]])
+    cut = slice_faces_plane(corners, np.array([[0, 1, 2]]), np.array([0, 0, -1.0]), np.zeros(3), np.zeros((3, 2)))
+    assert np.isnan(cut[2]).any()
 
 
 def test_a_floor_that_passes_under_the_eye_fills_the_lower_half():
