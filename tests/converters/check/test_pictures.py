@@ -92,6 +92,7 @@ def test_the_cut_leaves_out_slivers_which_have_no_texture_coordinates(width_m):
     whole = wall(2.0, 1.0, plain(RED))
     vertices = np.vstack([whole.vertices, whole.vertices[2] + [width_m, 0, 0]])
     faces = np.vstack([whole.faces, [0, 2, 4]])
+    assert whole.corner_uv is not None
     uv = np.concatenate([whole.corner_uv, np.zeros((1, 3, 2))])
     picture = Picture(*ahead((40, 40), 20.0))
     picture.draw(TexturedMesh(vertices, faces, uv, whole.texture), below_m=0.0)
@@ -102,8 +103,8 @@ def test_the_cut_leaves_out_slivers_which_have_no_texture_coordinates(width_m):
 def test_trimesh_still_cuts_slivers_into_nan():
     """When this fails (trimesh's issue 1889), `nondegenerate` in `Picture.draw` can go."""
     corners = np.array([[-1.0, 0, -1], [1, 0, 1], [1 + 1e-9, 0, 1]])
-    cut = slice_faces_plane(corners, np.array([[0, 1, 2]]), np.array([0, 0, -1.0]), np.zeros(3), np.zeros((3, 2)))
-    assert np.isnan(cut[2]).any()
+    _, _, uv = slice_faces_plane(corners, np.array([[0, 1, 2]]), np.array([0, 0, -1.0]), np.zeros(3), np.zeros((3, 2)))
+    assert np.isnan(np.asarray(uv)).any()
 
 
 def test_a_floor_that_passes_under_the_eye_fills_the_lower_half():
