@@ -83,7 +83,7 @@ class Picture:
             faces = faces[(unit_normals(points, faces) * (eye - points[::3])).sum(axis=1) > 0]
         cuts = [(axes_w[:, 0], eye + NEAREST_M * axes_w[:, 0]), (np.array([0, 0, -1]), np.array([0, 0, below_m]))]
         for normal, at in cuts if np.isfinite(below_m) else cuts[:1]:
-            faces = faces[nondegenerate(points[faces], height=1e-6)]  # cutting a thinner one would make its uv NaN
+            faces = faces[nondegenerate(points[faces], height=1e-6)]  # cutting a thinner one can make its uv NaN
             points, faces, uv = slice_faces_plane(points, faces, normal, at, uv)
         if not len(faces):
             return
