@@ -3,6 +3,9 @@
 import sys
 from pathlib import Path
 
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
+
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 project = "interactive-nav"
@@ -15,6 +18,7 @@ html_static_path = ["site.css", "site.js"]
 html_css_files = ["site.css"]
 html_js_files = [("site.js", {"defer": "defer"})]
 html_show_copyright = False
+html_math_renderer = "mathml"
 html_theme_options = {
     "light_css_variables": {
         "sidebar-caption-space-above": "0.5rem",
@@ -32,3 +36,14 @@ napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 suppress_warnings = ["ref.python"]
 """Fields of the same name in two records are distinguished by their place."""
+
+
+def formula(page, node):
+    """Write a formula as MathML, which browsers draw without a script, so that the site also works offline."""
+    page.body.append(tex2mathml(node.astext(), as_block=isinstance(node, nodes.math_block)))
+    raise nodes.SkipNode
+
+
+def setup(app):
+    """Register the renderer that `html_math_renderer` names."""
+    app.add_html_math_renderer("mathml", (formula, None), (formula, None))

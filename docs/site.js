@@ -6,6 +6,7 @@ for (const code of document.querySelectorAll("div:not(.highlight-text) > .highli
   button.onclick = async () => {
     await navigator.clipboard.writeText(code.querySelector("pre").textContent);
     button.textContent = "Copied";
+    setTimeout(() => (button.textContent = "Copy"), 2000);
   };
   code.append(button);
 }

@@ -22,6 +22,8 @@ from unittest.mock import patch
 
 import pytest
 from markdown_it import MarkdownIt
+from mdit_py_plugins.dollarmath import dollarmath_plugin
+from sphinx.application import Sphinx
 
 from interactive_nav.__main__ import PROGRAMS
 from interactive_nav.config import make_config
@@ -292,3 +294,35 @@ def test_words_of_a_sentence_are_counted():
 @pytest.mark.parametrize("page", [*PAGES, *GUIDES], ids=str)
 def test_sentences_are_short(page):
     assert words_a_sentence(page.read_text(encoding="utf-8")) <= 22
+
+
+def from_the_network(html: str) -> list[str]:
+    """Scripts, styles, pictures and frames that a page loads from elsewhere."""
+    return re.findall(r"<(?:script|link|img|source|iframe)\b[^>]*\s(?:src|href)=[\"']((?:https?:)?//[^\"']+)", html)
+
+
+def formulas(text: str) -> list[str]:
+    """TeX of a page's formulas."""
+    top = MarkdownIt().use(dollarmath_plugin).parse(text)
+    return [t.content for token in top for t in (token, *(token.children or ())) if t.type.startswith("math_")]
+
+
+@pytest.mark.filterwarnings("ignore:.*Check CHANGES for Sphinx API")  # of MyST's use of Sphinx
+def test_the_site_works_without_network(tmp_path):
+    docs, site = ROOT / "docs", tmp_path / "site"
+    left_out = {"exclude_patterns": ["_build", "api.md", "commands.md"]}  # these import or run every program
+    Sphinx(docs, docs, site, tmp_path / "trees", "html", left_out, status=None, warning=None).build()
+    pages = {page.name: page.read_text(encoding="utf-8") for page in site.glob("*.html")}
+    assert {name: found for name, html in pages.items() if (found := from_the_network(html))} == {}
+    sources = {f"{p.stem}.html": len(formulas(p.read_text(encoding="utf-8"))) for p in PAGES[1:]}
+    drawn = {name: len(re.findall(r"<math\b.*?</math>", html, re.DOTALL)) for name, html in pages.items()}
+    assert {name: count for name, count in drawn.items() if count} == {n: c for n, c in sources.items() if c}
+    # One half, which docutils reads as twelve over the parenthesis where its braces are left out.
+    assert re.search(r"<mfrac>\s*<mn>1</mn>\s*<mn>2</mn>\s*</mfrac>", pages["benchmark.html"])
+
+
+def test_a_page_that_loads_from_the_network_is_found():
+    cdn = "https://cdn.jsdelivr.net/npm/mathjax@4/tex-mml-chtml.js"
+    html = f'<script defer="defer" src="{cdn}"></script><script src="_static/site.js"></script><a href="{cdn}">a</a>'
+    assert from_the_network(html) == [cdn]
+    assert formulas("$a_1$ for `$S`\n\n```sh\necho $HOME $S\n```\n\n$$\nb\n$$\n") == ["a_1", "\nb\n"]
