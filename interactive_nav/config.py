@@ -41,11 +41,11 @@ class TaskRules(Settings):
     objects: tuple[str, ...] = ()
     """Folders of `python -m converters object`, relative to the current folder: they are the small objects in place of
     the built-in ones, in turn until there are num_objects."""
+    doors_shut: Annotated[tuple[float, float], Bounds(0, 1)] = (0.0, 0.0)
+    """How far the doors of rooms are shut at first: 0 as built, 1 at the end of their range that is farther away. Doors
+    that are built at an end stay there; the others are spread over this range, each the same in every episode."""
     k_int: NotNegative = 0.1
     """Interaction penalty per control step in which the robot touches a movable object."""
-    k_effort: NotNegative = 0.0
-    """For training: penalty per metre that objects move, times their mass over the robot's, and per second of contact
-    force, times the force over the robot's weight, as E_eff sums them."""
     success_reward: float = 10.0
     """Reward of reaching the goal."""
     episode_steps: AtLeastOne = 1000

@@ -256,8 +256,6 @@ class RunConfig(Settings):
     """Run folder (ppo or clone) whose best policy a new run starts from; critic and optimiser are new."""
     curriculum: tuple[NotNegative, NotNegative, Share] = (0.0, 0.0, 0.8)
     """Largest path from start to goal at first (m; 0: any), that from which any is drawn, success at which it grows."""
-    retry: Share = 0.0
-    """Probability that an episode that ran out of time starts again from the same state; scores count first tries."""
     devices: AtLeastOne = 1
     """Devices that share environments and minibatches, with a process per GPU; ppo only."""
     num_timesteps: AtLeastOne = 20_000_000

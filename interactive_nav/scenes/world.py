@@ -42,6 +42,10 @@ FEET = 12
 _FOOT_RADIUS_M = 2e-3
 _SOLID, _FLOOR, _CEILING = 1, 2, 4
 """Collision bits: bodies against each other, what can touch the floor, and flying robots against the ceiling."""
+AT_END_RAD = 0.03
+"""A door within this angle of an end of its range stands at that end."""
+GOLDEN = (math.sqrt(5) - 1) / 2
+"""Its multiples modulo 1 spread evenly over [0, 1)."""
 CEILING_M = 1.2
 """Height of the ceiling that flying robots meet: just below the tops of walls, which are cut above ground robots."""
 FLOOR_FRICTION = 0.05
@@ -271,10 +275,29 @@ def _parked(model: mujoco.MjModel, layout: Layout, robot: RobotSpec) -> tuple[in
     return first, qpos[first : first + layout.robot_nq]
 
 
-def _settle(model: mujoco.MjModel, first: int, parked: np.ndarray) -> np.ndarray:
-    """Return the rest configuration [nq]: furniture falls and slides to rest, with the robot parked (`_parked`)."""
+def _turned_doors(
+    slots: Sequence[Slot], index: int, layout: Layout, shares: tuple[float, float]
+) -> tuple[tuple[int, float], ...]:
+    """Return address in qpos and angle of a scene's doors; see `NavConfig.doors_shut`."""
+    placed = ((int(at), slot.bodies[index]) for at, slot in zip(layout.slot_qpos, slots, strict=True))
+    doors = ((at, body.joint) for at, body in placed if isinstance(body, Movable) and body.category == "door")
+    hinges = [(at, joint.range) for at, joint in doors if joint and joint.range and not joint.slides]
+    turned = [(at, max(ends, key=abs)) for at, ends in hinges if min(map(abs, ends)) > AT_END_RAD]
+    spread = np.interp(GOLDEN * (index + 7 * np.arange(len(turned))) % 1, (0, 1), shares)
+    return tuple((at, float(share) * end) for (at, end), share in zip(turned, spread, strict=True))
+
+
+def _settle(
+    model: mujoco.MjModel, first: int, parked: np.ndarray, turned: tuple[tuple[int, float], ...] = ()
+) -> np.ndarray:
+    """Return the rest configuration [nq]: furniture falls and slides to rest, with the robot parked (`_parked`).
+
+    `turned` has addresses in qpos and the positions that joints there start at.
+    """
     data, robot = mujoco.MjData(model), slice(first, first + len(parked))
     data.qpos[robot] = parked
+    for at, value in turned:
+        data.qpos[at] = value
     steps = math.ceil(_SETTLE_TIME_S / model.opt.timestep)
     iterations = model.opt.iterations
     model.opt.iterations = max(100, iterations)
@@ -304,7 +327,10 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
     models = [spec.compile() for spec in specs]
     layout = find_layout(models[0], robot, [(slot.name, slot.kind) for slot in slots])
     parked = _parked(models[0], layout, robot)
-    rest = for_each_home(_settle, [(model, *parked) for model in models], "settling homes")
+    calls: list[tuple] = [(model, *parked) for model in models]
+    if any(config.doors_shut):
+        calls = [(*call, _turned_doors(slots, i, layout, config.doors_shut)) for i, call in enumerate(calls)]
+    rest = for_each_home(_settle, calls, "settling homes")
     for scene, qpos in zip(scenes, rest, strict=True):
         if not np.isfinite(qpos).all():
             raise SceneError(f"{scene.path}: its furniture does not settle (non-finite); convert the scene again")

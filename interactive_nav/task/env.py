@@ -37,7 +37,7 @@ from interactive_nav.sensing.observation import waypoints_in_body
 from interactive_nav.sensing.sensors import Sensors
 from interactive_nav.task.dynamics import Dynamics
 from interactive_nav.task.privileged import PRIVILEGED_SIZE, privileged_state
-from interactive_nav.task.terms import EFFORT_TERM, HOOK_TERMS, TERMS, Moment, Step, Term
+from interactive_nav.task.terms import HOOK_TERMS, TERMS, Moment, Step, Term
 from interactive_nav.types import Detour, EpisodeStart, GoalField, NavInfo
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import matrix_from_quat
@@ -71,7 +71,7 @@ class InteractiveNav(Env):
         self.physics = make_physics(self.world, config)
         self.dynamics = Dynamics(config, robot)
         self.hook: Hook | None = self.physics.hook
-        terms = (*terms, *(HOOK_TERMS if self.hook else ()), *([EFFORT_TERM] if config.k_effort else ()))
+        terms = (*terms, *(HOOK_TERMS if self.hook else ()))
         observed = config.observations
         self.terms = (*(t for t in TERMS if t.kind != "observation" or t.name in observed), *terms)
         keys = [t.key for t in self.terms]

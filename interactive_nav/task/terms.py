@@ -193,14 +193,6 @@ def _dynamic_effort(memory: Any, step: Step) -> jax.Array:
     return _counts(step) * metrics.dynamic_effort(step.score_mass_kg, force_n, step.nav.step_count, gravity)
 
 
-def _effort(memory: Any, step: Step) -> jax.Array:
-    """Return [] -k_effort times the control step's part of both effort sums, divided by the robot's mass and weight."""
-    config, robot_kg = step.config, step.score_mass_kg
-    moved_m = step.nav.memory["object_path_m"] - step.last.memory["object_path_m"]
-    force_s = jnp.where(step.broken, 0.0, step.signals.force_n) * config.control_dt_s / config.score_gravity_m_s2
-    return -config.k_effort * (jnp.sum(masses_kg(step)[1:] * moved_m) + force_s) / robot_kg
-
-
 def _off_distance(memory: Any, step: Step) -> jax.Array:
     nav, config = step.nav, step.config
     near = jnp.linalg.norm(nav.start_xy_w - nav.goal_xy_w) < config.min_goal_distance_m - DISTANCE_TOLERANCE_M
@@ -296,7 +288,5 @@ HOOK_TERMS = (
            lambda step: _whole(step, step.physics.hook[0] == TORN)),
 )  # fmt: skip
 """The terms of a robot with a hook."""
-EFFORT_TERM = Term("effort", "-k_effort times moved mass (m) and force (s) over the robot's.", "reward", _effort)
-"""With `k_effort`."""
 EPISODE_METRICS = tuple(term.key for term in TERMS if term.kind == "metric")
 REWARD_TERMS = tuple(term.key for term in TERMS if term.kind == "reward")

@@ -165,10 +165,6 @@ class AutoResetEnv(Wrapper):
     curriculum: tuple[float, float, float] | None = None
     """First limit and last, and the success needed: see `Curriculum`, which `info["curriculum"]` then is. The score
     `curriculum_m` is the limit that an episode was drawn under."""
-    retry: float = 0.0
-    """Probability that an episode that ran out of time starts again from the same state.
-
-    `episode_done` is set where a first try ended: further tries are not scored, though a curriculum counts them."""
 
     def __init__(self, env: Any, action_repeat: int = 1, final_obs: bool = False):
         """Wrap an environment of one episode, or a wrapper of it.
@@ -190,8 +186,6 @@ class AutoResetEnv(Wrapper):
             first, scores = zero + self.curriculum[0], [*scores, "curriculum_m"]
             course["curriculum"] = Curriculum(first, first, zero, *self.curriculum[1:])  # type: ignore[call-arg]
             limit["limit_m"] = first
-        if self.retry:
-            course["drawn_from"] = rng, zero.astype(jnp.int32)
         state = reset_all(self.env, rng, slot, **limit)
         info = {
             **state.info,
@@ -226,14 +220,7 @@ class AutoResetEnv(Wrapper):
         total = state.info["running_reward"] + stepped.reward
         finished = {name: stepped.metrics[name] for name in self.env.metric_names}
         finished |= {"length": steps, "sum_reward": total}
-        course, limit, rng, counted = {}, {}, stepped.info["rng"], done
-        if self.retry:
-            keys, tries = state.info["drawn_from"]
-            chance = jax.vmap(lambda key, number: jax.random.uniform(jax.random.fold_in(key, number)))(keys, tries)
-            again, counted = (stepped.info["time_out"] > 0) & (chance < self.retry), done & (tries == 0)
-            rng = jnp.where(again[:, None], keys, rng)
-            tries = jnp.where(done, jnp.where(again, tries + 1, 0), tries)
-            course["drawn_from"] = jnp.where(done[:, None], rng, keys), tries
+        course, limit = {}, {}
         if self.curriculum:
             finished["curriculum_m"] = state.info["curriculum"].drawn_m
             course["curriculum"] = state.info["curriculum"].after(done, finished["success"])
@@ -241,7 +228,7 @@ class AutoResetEnv(Wrapper):
         last = state.info["episode_metrics"]
         episode_metrics = {name: jnp.where(done, finished[name], last[name]) for name in last}
 
-        moving = (stepped.pipeline_state, stepped.info["nav"], rng)
+        moving = (stepped.pipeline_state, stepped.info["nav"], stepped.info["rng"])
         physics, nav, rng = draw_where(self.env, moving, done, **limit)
         info = {
             **stepped.info,
@@ -249,7 +236,7 @@ class AutoResetEnv(Wrapper):
             "nav": nav,
             "rng": rng,
             "steps": steps,
-            "episode_done": counted.astype(stepped.done.dtype),
+            "episode_done": stepped.done,
             "running_reward": jnp.where(done, 0.0, total),
             "episode_metrics": episode_metrics,
         } | ({"final_obs": stepped.obs} if self.final_obs else {})

@@ -355,7 +355,6 @@ def learn(env: Any, config: TrainConfig, callbacks: Any) -> TrainResult:
     devices, privileged = devices_here(config.run.devices), config.network.critic_inputs == "privileged"
     batch = AutoResetEnv(PrivilegedEnv(env) if privileged else env)
     batch.curriculum = config.run.curriculum if config.run.curriculum[0] else None
-    batch.retry = config.run.retry
     return ALGORITHMS[config.algorithm].train(
         ShardedEnv(batch, devices) if len(devices) > 1 else batch, config, callbacks
     )

@@ -2,20 +2,24 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
 from interactive_nav.config import NavConfig, TaskRules
-from interactive_nav.navigation.tables import build_tables, furniture_map
+from interactive_nav.navigation.tables import build_tables, furniture_map, rest_poses
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes import objects
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import FEET, build_world, foot_points
 from interactive_nav_common.errors import UserError
+from interactive_nav_common.grids import clearance, label
 from scenes_mjcf.schema import SceneError, load_maps, save_maps
 from tests.toys import write_room
+
+ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture(scope="module")
@@ -169,6 +173,33 @@ def test_a_door_keeps_its_range_in_radians_and_swings(world):
         data.qfrc_applied[layout.slot_qvel[5]] = 4.0  # N m: 5 N at the leaf's edge
         mujoco.mj_step(model, data)
     assert data.qpos[layout.slot_qpos[5]] > 1.0
+
+
+def test_shut_doors_part_the_rooms():
+    # Packaged homes: alder's two doors close one room off, elm's three close two; both have doorways without a leaf.
+    homes = tuple(load_scene(ROOT / "scenes_mjcf" / name) for name in ("alder", "elm"))
+    worlds = {ends: build_world(get_robot("turtlebot"), homes, NavConfig.of(num_objects=0, doors_shut=ends))
+              for ends in ((0.0, 0.0), (1.0, 1.0), (0.2, 0.6))}  # fmt: skip
+    parts, shares = {}, []
+    for ends, world in worlds.items():
+        for k, home in enumerate(homes):
+            doors = [m.name for m in home.movables if m.category == "door"]
+            poses = rest_poses(world, k)
+            free = home.maps.traversable & ~furniture_map(home, {name: poses[name] for name in doors}, 0.4)
+            rooms = label(clearance(free, home.maps.resolution_m) > 0.15)[0]
+            sizes = np.bincount(rooms.ravel())[1:] * home.maps.resolution_m**2
+            parts[ends, home.name] = int((sizes > 5).sum())
+            at = [q for q, kind in zip(world.layout.slot_qpos, world.layout.slot_kind, strict=True) if kind == "hinge"]
+            ranges = [m.joint.range for m in home.movables if m.name in doors and m.joint and m.joint.range]
+            furthest = [max(map(abs, ends)) for ends in ranges]
+            angles = world.rest_qpos[k, at[: len(doors)]]
+            if ends == (0.2, 0.6):
+                shares += sorted(np.abs(angles) / np.mean(furthest))
+            else:
+                np.testing.assert_allclose(np.sort(np.abs(angles)), np.sort(furthest) * ends[0], atol=0.02)
+    assert parts == {((0.0, 0.0), "alder"): 1, ((0.0, 0.0), "elm"): 1, ((1.0, 1.0), "alder"): 2, ((1.0, 1.0), "elm"): 3,
+                     ((0.2, 0.6), "alder"): 1, ((0.2, 0.6), "elm"): 1}  # fmt: skip
+    assert len(shares) == 5 and 0.19 < min(shares) < 0.35 and 0.45 < max(shares) < 0.62
 
 
 def test_goals_and_starts_are_clear_of_furniture_and_walls(world, two_rooms):

@@ -349,20 +349,6 @@ def test_the_potential_goes_round_what_is_heavy_where_there_is_a_way(pushed, pap
     np.testing.assert_allclose(value(closed, "waypoints_b")[0, :, 1], 0.0, atol=1e-3)
 
 
-def test_a_reward_of_effort_adds_up_to_what_the_score_sums(pushed, paper):
-    env = make(pushed, k_effort=2.0)
-    states = play(env, [AHEAD] * 30)
-    memory, plain = states[-1].info["nav"].memory, play(make(pushed), [AHEAD] * 30)
-    moved_kg_m = MASS_KG * float(memory["object_path_m"][0].sum())
-    force_n_s, robot_kg = 0.1 * float(memory["force_sum_n"][0]), env.score_mass_kg
-    effort = np.array([float(s.metrics["reward/effort"][0]) for s in states[1:]])
-    assert moved_kg_m > 0.1 and force_n_s > 1.0 and (effort[:5] == 0).all() and (effort <= 0).all()
-    assert effort.sum() == pytest.approx(-2.0 * (moved_kg_m / robot_kg + force_n_s / (robot_kg * 9.81)), rel=1e-4)
-    rewards = [np.array([float(s.reward[0]) for s in each[1:]]) for each in (states, plain)]
-    np.testing.assert_allclose(rewards[0], rewards[1] + effort, atol=1e-5)
-    assert "reward/effort" not in paper[0].metrics
-
-
 def test_each_slot_keeps_its_scene(pushed, room):
     env = interactive_nav.make(
         "turtlebot", [pushed, room], backend="native", num_objects=0, episode_steps=3, scene_choice="slot"

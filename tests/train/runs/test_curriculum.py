@@ -15,7 +15,7 @@ import interactive_nav
 from interactive_nav.task.curriculum import Curriculum
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav_common.errors import ConfigError
-from tests.train.toy_env import ToyConfig, ToyEnv
+from tests.train.toy_env import ToyEnv
 from tests.train.toy_run import build_toy, toy_config
 from train.config import RunConfig, resolve
 from train.runs import checkpoint
@@ -81,43 +81,6 @@ def test_without_a_curriculum_a_batch_is_what_it_was(room):
     assert "curriculum" not in state.info and "curriculum_m" not in state.info["episode_metrics"]
     plain = jax.jit(jax.vmap(env.reset))(keys)
     jax.tree.map(np.testing.assert_array_equal, (state.obs, state.info["nav"]), (plain.obs, plain.info["nav"]))
-
-
-LIMIT = 4
-
-
-def retried(retry, many, episodes):
-    """Yield the states of a batch that stands still, so that every episode runs out of time: the first and each end."""
-    batch = AutoResetEnv(ToyEnv(ToyConfig(episode_steps=LIMIT)))
-    batch.retry = retry
-    step, state = jax.jit(batch.step), jax.jit(batch.reset)(jax.random.split(jax.random.PRNGKey(1), many))
-    yield state
-    for _ in range(episodes):
-        for _ in range(LIMIT):
-            state = step(state, jnp.zeros((many, 2)) - 1.0)
-        yield state
-
-
-def test_an_episode_that_ran_out_of_time_starts_again_and_is_scored_once():
-    first, *ends = retried(1.0, 4, 3)
-    for k, state in enumerate(ends, 1):
-        assert (state.info["time_out"] == 1).all() and (state.info["episode_done"] == (k == 1)).all()
-        assert (state.info["drawn_from"][1] == k).all()
-        begun = [(x.obs, x.info["nav"].goal_xy_w, x.info["nav"].yaw_rad, x.info["rng"]) for x in (state, first)]
-        jax.tree.map(np.testing.assert_array_equal, *begun)
-    other = list(retried(1e-9, 4, 1))[1]
-    assert np.abs(other.info["nav"].goal_xy_w - first.info["nav"].goal_xy_w).min() > 1e-3
-    assert (other.info["episode_done"] == 1).all() and (other.info["drawn_from"][1] == 0).all()
-
-
-def test_half_of_what_failed_starts_again():
-    before, *ends = (np.asarray(state.info["drawn_from"][1]) for state in retried(0.5, 1000, 4))
-    for tries in ends:
-        again = tries == before + 1
-        assert (again | (tries == 0)).all() and abs(again.mean() - 0.5) < 0.08  # 5 standard deviations
-        if before.any():
-            assert abs(again[before > 0].mean() - 0.5) < 0.13
-        before = tries
 
 
 def limit_m(result) -> float:
