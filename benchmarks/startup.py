@@ -16,12 +16,12 @@ PACKAGES = ("interactive_nav", "converters", "train.config_io", "topological_nav
 
 
 class Startup(Command):
-    """Measure how long programs take to print their help, and packages to be imported."""
+    """Measure how long programs take to print their help, and how long packages take to import."""
 
     repeats: AtLeastOne = 5
-    """Measurements of each, of which the best counts."""
+    """Number of measurements of each, of which the fastest counts."""
     out: Path = RESULTS / "startup.jsonl"
-    """Where rows are appended."""
+    """File to append rows to."""
 
 
 @reports_errors("benchmarks.startup")

@@ -313,32 +313,32 @@ def training(
 
 
 class Bench(Command):
-    """Measure env steps a second, and append rows."""
+    """Measure environment steps per second, and append a row for each measurement."""
 
     scenes: tuple[str, ...] = (SCENE,)
     """Scene folders."""
     robot: str = "turtlebot"
     """Name of the robot."""
     environment: Annotated[tuple[str, ...], option(name="set", metavar="KEY=JSON")] = ()
-    """Environment settings."""
+    """Environment setting to override, with its value as JSON."""
     backend: str = "auto"
     """Physics backend."""
     devices: AtLeastOne = 1
-    """Spread the environments over this many."""
+    """Number of devices to spread the environments over."""
     num_envs: tuple[AtLeastOne, ...] = (64,)
-    """Environments; a row each."""
+    """Numbers of environments to measure, one row each."""
     steps: AtLeastOne = 200
-    """Control steps of every environment."""
+    """Number of control steps of every environment."""
     mode: tuple[Literal["physics", "task", "observed", "simulation", "windows", "train"], ...] = ("simulation",)
-    """What to measure; a row each."""
+    """What to measure, one row each."""
     preset: str = "turtlebot_ppo"
-    """Of `python -m train`, for train."""
+    """Preset of `python -m train`, for --mode train."""
     learner: Annotated[tuple[str, ...], option(metavar="KEY=VALUE")] = ()
-    """Laid over the preset, for train."""
+    """Settings that override the preset, for --mode train."""
     commit: Annotated[str | None, option()] = None
-    """Recorded in the row (default: git's HEAD)."""
+    """Commit to record in the row (default: that of git's HEAD)."""
     out: Path = RESULTS / "steps_per_second.jsonl.gz"
-    """Where rows are appended."""
+    """File to append rows to."""
 
 
 @reports_errors("benchmarks.steps_per_second")

@@ -68,30 +68,28 @@ def alignment_table(rows: tuple[dict[str, Any], ...]) -> Table:
 
 
 class Convert(generating.OnCluster, segmenting.MeshFile, segmenting.WithLibrary, generating.Decomposing):
-    """Turn a raw scan with alignments into a scene folder: SRC OUT; or many: SRC... --into DIR, or @LIST --into DIR."""
+    """Convert a scan, drawing or home into a scene folder (SRC OUT), or several into one folder (SRC... --into DIR)."""
 
     places: Annotated[tuple[str, ...], *word("SRC OUT")] = ()
-    """Folder with the raw scan, or a mesh file, and the scene folder to write, whose name becomes the scene's; several
-    floors give OUT_0, OUT_1, ...; @LIST is a file of one SRC a line."""
+    """Raw folder or file, then the scene folder to write (OUT_0, ... for floors). @LIST is a file of one SRC a line."""
     settings: Words = ()
-    """structure_faces, object_faces (triangles drawn), structure_texture, object_texture (pixels)."""
+    """Override sizes: structure_faces, object_faces (triangles), structure_texture, object_texture (pixels)."""
     into: Annotated[Path | None, option(metavar="DIR")] = None
-    """Convert every SRC into a folder here, each in a process of its own, with a row in conversions.parquet; those that
-    exist with the same options and inputs are kept."""
+    """Convert each SRC into a folder of DIR and add a row to conversions.parquet. Up-to-date scenes are kept."""
     mirror: Flag = False
-    """Take -x for x in a mesh file."""
+    """Mirror a mesh file: replace x by -x."""
     root: Annotated[Path | None, option(metavar="DIR")] = None
-    """Of an MJCF or Gazebo home that names files outside of its folder: the folder that may be read."""
+    """Folder that may be read if an MJCF or Gazebo home names files outside its own folder."""
     split: Literal["train", "test"] = "train"
-    """Recorded in scene.json."""
+    """Split to record in scene.json."""
     jobs: Annotated[AtLeastOne, option(metavar="N")] = generating.CORES
-    """Decompositions side by side; with --into, sources."""
+    """Number of models to decompose in parallel; with --into, number of sources."""
     auto_align: Flag = False
-    """Also fit library models to labelled furniture that has no annotation."""
+    """Also fit CAD models to labelled furniture that has no annotation."""
     segment: Flag = False
-    """First label an unlabelled mesh file or Gibson folder by the network of segment; implies --auto-align."""
+    """First label an unlabelled mesh file or Gibson folder with the segmentation network; implies --auto-align."""
     annotations: Annotated[Path | None, option(metavar="JSON")] = None
-    """Alignments of annotate, in place of those of SRC; their models are of --library."""
+    """Alignments that `annotate` wrote, instead of those in SRC. --library contains their CAD models."""
 
     @property
     def source(self) -> Path:
@@ -166,12 +164,12 @@ class Convert(generating.OnCluster, segmenting.MeshFile, segmenting.WithLibrary,
 
 
 class Object(generating.ObjectConfig):
-    """Turn one mesh or URDF into a folder with a MuJoCo body."""
+    """Convert one mesh or URDF into a folder with a MuJoCo body."""
 
     source: Annotated[Path, *word("MESH_OR_URDF")]
-    """OBJ, PLY, STL, GLB, ... in metres, or a URDF."""
+    """Mesh (OBJ, PLY, STL, GLB, ...; in metres unless --scale is given) or URDF."""
     out: Annotated[Path, *word("OUT")]
-    """Folder to write; its name becomes the body's."""
+    """Folder to write. Its name becomes the body's name."""
 
     def run(self, console: Console) -> None:
         """Run the command."""
@@ -192,10 +190,10 @@ class Object(generating.ObjectConfig):
 
 
 class Check(generating.Command):
-    """Run the acceptance gates on a scene folder; exit with 1 if one fails."""
+    """Run the acceptance gates on a scene folder; the exit code is 1 if a gate fails."""
 
     scene: Annotated[Path, *word("SCENE_DIR")]
-    """Scene folder."""
+    """Scene folder to check."""
 
     def run(self, console: Console) -> int:
         """Run the command."""
@@ -216,14 +214,14 @@ class Check(generating.Command):
 
 
 class Preview(generating.Command):
-    """Draw a conversion's stages from above."""
+    """Draw the stages of a conversion from above."""
 
     scene: Annotated[Path, *word("SCENE_OR_OBJECT_DIR")]
-    """Folder of a scene or an object."""
+    """Folder of a scene or of an object."""
     output: Annotated[Path, option("-o", metavar="PNG")]
-    """The picture."""
+    """PNG file to write."""
     source: Annotated[Path | None, option(metavar="SRC")] = None
-    """Raw folder or file: draws scan and cut too."""
+    """Raw folder or file that the scene was converted from, to draw the scan and its cuts as well."""
 
     def run(self, console: Console) -> None:
         """Run the command."""
@@ -234,12 +232,12 @@ class Preview(generating.Command):
 
 
 class Export(generating.Command):
-    """Draw a scene for Sweet Home 3D, to edit it there and convert it again."""
+    """Export a scene as a Sweet Home 3D file, to edit it there and convert it again."""
 
     scene: Annotated[Path, *word("SCENE_DIR")]
-    """Scene folder."""
+    """Scene folder to export."""
     output: Annotated[Path, *word("HOME.sh3d")]
-    """File to write."""
+    """Sweet Home 3D file to write."""
 
     def run(self, console: Console) -> None:
         """Run the command."""

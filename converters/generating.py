@@ -36,9 +36,9 @@ class OnCluster(Command):
     """Base of the commands that can run on a cluster."""
 
     launcher: Literal["local", "ray"] = "local"
-    """This machine, or a Ray cluster."""
+    """Where to run: `local` is this machine, `ray` is a Ray cluster."""
     ray_address: Annotated[str | None, option(metavar="HOST:PORT")] = None
-    """Of the cluster's head (default: auto)."""
+    """Address of the Ray cluster's head node, with --launcher ray (default: auto)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -50,45 +50,45 @@ class Decomposing(Command):
     """Base of the commands that decompose models into hulls."""
 
     seed: int = 0
-    """Of the decomposition's search."""
+    """Random seed of the convex decomposition."""
     overwrite: Flag = False
     """Replace OUT if it exists."""
     strict: Flag = False
-    """Refuse what would be repaired with a warning."""
+    """Stop with an error where the converter would otherwise repair the input and print a warning."""
     timeout_s: Annotated[Positive, option(name="timeout", metavar="S")] = 240.0
-    """Seconds for the decomposition of one model before its convex hull is taken."""
+    """Time limit in seconds to decompose one model. If it is exceeded, the model's convex hull is used."""
 
 
 class ObjectConfig(Decomposing):
     """Choices of one object."""
 
     category: Annotated[str | None, option(metavar="NAME")] = None
-    """Category, a row of scenes_mjcf/categories.yaml (default: by the file's name, else other)."""
+    """Category, a row of scenes_mjcf/categories.yaml (default: guessed from the file name, otherwise other)."""
     mass_kg: Annotated[Positive | None, option(name="mass", metavar="KG")] = None
-    """Mass (default: the URDF's, else density x volume)."""
+    """Mass in kg (default: from the URDF, otherwise density times volume)."""
     friction: Annotated[Positive | None, option(metavar="MU")] = None
-    """Friction (default: the URDF's, else the category's)."""
+    """Friction coefficient (default: from the URDF, otherwise from the category)."""
     scale: Positive = 1.0
-    """Of a mesh that is not in metres."""
+    """Factor that converts the mesh's unit to metres, for example 0.01 for centimetres."""
     up: Literal["z", "y"] = "z"
-    """Axis of the mesh that points up; DAE files say it themselves."""
+    """Axis of the mesh that points up. DAE files name their own axis, which takes precedence."""
     within: Annotated[Path | None, option(metavar="DIR")] = None
-    """Folder that textures are read from (default: the model's folder)."""
+    """Folder that textures may be read from (default: the model's folder)."""
 
 
 class Generate(Command):
-    """Write a synthetic home in the raw Gibson layout."""
+    """Generate a synthetic home as a raw scan in the Gibson layout, which `convert` reads."""
 
     out: Annotated[Path, *word("OUT")]
     """Folder to create."""
     settings: Words = ()
-    """Settings of the tier's homes, such as floor_area_m2=80."""
+    """Override settings of the tier's homes, for example floor_area_m2=80."""
     seed: Annotated[int, option(metavar="N")]
-    """Same seed, same home. One that cannot be furnished takes another seed, which is printed."""
+    """Random seed. The same seed gives the same home. If it gives none, another seed is used and printed."""
     tier: str = "sparse"
-    """sparse, furnished or cluttered."""
+    """How full the home is: sparse, furnished or cluttered."""
     split: Literal["train", "test"] = "train"
-    """Whose CAD models."""
+    """Split whose CAD models furnish the home: the test models never occur in training homes."""
 
     def run(self, console: Console) -> None:
         """Run the command."""
@@ -106,25 +106,25 @@ class Generate(Command):
 
 
 class GenerateScenes(OnCluster):
-    """Generate, convert and draw the scenes of a recipe file, or homes of a tier; continue where it stopped."""
+    """Generate, convert and draw the homes of a recipe file or of a tier. The same command continues after a stop."""
 
     WRITES = ("{}/*",)
     out: Annotated[Path, *word("OUT")]
-    """Folder of scene folders; those that exist are kept."""
+    """Folder that contains the scene folders. Scenes that exist are kept."""
     recipes: Annotated[Path | None, option(metavar="YAML")] = None
-    """The recipe file (default: OUT/recipes.yaml)."""
+    """Recipe file to read (default: OUT/recipes.yaml)."""
     tier: Annotated[str | None, option(metavar="TIER")] = None
-    """Write OUT/recipes.yaml: sparse, furnished or cluttered homes."""
+    """Write OUT/recipes.yaml for homes of this tier: sparse, furnished or cluttered."""
     count: Annotated[AtLeastOne | None, option(metavar="N")] = None
-    """How many of a tier (default: 10)."""
+    """Number of homes to generate, with --tier (default: 10)."""
     seed: Annotated[int | None, option(metavar="N")] = None
-    """Of a tier's first home (default: 100000)."""
+    """Random seed of the first home, with --tier; each further home adds 1 (default: 100000)."""
     only: Annotated[tuple[str, ...], option(metavar="NAME")] = ()
-    """Scenes to generate (default: all)."""
+    """Names of the scenes to generate (default: all)."""
     overwrite: Flag = False
-    """Generate those again that exist."""
+    """Also generate scenes that exist, and replace them."""
     jobs: Annotated[AtLeastOne, option(metavar="N")] = CORES
-    """Scenes side by side."""
+    """Number of scenes to generate in parallel."""
 
     def run(self, console: Console) -> int:
         """Run the command."""
@@ -141,12 +141,12 @@ class GenerateScenes(OnCluster):
 
 
 class MakeScenes(Command):
-    """Generate them in the cache folder, where every program looks for them, and compare their digests."""
+    """Generate named homes in the cache folder, where every program finds them, and check their digests."""
 
     names: Annotated[tuple[str, ...], *word("NAME")]
-    """Scenes (alder, cluttered_003), sets (cluttered) or splits of them (furnished/test)."""
+    """Scenes (alder, cluttered_003), sets (cluttered) or splits of sets (furnished/test) to generate."""
     jobs: Annotated[AtLeastOne, option(metavar="N")] = CORES
-    """Scenes side by side."""
+    """Number of scenes to generate in parallel."""
 
     def run(self, console: Console) -> int:
         """Run the command."""
@@ -158,7 +158,7 @@ class MakeScenes(Command):
 
 
 class ListScenes(Command):
-    """List the scenes that are here, and those that can be generated: set, split, name, place."""
+    """List the set, split, name and folder of every home that is installed or can be generated."""
 
     def run(self, console: Console) -> None:
         """Run the command."""
@@ -177,12 +177,12 @@ class ListScenes(Command):
 
 
 class Models(Command):
-    """Draw the CAD models that generated buildings are furnished with."""
+    """Draw the CAD models that furnish generated homes."""
 
     names: Annotated[tuple[str, ...], *word("NAME")] = ()
-    """Models or categories (default: all models)."""
+    """Models or categories to draw (default: all models)."""
     output: Annotated[Path, option("-o", metavar="PNG")]
-    """The picture."""
+    """PNG file to write."""
 
     def run(self, console: Console) -> None:
         """Run the command."""
@@ -196,13 +196,13 @@ class Get(Command):
     """Fetch the furniture libraries of Sweet Home 3D."""
 
     name: Annotated[Literal["sweethome3d"], *word("NAME")]
-    """Which libraries."""
+    """Libraries to fetch."""
     given: Annotated[Path | None, option(name="from", metavar="FILE.deb|DIR")] = None
-    """Read them from here (default: apt-get downloads them)."""
+    """Debian package, or folder of .sh3f files, to read (default: apt-get downloads the package)."""
     out: Annotated[Path | None, option("-o", metavar="DIR")] = None
-    """Folder for them (default: the cache folder)."""
+    """Folder to write the libraries to (default: the cache folder)."""
     overwrite: Flag = False
-    """Replace what was fetched before."""
+    """Replace libraries that were fetched before."""
 
     def run(self, console: Console) -> None:
         """Run the command."""
@@ -214,15 +214,15 @@ class Get(Command):
 
 
 class Build(Command):
-    """Rebuild the packaged selection: models.zip and ATTRIBUTION.md."""
+    """Rebuild the packaged selection of furniture: models.zip and ATTRIBUTION.md."""
 
     WRITES = ("{}/*",)
     out: Annotated[Path, *word("OUT")]
-    """Folder for both files."""
+    """Folder to write both files to."""
     given: Annotated[Path | None, option(name="from", metavar="DIR")] = None
-    """Folder of the .sh3f files (default: as fetched)."""
+    """Folder that contains the .sh3f files (default: the folder that `library get` writes)."""
     jobs: Annotated[AtLeastOne, option(metavar="N")] = CORES
-    """Models side by side."""
+    """Number of models to process in parallel."""
 
     def run(self, console: Console) -> None:
         """Run the command."""
@@ -238,7 +238,7 @@ class Build(Command):
 
 
 class ListModels(Command):
-    """List the packaged models, with size and credit."""
+    """List the packaged models with their category, size and credits."""
 
     def run(self, console: Console) -> None:
         """Run the command."""

@@ -25,7 +25,7 @@ from converters.generate.models.cad import MODELS
 from converters.pipeline import ConvertConfig, Converted, convert
 from converters.records.errors import StageFailed
 from interactive_nav_common.config import Natural, nearest
-from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import check_name, part_folder, publish
 from interactive_nav_common.records import Reader
 from interactive_nav_common.untrusted.reading import read_bytes
@@ -190,8 +190,8 @@ def _generated(recipe: SceneRecipe, config: ConvertConfig, work: Path, report: R
 
 def make_scene(
     recipe: SceneRecipe, conversion: dict[str, Any], folder: Path, jobs: int, report: Report
-) -> tuple[list[str], str]:
-    """Generate, convert and draw one scene; return the names of the gates that fail, and its seed in words.
+) -> tuple[list[str], str, str]:
+    """Generate, convert and draw one scene; return the failed gates, its seed in words, and why it has no preview.
 
     `folder` is replaced atomically. `conversion` are settings of `ConvertConfig`, `jobs` parallel decompositions.
     """
@@ -199,10 +199,14 @@ def make_scene(
         config = ConvertConfig(format="gibson", split=recipe.split, jobs=jobs, keep=False, **conversion)
         (result, seed), scene = _generated(recipe, config, work, report), work / recipe.name
         report("drawing", GENERATE + CONVERT)
-        preview(scene, scene / "preview.png")
+        undrawn, again = "", f"python -m converters preview {folder} -o {folder / 'preview.png'}"
+        try:
+            preview(scene, scene / "preview.png")
+        except (ValueError, ArithmeticError, LookupError, RuntimeError, UserError) as error:  # the scene itself is fine
+            undrawn = f"; no preview: {type(error).__name__}: {' '.join(str(error).split())}; try again with '{again}'"
         publish({scene: folder})
     report("done", 1.0)
-    return [g.name for g in result.gates if not g.passed], seed
+    return [g.name for g in result.gates if not g.passed], seed, undrawn
 
 
 def chosen(
@@ -241,7 +245,7 @@ def make_scenes(
             log(f"{recipe.name}: {KEPT}")
             continue
         try:
-            failed[recipe.name], seed = make_scene(recipe, conversion, out / recipe.name, jobs, inner)
+            failed[recipe.name], seed, undrawn = make_scene(recipe, conversion, out / recipe.name, jobs, inner)
         except (GenerationError, StageFailed) as error:
             if len(todo) == 1:
                 raise
@@ -249,5 +253,5 @@ def make_scenes(
             log(f"{recipe.name}: {str(error).removeprefix(f'{recipe.name}: ')}")
             continue
         verdict = f"gates that fail: {', '.join(failed[recipe.name])}" if failed[recipe.name] else "every gate passes"
-        log(f"{recipe.name}: {recipe.split}, {seed}, {verdict}")
+        log(f"{recipe.name}: {recipe.split}, {seed}, {verdict}{undrawn}")
     return failed

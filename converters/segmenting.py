@@ -38,18 +38,18 @@ class MeshFile(Command):
     """Base of the commands that read mesh files."""
 
     up: Up = "auto"
-    """Axis of a mesh file that points up."""
+    """Axis of the mesh file that points up; auto determines it from the mesh."""
     unit: Unit = "auto"
-    """Of a mesh file."""
+    """Length unit of the mesh file; auto determines it from the height of a storey."""
 
 
 class WithLibrary(Command):
     """Base of the commands that fit library models."""
 
     format: Format = "auto"
-    """Layout of SRC; auto: by its files."""
+    """Layout of SRC; auto detects it from the files."""
     library: Annotated[Path | None, option(metavar="DIR")] = None
-    """Folder with cad/ that models are from (default: SRC, else the packaged furniture)."""
+    """Folder whose cad/ contains CAD models (default: SRC if it has a cad/, otherwise the packaged furniture)."""
 
 
 def _beside(source: Path, ending: str) -> Path:
@@ -73,12 +73,12 @@ def _read(arguments: Any) -> Any:
 
 
 class Segment(MeshFile):
-    """Label an unlabelled scan by a network, for propose and convert."""
+    """Label an unlabelled scan with the segmentation network, as input for `propose` and `convert`."""
 
     source: Annotated[Path, *word("SRC")]
-    """A mesh file, or a folder of layout gibson."""
+    """Mesh file, or folder in the Gibson layout."""
     weights: Annotated[Path | None, option(metavar="FILE")] = None
-    """weights.safetensors of a training (default: the packaged ones)."""
+    """Weights file of a training run, weights.safetensors (default: the packaged weights)."""
     overwrite: Flag = False
     """Replace labels that exist."""
     output: Annotated[Path | None, Suppress] = None
@@ -158,12 +158,12 @@ def _label(arguments: Any, target: Path, weights: Path | None, console: Console)
 
 
 class SegmentTrain(Command):
-    """Train the network of segment on generated buildings."""
+    """Train the segmentation network on generated buildings."""
 
     out: Annotated[Path, *word("OUT")]
-    """Folder of the run; one that exists is continued."""
+    """Folder of the training run. A run that exists is continued."""
     settings: Words = ()
-    """Settings of the training, such as steps=1000; see SegmentConfig."""
+    """Override settings of the training, for example steps=1000. `SegmentConfig` documents them."""
 
     def run(self, console: Console) -> None:
         """Run the command."""
@@ -177,14 +177,14 @@ class SegmentTrain(Command):
 
 
 class SegmentScore(Command):
-    """Score the network on labelled scans and generated buildings."""
+    """Score the segmentation network on labelled scans and on generated buildings."""
 
     sources: Annotated[tuple[Path, ...], *word("SRC")] = ()
-    """Labelled scans."""
+    """Labelled scans to score."""
     homes: Annotated[AtLeastOne | None, option(metavar="N")] = None
-    """Score whole generated buildings too, so many."""
+    """Number of generated buildings to score in addition."""
     weights: Annotated[Path | None, option(metavar="FILE")] = None
-    """weights.safetensors of a training (default: the packaged ones)."""
+    """Weights file of a training run, weights.safetensors (default: the packaged weights)."""
 
     def run(self, console: Console) -> None:
         """Run the command."""
@@ -239,15 +239,15 @@ def proposal_tables(proposed: Any) -> Iterator[Table]:
 
 
 class Propose(WithLibrary):
-    """Find furniture in a labelled scan; JSON in Scan2CAD's shape and PNG."""
+    """Find furniture in a labelled scan; write proposals.json, in the format of Scan2CAD, and a picture."""
 
     WRITES = ("{}/proposals.*",)
     source: Annotated[Path, *word("SRC")]
-    """Folder with the raw scan, or a mesh file."""
+    """Folder of the raw scan, or mesh file."""
     output: Annotated[Path, option("-o", metavar="DIR")]
-    """Folder for the two files."""
+    """Folder to write proposals.json and proposals.png to."""
     auto_align: Flag = False
-    """Also pick model and pose, and compare with annotations."""
+    """Also select a CAD model and its pose for each proposal, and compare them with annotations."""
 
     def run(self, console: Console) -> None:
         """Run the command."""
@@ -266,17 +266,17 @@ class Propose(WithLibrary):
 
 
 class Annotate(MeshFile, WithLibrary):
-    """Say in the browser which models stand where: proposals, models, pairs of points."""
+    """Place CAD models in a scan by hand, in the browser: accept proposals, choose models, match pairs of points."""
 
     WRITES = ("{}/*.json",)
     source: Annotated[Path, *word("SRC")]
-    """Folder with the raw scan, or a mesh file."""
+    """Folder of the raw scan, or mesh file."""
     output: Annotated[Path, option("-o", metavar="DIR")]
-    """Folder of one person's work; one that exists is continued."""
+    """Folder for one person's annotations. Work in a folder that exists is continued."""
     host: Annotated[str, option(metavar="ADDRESS")] = "127.0.0.1"
-    """Address to listen on; any other than this machine's needs a token, which is printed."""
+    """Address to listen on. Addresses that other machines reach need a token, which is printed."""
     port: int = 8080
-    """0: any that is free."""
+    """TCP port to listen on; 0 selects a free one."""
 
     def run(self, console: Console) -> int:
         """Run the command."""

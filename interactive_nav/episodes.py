@@ -252,22 +252,22 @@ def load_episode_files(paths: Sequence[str | Path]) -> tuple[EpisodeFile, str]:
 
 
 class Make(Command):
-    """Draw episodes and write them to a file."""
+    """Draw random episodes and write them to a file."""
 
     scenes: Annotated[tuple[str, ...], option(metavar="SCENE_DIR")]
-    """Scene folders."""
+    """Scene folders in which episodes take place."""
     out: Annotated[str, option("-o", metavar="FILE")]
-    """The file."""
+    """Episode file to write."""
     robot: Annotated[str, option(metavar="NAME|FILE")] = "turtlebot"
-    """A name, a URDF or MJCF file, or path.py:function."""
+    """Robot: a name, a URDF or MJCF file, or path.py:function."""
     episodes: int = 100
-    """How many."""
+    """Number of episodes."""
     seed: int = 0
-    """Of the episodes."""
+    """Random seed of the episodes."""
     num_objects: int = 10
-    """Small objects."""
+    """Number of small objects in each episode."""
     objects: Annotated[tuple[str, ...], option(metavar="OBJECT_DIR")] = ()
-    """Folders of small objects (default: the built-in ones)."""
+    """Folders of small objects to use (default: the built-in ones)."""
 
 
 COMMANDS = {"make": Make}

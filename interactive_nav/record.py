@@ -235,19 +235,19 @@ class Picture(Command):
     """Make a video of an episode."""
 
     episode: Natural = 0
-    """Which of the fixed episodes."""
+    """Number of the fixed episode, starting at 0."""
     policy: str = "learned"
-    """A policy of `train.evaluate`."""
+    """Policy that drives, named as in `python -m train.evaluate`."""
     out: Annotated[Path, option("-o", metavar="PATH")] = Path("episode.mp4")
-    """The video: .mp4, .gif or .webp."""
+    """Video file to write (.mp4, .gif or .webp)."""
     rerun: Annotated[Path | None, option(metavar="FILE.rrd")] = None
-    """Write a Rerun recording instead."""
+    """Write a Rerun recording to this file instead of a video."""
     height: int = 360
-    """Rows of the view from behind."""
+    """Height of the view from behind in pixels, a multiple of 12 from 120 on."""
     views: Annotated[tuple[Literal["eye", "follow", "above"], ...], option()] = ()
-    """Textured views, side by side, instead."""
+    """Textured views to show side by side, instead of the default layout."""
     every: AtLeastOne = 1
-    """Control steps from one frame to the next."""
+    """Number of control steps between two frames."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -283,10 +283,10 @@ class Picture(Command):
 
 
 class Record(Picture):
-    """Make a video of an episode."""
+    """Make a video of an episode from its replay."""
 
     replay: Annotated[Path, *word("REPLAY")]
-    """A replay (.npz), or a run folder that holds the episode's."""
+    """Replay file (.npz), or run folder that contains the replay of the episode."""
 
     def source(self, console: Console) -> Path:
         if self.replay.suffix == ".npz":

@@ -166,16 +166,16 @@ def _files(sources: Sequence[str]) -> list[Path]:
 
 
 class TopDown(Command):
-    """Draw episodes from above."""
+    """Draw recorded episodes from above."""
 
     replays: Annotated[tuple[Path, ...], *word("REPLAY")]
-    """Replay files, or run folders that hold replays."""
+    """Replay files (.npz), or run folders that contain replays."""
     out: Annotated[Path, option("-o", metavar="PATH")] = Path("topdown.png")
-    """The picture."""
+    """Picture to write."""
     colour_by: Literal["time", "contact"] = "time"
-    """Colour of the path."""
+    """What the colour of the path shows: the time, or contact with objects."""
     columns: AtLeastOne = 3
-    """Panels in a row."""
+    """Number of panels in a row."""
 
 
 @reports_errors("interactive_nav.topdown")

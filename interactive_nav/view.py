@@ -178,26 +178,26 @@ def open_browser(model: mujoco.MjModel, data: mujoco.MjData, host: str, port: in
 
 
 class View(Command):
-    """Look at a scene."""
+    """Look at a scene in a window or in the browser."""
 
     scene: Annotated[Path, *word("SCENE")]
     """Scene folder."""
     robot: Annotated[str, option(metavar="NAME|FILE")] = "turtlebot"
-    """Robot to put in: a name, a URDF or MJCF file, path.py:function, or none."""
+    """Robot to place: a name, a URDF or MJCF file, path.py:function, or none."""
     objects: int = 10
-    """Small objects."""
+    """Number of small objects to place."""
     small_objects: Literal["train", "test"] = "train"
-    """Whose models they are."""
+    """Split that the small objects come from."""
     seed: int = 0
-    """Of their places."""
+    """Random seed of the objects' places."""
     view: Literal["whole", "follow", "eye"] = "whole"
-    """Free, and first at the robot or the whole scene; or from behind the robot, 1.8 or 1.5 m up."""
+    """Camera: whole moves freely; follow and eye stay behind the robot, 1.8 m and 1.5 m above the floor."""
     viewer: Literal["auto", "window", "browser"] = "auto"
-    """auto: a window where there is a screen."""
+    """Viewer to open; auto opens a window if there is a screen, otherwise the browser."""
     host: Annotated[str, option(metavar="ADDRESS")] = "127.0.0.1"
-    """Address that the browser's viewer listens on; any other than this machine's needs a token, which is printed."""
+    """Address of the browser's viewer. Addresses that other machines reach need a token, which is printed."""
     port: int = 8080
-    """Of the browser's viewer."""
+    """TCP port of the browser's viewer."""
 
     @classmethod
     def epilog(cls) -> str:

@@ -132,7 +132,8 @@ def listing(prog: str, commands: Mapping[str, str]) -> str:
 
 
 def _summary(command: Any) -> str:
-    return ", ".join(command) if isinstance(command, Mapping) else " ".join(str(inspect.getdoc(command)).split())
+    words = f"Commands: {', '.join(command)}." if isinstance(command, Mapping) else str(inspect.getdoc(command))
+    return " ".join(words.split())
 
 
 def _union(commands: Any) -> Any:

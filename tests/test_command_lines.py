@@ -35,7 +35,7 @@ def shown(program: str) -> str:
     }
     text = "\n".join(f"$ {words} --help\n{text}" for words, text in kept.items())
     text = "".join(f"{line.rstrip()}\n" for line in text.splitlines() if line.strip(" -"))  # without frames
-    return re.sub(r"(Scenes|Models|sources\.|Decompositions)([^()]*)\(default: \d+\)", r"\1\2(default: cores)", text)
+    return re.sub(r"(in parallel|of sources)\.([^()]*)\(default: \d+\)", r"\1.\2(default: cores)", text)
 
 
 def answer(command: str) -> str:

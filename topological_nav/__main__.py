@@ -25,7 +25,7 @@ class Listed(Command):
     LISTED: ClassVar[dict[str, Any]]
     """Name of a group of settings -> their defaults."""
     settings: Words = ()
-    """Change settings, listed below; preset=report takes those of the report (topological_nav/presets.yaml) first."""
+    """Override settings, listed below. preset=report first applies the report's (topological_nav/presets.yaml)."""
 
     @classmethod
     def epilog(cls) -> str:
@@ -37,9 +37,9 @@ class UsesNetworks(Listed):
     """Base of the commands that use networks."""
 
     localiser: Annotated[Path | None, option(metavar="RUN")] = None
-    """Network that embeds images (default: a trained one, else the packaged)."""
+    """Run folder of the network that embeds images (default: a trained one, otherwise the packaged one)."""
     detector: Annotated[Path | None, option(metavar="RUN")] = None
-    """Network that judges passages (default: as the localiser)."""
+    """Run folder of the network that detects passages (default: chosen like the localiser)."""
 
 
 class _Driving(UsesNetworks):
@@ -47,27 +47,27 @@ class _Driving(UsesNetworks):
 
     LISTED = {"": configs.EvaluationConfig()}
     maps: Annotated[Path | None, option(metavar="DIR")] = None
-    """Folder of SCENE.npz (default: maps beside the networks, built where missing)."""
+    """Folder of maps, SCENE.npz (default: maps beside the networks; missing maps are built)."""
     policy: Annotated[str | None, option(metavar="RUN")] = None
-    """Local policy (default: the networks', if none is named); passage: ahead while the detector agrees, else turn."""
+    """Local policy: a run folder, or passage, a rule without learning (default: the networks', if you name none)."""
     domain: Annotated[str, option(metavar="NAME")] = "clean"
-    """Camera, goals included: clean, lens, light, noise, blur or camera; `adapt map` builds maps of its images."""
+    """Camera of all images: clean, lens, light, noise, blur or camera. `adapt map` builds maps for a domain."""
     truth: Flag = False
-    """Build maps from the plan, and replace both networks by the truth."""
+    """Build maps from the floor plan, and replace both networks by the ground truth."""
 
 
 class Data(Listed):
-    """Render room and passage images of scenes, or drives of the expert, or import photographs."""
+    """Render images of rooms and passages, record drives of the expert, or import photographs."""
 
     LISTED = {"": configs.DataConfig(), " of drives": configs.DriveConfig()}
     scenes: Annotated[tuple[str, ...], *word("SCENE")] = ()
-    """Scene folders or sets of them; with photographs, the one that they were taken in, if any."""
+    """Scene folders or sets; with --photographs, the scene that they were taken in, if it exists."""
     photographs: Annotated[Path | None, option(metavar="PATH")] = None
-    """Folder of photographs, with where they were taken in photographs.csv; or a ROS 2 bag, which becomes one."""
+    """Folder of photographs, with their poses in photographs.csv, or a ROS 2 bag to make one from."""
     drives: Flag = False
-    """Drive through the scenes, and render what the robot sees."""
+    """Let the expert drive through the scenes, and render what the robot sees."""
     out: Annotated[Path | None, option("-o", metavar="DIR")] = None
-    """The dataset."""
+    """Dataset folder to write (default: runs/topological/data, or .../drives with --drives)."""
 
 
 class Train(UsesNetworks):
@@ -75,13 +75,13 @@ class Train(UsesNetworks):
 
     LISTED = {"": configs.TASKS["rooms"], " of policy": configs.PolicyConfig()}
     task: Annotated[Literal["rooms", "passages", "policy"], *word("TASK")]
-    """What to train: rooms, passages (whose defaults differ: batch=32 epochs=20 hidden=0) or policy."""
+    """What to train: rooms, passages (with defaults batch=32 epochs=20 hidden=0) or policy."""
     data: Annotated[tuple[Path, ...], option(metavar="DIR")] = ()
-    """The dataset; policy: one or more folders of drives."""
+    """Dataset folder; for policy, one or more folders of drives."""
     grid: Flag = False
-    """policy: train with several pairs of alpha and lambda."""
+    """For policy: train with several pairs of alpha and lambda."""
     out: Annotated[Path | None, option("-o", metavar="DIR")] = None
-    """Run folder."""
+    """Run folder to write (default: runs/topological/TASK)."""
 
 
 class Map(UsesNetworks):
@@ -91,9 +91,9 @@ class Map(UsesNetworks):
     scene: Annotated[Path, *word("SCENE")]
     """Scene folder."""
     out: Annotated[Path | None, option("-o", metavar="PATH")] = None
-    """The map."""
+    """Map file to write, .npz (default: SCENE.npz beside the networks)."""
     route: Annotated[tuple[int, int] | None, option(metavar="FROM TO")] = None
-    """Draw the route between two nodes."""
+    """Numbers of two nodes to draw the route between."""
 
 
 class Explore(_Driving):
@@ -102,7 +102,7 @@ class Explore(_Driving):
     scene: Annotated[str, *word("SCENE")]
     """Scene folder."""
     out: Annotated[Path, option("-o", metavar="DIR")] = RUNS / "maps-explored"
-    """Folder of the map, for `--maps`; with --truth the map has no images and serves no navigation."""
+    """Folder to write the map to. With --truth the map has no images, so navigation cannot use it."""
 
 
 class Navigate(_Driving):
@@ -111,26 +111,26 @@ class Navigate(_Driving):
     scene: Annotated[str, *word("SCENE")]
     """Scene folder."""
     episode: Annotated[int, option(metavar="N")] = 0
-    """Number of the scene's episode."""
+    """Number of the scene's episode, starting at 0."""
     sparse: Flag = False
-    """Use the thinned map."""
+    """Use the thinned map, which has fewer nodes."""
     out: Annotated[Path | None, option("-o", metavar="PATH")] = None
-    """The picture."""
+    """Picture to write (default: in runs/topological/navigate)."""
     video: Annotated[Path | None, option(metavar="PATH")] = None
-    """Film it as well (.mp4), ten times as fast."""
+    """Also write a film to this .mp4 file, at ten times the real speed."""
 
 
 class Evaluate(_Driving):
     """Play fixed episodes of scenes and score them."""
 
     scenes: Annotated[tuple[str, ...], *word("SCENE")]
-    """Scene folders or sets of them."""
+    """Scene folders or sets."""
     contenders: Annotated[str | None, option(metavar="NAME,...")] = None
-    """dense, sparse (the navigator on its map and on the thinned map), expert, ppo (default: all that can)."""
+    """Navigator on its map (dense) or on the thinned map (sparse), expert, ppo (default: all that are available)."""
     ppo: Annotated[Path | None, option(metavar="RUN")] = None
-    """Run folder of `python -m train`, whose policy knows where the goal is."""
+    """Run folder of `python -m train`. Its policy knows where the goal is."""
     out: Annotated[Path, option("-o", metavar="DIR")] = RUNS / "evaluation"
-    """Rows and figures."""
+    """Folder to write rows and figures to."""
 
 
 class Adapt(UsesNetworks):
@@ -138,55 +138,55 @@ class Adapt(UsesNetworks):
 
     LISTED = {"": AdaptConfig()}
     what: Annotated[Literal["features", "passages", "map"], *word("WHAT")]
-    """The embedding, adversarially; the passage detector, in configurations A to D; or a map of the domain's images."""
+    """What to adapt: features (by adversarial training), passages (in configurations A to D), or map."""
     scene: Annotated[Path | None, *word("SCENE")] = None
-    """map: scene folder; may be left out with photographs."""
+    """For map: scene folder. You can omit it with photographs."""
     data: Annotated[Path | None, option(metavar="DIR")] = None
-    """The source's dataset."""
+    """Dataset of the source domain."""
     target: Annotated[Path | None, option(metavar="DIR")] = None
-    """Dataset of the target (default: the source's)."""
+    """Dataset of the target domain (default: that of the source)."""
     out: Annotated[Path | None, option("-o", metavar="PATH")] = None
-    """Folder of the networks, or the map."""
+    """Folder to write the networks to, or map file to write (default: in runs/topological/adapted)."""
 
 
 class Export(Listed):
-    """Write finished runs as a small folder of weights in half precision, or as ONNX files."""
+    """Export finished runs as a small folder of weights in half precision, or as ONNX files."""
 
     LISTED = {"": configs.ExportConfig()}
     localiser: Annotated[Path, option(metavar="RUN")] = RUNS / "rooms"
-    """Network that embeds images."""
+    """Run folder of the network that embeds images."""
     detector: Annotated[Path, option(metavar="RUN")] = RUNS / "passages"
-    """Network that judges passages."""
+    """Run folder of the network that detects passages."""
     policy: Annotated[Path | None, option(metavar="RUN")] = None
-    """Local policy."""
+    """Run folder of the local policy."""
     onnx: Flag = False
     """Write rooms.onnx, passages.onnx and policy.onnx instead."""
     maps: Annotated[Path | None, option(metavar="DIR")] = None
-    """Folder of SCENE.npz, all of which are exported."""
+    """Folder of maps, SCENE.npz, all of which are exported."""
     images: Annotated[Path, option(metavar="PATH")] = DATASET
-    """Dataset or scene whose images compare the networks."""
+    """Dataset or scene on whose images the runs and their exports are compared."""
     out: Annotated[Path, option("-o", metavar="DIR")] = RUNS / "export"
-    """The folder."""
+    """Folder to write."""
     picture: Annotated[Path | None, option(metavar="PATH")] = None
-    """The picture (default: DIR.png)."""
+    """Picture of the comparison to write (default: DIR.png)."""
 
 
 class Tables(Command):
-    """Write the report's tables with ours beside them."""
+    """Write the report's tables beside our results."""
 
     runs: Annotated[Path, *word("RUNS")]
-    """Folder of `make -f benchmarks/topological.mk SIZE=report`, which gets tables.md."""
+    """Folder that `make -f benchmarks/topological.mk SIZE=report` wrote; tables.md is added to it."""
 
 
 class Figures(_Driving):
-    """Draw the report's figures 8 to 11, 13 to 18 and 22 to 24 of one scene; a line says what is missing for others."""
+    """Draw the report's figures 8 to 11, 13 to 18 and 22 to 24 for one scene; print what other figures still need."""
 
     runs: Annotated[Path, *word("RUNS")]
-    """Folder of `make -f benchmarks/topological.mk`: drives, data-unseen and adapted-passages."""
+    """Folder that `make -f benchmarks/topological.mk` wrote: drives, data-unseen and adapted-passages."""
     scene: Annotated[str, option(metavar="SCENE")] = "scenes_mjcf/alder"
     """Scene folder."""
     out: Annotated[Path | None, option("-o", metavar="DIR")] = None
-    """The pictures (default: RUNS/figures)."""
+    """Folder to write the pictures to (default: RUNS/figures)."""
 
 
 KINDS = (Data, Train, Map, Explore, Navigate, Evaluate, Adapt, Export, Tables, Figures)

@@ -18,17 +18,17 @@ class Train(Command):
     """Train a policy. The same command continues a run that was stopped or killed."""
 
     settings: Words = ()
-    """Settings to change, listed below."""
+    """Override settings, listed below."""
     config: Annotated[str | None, option(metavar="NAME|PATH")] = None
-    """A preset, or a YAML file."""
+    """Preset to train, or path of a YAML file."""
     resume: Annotated[Path | None, option(metavar="RUN_DIR")] = None
-    """Continue this run folder with its config."""
+    """Run folder to continue, with its own config."""
     robot: Annotated[str | None, option(metavar="NAME|FILE")] = None
-    """Sets env.robot: a name, a URDF or MJCF file, or path.py:function."""
+    """Set env.robot: a name, a URDF or MJCF file, or path.py:function."""
     checkpoint: Annotated[str, option(metavar="best|last|STEPS")] = "last"
-    """With --resume: the checkpoint to continue from."""
+    """Checkpoint to continue from, with --resume."""
     print_config: Flag = False
-    """Print the whole config as YAML, which --config reads, and do nothing."""
+    """Print the complete config as YAML, which --config can read, and exit."""
 
     @classmethod
     def epilog(cls) -> str:

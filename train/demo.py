@@ -22,7 +22,7 @@ class Demo(Command):
     out: Annotated[Path, option("-o", metavar="DIR")] = Path("interactive-nav-demo")
     """Folder for the film and the replay."""
     episode: int = EPISODE
-    """Which of the fixed episodes."""
+    """Number of the fixed episode, starting at 0."""
 
 
 @reports_errors("interactive-nav demo")

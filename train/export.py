@@ -39,16 +39,16 @@ OBSERVATIONS, ENVS = 1000, 20
 
 
 class Export(Command):
-    """Write a run's policy as an ONNX file."""
+    """Export the policy of a run as an ONNX file."""
 
     run: Annotated[Path, *word("RUN_DIR")]
-    """Folder that `python -m train` wrote."""
+    """Run folder that `python -m train` wrote."""
     out: Annotated[Path, option("-o", metavar="FILE.onnx")]
-    """The file to write."""
+    """ONNX file to write."""
     checkpoint: Annotated[str, option(metavar="best|last|STEPS")] = "best"
-    """Which checkpoint is exported."""
+    """Checkpoint to export."""
     settings: Words = ()
-    """Environment settings to change: env.NAME=VALUE, as the homes that observations are recorded in (env.scenes)."""
+    """Override environment settings, such as env.scenes, the homes in which observations are recorded."""
 
 
 def outputs_of(env: Any, policy: PolicyFn, names: Sequence[str], *inputs: jax.Array) -> tuple[jax.Array, ...]:

@@ -14,7 +14,7 @@ from train.replay import OfRun
 
 
 class Record(Picture, OfRun):
-    """Make a video of an episode of a run."""
+    """Play an episode of a run and make a video of it."""
 
     def source(self, console: Console) -> Path:
         """Play the episode; return its replay."""

@@ -32,13 +32,13 @@ class OfRun(Command):
     """Base of the commands that record episodes of a run."""
 
     run: Annotated[Path, *word("RUN_DIR")]
-    """Folder that `python -m train` wrote."""
+    """Run folder that `python -m train` wrote."""
     settings: Words = ()
-    """Environment settings to change: env.NAME=VALUE."""
+    """Override environment settings: env.NAME=VALUE."""
     checkpoint: Annotated[str, option(metavar="best|last|STEPS")] = "best"
-    """Which checkpoint plays."""
+    """Checkpoint to play."""
     episode_file: Annotated[str | None, option(metavar="FILE")] = None
-    """Play those of this one (python -m interactive_nav.episodes make)."""
+    """Episode file to play from, made by `python -m interactive_nav.episodes make`."""
 
     def play(
         self,
@@ -81,18 +81,18 @@ class OfRun(Command):
 
 
 class Replay(OfRun):
-    """Record episodes step by step."""
+    """Record replays of episodes of a run, step by step."""
 
     episodes: Annotated[str, option(metavar="K,K,...")] = "0"
-    """Which of the fixed episodes."""
+    """Numbers of the fixed episodes, starting at 0."""
     policies: Annotated[str, option(metavar="NAME,...")] = "learned"
-    """Which policies play."""
+    """Policies to play."""
     scenes: Annotated[tuple[str, ...], option(metavar="SCENE_DIR")] = ()
-    """Where to play (default: the scenes that the policy was trained on)."""
+    """Scenes to play in (default: those that the policy was trained in)."""
     seed: Annotated[int | None, option()] = None
-    """Of the fixed episodes."""
+    """Random seed of the fixed episodes (default: that of `python -m train.evaluate`)."""
     stochastic: bool = True
-    """Sample the learned policy's actions, as the original did, or take their mode."""
+    """Sample the learned policy's actions, as the original code did, or take the most likely ones."""
 
 
 @reports_errors("train.replay")

@@ -13,12 +13,12 @@ from interactive_nav_common.jobs.progress import SafeConsole
 
 
 class Robots(Command):
-    """Print the table of robots."""
+    """Print a table of robots."""
 
     files: Annotated[tuple[str, ...], *word("FILE")] = ()
-    """Your robots: URDF or MJCF files, or path.py:function."""
+    """Your own robots: URDF or MJCF files, or path.py:function."""
     robots: Annotated[str | None, option(metavar="NAME,...")] = None
-    """Robots by name (default: all; with FILE none)."""
+    """Names of the built-in robots to list (default: all, or none if you give FILE)."""
 
     def names(self) -> tuple[str, ...]:
         """Return the names and files of the table's rows."""

@@ -24,31 +24,30 @@ DEFAULTS = {"observations": ("depth", "segmentation", "rgb"), "episode_steps": 1
 
 
 class Simulate(Command):
-    """Run a simulated robot in a scene: sensors on topics, driven by cmd_vel. The odometry begins at the robot's pose
-    in the map."""
+    """Simulate a robot in a scene: publish its sensors and follow cmd_vel. Odometry starts at its pose in the map."""
 
     scene: Annotated[Path, *word("SCENE")]
     """Scene folder."""
     settings: Words = ()
-    """Change settings, listed below."""
+    """Override settings, listed below."""
     robot: Annotated[str, option(metavar="NAME")] = "turtlebot"
-    """Robot, or its file."""
+    """Robot: a name, or a file that describes it."""
     start: Annotated[str | None, option(metavar="X,Y,YAW")] = None
-    """In m and rad, map (default: drawn)."""
+    """Start pose in the map, in m and rad (default: random)."""
     seed: int = 0
-    """Of the start, small objects and noise."""
-    engine: Literal["gl", "warp", "rays"] | None = None
-    """Draw colours as films do, which the topological networks know (warp; default: as observed)."""
+    """Random seed of the start, the small objects and the noise."""
+    engine: Annotated[Literal["gl", "warp", "rays"] | None, option()] = None
+    """Renderer of colour images, as in films; topological networks expect warp (default: as observed)."""
     limit: Annotated[float, option(metavar="S")] = 1800.0
-    """Simulated seconds of an episode."""
+    """Length of an episode in simulated seconds."""
     lockstep: Flag = False
-    """Each picture waits for its velocity command."""
+    """Wait for a velocity command after each image."""
     factor: float = 1.0
-    """Simulated seconds a second; 0: no waiting."""
+    """Simulated seconds per second of real time; 0 does not wait."""
     bag: Annotated[Path | None, option(metavar="FOLDER")] = None
-    """Record all topics there (rosbag2)."""
+    """Folder to record all topics to, as a rosbag2 bag."""
     run: Annotated[str | None, option(metavar="COMMAND")] = None
-    """Run a node beside, such as 'interactive-nav ros drive policy.onnx', and end with it."""
+    """Also run this node, for example 'interactive-nav ros drive policy.onnx', and stop when it ends."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -61,25 +60,25 @@ class Simulate(Command):
 
 
 class Drive(Command):
-    """Drive a robot by a policy: cmd_vel from odom and the scan, contacts and cameras that the policy needs. It goes
-    along plan, or to goal_pose: by the shortest path in --map, without one straight ahead, whatever stands there."""
+    """Drive a robot with a policy: read odom and the sensors that the policy needs, publish cmd_vel. The robot follows
+    `plan` or drives to `goal_pose`, on the shortest path in --map; without --map straight ahead, even through walls."""
 
     policy: Annotated[Path, *word("POLICY.onnx")]
-    """File of interactive-nav export."""
+    """Policy file that `interactive-nav export` wrote."""
     robot: Annotated[str | None, option(metavar="NAME")] = None
-    """Refuse a policy of another robot."""
+    """Name of your robot; policies of other robots are refused."""
     map: Annotated[Path | None, option(metavar="SCENE")] = None
-    """Scene folder, for shortest paths."""
+    """Scene folder in which shortest paths are computed."""
     odom_in_map: Annotated[str, option(metavar="X,Y,YAW")] = "0,0,0"
-    """Pose of the odometry's frame in the map, m and rad, until /tf has one."""
+    """Pose of the odometry frame in the map, in m and rad, until /tf provides one."""
     max_linear: Annotated[Positive | None, option(metavar="M/S")] = None
-    """Limit of the speed (default: the policy's)."""
+    """Speed limit in m/s (default: the policy's)."""
     max_angular: Annotated[Positive | None, option(metavar="RAD/S")] = None
-    """Limit of the turn rate (default: the policy's)."""
+    """Turn rate limit in rad/s (default: the policy's)."""
     silence: Annotated[Positive, option(metavar="S")] = 1.0
-    """Stop when a needed topic is silent for so long."""
+    """Stop the robot when a required topic has been silent for this many seconds."""
     dead_man: Annotated[int | None, option(metavar="BUTTON")] = None
-    """Drive only while this button of joy is held."""
+    """Drive only while this button of the joy topic is held."""
 
 
 COMMANDS = {kind.__name__.lower(): kind for kind in (Drive, Simulate)}

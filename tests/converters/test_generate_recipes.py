@@ -17,6 +17,7 @@ from converters.generate.models.cad import HOME_TEST_MODELS, HOME_TRAIN_MODELS
 from converters.pipeline import ConvertConfig
 from converters.recipes import chosen, load_recipes, make_scenes, parse_recipes
 from interactive_nav_common.errors import FileError
+from scenes_mjcf.schema import SceneError
 
 SCENES = Path(__file__).parents[2] / "scenes_mjcf"
 TINY = """
@@ -246,6 +247,35 @@ def test_a_scene_that_cannot_be_put_in_place_leaves_the_old_one(tmp_path, quick,
         make_scenes(chosen(quick, tmp_path, ("hut",), overwrite=True), {}, tmp_path, overwrite=True)
     assert (tmp_path / "hut" / "scene.json").read_text() == "old"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["hut", "recipes.yaml"]
+
+
+@pytest.mark.parametrize(
+    "error", [ValueError("a cannot\n be b"), IndexError("a cannot be b"), SceneError("a cannot be b")]
+)
+def test_a_scene_whose_preview_fails_is_kept_and_its_line_names_the_error(tmp_path, quick, monkeypatch, error):
+    draw, lines = recipes.preview, []
+
+    def fail(folder: Path, target: Path) -> None:
+        if folder.name == "hut":
+            raise error
+        draw(folder, target)
+
+    monkeypatch.setattr(recipes, "preview", fail)
+    assert make_scenes(chosen(quick, tmp_path), {}, tmp_path, log=lines.append) == {"hut": [], "shed": []}
+    assert [p.name for p in sorted((tmp_path / "hut").iterdir())] == ["scene.json"]
+    assert (tmp_path / "shed" / "preview.png").read_text() == "drawn"
+    again = f"try again with 'python -m converters preview {tmp_path}/hut -o {tmp_path}/hut/preview.png'"
+    assert lines == [
+        f"hut: train, seed 1, every gate passes; no preview: {type(error).__name__}: a cannot be b; {again}",
+        "shed: test, seed 2, every gate passes",
+    ]
+
+
+def test_a_full_disk_while_drawing_is_no_missing_preview(tmp_path, quick, monkeypatch):
+    monkeypatch.setattr(recipes, "preview", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOSPC, "full")))
+    with pytest.raises(OSError, match="full"):
+        make_scenes(chosen(quick, tmp_path), {}, tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["recipes.yaml"]
 
 
 def test_what_a_killed_generator_left_goes_with_the_next(tmp_path, quick):

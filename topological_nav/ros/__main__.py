@@ -21,23 +21,23 @@ from topological_nav.config import NavigatorConfig
 
 
 class Navigator(UsesNetworks):
-    """Run the navigator as a node of ROS 2, for a robot or a simulator."""
+    """Run the topological navigator as a ROS 2 node, for a robot or a simulator."""
 
     LISTED = {"": NavigatorConfig()}
     settings: Words = ()
-    """Change settings of the navigator, listed below."""
+    """Override settings of the navigator, listed below."""
     map: Annotated[Path, option(metavar="PATH")]
-    """Map file of `python -m topological_nav map`."""
+    """Map file that `python -m topological_nav map` wrote."""
     heading_from: Literal["imu", "odom"] = "imu"
-    """Topic of the heading."""
+    """Topic that the heading is read from."""
     heading_offset: Annotated[float, option(metavar="RAD")] = 0.0
-    """Yaw of the heading's frame in the map's frame."""
+    """Yaw of the heading's frame in the map's frame, in rad."""
     policy: Annotated[str | None, option(metavar="RUN")] = None
-    """Run of the local policy, or passage (default: as the networks, if none is named)."""
+    """Local policy: a run folder, or passage, a rule without learning (default: the networks', if you name none)."""
     goal: Annotated[UseAppendAction[tuple[Path, ...]], option(metavar="PICTURE")] = ()
     """Image taken at the goal."""
     goal_heading: Annotated[float, option(metavar="RAD")] = 0.0
-    """Heading of the first image of the goal."""
+    """Heading of the first image of the goal, in rad."""
 
 
 @reports_errors("topological_nav.ros")

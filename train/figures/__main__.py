@@ -10,20 +10,20 @@ from interactive_nav_common.errors import FileError, reports_errors
 
 
 class Draw(Command):
-    """Draw what runs have written."""
+    """Draw figures of runs and sweeps, or print their tables."""
 
     results: Annotated[Path, *word("RESULTS_DIR")]
-    """A run folder, a sweep's folder, or a folder of either."""
+    """Run folder, sweep folder, or folder that contains some."""
     out: Annotated[Path, option("-o", metavar="DIR")] = Path("figures")
-    """Where to."""
+    """Folder to write the pictures to."""
     format: Literal["png", "pdf", "svg"] = "png"
-    """Of the pictures."""
+    """File format of the pictures."""
     split: Literal["auto", "train", "test", "all"] = "auto"
-    """Scenes of a sweep's figures; auto takes test where there are rows of them."""
+    """Split of the scenes in a sweep's figures; auto takes test if there are rows of it."""
     tables: Flag = False
-    """Print Markdown tables of a sweep instead of drawing."""
+    """Print the tables of a sweep as Markdown instead of drawing figures."""
     table: Annotated[str | None, option(metavar="NAME")] = None
-    """Print only the table with this heading: `scores`, `runs`, `the-paper-s-claims` and so on."""
+    """Print only the table with this heading, such as `scores`, `runs` or `the-paper-s-claims`."""
 
 
 @reports_errors("train.figures")

@@ -39,16 +39,16 @@ FILM_FRAMES = 150
 
 
 class Report(Command):
-    """Write one HTML file, readable offline, of what runs have written."""
+    """Write one HTML file, readable offline, with the results of runs and sweeps."""
 
     results: Annotated[tuple[Path, ...], *word("RESULTS")]
-    """Run folders, sweeps' folders, folders of either, or files of rows; each gets its part of the report."""
+    """Run folders, sweep folders, folders that contain some, or files of rows. Each becomes a part of the report."""
     out: Annotated[Path, option("-o", metavar="FILE")] = Path("report.html")
-    """Where to."""
+    """HTML file to write."""
     split: Literal["auto", "train", "test", "all"] = "auto"
-    """Scenes of a sweep's figures; auto takes test where there are rows of them."""
+    """Split of the scenes in a sweep's figures; auto takes test if there are rows of it."""
     films: Natural = 1
-    """Films of so many of the best and of the worst replays in each part."""
+    """Number of films of the best replays in each part, and of the worst."""
 
 
 def table(header: Sequence[str], lines: Sequence[Sequence[Any]], sorted_by: int | None = None) -> str:

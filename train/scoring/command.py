@@ -9,44 +9,42 @@ from train.scoring import AUTO_BATCH, PLANNERS, POLICIES, SEED
 
 
 class Evaluate(Command):
-    """Play fixed episodes."""
+    """Play fixed episodes and score them."""
 
     runs: Annotated[tuple[str, ...], *word("RUN_DIR")] = ()
-    """Folders that `python -m train` wrote; several share what is compiled. Without one, --scenes, --out and --policies
-    say what to play."""
+    """Run folders to evaluate. Without one, --scenes, --policies and --out determine what to play."""
     settings: Words = ()
-    """Environment settings to change: env.NAME=VALUE."""
+    """Override environment settings: env.NAME=VALUE."""
     robot: Annotated[str | None, option(metavar="NAME|FILE")] = None
-    """Sets env.robot: a name, a URDF or MJCF file, or path.py:function."""
+    """Set env.robot: a name, a URDF or MJCF file, or path.py:function."""
     episodes: Annotated[AtLeastOne | None, option(metavar="N")] = None
-    """Episodes of each policy (default: 200; of files, all)."""
+    """Number of episodes for each policy (default: 200, or all of --episode-file)."""
     episode_file: Annotated[Repeated, option(metavar="FILE")] = ()
-    """Play these (python -m interactive_nav.episodes make)."""
+    """Episode file to play, made by `python -m interactive_nav.episodes make`."""
     balanced: Flag = False
-    """Scenes take turns; otherwise each episode draws one."""
+    """Let scenes take turns. Otherwise each episode draws its scene at random."""
     policies: Annotated[str | None, option(metavar="NAME,...")] = None
-    """Policies and planners to play, keyboard: you drive, or ros: a ROS 2 node (default: all policies; with --policy
-    none)."""
+    """Policies and planners; keyboard: you drive; ros: a node drives (default: all policies, or none with --policy)."""
     policy: Annotated[Repeated, option(metavar="[NAME=]MODULE:FACTORY")] = ()
-    """Also play what this function of your module, or of path/to/file.py, returns."""
+    """Also play the policy that this function of your module, or of path/to/file.py, returns."""
     scenes: Annotated[tuple[str, ...], option(metavar="SCENE_DIR")] = ()
-    """Where to play (default: the scenes that the policy was trained on)."""
+    """Scenes to play in (default: those that the policy was trained in)."""
     seed: Annotated[int | None, Bounds(-(2**63), 2**63 - 1), option()] = None
-    """Of the fixed episodes."""
+    """Random seed of the fixed episodes (default: see below)."""
     checkpoint: Annotated[str, option(metavar="best|last|STEPS")] = "best"
-    """Which checkpoint plays."""
+    """Checkpoint to play."""
     stochastic: bool = True
-    """Sample the learned policy's actions, as the original did, or take their mode."""
+    """Sample the learned policy's actions, as the original code did, or take the most likely ones."""
     record: Natural = 8
-    """Episodes to record paths of."""
+    """Number of episodes whose paths are recorded."""
     batch: Annotated[AtLeastOne | None, option(metavar="N")] = None
-    """Episodes played at a time (default: by the backend)."""
+    """Number of episodes to play in parallel (default: depends on the backend, see below)."""
     out: Annotated[Path | None, option(metavar="PATH")] = None
-    """Parquet file of rows (default: RUN_DIR/evaluation/episodes.parquet)."""
+    """Parquet file to write rows to (default: RUN_DIR/evaluation/episodes.parquet)."""
     dataset: Annotated[Path | None, option(metavar="DIR")] = None
-    """Add a file for each run and evaluation to this folder instead."""
+    """Folder to add one file of rows to for each run and evaluation, instead of --out."""
     demonstrations: Annotated[Path | None, option(metavar="FILE")] = None
-    """Also write every control step to this Parquet file, for algorithm=clone."""
+    """Also write every control step to this Parquet file, as training data of algorithm=clone."""
 
     @classmethod
     def epilog(cls) -> str:

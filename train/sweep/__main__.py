@@ -21,35 +21,34 @@ from train.sweep.spec import SweepConfig
 
 
 class Sweep(Command):
-    """Train and evaluate every run of a sweep. The same command continues what was stopped or killed, and leaves out
-    what is done."""
+    """Train and evaluate every run of a sweep. The same command continues unfinished runs and skips finished ones."""
 
     sweep: Annotated[str, *word("NAME|PATH")]
-    """A sweep, or a YAML file."""
+    """Name of a sweep, or path of a YAML file."""
     status: Flag = False
-    """Print how far every run is, and do nothing."""
+    """Print the progress of every run and exit."""
     export: Annotated[Path | None, option(metavar="DIR")] = None
-    """Copy rows, curves and the best run's checkpoint of each cell there."""
+    """Copy rows, curves and the checkpoint of each cell's best run to this folder."""
     policy_step: Annotated[float, Bounds(0, 4, open=True)] = STEP
-    """With --export: round the checkpoint's weights to so many standard deviations."""
+    """Rounding step of the exported weights in standard deviations, with --export."""
     resume: Flag = False
-    """Only continue: refuse a sweep that was never begun."""
+    """Only continue: refuse a sweep that was never started."""
     only: Annotated[Literal["train", "evaluate"] | None, option(metavar="train|evaluate")] = None
-    """Train without evaluating, or evaluate what is trained."""
+    """Only train runs, or only evaluate trained runs."""
     redo: Flag = False
-    """Evaluate again what is evaluated."""
+    """Evaluate runs again that are already evaluated."""
     unfinished: Flag = False
-    """Also evaluate unfinished runs."""
+    """Also evaluate unfinished runs, with --only evaluate."""
     time_limit: Annotated[Positive | None, option(metavar="SECONDS")] = None
-    """Then stop all runs, with their checkpoints."""
+    """Stop all runs after this time in seconds; their checkpoints are kept."""
     where: Annotated[Repeated, option(metavar="KEY=VALUE[,VALUE]")] = ()
-    """Only these runs."""
+    """Only process runs with these settings, for example env.robot=fetch."""
     shard: Annotated[str | None, option(metavar="I/N")] = None
-    """Only every N-th run, from the I-th: one machine's part."""
+    """Only process every N-th run, starting with run I: the share of one machine."""
     launcher: Literal["local", "ray"] = "local"
-    """This machine, or a Ray cluster."""
+    """Where to run: `local` is this machine, `ray` is a Ray cluster."""
     ray_address: Annotated[str | None, option(metavar="ADDRESS")] = None
-    """Of the cluster (default: auto)."""
+    """Address of the Ray cluster's head node, with --launcher ray (default: auto)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
