@@ -25,16 +25,14 @@ class Estimate:
     runs: int
 
     @property
-    def half(self) -> float:
-        return 0.5 * (self.high - self.low)
+    def bar(self) -> np.ndarray:
+        """Return how far the interval reaches below and above the mean, [2, 1], for matplotlib's error bars."""
+        return np.abs([[self.low - self.mean], [self.high - self.mean]])
 
     def with_ends(self, digits: int = 3) -> str:
         """Return the mean and the interval's ends, for tables."""
         mean, low, high = (f"{value:.{digits}f}" for value in (self.mean, self.low, self.high))
         return mean if math.isnan(self.low) else f"{mean} [{low}, {high}]"
-
-    def __str__(self) -> str:
-        return f"{self.mean:.3f}" + ("" if math.isnan(self.half) else f" ± {self.half:.3f}")
 
 
 def estimate(values: Iterable[float]) -> Estimate:

@@ -9,7 +9,7 @@ from matplotlib.ticker import EngFormatter
 from scipy.ndimage import uniform_filter1d
 
 from interactive_nav_common.figures import draw_means, legend, panels
-from interactive_nav_common.statistics import estimate
+from interactive_nav_common.statistics import over_runs
 from train.figures import style
 
 CURVES = (("episode/success", "success"), ("episode/ins_0.5", "INS$_{0.5}$"), ("episode/sum_reward", "episode reward"))
@@ -83,14 +83,14 @@ def cell_curves(cells: Mapping[style.Cell, Sequence[Sequence[Mapping[str, Any]]]
         values = running_mean(values, len(steps) // 20 if len(steps) > SMOOTHED else 1)
         look = {**looks.algorithm(algorithm), "markersize": 4, **looks.k_int(k_int)}
         look |= {"markevery": max(1, len(steps) // 6), "linewidth": 1.2}
-        points = [estimate(column) for column in values.T]
+        points = [over_runs(column) for column in values.T]
         draw_means(axes[looks.robots.index(robot)], steps, points, (0.0, np.inf), **look)
     for axis, robot in zip(axes, looks.robots, strict=True):
         axis.set_ylim(bottom=0.0)
         _label(axis, GOALS_LABEL if axis is axes[0] else "")
         axis.set_title(style.robot_name(robot))
     legend(figure, [*looks.algorithm_handles(markersize=4), *looks.k_int_handles(markersize=4)], 3)
-    figure.suptitle(f"exploring policy, mean of {style.seeds_text(seeds)}, 95 % t interval", fontsize=9)
+    figure.suptitle(f"exploring policy, mean of {style.seeds_text(seeds)}, 95 % bootstrap interval", fontsize=9)
     return figure
 
 

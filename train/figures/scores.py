@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from interactive_nav_common.figures import draw_means, handle, legend, panels
 from interactive_nav_common.rows import where
-from interactive_nav_common.statistics import correlation, estimate, over_episodes, p_text
+from interactive_nav_common.statistics import correlation, over_episodes, over_runs, p_text
 from train.figures import style
 from train.scoring.statistics import RunMean, cells, learned_rows, run_means, train_test_contrast
 
@@ -34,10 +34,9 @@ def frontier(rows: Mapping[str, Sequence[Any]], title: str) -> Figure:
     colours = style.policy_colours([policy for policy in policies if policy.partition(":")[0] != "namo"])
     for policy in policies:
         x, y = (over_episodes(name, values[names == policy]) for name, values in scores.items())
-        bars = [np.abs([[e.low - e.mean], [e.high - e.mean]]) for e in (x, y)]
         kind, _, weight = policy.partition(":")
         colour = colours.get(policy, "0.25")
-        axis.errorbar(x.mean, y.mean, bars[1], bars[0], fmt="o", color=colour, capsize=2, linewidth=0.9)
+        axis.errorbar(x.mean, y.mean, y.bar, x.bar, fmt="o", color=colour, capsize=2, linewidth=0.9)
         right = kind == "namo" or x.mean < 0.2  # the avoider's point lies close to that of w = 1
         axis.annotate(
             f"w = {float(weight):g}" if kind == "namo" else policy,
@@ -78,7 +77,7 @@ def ins_over_alpha(rows: pa.Table, robot: str, split: str | None) -> Figure:
     for axis in grid.flat:
         axis.set_visible(False)
     for (_, algorithm, k_int), runs in by_cell.items():
-        points = [estimate(run.ins(alpha) for run in runs) for alpha in ALPHAS]
+        points = [over_runs(run.ins(alpha) for run in runs) for alpha in ALPHAS]
         look = {**looks.algorithm(algorithm), **looks.k_int(k_int), "markevery": 5, "markersize": 5}
         places = (grid[0, looks.algorithms.index(algorithm)], grid[1, looks.k_ints.index(k_int)])
         for axis, title in zip(places, (algorithm.upper(), f"k$_{{int}}$ = {k_int:g}"), strict=True):
@@ -94,7 +93,9 @@ def ins_over_alpha(rows: pa.Table, robot: str, split: str | None) -> Figure:
     for axis in grid[0]:
         axis.tick_params(labelbottom=True)
     legend(figure, [*looks.algorithm_handles(), *looks.k_int_handles()])
-    figure.suptitle(f"{style.robot_name(robot)}, {SPLITS[split]}; mean of {looks.seeds}, 95 % t interval", fontsize=9)
+    figure.suptitle(
+        f"{style.robot_name(robot)}, {SPLITS[split]}; mean of {looks.seeds}, 95 % bootstrap interval", fontsize=9
+    )
     return figure
 
 
@@ -112,7 +113,7 @@ def efficiency_plane(rows: pa.Table, robot: str, split: str | None) -> Figure:
     planner = [handle("planner that knows all poses, weight w of pushing", color="0.45", marker=".")]
     legend(figure, handles + planner * any(text.get_text()[:2] == "w=" for text in axis.texts), 3)
     axis.set_title(
-        f"{style.robot_name(robot)}, {SPLITS[split]}; mean of {looks.seeds}, 95 % t intervals\n"
+        f"{style.robot_name(robot)}, {SPLITS[split]}; mean of {looks.seeds}, 95 % bootstrap intervals\n"
         f"grey lines: equal INS$_{{0.5}}$, steps of {step:g}"
     )
     return figure
@@ -133,7 +134,7 @@ def robots_plane(rows: pa.Table, split: str | None) -> Figure:
     for axis in grid[0, 1:]:
         axis.set_ylabel("")
     legend(figure, [*looks.robot_handles(), *looks.k_int_handles(linestyle="")], 5)
-    figure.suptitle(f"{SPLITS[split]}; mean of {looks.seeds}, 95 % t intervals", fontsize=9)
+    figure.suptitle(f"{SPLITS[split]}; mean of {looks.seeds}, 95 % bootstrap intervals", fontsize=9)
     return figure
 
 
@@ -160,9 +161,9 @@ def effort_terms(rows: pa.Table, split: str | None) -> Figure:
         for run in runs:
             look = {**looks.algorithm(run.algorithm), "fillstyle": looks.fill(run.k_int), "linestyle": ""}
             axis.plot(*(run.scores[name] for name in EFFORT), markersize=6, zorder=3, **look)
-        over_runs = correlation(*([run.scores[name] for run in runs] for name in EFFORT))
+        of_runs = correlation(*([run.scores[name] for run in runs] for name in EFFORT))
         axis.set_title(
-            f"{style.robot_name(robot)}\nr over runs: {over_runs}\nr over episodes: {correlation(x, y)}", fontsize=8
+            f"{style.robot_name(robot)}\nr over runs: {of_runs}\nr over episodes: {correlation(x, y)}", fontsize=8
         )
         axis.set(xlabel="kinematic term of E$_{eff}$", ylabel="dynamic term of E$_{eff}$")
         lows = [min(np.quantile(v, 0.02), *(r.scores[n] for r in runs)) for v, n in zip((x, y), EFFORT, strict=True)]
@@ -188,8 +189,8 @@ def seen_and_unseen(rows: pa.Table) -> Figure:
     for i, cell in enumerate(order):
         look = {**looks.algorithm(cell[1]), "capsize": 2, "markersize": 6}
         for runs, shift, fill in ((by_cell[cell], -0.14, "full"), (unseen[cell], 0.14, "none")):
-            e = estimate(run.ins(0.5) for run in runs)
-            axis.errorbar(i + shift, e.mean, e.half, fillstyle=fill, **look)
+            e = over_runs(run.ins(0.5) for run in runs)
+            axis.errorbar(i + shift, e.mean, e.bar, fillstyle=fill, **look)
             x = np.full(len(runs), i + shift + 0.09 * np.sign(shift))
             axis.scatter(x, [run.ins(0.5) for run in runs], s=5, color="0.5", linewidths=0, zorder=1)
     robot_too = len(looks.robots) > 1
@@ -200,7 +201,7 @@ def seen_and_unseen(rows: pa.Table) -> Figure:
     p = "" if math.isnan(test.p_value) else f", one-sample t test p {p_text(test.p_value)}"
     axis.set_title(
         f"unseen minus seen: {test.difference:+.3f} over {len(pairs)} runs{p}\n"
-        "markers: mean over seeds, 95 % t interval; dots: runs"
+        "markers: mean over seeds, 95 % bootstrap interval; dots: runs"
     )
     grey: dict[str, Any] = {"color": "0.3", "marker": "o", "linestyle": "", "markersize": 6}
     kinds = (("training scenes", "full"), ("unseen scenes", "none"))
@@ -214,9 +215,9 @@ def _chain(axis: Axes, runs: Sequence[RunMean], looks: style.Looks, look: dict[s
     places = []
     for k_int in sorted({run.k_int for run in runs}):
         scores = [run.scores for run in runs if run.k_int == k_int]
-        p, e = (estimate(score[name] for score in scores) for name in ("path_efficiency", "effort_efficiency"))
+        p, e = (over_runs(score[name] for score in scores) for name in ("path_efficiency", "effort_efficiency"))
         bars: dict[str, Any] = {"capsize": 2, "elinewidth": 0.8, "markersize": 7, "linestyle": "", "zorder": 4}
-        axis.errorbar(p.mean, e.mean, e.half, p.half, fillstyle=looks.fill(k_int), **look, **bars)
+        axis.errorbar(p.mean, e.mean, e.bar, p.bar, fillstyle=looks.fill(k_int), **look, **bars)
         places.append((p.mean, e.mean))
     axis.plot(*np.array(places).T, color=look["color"], linewidth=0.9, alpha=0.7, zorder=3)
 
@@ -276,7 +277,8 @@ def _finish_plane(*axes: Axes) -> float:
     """Add labels, limits that follow the data and lines of equal INS_0.5; return the step between these."""
     x, y = axes[0].get_xlim(), axes[0].get_ylim()
     more_x, more_y = 0.12 * (x[1] - x[0]), 0.12 * (y[1] - y[0])
-    step = 0.1 if x[1] - x[0] + y[1] - y[0] > 0.6 else 0.01
+    wide = x[1] - x[0] + y[1] - y[0]
+    step = 0.1 if wide > 0.6 else 0.05 if wide > 0.3 else 0.01
     for axis in axes:
         equal_ins(axis, step)
         axis.set(xlabel="P$_{eff}$ (SPL)", xlim=(max(-0.02, x[0] - more_x), min(1.03, x[1] + more_x)))

@@ -9,7 +9,15 @@ import pyarrow as pa
 import pyarrow.compute
 import pytest
 
-from interactive_nav_common.statistics import correlation, estimate, over_runs, p_text, paired_difference, welch
+from interactive_nav_common.statistics import (
+    Estimate,
+    correlation,
+    estimate,
+    over_runs,
+    p_text,
+    paired_difference,
+    welch,
+)
 from tests.train.synthetic import K_INTS, baseline_rows, paper_like, run_rows
 from train.scoring.rows import BY_CATEGORY
 from train.scoring.statistics import LARGE, MEDIUM, SMALL, claims, contrast, run_means, train_test_contrast
@@ -29,8 +37,10 @@ def test_a_run_counts_once_whatever_its_episodes():
 def test_t_interval_by_hand():
     """1, 2, 3: mean 2, deviation 1, t(0.975, 2) = 4.302653: half width 4.302653 / sqrt(3)."""
     e = estimate([1.0, 2.0, 3.0])
-    assert (e.mean, e.half, e.runs) == pytest.approx((2.0, 4.302653 / math.sqrt(3), 3), abs=1e-5)
-    assert str(e) == "2.000 ± 2.484" and str(estimate([0.5])) == "0.500" and math.isnan(estimate([0.5]).low)
+    half = 4.302653 / math.sqrt(3)
+    assert (e.mean, e.low, e.high, e.runs) == pytest.approx((2.0, 2.0 - half, 2.0 + half, 3), abs=1e-5)
+    assert e.with_ends() == "2.000 [-0.484, 4.484]" and math.isnan(estimate([0.5]).low)
+    np.testing.assert_allclose(Estimate(0.5, 0.4, 0.8, 3).bar, [[0.1], [0.3]])
 
 
 def test_welch_by_hand():
@@ -81,7 +91,7 @@ def test_seen_against_unseen():
 
 def test_intervals_of_runs():
     e = over_runs([0.587, 0.033, 0.55])  # lowest thrice: 3.7 %
-    assert (e.low, e.high) == (0.033, 0.587) and str(over_runs([0.5])) == "0.500"
+    assert (e.low, e.high) == (0.033, 0.587) and over_runs([0.5]).with_ends() == "0.500"
 
 
 def test_paired_differences_by_hand():
