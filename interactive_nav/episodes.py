@@ -2,8 +2,8 @@
 
 `python -m interactive_nav.episodes make --robot turtlebot --scenes DIR ... --episodes N --seed S -o FILE`
 
-A file identifies its scenes by digests (`Scene.task_digest`; in old files, of scene.xml and maps.npz), so it means the
-same episodes on every machine and backend. Other scenes, robots or objects are refused.
+A file identifies its scenes by digests (`Scene.task_digest`), so it means the same episodes on every machine and backend.
+Other scenes, robots or objects are refused.
 """
 
 import dataclasses
@@ -46,16 +46,16 @@ class EpisodeFile:
     robot: str
     seed: Seed
     scenes: tuple[tuple[str, str], ...]
-    """(name, digest) of each scene: `Scene.task_digest`, in old files `Scene.digest`."""
+    """(name, `Scene.task_digest`) of each scene."""
     objects: tuple[str, ...]
     """Categories of the small objects, in order."""
     objects_digest: str
     """`TASK_DIGEST` and SHA-256 of the small objects' boxes, masses, friction and categories, of those from folders
-    of inertia, centre of mass and hulls too; in old files without it, also of their looks."""
+    of inertia, centre of mass and hulls too."""
     episodes: tuple[dict[str, Any], ...]
     """scene (index into scenes), start_xy_w, start_yaw_rad, goal_xy_w, objects ([x, y, yaw] each, or null for one
-    that got no place), shortest_path_m, and, in newer files, push_needed: whether there is no way round everything
-    that can be moved; metres and radians, world frame."""
+    that got no place), shortest_path_m and push_needed: whether there is no way round everything that can be moved;
+    metres and radians, world frame."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +68,7 @@ class _Episode:
     goal_xy_w: tuple[float, float]
     objects: tuple[tuple[float, float, float] | None, ...]
     shortest_path_m: NotNegative
-    push_needed: bool | None = None
+    push_needed: bool
 
 
 class EpisodeFileError(UserError):
@@ -111,7 +111,7 @@ def draw_episode_file(env: InteractiveNav, episodes: int, seed: int) -> EpisodeF
         seed=seed,
         scenes=tuple((scene.name, scene.task_digest) for scene in env.scenes),
         objects=tuple(o.category for o in env.world.small_objects),
-        objects_digest=_objects_digests(env)[0],
+        objects_digest=_objects_digest(env),
         episodes=tuple(rows),
     )
 
@@ -126,12 +126,9 @@ def _with_length(env: InteractiveNav, start: EpisodeStart) -> tuple[EpisodeStart
     return start, geodesic_at(env.tables, start.scene_index, field, start.start_xy_w)
 
 
-def _objects_digests(env: InteractiveNav) -> tuple[str, str]:
-    """Return the digest of what decides the task, and the one that old files have."""
-    small = env.world.small_objects
-    task = [o.task_parts for o in small]
-    new, old = (hashlib.sha256(repr(content).encode()).hexdigest() for content in (task, small))
-    return TASK_DIGEST + new, old
+def _objects_digest(env: InteractiveNav) -> str:
+    """Return the digest of what in the small objects decides the task."""
+    return TASK_DIGEST + hashlib.sha256(repr([o.task_parts for o in env.world.small_objects]).encode()).hexdigest()
 
 
 def _short(digest: str) -> str:
@@ -145,24 +142,22 @@ def _check_fits(file: EpisodeFile, env: InteractiveNav, where: str) -> dict[str,
             f"{where}: made for robot '{file.robot}', the environment's is '{env.robot.name}'; "
             "make the episodes again for it"
         )
-    # Each file is held to digests of the kind that it has; no digest of one kind is one of the other.
-    ours = {digest: i for i, scene in enumerate(env.scenes) for digest in (scene.digest, scene.task_digest)}
+    ours = {scene.task_digest: i for i, scene in enumerate(env.scenes)}
     by_name = {scene.name: scene for scene in env.scenes}
     for name, digest in file.scenes:
         if digest in ours:
             continue
         if name in by_name:
-            has = by_name[name].task_digest if digest.startswith(TASK_DIGEST) else by_name[name].digest
             raise EpisodeFileError(
                 f"{where}: scene '{name}' has digest {_short(digest)}, the environment's '{name}' has "
-                f"{_short(has)}: its content changed since; use the scene it was made from or make the "
+                f"{_short(by_name[name].task_digest)}: its content changed since; use the scene it was made from or make the "
                 "episodes again"
             )
         raise EpisodeFileError(
             f"{where}: needs scene '{name}' (digest {_short(digest)}), the environment has {', '.join(by_name)}; "
             "add it to --scenes"
         )
-    if file.objects_digest not in _objects_digests(env):
+    if file.objects_digest != _objects_digest(env):
         raise EpisodeFileError(
             f"{where}: made with {len(file.objects)} small objects ({', '.join(file.objects) or 'none'}), the "
             f"environment has {len(env.world.small_objects)} or other models; set num_objects={len(file.objects)} and "

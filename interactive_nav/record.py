@@ -68,7 +68,7 @@ class Compositor:
         """Columns and rows of a frame."""
         robot = get_robot(replay.robot)
         self._middle_m = 0.6 * robot.height_m
-        self._goal_radius_m = replay.success_distance_m or robot.body_width_m
+        self._goal_radius_m = replay.success_distance_m
         self._view = SceneView(robot, scene, replay.small, replay.segmentation_classes)
         yaw = np.unwrap(yaw_from_quat(replay.body_quat_w[:, 0]))
         self._yaw = gaussian_filter1d(yaw, _CAMERA_LAG_S / replay.control_dt_s, mode="nearest")

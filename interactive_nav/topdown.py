@@ -69,7 +69,7 @@ def draw_topdown(axis: Axes, replay: Replay, scene: Scene, colour_by: str = "tim
         axis.add_patch(Circle((x, y), robot.footprint_radius_m, fill=False, linestyle=style, zorder=6))
         nose = place + robot.footprint_radius_m * np.array([np.cos(yaw), np.sin(yaw)])
         axis.plot(*np.stack([place, nose]).T, color="k", linewidth=1, linestyle=style, zorder=6)
-    (x, y), reach_m = map(float, replay.goal_xy_w), replay.success_distance_m or robot.body_width_m
+    (x, y), reach_m = map(float, replay.goal_xy_w), replay.success_distance_m
     axis.add_patch(Circle((x, y), reach_m, color="#009e73", alpha=0.35, linewidth=0, zorder=2))
     axis.plot(*replay.goal_xy_w, marker="*", color="#009e73", markeredgecolor="k", markersize=11, zorder=7)
     s = replay.metrics

@@ -29,21 +29,9 @@ def from_dict(plain: Any, base: TrainConfig | None = None, where: str = "config"
     return overlay(base or TrainConfig(), plain, where, elsewhere=list(flatten(TrainConfig())))
 
 
-GONE = {
-    **{"env": {"windows"}, "sac": {"replay_dtype"}, "ddpg": {"replay_dtype"}},
-    "ppo": {"learning_rate_schedule", "desired_kl"},
-}
-"""Section -> settings that older runs wrote: they sized what was simulated or stored, or how step sizes changed while a
-run was trained; none changes what a policy does."""
-
-
 def from_yaml(text: str, where: str = "config") -> TrainConfig:
-    """Return the config that a run wrote as YAML, as `from_dict`, without settings that are gone."""
-    values = parsed(text, where)
-    for section, names in GONE.items() if isinstance(values, dict) else ():
-        if isinstance(plain := values.get(section), dict):
-            values = values | {section: {name: value for name, value in plain.items() if name not in names}}
-    return from_dict(values, where=where)
+    """Return the config that a run wrote as YAML, as `from_dict`."""
+    return from_dict(parsed(text, where), where=where)
 
 
 def parsed(text: str, where: str) -> Any:

@@ -68,21 +68,21 @@ class Replay:
     """[T] bool."""
     metrics: dict[str, float]
     """The episode's scores."""
-    small_objects: str = "train"
-    """Whose models the small objects are; this and what follows is not in older files."""
-    objects: tuple[str, ...] = ()
+    small_objects: str
+    """Whose models the small objects are."""
+    objects: tuple[str, ...]
     """Their folders, absolute, where they are not the built-in ones."""
-    segmentation_classes: MaskClasses = 4
+    segmentation_classes: MaskClasses
     """As in `NavConfig`."""
-    success_distance_m: float | None = None
-    """Of the goal; None, in older files: the robot's width is taken."""
-    image_fov_deg: float | None = None
-    """Vertical, of the robot's camera as the episode had it; None: the robot's."""
-    waypoints_b: np.ndarray | None = None
+    success_distance_m: float
+    """Of the goal."""
+    image_fov_deg: float
+    """Vertical, of the robot's camera as the episode had it."""
+    waypoints_b: np.ndarray
     """[T + 1, W, 2] f32, m: in the frame of the robot's base."""
-    reward_names: tuple[str, ...] = ()
+    reward_names: tuple[str, ...]
     """`reward/...`, of each of the K terms."""
-    reward_terms: np.ndarray | None = None
+    reward_terms: np.ndarray
     """[T, K] f32."""
 
     @property
@@ -100,8 +100,7 @@ class Replay:
         return self.body_pos_w[:, 0, :2]
 
 
-_LATER = tuple(field.name for field in dataclasses.fields(Replay) if field.type == np.ndarray | None)
-_ARRAYS = tuple(field.name for field in dataclasses.fields(Replay) if field.type is np.ndarray) + _LATER
+_ARRAYS = tuple(field.name for field in dataclasses.fields(Replay) if field.type is np.ndarray)
 
 
 def _read(state: Any, action: jax.Array) -> dict[str, Any]:
@@ -181,8 +180,7 @@ def save_replay(replay: Replay, path: str | Path) -> None:
     """Write a replay as npz, whole or not at all."""
     fields = {f.name: getattr(replay, f.name) for f in dataclasses.fields(Replay)}
     header = {name: value for name, value in fields.items() if name not in _ARRAYS} | {"format": FORMAT}
-    arrays = {name: fields[name] for name in _ARRAYS if fields[name] is not None}
-    write_arrays(path, header=np.array(json.dumps(header)), **arrays)
+    write_arrays(path, header=np.array(json.dumps(header)), **{name: fields[name] for name in _ARRAYS})
 
 
 def load_replay(path: str | Path) -> Replay:
@@ -198,12 +196,12 @@ def load_replay(path: str | Path) -> Replay:
                 "(python -m train.replay RUN_DIR)"
             )
         header = json.loads(str(stored["header"]))
-        arrays = {name: stored[name] for name in _ARRAYS if name in stored.files or name not in _LATER}
+        arrays = {name: stored[name] for name in _ARRAYS}
     if header.pop("format", None) != FORMAT:
         raise ReplayError(f"{path}: is of another format than {FORMAT}; record the episode again")
     robot, moved = Path(header["robot"]), path.parent.parent / "robot" / Path(header["robot"]).name
     if robot.is_absolute() and not robot.is_file() and moved.is_file():
         header["robot"] = str(moved)  # the run's folder is elsewhere now
     for name in ("bodies", "objects", "reward_names"):
-        header[name] = tuple(header.get(name, ()))
+        header[name] = tuple(header[name])
     return Replay(**header, **arrays)

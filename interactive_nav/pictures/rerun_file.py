@@ -96,7 +96,7 @@ def _log_bodies(rr: Any, replay: Replay, view: SceneView) -> None:
 
 
 def _log_task(rr: Any, replay: Replay, view: SceneView) -> None:
-    radius_m = replay.success_distance_m or view.robot.body_width_m
+    radius_m = replay.success_distance_m
     disc = {"centers": [[*replay.goal_xy_w, 0]], "half_sizes": [[radius_m, radius_m, 0.01]], "fill_mode": "solid"}
     rr.log("world/goal", rr.Ellipsoids3D(**disc, colors=[GOAL_COLOUR], labels=["goal"]), static=True)
     path = np.pad(replay.robot_xy_w, ((0, 0), (0, 1)))

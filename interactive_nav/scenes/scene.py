@@ -30,10 +30,8 @@ BASE_M = (-0.5, 3.0)
 """Least and greatest height of an object's lowest point above the floor."""
 BESIDE_M = 1.0
 """Objects may stand, and free floor may reach, so far beyond the map and the walls."""
-
-
 TASK_DIGEST = "task-1:"
-"""Begins a digest of what decides a task, and names the method; what does not begin so is `Scene.digest`."""
+"""Begins a digest of what decides a task, and names the method."""
 # MuJoCo would keep 500 MB of textures and meshes that it has read, 50 MB of each cluttered home.
 mujoco.mj_setCacheCapacity(mujoco.mj_getCache(), 100 * 2**20)
 _DECIMALS = 9

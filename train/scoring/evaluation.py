@@ -171,7 +171,7 @@ def evaluate(
             constants |= dict.fromkeys(OF_LEARNED)
         table = episode_table(played[name], env.scenes, env.world.slots.categories, constants)
         if fixed:
-            needed = [row.get("push_needed") for row in fixed.episodes]
+            needed = [row["push_needed"] for row in fixed.episodes]
             table = table.append_column("push_needed", pa.array(needed, pa.bool_()))
         tables.append(table)
         note = f" ({policy.note})" if isinstance(policy, HostPolicy) and policy.note else ""
