@@ -2,8 +2,8 @@
 
 `python -m interactive_nav.episodes make --robot turtlebot --scenes DIR ... --episodes N --seed S -o FILE`
 
-A file identifies its scenes by digests (`Scene.task_digest`), so it means the same episodes on every machine and backend.
-Other scenes, robots or objects are refused.
+A file identifies its scenes by digests (`Scene.task_digest`), so it means the same episodes on every machine and
+backend. Other scenes, robots or objects are refused.
 """
 
 import dataclasses
@@ -150,8 +150,8 @@ def _check_fits(file: EpisodeFile, env: InteractiveNav, where: str) -> dict[str,
         if name in by_name:
             raise EpisodeFileError(
                 f"{where}: scene '{name}' has digest {_short(digest)}, the environment's '{name}' has "
-                f"{_short(by_name[name].task_digest)}: its content changed since; use the scene it was made from or make the "
-                "episodes again"
+                f"{_short(by_name[name].task_digest)}: its content changed since; use the scene it was made from, or "
+                "make the episodes again"
             )
         raise EpisodeFileError(
             f"{where}: needs scene '{name}' (digest {_short(digest)}), the environment has {', '.join(by_name)}; "

@@ -2,8 +2,8 @@
 
 `WHEELED` are the robots of `models/wheeled.yaml`. Control modes: `native`, velocities of the wheels, left then right,
 front before rear (Husky: their torques), an arm folded; `whole_body`, of a robot with an arm, its velocities too, and a
-gripper's opening; `twist`, linear and angular velocity of the base, an arm folded; `velocity`, `position` or `torque`
-of all joints.
+gripper's opening; `twist`, linear and angular velocity of the base, an arm folded; `hand`, `twist` with the velocity of
+an arm's hand in the base's frame, and a gripper's opening; `velocity`, `position` or `torque` of all joints.
 
 Files are written without the robot's name in front of theirs; the loader adds it (`wheel_left` becomes
 `fetch_wheel_left`) and attaches the file to the world. Collision geoms are in group 3. A group-3 geom
@@ -21,9 +21,11 @@ import mujoco
 import numpy as np
 
 from interactive_nav.robots.files import read_file
+from interactive_nav.robots.links import make_links
 from interactive_nav.robots.spec import ControlLaw, Figures, RobotCamera, RobotSpec, TwistMap, check_mode, set_servo
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.records import read_packaged
+from interactive_nav_common.rotations import apply_axes
 
 FOLDER = Path(__file__).parent / "mjcf"
 _OPTIONS = ("timestep", "integrator", "cone", "solver", "iterations", "ls_iterations", "gravity")
@@ -34,6 +36,10 @@ _ADVANCE_S = 0.1
 """Position mode: a wheel's largest advance per command is its largest speed times this."""
 _WHEEL_STIFFNESS = 8.0
 """1/s: position gain of a wheel over its velocity gain; critically damped within a factor of 2 on all our robots."""
+HAND_M_S = 0.25
+"""Mode `hand`: its largest velocity along each axis."""
+_DAMPING_M_S = 0.05
+"""Of the inverse kinematics: along a direction in which the arm moves the hand more slowly, it falls behind."""
 _SPEED_ERROR = 0.05
 """Velocity mode: a joint's torque limit is reached when its speed is off by this fraction of its largest."""
 
@@ -74,7 +80,9 @@ class WheeledBase:
     whole_body: tuple[str, ...] = ()
     """Joints that mode `whole_body` drives by velocity, beside the wheels."""
     gripper: tuple[str, ...] = ()
-    """Finger joints that mode `whole_body` opens and closes together, by position."""
+    """Finger joints that modes `whole_body` and `hand` open and close together, by position."""
+    hand: str = ""
+    """Body that mode `hand` moves by the joints of `whole_body`."""
 
     @property
     def wheel_rows(self) -> tuple[tuple[float, float], ...]:
@@ -86,7 +94,7 @@ class WheeledBase:
     def modes(self) -> tuple[str, ...]:
         """Return the control modes, `native` first."""
         whole = ("whole_body",) if self.whole_body else ()
-        return ("native", *whole, "twist", "velocity", "position", "torque")
+        return ("native", *whole, "twist", *(("hand",) if self.hand else ()), "velocity", "position", "torque")
 
 
 class _Action(NamedTuple):
@@ -159,12 +167,30 @@ def _law(base: WheeledBase, mode: str, child: mujoco.MjSpec, actions: list[_Acti
     """
     joints, model = base.joints, child.copy().compile()
     matrix = np.stack([action.gain for action in actions], 1)
-    offset = np.where(matrix.any(1), 0.0, [joint.home for joint in joints])
+    arm = [i for i, joint in enumerate(joints) if mode == "hand" and joint.name in base.whole_body]
+    offset = np.where(matrix.any(1) | np.isin(np.arange(len(joints)), arm), 0.0, [joint.home for joint in joints])
     relative = np.asarray([float(mode == "position" and joint.side != 0) for joint in joints])
     address = np.asarray([model.joint(joint.name).qposadr[0] for joint in joints])
     moved, yaw_gain = bool(relative.any()), base.yaw_gain if mode == "twist" else 0.0
     if np.array_equal(matrix, np.eye(len(joints))) and not moved:
         return None
+
+    bodies = [b for b in range(1, model.nbody) if model.body_rootid[b] == 1]
+    links, hand = make_links(model, bodies), bodies.index(model.body(base.hand).id) if arm else 0
+    fastest, ids = np.array([joint.max_speed for joint in joints])[arm], [model.joint(joints[i].name).id for i in arm]
+    ends = np.where(model.jnt_limited[ids, None] > 0, model.jnt_range[ids], [-np.inf, np.inf])
+
+    def arm_speeds(velocity, state, xp):
+        """Return [..., joints], damped least squares (Wampler 1986); joints share by speed, and none is too fast."""
+        lever = links.jacobian(state.qpos, hand, address[arm].tolist()) * xp.asarray(fastest)
+        room = abs(xp.asarray(ends) - state.qpos[..., address[arm], None])
+        for _ in range(3):  # again without the joints that come to an end of their range
+            square = (lever[..., :, None, :] * lever[..., None, :, :]).sum(-1) + xp.asarray(_DAMPING_M_S**2 * np.eye(3))
+            shares = (lever * apply_axes(xp.linalg.inv(square), velocity)[..., None]).sum(-2)
+            ahead = xp.where(shares > 0, room[..., 1], room[..., 0])
+            lever = lever * (abs(shares) * xp.asarray(fastest * _ADVANCE_S) <= ahead)[..., None, :]
+        shares = shares / xp.maximum(abs(shares).max(-1, keepdims=True), 1.0)
+        return shares @ xp.asarray(fastest[:, None] * np.eye(len(joints))[arm])
 
     def law(command, state, xp):
         if yaw_gain:
@@ -172,6 +198,8 @@ def _law(base: WheeledBase, mode: str, child: mujoco.MjSpec, actions: list[_Acti
             command = xp.stack([command[..., 0], turn], -1)
         controls = command @ xp.asarray(matrix).T
         controls = controls + xp.broadcast_to(xp.asarray(offset), controls.shape)
+        if arm:
+            controls = controls + arm_speeds(command[..., 2:5], state, xp)
         if moved:
             controls = controls + xp.broadcast_to(xp.asarray(relative), controls.shape) * state.qpos[..., address]
         return controls
@@ -196,7 +224,7 @@ def _mode(base: WheeledBase, mode: str, limits: list[tuple[Any, float]]) -> tupl
         servos[i], (low, high) = kind, native or (low, high)
         actions.append(_Action(f"{joint.name.replace('_', ' ')} {unit}", low, high, alone[i]))
 
-    if mode == "twist":
+    if mode in ("twist", "hand"):
         gains, least = np.zeros((len(joints), 2)), base.min_linear_m_s
         gains[wheels] = base.wheel_rows
         for i in wheels:
@@ -208,13 +236,16 @@ def _mode(base: WheeledBase, mode: str, limits: list[tuple[Any, float]]) -> tupl
         drive(i, mode)
     for i in wheels if mode in ("native", "whole_body") else ():
         drive(i, "torque" if base.native_torque else "velocity", base.native)
-    if mode == "whole_body":
-        for name in base.whole_body:
-            drive(names.index(name), "velocity")
-        if base.gripper:
-            fingers = [names.index(name) for name in base.gripper]
-            low, high = limits[fingers[0]][0] or (0.0, 0.0)
-            actions.append(_Action("finger opening m", low, high, alone[fingers].sum(0)))
+    for i in map(names.index, base.whole_body if mode in ("whole_body", "hand") else ()):
+        if mode == "whole_body":
+            drive(i, "velocity")
+        servos[i] = "velocity"
+    for way in ("forward", "left", "up") if mode == "hand" else ():
+        actions.append(_Action(f"hand {way} m/s", -HAND_M_S, HAND_M_S, np.zeros(len(joints))))
+    if mode in ("whole_body", "hand") and base.gripper:
+        fingers = [names.index(name) for name in base.gripper]
+        low, high = limits[fingers[0]][0] or (0.0, 0.0)
+        actions.append(_Action("finger opening m", low, high, alone[fingers].sum(0)))
     return servos, actions
 
 
@@ -223,9 +254,8 @@ def _twist_map(base: WheeledBase, mode: str, num_actions: int) -> TwistMap | Non
     rows = ((1.0, 0.0), (0.0, 1.0))
     if mode in ("position", "torque") or (mode in ("native", "whole_body") and base.native_torque):
         return None
-    if mode != "twist":
-        rows = base.wheel_rows + ((0.0, 0.0),) * (num_actions - len(base.wheel_rows))
-    return TwistMap(rows, base.max_linear_m_s, base.max_angular_rad_s)
+    rows = rows if mode in ("twist", "hand") else base.wheel_rows
+    return TwistMap(rows + ((0.0, 0.0),) * (num_actions - len(rows)), base.max_linear_m_s, base.max_angular_rad_s)
 
 
 def wheeled_robot(

@@ -132,11 +132,6 @@ def strip(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
             geom.group, geom.mass = 2, 0.0
 
 
-def slip_torque_n_m(model: mujoco.MjModel, wheel_radius_m: float) -> float:
-    """Return the torque at which a wheel that carries the whole robot slips."""
-    return _WHEEL_FRICTION * _G_M_S2 * float(sum(model.body_mass)) * wheel_radius_m
-
-
 def _replace_wheel(child: mujoco.MjSpec, wheel: Round, base_body: str) -> None:
     body = child.body(wheel.body)
     old = next(g for g in body.geoms if g.group == 3)
@@ -320,7 +315,8 @@ def complete(
     for geom in [g for g in child.geoms if g.group == 3 and g.type == _GEOM.mjGEOM_CYLINDER]:
         warn(path, f"cylinder '{geom.name}' now collides as four boxes, an octagon")
         _replace_cylinder(child, geom)
-    slip_n_m = slip_torque_n_m(compiled(child, path), base.wheel_radius_m)
+    # The torque at which a wheel that carries the whole robot slips.
+    slip_n_m = _WHEEL_FRICTION * _G_M_S2 * float(sum(compiled(child, path).body_mass)) * base.wheel_radius_m
     for joint in base.joints:
         if joint.side:
             turn_freely(child.joint(joint.name), path, slip_n_m)

@@ -3,9 +3,6 @@
 All backends draw these boxes and the floor, the plane z = 0. Settings decide if the robot sees itself.
 """
 
-import dataclasses
-import functools
-from collections.abc import Sequence
 from typing import Any
 
 import flax.struct
@@ -14,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from interactive_nav.robots.links import Links, make_links
 from interactive_nav.scenes.objects import VISUAL_GROUP
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import World
@@ -32,66 +30,6 @@ CLEAR_M = 5.0
 """Boxes that are farther away count as this far in clearances."""
 HOUSING_M = 0.01
 """A box this near to the robot's camera counts as its housing."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Link:
-    """A body of the robot's in its parent's frame at rest, and the joints that carry it."""
-
-    parent: int
-    """Its index among the links; 0 is the base."""
-    pos: np.ndarray
-    axes: np.ndarray
-    joints: tuple[tuple[bool, int, float, np.ndarray, np.ndarray], ...]
-    """(slides, address in qpos, qpos0, axis, anchor) in order."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Links:
-    """The robot's bodies, its base first and parents before their children."""
-
-    base_qpos: int
-    rest: tuple[Link, ...]
-    """All but the base."""
-
-    def frames(self, qpos: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
-        """Return world frames of the base and the rest, [..., 3], m, and [..., 3, 3], for `qpos` [..., nq]."""
-        at = self.base_qpos
-
-        constant = functools.partial(repeated, qpos)
-        frames = [(qpos[..., at : at + 3], matrix_from_quat(qpos[..., at + 3 : at + 7]))]
-        for link in self.rest:
-            pos, axes = frames[link.parent]
-            pos, axes = pos + apply_axes(axes, constant(link.pos)), compose(axes, constant(link.axes))
-            for slides, address, zero, axis, anchor in link.joints:
-                value, axis = qpos[..., address] - zero, constant(axis)
-                if slides:
-                    pos = pos + apply_axes(axes, axis) * value[..., None]
-                    continue
-                arm, turn = swing(axis, constant(anchor), value)
-                pos = pos + apply_axes(axes, arm)
-                axes = compose(axes, turn)
-            frames.append((pos, axes))
-        return frames
-
-
-def repeated(qpos: jax.Array, value: np.ndarray) -> jax.Array:
-    """Return a constant with the leading axes and the type of qpos [..., nq]."""
-    return jnp.broadcast_to(jnp.asarray(value, qpos.dtype), (*qpos.shape[:-1], *value.shape))
-
-
-def make_links(model: mujoco.MjModel, bodies: Sequence[int]) -> Links:
-    """Return the links of a model's bodies: the one with the free joint first, parents before children."""
-    rest = []
-    for body in bodies[1:]:
-        joints = []
-        for j in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
-            slides = model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE
-            address = int(model.jnt_qposadr[j])
-            joints.append((bool(slides), address, float(model.qpos0[address]), model.jnt_axis[j], model.jnt_pos[j]))
-        parent = list(bodies).index(model.body_parentid[body])
-        rest.append(Link(parent, model.body_pos[body], matrix_from_quat(model.body_quat[body]), tuple(joints)))
-    return Links(int(model.jnt_qposadr[model.body_jntadr[bodies[0]]]), tuple(rest))
 
 
 def visual_geoms(scene: Scene) -> tuple[mujoco.MjModel, dict[str, list[int]]]:

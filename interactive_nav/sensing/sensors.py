@@ -20,17 +20,17 @@ import numpy as np
 from interactive_nav.camera_config import CameraNoise
 from interactive_nav.config import IMAGES, NavConfig, SensorConfig
 from interactive_nav.physics.base import PhysicsState
+from interactive_nav.robots.links import Links, make_links, repeated
 from interactive_nav.robots.spec import RobotCamera
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing import Renderer, build_boxes, make_renderer
 from interactive_nav.sensing.base import draw_look
-from interactive_nav.sensing.boxes import Links, apply_axes, make_links, repeated
 from interactive_nav.sensing.observation import task_observation
 from interactive_nav.sensing.rays import cast_fan
 from interactive_nav.types import NavInfo
 from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.rotations import matrix_from_quat, wrap_angle
+from interactive_nav_common.rotations import apply_axes, matrix_from_quat, wrap_angle
 from scenes_mjcf.categories import SEGMENTATIONS
 from scenes_mjcf.look import CameraPose, Lens, look_along
 

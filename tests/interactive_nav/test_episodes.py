@@ -130,18 +130,12 @@ def test_hulls_and_maps_are_part_of_the_task(room, tmp_path):
     assert load_scene(tmp_path / "room").task_digest != load_scene(room).task_digest
 
 
-def test_less_friction_is_refused_and_files_of_before_still_load(env, made, room, two_rooms, tmp_path):
+def test_less_friction_is_refused(env, made, tmp_path):
     slippery = load_scene(write_room(tmp_path / "room", blocks=(("chair", 0.7, 0.0, 5.0, 0.05),)))
     other = types.SimpleNamespace(robot=env.robot, world=env.world, tables=env.tables,
                                   scenes=(slippery, *env.scenes[1:]))  # fmt: skip
     with pytest.raises(EpisodeFileError, match="scene 'room' has digest .*: its content changed since"):
         episodes.starts_of(made, other)  # pyright: ignore[reportArgumentType]
-    old = dataclasses.replace(
-        made,
-        scenes=tuple((s.name, s.digest) for s in env.scenes),
-        objects_digest=hashlib.sha256(repr(env.world.small_objects).encode()).hexdigest(),
-    )
-    np.testing.assert_array_equal(episodes.starts_of(old, env).goal_xy_w, episodes.starts_of(made, env).goal_xy_w)
 
 
 def test_files_that_do_not_fit_are_refused(env, made, room):

@@ -13,7 +13,7 @@ from interactive_nav_common.config import field_docs
 from interactive_nav_common.errors import ConfigError
 from train import config_io
 from train.config import AUTO, EnvConfig, PPOConfig, RunConfig, TrainConfig, resolve, validate
-from train.config_io import apply_overrides, flatten, from_dict, from_yaml, help_text, load_config, to_yaml
+from train.config_io import apply_overrides, flatten, from_yaml, help_text, load_config, to_yaml
 
 BASE = TrainConfig(env=EnvConfig(scenes=("a",)))
 
@@ -27,23 +27,6 @@ def test_round_trip_of_every_kind_of_value():
     assert from_yaml(to_yaml(config)) == config
     assert from_yaml(to_yaml(TrainConfig())) == TrainConfig()
     assert from_yaml("") == TrainConfig()
-
-
-@pytest.mark.parametrize(
-    ("section", "before", "name", "count"),
-    [
-        ("env", "active_walls", "windows", 1),
-        ("sac", "replay_limit_gb", "replay_dtype", 2),
-        ("ppo", "gae_lambda", "learning_rate_schedule", 1),
-        ("ppo", "gae_lambda", "desired_kl", 1),
-    ],
-)
-def test_a_run_of_an_older_version_is_read_without_settings_that_are_gone(section, before, name, count):
-    """Both off-policy learners had a `replay_dtype`; on a command line a setting that is gone is an error."""
-    older = to_yaml(TrainConfig()).replace(f"  {before}:", f"  {name}: float32\n  {before}:")
-    assert older.count(f"  {name}:") == count and from_yaml(older) == TrainConfig()
-    with pytest.raises(ConfigError, match=f"unknown key '{section}.{name}'"):
-        from_dict({section: {name: "float32"}})
 
 
 @pytest.mark.parametrize("name", config_io.preset_names())

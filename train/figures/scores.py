@@ -133,7 +133,8 @@ def robots_plane(rows: pa.Table, split: str | None) -> Figure:
     _finish_plane(*grid[0])
     for axis in grid[0, 1:]:
         axis.set_ylabel("")
-    legend(figure, [*looks.robot_handles(), *looks.k_int_handles(linestyle="")], 5)
+    robots = [handle(style.robot_name(name), **looks.robot(name)) for name in looks.robots]
+    legend(figure, [*robots, *looks.k_int_handles(linestyle="")], 5)
     figure.suptitle(f"{SPLITS[split]}; mean of {looks.seeds}, 95 % bootstrap intervals", fontsize=9)
     return figure
 

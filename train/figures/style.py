@@ -57,9 +57,6 @@ class Looks:
     def algorithm_handles(self, **more: Any) -> list[Line2D]:
         return [handle(name.upper(), **{**self.algorithm(name), **more}) for name in self.algorithms]
 
-    def robot_handles(self) -> list[Line2D]:
-        return [handle(robot_name(name), **self.robot(name)) for name in self.robots]
-
     def k_int_handles(self, **more: Any) -> list[Line2D]:
         grey = {"color": "0.3", "marker": "o"}
         return [handle(f"k$_{{int}}$ = {k:g}", **{**grey, **self.k_int(k), **more}) for k in self.k_ints]

@@ -87,11 +87,6 @@ def _fly_rates(rates, thrust_n, state, xp):
     return xp.clip(wrench @ xp.asarray(_MIXER).T, 0.0, MAX_THRUST_N)
 
 
-def _rate_law(command, state, xp):
-    """Convert (roll, pitch, yaw rate rad/s, total thrust N) to thrusts."""
-    return _fly_rates(command[..., :3], command[..., 3], state, xp)
-
-
 def _velocity_law(command, state, xp):
     """Convert (vx, vy, vz m/s along the heading, yaw rate rad/s) to thrusts."""
     quat, velocity_w = state.qpos[..., 3:7], state.qvel[..., :3]
@@ -125,7 +120,8 @@ _TABLE = read_packaged(
     dict[str, tuple[tuple[str, ...], tuple[float, ...], tuple[float, ...], tuple[tuple[float, float], ...]]],
 )
 """Mode -> action names, commands at -1 and +1, matrix of a `TwistMap` (empty: none)."""
-_LAWS = {"native": _velocity_law, "velocity": _velocity_law, "rate": _rate_law, "twist": _twist_law}
+_LAWS = {"native": _velocity_law, "velocity": _velocity_law, "twist": _twist_law,
+         "rate": lambda command, state, xp: _fly_rates(command[..., :3], command[..., 3], state, xp)}  # fmt: skip
 
 
 def quadrotor(control_mode: str = "native") -> RobotSpec:
