@@ -22,7 +22,7 @@ from rich.text import Text
 
 from converters import generating, segmenting
 from converters.records.errors import StageFailed
-from interactive_nav_common.commands import Flag, Words, option, parse, word
+from interactive_nav_common.commands import Flag, OnCluster, Words, option, parse, word
 from interactive_nav_common.config import AtLeastOne, read_words, refuse_unused
 from interactive_nav_common.errors import ConfigError, UserError, printable, readable, reports_errors
 from interactive_nav_common.jobs.progress import SafeConsole, stage_progress, warn_once
@@ -67,7 +67,7 @@ def alignment_table(rows: tuple[dict[str, Any], ...]) -> Table:
     return table
 
 
-class Convert(generating.OnCluster, segmenting.MeshFile, segmenting.WithLibrary, generating.Decomposing):
+class Convert(OnCluster, segmenting.MeshFile, segmenting.WithLibrary, generating.Decomposing):
     """Convert a scan, drawing or home into a scene folder (SRC OUT), or several into one folder (SRC... --into DIR)."""
 
     places: Annotated[tuple[str, ...], *word("SRC OUT")] = ()

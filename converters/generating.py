@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Literal
 from rich.console import Console
 
 from interactive_nav_common.commands import Command as AnyCommand
-from interactive_nav_common.commands import Flag, Words, option, word
+from interactive_nav_common.commands import Flag, OnCluster, Words, option, word
 from interactive_nav_common.config import AtLeastOne, Positive, read_words, refuse_unused
 from interactive_nav_common.jobs.progress import stage_progress
 from scenes_mjcf import sets
@@ -30,20 +30,6 @@ class Command(AnyCommand):
     def run(self, console: Console) -> int | None:
         """Run the command; return its exit code, None for 0."""
         raise NotImplementedError
-
-
-class OnCluster(Command):
-    """Base of the commands that can run on a cluster."""
-
-    launcher: Literal["local", "ray"] = "local"
-    """Where to run: `local` is this machine, `ray` is a Ray cluster."""
-    ray_address: Annotated[str | None, option(metavar="HOST:PORT")] = None
-    """Address of the Ray cluster's head node, with --launcher ray (default: auto)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.launcher != "ray":
-            refuse_unused(self, "--ray-address", "without --launcher ray")
 
 
 class Decomposing(Command):
@@ -105,7 +91,7 @@ class Generate(Command):
         )
 
 
-class GenerateScenes(OnCluster):
+class GenerateScenes(OnCluster, Command):
     """Generate, convert and draw the homes of a recipe file or of a tier. The same command continues after a stop."""
 
     WRITES = ("{}/*",)

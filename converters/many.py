@@ -269,7 +269,7 @@ def make_packaged(
     scenes = {name: sets.packaged_set(name).scenes for name in sets.PACKAGED}
     words = [word for name, members in scenes.items() for word in (name, f"{name}/train", f"{name}/test", *members)]
     for word in (word for word in names if word not in words):
-        raise GenerationError(f"no scene or set {word!r}{nearest(word, words)}; 'scenes list' shows them")
+        raise GenerationError(f"no scene or set {word!r}{nearest(word, words)}; see 'python -m converters scenes list'")
     failed: list[str] = []
     for name, folder in sets.PACKAGED.items():
         members = scenes[name]

@@ -25,7 +25,7 @@ from converters.generate.models.cad import MODELS
 from converters.pipeline import ConvertConfig, Converted, convert
 from converters.records.errors import StageFailed
 from interactive_nav_common.config import Natural, nearest
-from interactive_nav_common.errors import ConfigError, UserError
+from interactive_nav_common.errors import ConfigError, UserError, readable
 from interactive_nav_common.files import check_name, part_folder, publish
 from interactive_nav_common.records import Reader
 from interactive_nav_common.untrusted.reading import read_bytes
@@ -131,13 +131,9 @@ def parse_recipes(data: Any, where: str) -> Recipes:
 
 def load_recipes(path: Path) -> Recipes:
     """Read a recipe file; raise `GenerationError` if it cannot be used."""
-    try:
+    remedy = "write it with --tier TIER, name another with --recipes, or run python -m converters scenes make NAME"
+    with readable(path, GenerationError, remedy):
         text = read_bytes(path)
-    except OSError as error:
-        why = "no such file" if isinstance(error, FileNotFoundError) else error.strerror
-        raise GenerationError(
-            f"{path}: {why}; name recipes by --recipes, or a set: python -m converters scenes make NAME"
-        ) from None
     return parse_recipes(_RECIPES.decoded(text, "YAML", str(path)), str(path))
 
 

@@ -17,6 +17,7 @@ from converters.generating import Command
 from converters.records.errors import SceneRejected
 from interactive_nav_common.commands import Flag, Words, option, word
 from interactive_nav_common.config import AtLeastOne
+from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import write_arrays, write_text
 from interactive_nav_common.jobs.progress import stage_progress
 from interactive_nav_common.signals import number_of
@@ -192,6 +193,8 @@ class SegmentScore(Command):
         from converters.segment.labelling import load_scores, score_homes, score_source
         from converters.segment.train import HELD_OUT_SEED
 
+        if not (self.sources or self.homes):
+            raise ConfigError("nothing to score; expected SRC, a labelled scan, or --homes N")
         scores = load_scores(self.weights)
         with stage_progress(console) as report:
             for source in self.sources:

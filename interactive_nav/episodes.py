@@ -26,7 +26,7 @@ from interactive_nav.scenes.scene import TASK_DIGEST
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav.types import EpisodeStart
 from interactive_nav_common.commands import Command, option, parse
-from interactive_nav_common.config import Natural, NotNegative, Seed
+from interactive_nav_common.config import AtLeastOne, Natural, NotNegative, Seed
 from interactive_nav_common.errors import ConfigError, UserError, readable, reports_errors
 from interactive_nav_common.files import write_text
 from interactive_nav_common.records import Reader
@@ -255,11 +255,11 @@ class Make(Command):
     """Episode file to write."""
     robot: Annotated[str, option(metavar="NAME|FILE")] = "turtlebot"
     """Robot: a name, a URDF or MJCF file, or path.py:function."""
-    episodes: int = 100
+    episodes: AtLeastOne = 100
     """Number of episodes."""
     seed: int = 0
     """Random seed of the episodes."""
-    num_objects: int = 10
+    num_objects: Natural = 10
     """Number of small objects in each episode."""
     objects: Annotated[tuple[str, ...], option(metavar="OBJECT_DIR")] = ()
     """Folders of small objects to use (default: the built-in ones)."""

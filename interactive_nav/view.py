@@ -24,6 +24,7 @@ from interactive_nav.robots import RobotSpec, get_robot, robot_names
 from interactive_nav.scenes.objects import VISUAL_GROUP, SmallObject, add_shapes, body_names, pick
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.commands import Command, option, parse, word
+from interactive_nav_common.config import Natural
 from interactive_nav_common.errors import UserError, missing, reports_errors
 from interactive_nav_common.grids import cell_centres, clearance
 from interactive_nav_common.untrusted.guard import guarded_server
@@ -184,7 +185,7 @@ class View(Command):
     """Scene folder."""
     robot: Annotated[str, option(metavar="NAME|FILE")] = "turtlebot"
     """Robot to place: a name, a URDF or MJCF file, path.py:function, or none."""
-    objects: int = 10
+    objects: Natural = 10
     """Number of small objects to place."""
     small_objects: Literal["train", "test"] = "train"
     """Split that the small objects come from."""

@@ -11,13 +11,13 @@ import sys
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeAlias, dataclass_transform, get_args, get_type_hints
+from typing import Annotated, Any, Literal, NoReturn, TypeAlias, dataclass_transform, get_args, get_type_hints
 
 import tyro
 from tyro import _errors as events  # the only way to tyro's mistakes as data; the lock file pins its version
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
-from interactive_nav_common.config import check, field_docs, nearest
+from interactive_nav_common.config import check, field_docs, nearest, refuse_unused
 from interactive_nav_common.errors import ConfigError
 
 PROJECT = "interactive-nav"
@@ -66,6 +66,20 @@ class Command:
     def epilog(cls) -> str:
         """Return text for the end of the help."""
         return ""
+
+
+class OnCluster(Command):
+    """Base of the commands that can run on a cluster."""
+
+    launcher: Literal["local", "ray"] = "local"
+    """Where to run: `local` is this machine, `ray` is a Ray cluster."""
+    ray_address: Annotated[str | None, option(metavar="HOST:PORT")] = None
+    """Address of the Ray cluster's head node, with --launcher ray (default: auto)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.launcher != "ray":
+            refuse_unused(self, "--ray-address", "without --launcher ray")
 
 
 @functools.cache

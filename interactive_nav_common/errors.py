@@ -70,7 +70,9 @@ def readable(path: str | Path, kind: type[UserError], remedy: str, what: str = "
     except Exception as error:  # noqa: BLE001
         cause = " ".join(f"{type(error).__name__}: {error}".replace(str(path), Path(path).name).split())[:300]
         cause = "it is empty" if Path(path).is_file() and not Path(path).stat().st_size else cause
-        raise kind(f"{path}: not readable{what} ({cause}); {remedy}") from error
+        gone = isinstance(error, OSError) and not os.path.lexists(path)
+        why = "no such file" if gone else f"not readable{what} ({cause})"
+        raise kind(f"{path}: {why}; {remedy}") from error
 
 
 _REFUSED = {errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EACCES, errno.ENAMETOOLONG}

@@ -125,7 +125,7 @@ def load_manifest(folder: str | Path) -> SceneManifest:
     if not path.is_file():
         raise SceneError(
             f"{path}: no such file; expected a scene folder (scene.xml, scene.json, maps.npz, assets/), "
-            "make one with 'python -m converters convert SRC OUT'"
+            "as 'python -m converters scenes list' shows; make one with 'python -m converters convert SRC OUT'"
         )
     if (xml := path.with_suffix(".xml")).is_file():
         check_named(xml, SceneError, "convert the scene again")
@@ -141,8 +141,6 @@ def save_manifest(manifest: SceneManifest, folder: str | Path) -> None:
 def load_maps(folder: str | Path) -> SceneMaps:
     """Read and check `folder/maps.npz`; raise `SceneError` if it is missing or unusable, or coarser than 0.05 m."""
     path = Path(folder) / "maps.npz"
-    if not path.is_file():
-        raise SceneError(f"{path}: no such file; convert the scene again")
     with read_npz(path, SceneError, "convert the scene again") as arrays:
         traversable = arrays["traversable"]
         resolution, floor_height = float(arrays["resolution"]), float(arrays["floor_height"])

@@ -16,7 +16,7 @@ from interactive_nav.episodes import load_episode_file, starts_of
 from interactive_nav.pictures import replay
 from interactive_nav.task.rollout import episode_keys
 from interactive_nav_common.commands import Command, Words, option, parse, word
-from interactive_nav_common.config import refuse_unused
+from interactive_nav_common.config import Bounds, refuse_unused
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.jobs.progress import SafeConsole
 from scenes_mjcf.sets import installed
@@ -89,7 +89,7 @@ class Replay(OfRun):
     """Policies to play."""
     scenes: Annotated[tuple[str, ...], option(metavar="SCENE_DIR")] = ()
     """Scenes to play in (default: those that the policy was trained in)."""
-    seed: Annotated[int | None, option()] = None
+    seed: Annotated[int | None, Bounds(-(2**63), 2**63 - 1), option()] = None
     """Random seed of the fixed episodes (default: that of `python -m train.evaluate`)."""
     stochastic: bool = True
     """Sample the learned policy's actions, as the original code did, or take the most likely ones."""

@@ -20,6 +20,7 @@ from converters.geometry.faces import corner_normals, face_vectors, unit_normals
 from converters.read.obj import in_colour, join_meshes
 from converters.records.raw import TexturedMesh
 from converters.write.texture import box_pixels
+from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.grids import cell_centres, clearance
@@ -276,8 +277,9 @@ def model_sheet(target: Path, names: Sequence[str] = ()) -> int:
     """Draw models into a PNG, whole or not at all; return how many."""
     unknown = [n for n in names if n not in LIBRARY and n not in {d.category for d in LIBRARY.values()}]
     if unknown:
-        categories = ", ".join(sorted({d.category for d in LIBRARY.values()}))
-        raise UserError(f"no model or category named {', '.join(unknown)}; categories: {categories}")
+        words = sorted({d.category for d in LIBRARY.values()})
+        near = nearest(unknown[0], [*words, *LIBRARY])
+        raise UserError(f"no model or category named {', '.join(unknown)}{near}; categories: {', '.join(words)}")
     wanted = [n for n, d in LIBRARY.items() if not names or n in names or d.category in names]
     wanted = [tint for n in sorted(wanted, key=lambda name: LIBRARY[name].category) for tint in tints(n)]
     rows = -(-len(wanted) // COLUMNS)

@@ -186,9 +186,7 @@ def save_replay(replay: Replay, path: str | Path) -> None:
 def load_replay(path: str | Path) -> Replay:
     """Read a replay; raise `ReplayError` if it is missing, damaged or of another format."""
     path = Path(path)
-    if not path.is_file():
-        raise ReplayError(f"{path}: no such file, expected a replay (npz)")
-    with read_npz(path, ReplayError, "record the episode again") as stored:
+    with read_npz(path, ReplayError, "expected a replay (.npz); record the episode again") as stored:
         if "policies" in stored.files:
             raise ReplayError(
                 f"{path}: holds paths that an evaluation recorded, expected a replay, which has the poses of all "

@@ -105,7 +105,7 @@ def _simulate(arguments: Simulate, stops: list[int]) -> None:
     config = overridden(make_config(**DEFAULTS), arguments.settings)
     start = _pose(arguments.start, "--start") if arguments.start else ()
     if not (installed(arguments.scene) / "scene.json").is_file():  # before what takes long to import
-        raise UserError(f"{arguments.scene}: no scene folder (no scene.json in it)")
+        raise UserError(f"{arguments.scene}: no scene folder (no scene.json); see 'python -m converters scenes list'")
     need_ros("interactive_nav.ros")
     from interactive_nav import make
     from interactive_nav.ros import messages as ros

@@ -233,7 +233,7 @@ def test_the_command_line(room, tmp_path, capsys):
     assert episodes.main(["make", "--scenes", str(tmp_path / "nowhere"), "-o", str(out)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("interactive_nav.episodes: ") and "no such file" in line
-    with pytest.raises(EpisodeFileError, match="not readable .FileNotFoundError"):
+    with pytest.raises(EpisodeFileError, match="absent.json: no such file; make one with"):
         episodes.load_episode_file(tmp_path / "absent.json")
     (tmp_path / "bad.json").write_text("{")
     with pytest.raises(EpisodeFileError, match="not readable as JSON"):

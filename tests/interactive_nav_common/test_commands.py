@@ -124,7 +124,7 @@ def test_help_shows_fields_settings_and_what_follows(capsys):
     with pytest.raises(SystemExit, match="0"):
         parse(COMMANDS, "tool", ["--help"])
     text = " ".join(capsys.readouterr().out.split())
-    assert "draw Draw it." in text and "more show, hide" in text
+    assert "draw Draw it." in text and "more Commands: show, hide." in text
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

@@ -257,7 +257,7 @@ def test_rows_are_never_without_their_paths(run, tmp_path, monkeypatch):
         ),
         (["--policies", "namo:x"], "policy namo: got 'namo:x', expected a weight, as in namo:0.5"),
         (["--policies", "namo:2"], "policy namo: weight is 2.0, expected between 0 and 1"),
-        (["--episode-file", "/nowhere.json"], "--episode-file: /nowhere.json: not readable"),
+        (["--episode-file", "/nowhere.json"], "--episode-file: /nowhere.json: no such file"),
         (["--episode-file", SPARSE, "--episodes", "1001"], "--episodes is 1001, expected at most 1000"),
         (["--checkpoint", "7"], "no checkpoint '7'; expected best, last or one of 512"),
         (["--episode-file", SPARSE, "--balanced"], "--balanced has no effect with --episode-file, whose episodes are"),

@@ -235,7 +235,7 @@ def test_other_files_are_refused(run, tmp_path, capsys):
         (plain, "not readable as an ONNX model (ValueError: it has no description)"),
         (bad, "not readable as an ONNX model (ValueError: it has no description)"),
         (text, "not readable as an ONNX model (InvalidProtobuf"),
-        (tmp_path / "none.onnx", "not readable as an ONNX model (FileNotFoundError"),
+        (tmp_path / "none.onnx", "no such file; expected a file of interactive-nav export"),
     ):
         assert evaluate.main([str(folder.path), "--policies", str(file)], build_env=build_toy) == 2
         (error,) = capsys.readouterr().err.strip().splitlines()

@@ -97,7 +97,7 @@ def load_scenes(folders: Sequence[Path], engine: str) -> list[Scene]:
     need_engine(engine)
     names = [scene.name for scene in scenes]
     if len(set(names)) != len(names) or not names:
-        raise FileError(f"scenes are {', '.join(names) or 'none'}, expected one or more with different names")
+        raise FileError(f"SCENE is {', '.join(names) or 'missing'}, expected one or more scenes with different names")
     return scenes
 
 

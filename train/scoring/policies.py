@@ -20,6 +20,7 @@ import numpy as np
 from interactive_nav.navigation.ways import Ways
 from interactive_nav.robots.spec import RobotSpec, TwistMap
 from interactive_nav.task.rollout import HostPolicy, PolicyFn
+from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.rotations import wrap_angle
 from train.scoring import PLANNERS, POLICIES
@@ -173,5 +174,5 @@ def make_baseline(name: str, env: Any) -> PolicyFn | Planner:
         except ValueError:
             raise UserError(f"policy namo: got {name!r}, expected a weight, as in namo:0.5") from None
         return Planner(env, share)
-    choices = ", ".join((*POLICIES, *PLANNERS))
-    raise UserError(f"--policies: got {name!r}, expected a choice from {choices}")
+    known = (*POLICIES, *PLANNERS)
+    raise UserError(f"--policies: got {name!r}, expected a choice from {', '.join(known)}{nearest(name, known)}")

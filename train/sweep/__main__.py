@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-from interactive_nav_common.commands import Command, Flag, Repeated, option, parse, word
-from interactive_nav_common.config import Bounds, Positive, refuse_unused, settings_help
+from interactive_nav_common.commands import Flag, OnCluster, Repeated, option, parse, word
+from interactive_nav_common.config import Bounds, Positive, settings_help
 from interactive_nav_common.errors import ConfigError, reports_errors
 from interactive_nav_common.jobs.gpus import find_gpus
 from interactive_nav_common.jobs.progress import SafeConsole
@@ -20,7 +20,7 @@ from train.sweep.scheduler import PROGRAMS, STAGES, Machine, Programs, Scheduler
 from train.sweep.spec import SweepConfig
 
 
-class Sweep(Command):
+class Sweep(OnCluster):
     """Train and evaluate every run of a sweep. The same command continues unfinished runs and skips finished ones."""
 
     sweep: Annotated[str, *word("NAME|PATH")]
@@ -45,15 +45,9 @@ class Sweep(Command):
     """Only process runs with these settings, for example env.robot=fetch."""
     shard: Annotated[str | None, option(metavar="I/N")] = None
     """Only process every N-th run, starting with run I: the share of one machine."""
-    launcher: Literal["local", "ray"] = "local"
-    """Where to run: `local` is this machine, `ray` is a Ray cluster."""
-    ray_address: Annotated[str | None, option(metavar="ADDRESS")] = None
-    """Address of the Ray cluster's head node, with --launcher ray (default: auto)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.launcher != "ray":
-            refuse_unused(self, "--ray-address", "without --launcher ray")
         if self.unfinished and self.only != "evaluate":
             raise ConfigError("--unfinished evaluates without training on; expected --only evaluate with it")
 

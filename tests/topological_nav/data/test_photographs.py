@@ -93,7 +93,7 @@ def test_bad_tables_are_refused_in_one_line(tmp_path, capsys):
             capsys, "data", "--photographs", folder, "-o", tmp_path / "out", "headings=6", "width=32", "height=32"
         )
 
-    assert "photographs.csv: not readable" in line(tmp_path / "none")
+    assert "photographs.csv: no such file" in line(tmp_path / "none")
     assert "expected some with file,x_m,y_m,heading_deg; complete it" in line(
         write(tmp_path / "a", drop=("heading_deg",))
     )

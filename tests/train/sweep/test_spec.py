@@ -171,7 +171,7 @@ def test_fixed_episodes_of_each_run_s_robot_are_played(monkeypatch):
 def test_a_wrong_file_is_one_line_and_exit_2(tmp_path, capsys):
     for words, message in (
         (["kitn"], "no sweep 'kitn', did you mean 'kint'?"),
-        ([str(tmp_path / "no.yaml")], "no.yaml: not readable"),
+        ([str(tmp_path / "no.yaml")], "no.yaml: no such file; expected a YAML file"),
         ([], "missing NAME|PATH"),
         (["kint", "--unfinished"], "expected --only evaluate with it"),
         (["kint", "--time-limit", "0"], "--time-limit is 0.0, expected a positive number"),
