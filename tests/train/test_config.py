@@ -151,7 +151,7 @@ def test_files_that_cannot_be_read(tmp_path):
         load_config("sweeps/kint")
     with pytest.raises(ConfigError, match="no preset 'demos', did you mean 'demo'"):
         load_config("demos")
-    with pytest.raises(ConfigError, match="No such file"):
+    with pytest.raises(ConfigError, match="no such file"):
         load_config(str(tmp_path / "none.yaml"))
     (tmp_path / "bad.yaml").write_text("env: [1")
     with pytest.raises(ConfigError, match="bad.yaml: not readable as YAML"):

@@ -79,9 +79,9 @@ def test_a_stretched_arm_gets_finite_speeds_below_its_largest():
     model, data = _alone(robot)
     data.qpos[7:] = 0.0
     state = RobotState(data.qpos, data.qvel, 0.0)
-    ahead = robot.control(np.array([0, 0, HAND_M_S, 0, 0, 0]), state, np)
+    ahead = robot.controls(np.array([0, 0, HAND_M_S, 0, 0, 0]), state)
     assert np.isfinite(ahead).all() and np.abs(ahead).max() < 0.05  # no joint moves a straight arm's hand ahead
-    aside = robot.control(np.array([0, 0, 0, 10.0, 0, 0]), state, np)
+    aside = robot.controls(np.array([0, 0, 0, 10.0, 0, 0]), state)
     fastest = {"torso": 0.1, "shoulder_pan": 1.256, "shoulder_lift": 1.454, "elbow_flex": 1.521, "wrist_flex": 2.268}
     shares = [abs(v) / fastest[n.removeprefix("fetch_")] for n, v in zip(robot.actuators, aside, strict=True)
               if n.removeprefix("fetch_") in fastest]  # fmt: skip
