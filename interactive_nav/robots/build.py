@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 from interactive_nav.robots.files import read_file
-from interactive_nav.robots.links import make_links
+from interactive_nav.robots.links import make_links, repeated
 from interactive_nav.robots.spec import ControlLaw, Figures, RobotCamera, RobotSpec, TwistMap, check_mode, set_servo
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.records import read_packaged
@@ -182,13 +182,14 @@ def _law(base: WheeledBase, mode: str, child: mujoco.MjSpec, actions: list[_Acti
 
     def arm_speeds(velocity, state, xp):
         """Return [..., joints], damped least squares (Wampler 1986); joints share by speed, and none is too fast."""
-        lever = links.jacobian(state.qpos, hand, address[arm].tolist()) * xp.asarray(fastest)
-        room = abs(xp.asarray(ends) - state.qpos[..., address[arm], None])
+        constant = functools.partial(repeated, state.qpos)
+        lever = links.jacobian(state.qpos, hand, address[arm].tolist()) * constant(fastest[None])
+        room = abs(constant(ends) - state.qpos[..., address[arm], None])
         for _ in range(3):  # again without the joints that come to an end of their range
-            square = (lever[..., :, None, :] * lever[..., None, :, :]).sum(-1) + xp.asarray(_DAMPING_M_S**2 * np.eye(3))
+            square = (lever[..., :, None, :] * lever[..., None, :, :]).sum(-1) + constant(_DAMPING_M_S**2 * np.eye(3))
             shares = (lever * apply_axes(xp.linalg.inv(square), velocity)[..., None]).sum(-2)
             ahead = xp.where(shares > 0, room[..., 1], room[..., 0])
-            lever = lever * (abs(shares) * xp.asarray(fastest * _ADVANCE_S) <= ahead)[..., None, :]
+            lever = lever * (abs(shares) * constant(fastest * _ADVANCE_S) <= ahead)[..., None, :]
         shares = shares / xp.maximum(abs(shares).max(-1, keepdims=True), 1.0)
         return shares @ xp.asarray(fastest[:, None] * np.eye(len(joints))[arm])
 
