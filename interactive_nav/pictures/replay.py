@@ -22,7 +22,7 @@ from interactive_nav_common.files import write_arrays
 from interactive_nav_common.untrusted.reading import read_npz
 from scenes_mjcf.categories import MaskClasses
 
-FORMAT = 1
+FORMAT = 2
 
 
 class ReplayError(UserError):
@@ -194,9 +194,9 @@ def load_replay(path: str | Path) -> Replay:
                 "(python -m train.replay RUN_DIR)"
             )
         header = json.loads(str(stored["header"]))
+        if (form := header.pop("format", None)) != FORMAT:
+            raise ReplayError(f"{path}: its format is {form}, expected {FORMAT}; record the episode again")
         arrays = {name: stored[name] for name in _ARRAYS}
-    if header.pop("format", None) != FORMAT:
-        raise ReplayError(f"{path}: is of another format than {FORMAT}; record the episode again")
     robot, moved = Path(header["robot"]), path.parent.parent / "robot" / Path(header["robot"]).name
     if robot.is_absolute() and not robot.is_file() and moved.is_file():
         header["robot"] = str(moved)  # the run's folder is elsewhere now

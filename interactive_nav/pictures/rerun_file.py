@@ -105,12 +105,11 @@ def _log_task(rr: Any, replay: Replay, view: SceneView) -> None:
     rows = [(i, *row) for i, row in enumerate(zip(classes.names, classes.colours, strict=True))]
     rr.log("world/camera", rr.AnnotationContext(rows), static=True)
 
+    points = np.pad(replay.waypoints_b, ((0, 0), (0, 0), (0, 1)))
+    columns = rr.Points3D.columns(positions=points.reshape(-1, 3)).partition([points.shape[1]] * len(points))
+    base = rr.new_entity_path(["world", "robot", replay.bodies[0]])
+    rr.send_columns(f"{base}/waypoints", _times(rr, replay, 0), columns)
     series = {"reward": replay.reward, "force": replay.force_n}
-    if replay.waypoints_b is not None and replay.reward_terms is not None:
-        points = np.pad(replay.waypoints_b, ((0, 0), (0, 0), (0, 1)))
-        columns = rr.Points3D.columns(positions=points.reshape(-1, 3)).partition([points.shape[1]] * len(points))
-        base = rr.new_entity_path(["world", "robot", replay.bodies[0]])
-        rr.send_columns(f"{base}/waypoints", _times(rr, replay, 0), columns)
-        series |= dict(zip(replay.reward_names, replay.reward_terms.T, strict=True))
+    series |= dict(zip(replay.reward_names, replay.reward_terms.T, strict=True))
     for name, values in series.items():
         rr.send_columns(name, _times(rr, replay, 1), rr.Scalars.columns(scalars=values))

@@ -162,6 +162,14 @@ def still(room: Path) -> Replay:
         touches_movable=np.zeros(steps, bool),
         touches_structure=np.zeros(steps, bool),
         metrics={},
+        small_objects="train",
+        objects=(),
+        segmentation_classes=4,
+        success_distance_m=0.333,
+        image_fov_deg=60.0,
+        waypoints_b=np.zeros((steps + 1, 10, 2), np.float32),
+        reward_names=(),
+        reward_terms=np.zeros((steps, 0), np.float32),
     )
 
 

@@ -105,6 +105,9 @@ def test_files_that_are_no_replays_are_refused(played, tmp_path):
     for name in ("other", "text", "cut"):
         with pytest.raises(ReplayError, match=rf"{name}\.npz: not readable .*; record the episode again"):
             replay.load_replay(tmp_path / f"{name}.npz")
+    np.savez(tmp_path / "older.npz", header=np.array(json.dumps({"format": 1})))
+    with pytest.raises(ReplayError, match=r"older\.npz: its format is 1, expected 2; record the episode again"):
+        replay.load_replay(tmp_path / "older.npz")
 
 
 @pytest.fixture(scope="module")
@@ -188,20 +191,18 @@ def test_pictures_show_the_episodes_own_models_and_goal(room, played, tmp_path, 
         np.testing.assert_allclose(view.model.geom_size[body.geomadr[0] : body.geomadr[0] + body.geomnum[0]], halves)
     painted = []
     monkeypatch.setattr(record, "FloorPaint", lambda goal, radius, trail: painted.append(radius))
-    for each, radius in ((told, 0.7), (dataclasses.replace(told, success_distance_m=None), 0.333)):
-        record.Compositor(each, load_scene(room), height=120).frame(0)
-        axis = topdown.panels([each], {str(room): load_scene(room)}).axes[0]
-        assert painted.pop() == pytest.approx(radius, abs=1e-3)
-        assert any(getattr(patch, "radius", 0) == pytest.approx(radius, abs=1e-3) for patch in axis.patches)
+    record.Compositor(told, load_scene(room), height=120).frame(0)
+    axis = topdown.panels([told], {str(room): load_scene(room)}).axes[0]
+    assert painted.pop() == 0.7
+    assert any(getattr(patch, "radius", 0) == pytest.approx(0.7, abs=1e-3) for patch in axis.patches)
 
 
 def test_the_robots_pictures_have_the_episodes_field_of_view(room, env, played):
     assert played.image_fov_deg == env.sensors.lens.fov_deg == env.robot.camera.fov_deg
-    usual, narrow, old = (
+    usual, narrow = (
         record.Compositor(dataclasses.replace(played, image_fov_deg=fov), load_scene(room), height=120).frame(0)
-        for fov in (played.image_fov_deg, 40.0, None)
+        for fov in (played.image_fov_deg, 40.0)
     )
-    np.testing.assert_array_equal(old, usual)
     np.testing.assert_array_equal(narrow[:, :160], usual[:, :160])
     assert all((narrow[at : at + 40, 160:] != usual[at : at + 40, 160:]).any() for at in (0, 40))
 
@@ -210,17 +211,6 @@ def test_a_policy_draws_from_another_key_than_the_environment(env):
     key = jax.random.PRNGKey(3)
     own = jax.jit(env.reset)(key).info["rng"]
     assert (own == jax.random.fold_in(key, 0)).all() and (policy_key_of(key) != own).any()
-
-
-def test_a_replay_of_before_can_be_read(played, tmp_path):
-    fields = {f.name: getattr(played, f.name) for f in dataclasses.fields(played)}
-    later = ("small_objects", "segmentation_classes", "success_distance_m", "image_fov_deg", "reward_names")
-    header = {n: v for n, v in fields.items() if n not in (*replay._ARRAYS, *later)} | {"format": 1}
-    arrays = {name: fields[name] for name in replay._ARRAYS if name not in replay._LATER}
-    np.savez(tmp_path / "old.npz", header=np.array(json.dumps(header)), **arrays)
-    old = replay.load_replay(tmp_path / "old.npz")
-    assert (old.small_objects, old.segmentation_classes, old.success_distance_m) == ("train", 4, None)
-    assert old.reward_names == () and old.reward_terms is old.waypoints_b is None
 
 
 def test_importing_and_drawing_leave_matplotlibs_backend_alone():
