@@ -17,9 +17,11 @@ class Link:
     parent: int
     """Its index among the links; 0 is the base."""
     pos: np.ndarray
+    """(3,), m."""
     axes: np.ndarray
+    """(3, 3), as columns."""
     joints: tuple[tuple[bool, int, float, np.ndarray, np.ndarray], ...]
-    """(slides, address in qpos, qpos0, axis, anchor) in order."""
+    """(slides, address in qpos, qpos0, axis (3,), anchor (3,) in m), in order; both in the body's frame."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +29,7 @@ class Links:
     """The robot's bodies, its base first and parents before their children."""
 
     base_qpos: int
+    """Address of the base's free joint in qpos."""
     rest: tuple[Link, ...]
     """All but the base."""
 
