@@ -167,8 +167,6 @@ class Export(Listed):
     """Dataset or scene on whose images the runs and their exports are compared."""
     out: Annotated[Path, option("-o", metavar="DIR")] = RUNS / "export"
     """Folder to write."""
-    picture: Annotated[Path | None, option(metavar="PATH")] = None
-    """Picture of the comparison to write (default: DIR.png)."""
 
 
 class Tables(Command):

@@ -180,7 +180,7 @@ def keep_map(built: Built, out: Path, ends: Sequence[int] | None = None) -> None
 def run_export(arguments: Any) -> None:
     config = overridden(configs.ExportConfig(), arguments.settings)
     if arguments.onnx:
-        refuse_unused(arguments, "--maps --picture limit_mib tolerance commit", "with --onnx")
+        refuse_unused(arguments, "--maps limit_mib tolerance commit", "with --onnx")
         networks = load_networks(arguments.localiser, arguments.detector)
         driver = arguments.policy and load_policy(arguments.policy, arguments.localiser, arguments.detector)
         with bar() as report, whole_folder(arguments.out) as part:
@@ -191,11 +191,9 @@ def run_export(arguments: Any) -> None:
     with bar() as report:
         runs = (arguments.localiser, arguments.detector, arguments.policy, arguments.maps)
         sizes, compared = export(*runs, arguments.images, arguments.out, config, report)
-    picture = arguments.picture or arguments.out.with_name(f"{arguments.out.name}.png")
-    save(figures.export_figure(compared), picture)
-    for name, value in compared.scores.items():
+    for name, value in compared.items():
         print(f"{name.replace('_', ' ')}: {value:.3g}")
-    print(f"{arguments.out}: {size_lines(sizes, config.limit_mib)}; drawn in {picture}")
+    print(f"{arguments.out}: {size_lines(sizes, config.limit_mib)}")
 
 
 def run_tables(arguments: Any) -> None:

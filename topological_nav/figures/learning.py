@@ -1,4 +1,4 @@
-"""Draw training data and training: drives, learning curves, scores, domains, exports."""
+"""Draw training data and training: drives, learning curves, scores, domains."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +15,6 @@ from interactive_nav_common.figures import BLUE, ORANGE, RC, VERMILION, curves, 
 from topological_nav.drives.dataset import drive_images, load_drives, read_drives_header
 from topological_nav.figures.maps import floor_plan
 from topological_nav.scenes.space import free_space
-from topological_nav.weights.export import PRECISION, Compared
 
 SHOWN = 4
 """Drives with images."""
@@ -117,16 +116,10 @@ def policy_figure(lines: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
 
 
 def curves_figure(lines: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw loss and accuracy over epochs from lines of metrics.jsonl, a column per phase."""
-    names = {"pairs": "without labels (VICReg)", "labels": "with labels"}
-    phases = list(dict.fromkeys(line["phase"] for line in lines))
-    figure, grid = panels((4.6 * len(phases), 3.2), 1, len(phases))
-    for axis, phase in zip(grid[0], phases, strict=True):
-        mine = [line for line in lines if line["phase"] == phase]
-        labels = {"loss": "loss", "accuracy": "accuracy on training images"}
-        curves(axis, mine, {name: label for name, label in labels.items() if name in mine[0]}, marker=".")
-        axis.set_title(names[phase], fontsize=9)
-        axis.set_ylim(bottom=0)
+    """Draw loss and accuracy over epochs from lines of metrics.jsonl."""
+    figure, ((axis,),) = panels((4.6, 3.2))
+    curves(axis, lines, {"loss": "loss", "accuracy": "accuracy on training images"}, marker=".")
+    axis.set_ylim(bottom=0)
     return figure
 
 
@@ -162,25 +155,4 @@ def features_figure(
     title = "share of the target's held-out images localised"
     scores.set(xticks=[0, 1], xticklabels=[label for _, label in kinds], ylim=(0, 1), title=title)
     scores.legend(loc="upper left")
-    return figure
-
-
-def export_figure(compared: Compared) -> Figure:
-    """Draw two panels: distances of embeddings, probabilities of passages."""
-    figure, ((left, right),) = panels((9, 3.8), 1, 2)
-    rows = [("by precision, localiser", compared.embedding[0]), ("by precision, detector", compared.embedding[1])]
-    if (compared.apart > 0).any():
-        rows.append(("to the nearest image of another place", compared.apart))
-    floor = 1e-7
-    shown = [np.maximum(values, floor) for _, values in rows]
-    low, high = np.log10(min(v.min() for v in shown)), np.log10(max(v.max() for v in shown))
-    bins = np.logspace(low - 0.05, high + 0.05, 60)
-    for (name, _), values in zip(rows, shown, strict=True):
-        left.hist(values, bins, alpha=0.65, label=name)  # type: ignore[arg-type]
-    left.set(xscale="log", xlabel="distance of embeddings", ylabel="images")
-    left.set_ylim(0, 1.35 * left.get_ylim()[1])
-    left.legend(fontsize=8, loc="upper center")
-    right.plot([0, 1], [0, 1], color="0.7", lw=1)
-    right.scatter(*compared.probability.reshape(2, -1), s=8, alpha=0.6)
-    right.set(xlabel="probability of a passage, the run", ylabel=f"the same, {PRECISION}", aspect="equal")
     return figure

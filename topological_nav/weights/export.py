@@ -20,7 +20,6 @@ from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from interactive_nav import get_robot, load_scene
 from interactive_nav_common.errors import ConfigError, FileError
@@ -49,19 +48,6 @@ from topological_nav.scenes.space import free_space
 FORMAT, PRECISION, ABOUT = 1, "fp16", "export.json"
 
 
-@dataclasses.dataclass(frozen=True)
-class Compared:
-    """Compare the outputs of runs and their exports for the same images of P places and K headings."""
-
-    embedding: np.ndarray
-    """[2, P K] distance between the two embeddings of an image, by the localiser and by the detector."""
-    apart: np.ndarray
-    """[P K] distance of an image's embedding to the nearest of another place, by the localiser."""
-    probability: np.ndarray
-    """[2, P K, L] probability that the path is free for each of the detector's lengths, by run and by export."""
-    scores: dict[str, float]
-
-
 def export(
     localiser: Path,
     detector: Path,
@@ -71,7 +57,7 @@ def export(
     out: Path,
     config: ExportConfig,
     progress: Progress = lambda *_: None,
-) -> tuple[dict[str, int], Compared]:
+) -> tuple[dict[str, int], dict[str, float]]:
     """Write an export atomically, replacing one at `out`; return `sizes_of` it and the comparison."""
     out = Path(os.path.abspath(out))
     if out.exists() and not (out / ABOUT).is_file() and (not out.is_dir() or any(out.iterdir())):
@@ -103,12 +89,12 @@ def export(
         exported = Networks(load_trained(part / "rooms"), load_trained(part / "passages"))
         compared = compare(networks, exported, driver, load_policy(part / "policy") if driver else None, pictures)
         for name in ("largest_embedding_distance", "largest_probability_difference"):
-            if not compared.scores[name] <= config.tolerance:
+            if not compared[name] <= config.tolerance:
                 raise FileError(
-                    f"{PRECISION} changes the predictions: {name} is {compared.scores[name]:.2g}, expected at most "
+                    f"{PRECISION} changes the predictions: {name} is {compared[name]:.2g}, expected at most "
                     f"{config.tolerance:g} (tolerance)"
                 )
-        about |= {"compared": compared.scores, "exported_by": {"commit": versions()["commit"]}}
+        about |= {"compared": compared, "exported_by": {"commit": versions()["commit"]}}
         write_json(part / ABOUT, about)
         sizes = sizes_of(part)
         if sum(sizes.values()) > config.limit_mib * 2**20:
@@ -141,9 +127,8 @@ def compare(
     driver: TrainedPolicy | None,
     exported_driver: TrainedPolicy | None,
     images: np.ndarray,
-) -> Compared:
+) -> dict[str, float]:
     """Compare runs with exports by images [P, K, H, W, 3] u8; policies see each place's images one after the other."""
-    places, around = images.shape[:2]
     flat = images.reshape(-1, *images.shape[2:])
     before, after = ([net.embed(flat) for net in pair] for pair in (networks, exported))
     embedding = np.stack([np.linalg.norm(a - b, axis=-1) for a, b in zip(before, after, strict=True)])
@@ -158,18 +143,11 @@ def compare(
         "same_passage": float(((probability[0] > 0.5) == (probability[1] > 0.5)).mean()),
         "same_room": float((rooms[0] == rooms[1]).mean()),
     }
-    apart = np.zeros(len(flat))
-    if places > 1:
-        place, embedded = np.arange(len(flat)) // around, [one[0].astype(float) for one in (before, after)]
-        far = [np.where(place[:, None] == place, np.inf, cdist(one, embedded[0])) for one in embedded]
-        apart = far[0].min(1)
-        scores["same_nearest_place"] = float((place[far[0].argmin(1)] == place[far[1].argmin(1)]).mean())
-        scores["mean_distance_to_nearest_place"] = float(apart.mean())
     if driver is not None and exported_driver is not None:
         driven = [_driven(one, images) for one in (driver, exported_driver)]
         same = (driven[0] == driven[1]).mean((0, 2))
         scores |= {"same_linear": float(same[0]), "same_angular": float(same[1])}
-    return Compared(embedding, apart, probability, scores)
+    return scores
 
 
 def level_images(source: Path, networks: Networks, places: int, progress: Progress = lambda *_: None) -> np.ndarray:

@@ -45,7 +45,7 @@ class ActorCriticState:
 
 
 @dataclasses.dataclass(frozen=True)
-class ActorCritic(abc.ABC):
+class ActorCritic(memory.Agent):
     """Holds all that learning does not change; a subclass adds its losses, targets and exploration."""
 
     section: str
@@ -107,30 +107,11 @@ class ActorCritic(abc.ABC):
     def init(self, key_networks: jax.Array, key: jax.Array) -> Any:
         """Return a new learner; `key` is what its updates will draw from."""
 
-    @abc.abstractmethod
-    def policy(self, learner: Any, deterministic: bool) -> types.Policy:
-        """Return (observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
-
-    def first_memory(self) -> memory.Memory:
-        """Return what the networks remember when episodes start, [envs, H] of each recurrent layer, if any."""
-        return [jnp.zeros((self.config.num_envs or 1, self.memory_size))] * bool(self.memory_size) * (2 - self.shared)
-
     def recall(self, learner: Any, observation: Any, kept: memory.Memory) -> tuple[Self, memory.Memory]:
-        """Return an agent with the policy for this observation [N, ...] after what was kept, and the new memory."""
         params = self.whole_policy(learner.policy_params, learner.q_params), learner.q_params
         of_both = self.networks.policy_network, self.networks.q_network
         policy, new = memory.advance(of_both, params, learner.normalizer_params, observation, kept)
         return dataclasses.replace(self, networks=self.networks.replace(policy_network=policy)), new  # type: ignore
-
-    def recurrent_policy(self, learner: Any, deterministic: bool) -> memory.Act:
-        """Return the policy of networks with memory; it carries on as many of their memories as it is given."""
-
-        def act(observation: Any, kept: memory.Memory, key: jax.Array) -> tuple[jax.Array, dict[str, Any]]:
-            agent, new = self.recall(learner, observation, kept)
-            action, extras = agent.policy(learner, deterministic)(observation, key)
-            return action, {**extras, "memory": new}
-
-        return act
 
     def init_noise(self) -> Any:
         """Return the exploration noise of every environment at the start of an episode; none by default."""
@@ -218,11 +199,6 @@ def descend(loss: Callable[..., jax.Array], optimizer: optax.GradientTransformat
     return gradients.gradient_update_fn(loss, optimizer, None)  # type: ignore[arg-type]
 
 
-def soft_update(target: Any, online: Any, tau: float | jax.Array) -> Any:
-    """Move targets by `tau` towards the networks they follow, written as Brax writes it."""
-    return jax.tree.map(lambda x, y: x * (1 - tau) + y * tau, target, online)
-
-
 @flax.struct.dataclass
 class SACState(ActorCriticState):
     """Adds the temperature."""
@@ -279,7 +255,7 @@ class SAC(ActorCritic):
         )
         return learner.replace(  # type: ignore[attr-defined]
             **changed,
-            target_q_params=soft_update(learner.target_q_params, changed["q_params"], self.config.tau),
+            target_q_params=optax.incremental_update(changed["q_params"], learner.target_q_params, self.config.tau),
             alpha_optimizer_state=alpha_optimizer_state,
             alpha_params=alpha_params,
         ), {**metrics, "alpha_loss": alpha_loss_value, "alpha": jnp.exp(alpha_params)}
@@ -384,8 +360,7 @@ class DDPG(ActorCritic):
             transitions,
         )
         tau = jnp.where(changed["gradient_steps"] % c.target_update_period == 0, c.tau, 0.0)
-        return learner.replace(  # type: ignore[attr-defined]
-            **changed,
-            target_policy_params=soft_update(learner.target_policy_params, changed["policy_params"], tau),
-            target_q_params=soft_update(learner.target_q_params, changed["q_params"], tau),
-        ), metrics
+        policy = optax.incremental_update(changed["policy_params"], learner.target_policy_params, tau)
+        q = optax.incremental_update(changed["q_params"], learner.target_q_params, tau)
+        targets = {"target_policy_params": policy, "target_q_params": q}
+        return learner.replace(**changed, **targets), metrics  # type: ignore[attr-defined]

@@ -5,16 +5,16 @@ as `state.info["policy"]`, is zero when an episode starts, and gradients go back
 learners take each sequence as a `History`, which their networks read in place of an observation.
 """
 
+import abc
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Self
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 from brax.envs import Env
 from brax.training import acting, types
-from brax.training.agents.ppo import networks as ppo_networks
 
 from interactive_nav_common.errors import ConfigError
 
@@ -32,17 +32,34 @@ def lost(where: str) -> ConfigError:
     )
 
 
-def make_act(both: ppo_networks.PPONetworks, statistics: Any, params: Sequence[Any], deterministic: bool) -> Act:
-    """Return a policy that draws actions as Brax's does."""
+class Agent(abc.ABC):
+    """Base of what acts by networks that may have memory."""
 
-    def act(observation: Any, memory: Memory, key: jax.Array) -> tuple[jax.Array, dict[str, Any]]:
-        networks = (both.policy_network, both.value_network)
-        head, new = advance(networks, params, statistics, observation, memory)
-        policy = ppo_networks.make_inference_fn(both.replace(policy_network=head))  # type: ignore[attr-defined]
-        action, extras = policy((None, None), deterministic)(observation, key)
-        return action, {**extras, "memory": new}
+    config: Any
+    shared: bool
+    memory_size: int
 
-    return act
+    @abc.abstractmethod
+    def policy(self, learner: Any, deterministic: bool) -> types.Policy:
+        """Return (observation [N, ...], key) -> (action [N, A] in [-1, 1], extras)."""
+
+    @abc.abstractmethod
+    def recall(self, learner: Any, observation: Any, kept: Memory) -> tuple[Self, Memory]:
+        """Return an agent with the policy for this observation [N, ...] after what was kept, and the new memory."""
+
+    def first_memory(self) -> Memory:
+        """Return what the networks remember when episodes start, [envs, H] of each recurrent layer, if any."""
+        return [jnp.zeros((self.config.num_envs or 1, self.memory_size))] * bool(self.memory_size) * (2 - self.shared)
+
+    def recurrent_policy(self, learner: Any, deterministic: bool) -> Act:
+        """Return the policy of networks with memory; it carries on as many of their memories as it is given."""
+
+        def act(observation: Any, kept: Memory, key: jax.Array) -> tuple[jax.Array, dict[str, Any]]:
+            agent, new = self.recall(learner, observation, kept)
+            action, extras = agent.policy(learner, deterministic)(observation, key)
+            return action, {**extras, "memory": new}
+
+        return act
 
 
 def advance(networks: Any, params: Any, statistics: Any, observation: Any, memory: Memory) -> tuple[Any, Memory]:

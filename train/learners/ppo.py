@@ -17,7 +17,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Self
 
 import flax.struct
 import jax
@@ -62,7 +62,7 @@ class PPOState:
 
 
 @dataclasses.dataclass(frozen=True)
-class PPOParts:
+class PPOParts(memory.Agent):
     """Holds all that learning does not change."""
 
     config: PPOConfig
@@ -100,25 +100,17 @@ class PPOParts:
             key=key,
         )
 
-    @property
-    def remembers(self) -> bool:
-        """Return whether the policy has memory."""
-        return getattr(self.nets.policy_network, "remember", None) is not None
-
-    def first_memory(self) -> list[jax.Array]:
-        """Return what actor and critic remember when episodes start, [envs, H] of each recurrent layer."""
-        size = (self.config.num_envs or 1, self.memory_size)
-        return [jnp.zeros(size)] * (self.remembers * (1 if self.shared else 2))
-
     def policy(self, learner: PPOState, deterministic: bool) -> types.Policy:
-        if self.remembers:
+        if self.memory_size:
             raise memory.lost("a function of the observation alone")
         make = ppo_networks.make_inference_fn(self.nets)
         return make((learner.normalizer_params, *whole_params(learner.params)), deterministic)
 
-    def recurrent_policy(self, learner: PPOState, deterministic: bool) -> memory.Act:
-        """Return the policy of networks with memory; it carries on as many of their memories as it is given."""
-        return memory.make_act(self.nets, learner.normalizer_params, whole_params(learner.params), deterministic)
+    def recall(self, learner: PPOState, observation: Any, kept: memory.Memory) -> tuple[Self, memory.Memory]:
+        both, params = (self.nets.policy_network, self.nets.value_network), whole_params(learner.params)
+        policy, new = memory.advance(both, params, learner.normalizer_params, observation, kept)
+        nets = self.nets.replace(policy_network=policy)  # type: ignore[attr-defined]
+        return dataclasses.replace(self, nets=nets, memory_size=0), new
 
 
 def make_agent(env: Any, config: TrainConfig) -> PPOParts:
@@ -127,8 +119,9 @@ def make_agent(env: Any, config: TrainConfig) -> PPOParts:
     layers = c.policy_hidden_layer_sizes, c.value_hidden_layer_sizes
     n = env.privileged_size if network.critic_inputs == "privileged" else 0
     built = nets.make_ppo_networks(network, size, env.action_size, *layers, c.normalize_observations, n)
-    shared = network.share_encoder and isinstance(built.policy_network, nets.Split)
-    parts = PPOParts(c, built, optax.identity(), size, shared, network.memory_size, config.run.devices)
+    shared, memory_size = network.share_encoder and isinstance(built.policy_network, nets.Split), network.memory_size
+    memory_size *= network.memory != "none"
+    parts = PPOParts(c, built, optax.identity(), size, shared, memory_size, config.run.devices)
     rate, end = None, c.final_learning_rate
     if end is not None:
         updates = math.ceil(config.run.num_timesteps / parts.steps_per_update)
@@ -156,7 +149,7 @@ def collect(
     """Act for one update; return environment state, transitions [sequences, time, ...], and ended episodes' sums."""
     config = parts.config
     make, generate_unroll = parts.policy, acting.generate_unroll
-    if parts.remembers:
+    if parts.memory_size:
         make, generate_unroll = parts.recurrent_policy, memory.generate_unroll
     act: Any = make(state, deterministic=False)
     assert config.batch_size and config.num_minibatches and config.num_envs

@@ -7,7 +7,6 @@ import shutil
 import jax
 import numpy as np
 import pytest
-from PIL import Image
 
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.errors import FileError
@@ -64,7 +63,7 @@ def test_an_exported_network_computes_with_its_rounded_weights(made, exported):
     p = 1 / (1 + np.exp(-np.array(judged, float)))
     assert 0 < np.abs(p[0] - p[1]).max() < 0.02
     about = json.loads((exported / "export.json").read_text())["compared"]
-    assert about["largest_probability_difference"] < 0.02 and about["same_nearest_place"] > 0.95
+    assert about["largest_probability_difference"] < 0.02 and about["same_passage"] > 0.95
     assert half_run.about["digest"] == run.about["digest"]
     assert (run.stored, half_run.stored) == (run.about["digest"], f"{run.about['digest']}-fp16")
 
@@ -115,8 +114,6 @@ def test_it_says_where_everything_comes_from(made, exported):
         "nodes": len(made_map.xy_w),
         "edges": len(made_map.edges),
     }
-    picture = np.asarray(Image.open(exported.with_name("weights.png")).convert("RGB"))
-    assert picture.shape[0] > 200 and picture.std() > 10
 
 
 def test_what_is_too_large_is_refused_and_nothing_is_left(made, tmp_path, capsys):

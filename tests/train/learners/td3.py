@@ -12,7 +12,7 @@ from brax.training import types
 from interactive_nav_common.config import AtLeastOne, NotNegative, Positive, Share
 from train.config import OffPolicyConfig, TrainConfig
 from train.learners import offpolicy
-from train.learners.actor_critic import ActorCritic, ActorCriticState, action_of, policy_part, soft_update
+from train.learners.actor_critic import ActorCritic, ActorCriticState, action_of, policy_part
 from train.learners.algorithms import Algorithm
 
 
@@ -105,8 +105,8 @@ class TD3(ActorCritic):
         tau = jnp.where(due, c.tau, 0.0)
         return learner.replace(  # type: ignore[attr-defined]
             **changed,
-            target_policy_params=soft_update(learner.target_policy_params, changed["policy_params"], tau),
-            target_q_params=soft_update(learner.target_q_params, changed["q_params"], tau),
+            target_policy_params=optax.incremental_update(changed["policy_params"], learner.target_policy_params, tau),
+            target_q_params=optax.incremental_update(changed["q_params"], learner.target_q_params, tau),
         ), metrics
 
 
