@@ -11,6 +11,7 @@ import signal
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 # Before JAX: tests compile more than they compute, and often the same as another test, worker or subprocess (see also
 # `quick_compilation`). The fusion emitters of jaxlib 0.10 take half of the time that all else of a compilation takes.
@@ -38,6 +39,7 @@ from filelock import FileLock
 from hypothesis import settings
 
 import interactive_nav  # noqa: F401  (before JAX: it sets how constants are compiled)
+from interactive_nav_common.runs import folder
 from tests.changed import changed_files, chosen
 from tests.toys import write_room
 
@@ -139,3 +141,20 @@ def sample_data() -> Path:
         if place and (Path(place) / "scan2cad_scene0470_00" / "full_annotations.json").is_file():
             return Path(place)
     pytest.skip("the licensed ScanNet sample is not on this machine (set INTERACTIVE_NAV_DATA to its folder)")
+
+
+@pytest.fixture
+def stop_after(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """Return a function that lets a signal stop `run_epochs` in the N-th epoch from the start of the test."""
+    append, epochs = folder.append_metrics, []
+
+    def after(count: int) -> None:
+        def counted(*line: Any) -> None:
+            append(*line)
+            epochs.append(line)
+            if len(epochs) == count:
+                signal.raise_signal(signal.SIGTERM)
+
+        monkeypatch.setattr(folder, "append_metrics", counted)
+
+    return after

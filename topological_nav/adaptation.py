@@ -29,7 +29,6 @@ from interactive_nav import get_robot, load_scene
 from interactive_nav_common.config import to_dict
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import write_json
-from interactive_nav_common.jobs.progress import ALONE, Host
 from interactive_nav_common.rows import digest_of
 from interactive_nav_common.runs.folder import claimed, run_epochs
 from topological_nav.config import PITCHES
@@ -131,9 +130,7 @@ def target_statistics(trained: Trained, images: np.ndarray, batch: int, passes: 
     return dataclasses.replace(trained, variables={**trained.variables, "batch_stats": stats})
 
 
-def adapt_features(
-    run: Path, source: Path, target: Path, out: Path, config: AdaptConfig, host: Host = ALONE
-) -> dict[str, Any]:
+def adapt_features(run: Path, source: Path, target: Path, out: Path, config: AdaptConfig) -> dict[str, Any]:
     """Adapt a run's embedding to another domain, or resume; return results: localisation before, with AdaBN, after."""
     trained = load_trained(run)
     near, far = load_rooms(source), target_rooms(target, config)
@@ -145,7 +142,7 @@ def adapt_features(
         state, critic = make_adapting(trained.variables, embedded.shape[1], config)
         epoch: Any = learning.over(adversarial_epoch(trained.network, critic, config), unlabelled, embedded)
         keys, kept = learning.phase_key(config.seed, 3), "checkpoint-features.msgpack"
-        state = run_epochs(out, "features", state, epoch, config.epochs, keys, host, kept)
+        state = run_epochs(out, "features", state, epoch, config.epochs, keys, kept)
         adapted = save_trained(out, Trained(trained.network, state.variables, adapted_about(trained, config)))
         fitted = target_statistics(trained, unlabelled, config.batch)
         same = headers[0]["scenes"] == headers[1]["scenes"]
@@ -193,9 +190,7 @@ CONFIGURATIONS = {"A": (False, False), "B": (False, True), "C": (True, False), "
 """Name -> whether weights are the source's, and whether they are fine-tuned."""
 
 
-def passage_configurations(
-    run: Path, target: Path, out: Path, config: AdaptConfig, host: Host = ALONE
-) -> dict[str, Any]:
+def passage_configurations(run: Path, target: Path, out: Path, config: AdaptConfig) -> dict[str, Any]:
     """Score a passage detector in another domain, with each of `CONFIGURATIONS`; return results.json."""
     trained = load_trained(run)
     need_task(trained.about, "passages", f"{run}:")
@@ -217,7 +212,7 @@ def passage_configurations(
             learner = jax.tree.map(jnp.array, learning.Learner.start(trained.variables, tx) if from_source else fresh)
             if tunes:
                 kept = f"checkpoint-{name}.msgpack"
-                learner = run_epochs(out, name, learner, one, config.fine_tune_epochs, keys, host, kept)
+                learner = run_epochs(out, name, learner, one, config.fine_tune_epochs, keys, kept)
             tuned = Trained(network, learner.variables, trained.about)
             logits, scored = tuned.logits(tested.images), tested.scored
             results[name] = class_scores(tested.free[:, scored], logits[:, scored] > 0, 2)

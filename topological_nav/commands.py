@@ -2,8 +2,7 @@
 
 import dataclasses
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ from interactive_nav import load_scene
 from interactive_nav_common.config import field_docs, overridden, refuse_unused
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.files import whole_folder, write_text
-from interactive_nav_common.jobs.progress import Host, SafeConsole, bar, say
+from interactive_nav_common.jobs.progress import SafeConsole, bar, say
 from interactive_nav_common.records import read_metrics
 from interactive_nav_common.rows import where
 from interactive_nav_common.signals import stop_signals
@@ -39,13 +38,6 @@ from topological_nav.presets import configured, preset_of
 from topological_nav.tables import tables
 from topological_nav.weights.export import choose, export, fitting_map, level_images, size_lines
 from topological_nav.weights.onnx_files import onnx_models
-
-
-@contextmanager
-def terminal() -> Iterator[Host]:
-    """Print lines on stdout without buffering, and stop at a signal."""
-    with stop_signals() as stops:
-        yield Host(lambda line: print(line, flush=True), lambda: stops[0] if stops else 0)
 
 
 def contest_of(arguments: Any, scenes: Sequence[str], contenders: Sequence[str], out: Path):
@@ -276,8 +268,7 @@ def run_train(arguments: Any) -> None:
     folders = arguments.data or (DATASET,)
     if len(folders) > 1:
         raise ConfigError(f"--data names {len(folders)} folders, expected one in 'train {arguments.task}'")
-    with terminal() as host:
-        results = train(arguments.task, folders[0], out, config, host)
+    results = train(arguments.task, folders[0], out, config)
     save(figures.curves_figure(read_metrics(out / "metrics.jsonl")), out / "curves.png")
     for name, row in results.get("groups", {}).items():
         print(f"{name:<8}{row['images']:>7} images  accuracy {row['accuracy']:.3f}  macro F1 {row['macro_f1']:.3f}")
@@ -293,10 +284,9 @@ def _policy(arguments: Any) -> None:
     unused = ("alpha lam", "with --grid, which takes several") if arguments.grid else ("pairs", "without --grid")
     refuse_unused(arguments, *unused)
     out = arguments.out or RUNS / ("policy-grid" if arguments.grid else "policy")
-    with terminal() as host:
-        runs = arguments.localiser or RUNS / "rooms", arguments.detector or RUNS / "passages"
-        frames = embed_drives(arguments.data or (DRIVES,), *runs, config.mirror, host)
-        results = (train_grid if arguments.grid else train_policy)(frames, out, config, host)
+    runs = arguments.localiser or RUNS / "rooms", arguments.detector or RUNS / "passages"
+    frames = embed_drives(arguments.data or (DRIVES,), *runs, config.mirror)
+    results = (train_grid if arguments.grid else train_policy)(frames, out, config)
     rows = results if isinstance(results, list) else [results]
     for row in rows:
         folder = out / f"alpha-{row['alpha']:g}-lambda-{row['lambda']:g}" if arguments.grid else out
@@ -321,8 +311,7 @@ def run_adapt(arguments: Any) -> None:
         raise ConfigError(f"{arguments.target}: is of photographs, which no camera is laid over; say domain=clean")
     arguments.localiser, arguments.detector = chosen.localiser, chosen.detector
     chosen.report(policy=False)
-    with terminal() as host:
-        ADAPTATIONS[arguments.what](arguments, config, host)
+    ADAPTATIONS[arguments.what](arguments, config)
 
 
 def _refuse_unused_to_adapt(arguments: Any) -> None:
@@ -342,9 +331,9 @@ def _refuse_unused_to_adapt(arguments: Any) -> None:
         refuse_unused(arguments, "--data", f"{why} with --target")
 
 
-def _adapt_features(arguments: Any, config: AdaptConfig, host: Host) -> None:
+def _adapt_features(arguments: Any, config: AdaptConfig) -> None:
     out = arguments.out or ADAPTED / "features"
-    results = adaptation.adapt_features(arguments.localiser, arguments.data, arguments.target, out, config, host)
+    results = adaptation.adapt_features(arguments.localiser, arguments.data, arguments.target, out, config)
     rendered, captured = load_rooms(arguments.target).images, adaptation.target_rooms(arguments.target, config).images
     level = configs.PITCHES.index("level")
     figure = figures.features_figure(
@@ -356,9 +345,9 @@ def _adapt_features(arguments: Any, config: AdaptConfig, host: Host) -> None:
     print(f"{out}: {results['target_images']:,} target images, {results['before']['queries']} queries")
 
 
-def _adapt_passages(arguments: Any, config: AdaptConfig, host: Host) -> None:
+def _adapt_passages(arguments: Any, config: AdaptConfig) -> None:
     out = arguments.out or ADAPTED / "passages"
-    results = adaptation.passage_configurations(arguments.detector, arguments.target, out, config, host)
+    results = adaptation.passage_configurations(arguments.detector, arguments.target, out, config)
     for _, figure in transferred(out, arguments.target, arguments.detector):
         save(figure, out / "configurations.png")
     for name, (from_source, tunes) in adaptation.CONFIGURATIONS.items():
@@ -368,7 +357,7 @@ def _adapt_passages(arguments: Any, config: AdaptConfig, host: Host) -> None:
     print(f"{out}: fine-tuned on {results['fine_tuned_on']} images, tested on {results['tested_on']}")
 
 
-def _adapt_map(arguments: Any, config: AdaptConfig, host: Host) -> None:
+def _adapt_map(arguments: Any, config: AdaptConfig) -> None:
     runs = arguments.localiser, arguments.detector
     built = adaptation.collected_map(arguments.scene, arguments.target, *runs, config)
     keep_map(built, arguments.out or ADAPTED / f"{built.map.scene}.npz")

@@ -1,7 +1,6 @@
 """Show the share of work that is done as a bar on the console."""
 
 import contextlib
-import dataclasses
 import functools
 import sys
 import time
@@ -80,19 +79,6 @@ class Stopped(Exception):
 
 Progress = Callable[[str, int, int], None]
 """Called with what is done, how much of it, and of how much; may raise to stop."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Host:
-    """Show the lines of long work, and stop it between two steps."""
-
-    show: Callable[[str], None] = lambda _: None
-    signal: Callable[[], int] = lambda: 0
-    """Return the number of the signal that wants the work to stop; 0: go on."""
-
-
-ALONE = Host()
-"""Shows nothing and never stops."""
 
 
 def say(line: str) -> None:

@@ -14,8 +14,9 @@ import yaml
 
 from interactive_nav_common.errors import FileError, readable
 from interactive_nav_common.files import alone_in, append_text, write_json, write_text, writing
-from interactive_nav_common.jobs.progress import Host, Stopped
+from interactive_nav_common.jobs.progress import Stopped
 from interactive_nav_common.records import METRICS, cut_metrics
+from interactive_nav_common.signals import stop_signals
 from interactive_nav_common.untrusted.reading import Loader
 from interactive_nav_common.versions import versions
 
@@ -68,13 +69,12 @@ def run_epochs(
     epoch: Callable[[State, int, jax.Array], tuple[State, dict[str, jax.Array]]],
     epochs: int,
     key: jax.Array,
-    host: Host,
     checkpoint: str = CHECKPOINT,
 ) -> State:
-    """Run the epochs of one phase of a run, without those that the checkpoint holds, and return the state.
+    """Run and print the epochs of one phase of a run that the checkpoint does not hold, and return the state.
 
     `epoch` takes the state, the epoch's number from 0 and its key to the state and means over the epoch, `loss` among
-    them.
+    them. At a signal, the epoch ends and is saved before `Stopped` is raised.
     """
     import jax
 
@@ -86,21 +86,23 @@ def run_epochs(
     # Epochs after the last one that the checkpoint holds are run again.
     cut_metrics(out / METRICS, lambda line: line["phase"] != phase or line["epoch"] <= first)
     began = saved_at = time.perf_counter()
-    for number in range(first, epochs):
-        started = time.perf_counter()
-        state, means = epoch(state, number, jax.random.fold_in(key, number))
-        line = {"phase": phase, "epoch": number + 1, **{k: float(v) for k, v in means.items()}}
-        now = time.perf_counter()
-        if not np.isfinite(line["loss"]):
-            raise FileError(f"{out}: the loss of epoch {number + 1} is {line['loss']}; try a smaller learning_rate")
-        append_metrics(out, {**line, "seconds": round(now - started, 3)})
-        left = (now - began) / (number + 1 - first) * (epochs - number - 1)
-        scores = "  ".join(f"{k} {line[k]:.3f}" for k in means)
-        host.show(f"{phase}: epoch {number + 1} of {epochs}  {scores}  {now - started:.1f} s  {left:.0f} s left")
-        stop = host.signal()
-        if number + 1 == epochs or stop or now - saved_at > SAVE_EVERY_S:
-            write_state(out / checkpoint, {"phase": phase, "epoch": number + 1, "learner": state})
-            saved_at = now
-        if stop:
-            raise Stopped(stop)
+    with stop_signals() as stops:
+        for number in range(first, epochs):
+            started = time.perf_counter()
+            state, means = epoch(state, number, jax.random.fold_in(key, number))
+            line = {"phase": phase, "epoch": number + 1, **{k: float(v) for k, v in means.items()}}
+            now = time.perf_counter()
+            if not np.isfinite(line["loss"]):
+                raise FileError(f"{out}: the loss of epoch {number + 1} is {line['loss']}; try a smaller learning_rate")
+            append_metrics(out, {**line, "seconds": round(now - started, 3)})
+            left = (now - began) / (number + 1 - first) * (epochs - number - 1)
+            scores = "  ".join(f"{k} {line[k]:.3f}" for k in means)
+            spent = f"{now - started:.1f} s  {left:.0f} s left"
+            print(f"{phase}: epoch {number + 1} of {epochs}  {scores}  {spent}", flush=True)
+            stop = bool(stops)
+            if number + 1 == epochs or stop or now - saved_at > SAVE_EVERY_S:
+                write_state(out / checkpoint, {"phase": phase, "epoch": number + 1, "learner": state})
+                saved_at = now
+            if stop:
+                raise Stopped(stops[0])
     return state

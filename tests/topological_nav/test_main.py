@@ -5,12 +5,12 @@ import signal
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.distance import cdist
 
 from docs.studies import rooms as rooms_study
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.jobs import progress
 from topological_nav.__main__ import main
-from topological_nav.learn.networks import squares_between
 from topological_nav.maps import build
 from topological_nav.maps.graph import load_map
 from topological_nav.scenes import space as rooms
@@ -27,7 +27,7 @@ def test_the_map_has_nodes_in_both_rooms_and_images_around_each(made):
     assert away.max() < 2.5 and ((read.p > 0) & (read.p < 1)).all()
     # A node's own images lead back to it, or to one that saw the same.
     nodes = read.embeddings.astype(float)
-    away = np.stack([squares_between(nodes[:, 5], nodes[:, k]) for k in range(18)]).min(0)
+    away = np.stack([cdist(nodes[:, 5], nodes[:, k], "sqeuclidean") for k in range(18)]).min(0)
     assert (away.argmin(1) == np.arange(len(nodes))).mean() > 0.8 and away.min(1).max() < 1e-6
     assert set(read.about) >= {"localiser", "detector", "settings", "data"}
 

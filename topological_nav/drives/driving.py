@@ -15,8 +15,9 @@ import optax
 
 from interactive_nav_common.errors import FileError, readable
 from interactive_nav_common.files import whole_file
-from interactive_nav_common.jobs.progress import ALONE, Host, Stopped
+from interactive_nav_common.jobs.progress import Stopped
 from interactive_nav_common.rows import digest_of
+from interactive_nav_common.signals import stop_signals
 from topological_nav.config import PASSAGE_POLICY, DriveConfig, NavigatorConfig
 from topological_nav.drives.dataset import Drives, drive_images, load_drives, read_drives_header
 from topological_nav.learn.learning import in_batches, initial, read_description, read_weights
@@ -227,9 +228,7 @@ def need_camera(folder: Path, header: Mapping[str, Any], networks: Networks) -> 
             )
 
 
-def embed_drives(
-    folders: Sequence[Path], localiser_run: Path, detector_run: Path, mirror: bool, host: Host = ALONE
-) -> Frames:
+def embed_drives(folders: Sequence[Path], localiser_run: Path, detector_run: Path, mirror: bool) -> Frames:
     """Embed the images of all kept drives of one or more folders, which keep the embeddings for the next time."""
     networks = load_networks(localiser_run, detector_run, classifies=True, same=SAME)
 
@@ -241,10 +240,13 @@ def embed_drives(
 
     embed = functools.partial(sides, [network.variables for network in networks])
     by = [mirror, *(network.stored for network in networks)]
-    return Frames.joined([_folder_frames(Path(folder), by, networks, embed, host) for folder in folders])
+    with stop_signals() as stops:
+        return Frames.joined([_folder_frames(Path(folder), by, networks, embed, stops) for folder in folders])
 
 
-def _folder_frames(folder: Path, by: list[Any], networks: Networks, embed: Callable[[Any], Any], host: Host) -> Frames:
+def _folder_frames(
+    folder: Path, by: list[Any], networks: Networks, embed: Callable[[Any], Any], stops: list[int]
+) -> Frames:
     header, config = read_drives_header(folder)
     drives = load_drives(folder)
     need_camera(folder, header, networks)
@@ -262,9 +264,9 @@ def _folder_frames(folder: Path, by: list[Any], networks: Networks, embed: Calla
             features[at + side * count] = part[:, side]
         done += len(images)
         if i % _REPORT_EVERY == 0 or done == total:
-            host.show(f"embedded {done:,} of {total:,} images of {folder}")
-        if stop := host.signal():
-            raise Stopped(stop)
+            print(f"embedded {done:,} of {total:,} images of {folder}", flush=True)
+        if stops:
+            raise Stopped(stops[0])
     if features is None:
         raise FileError(f"{folder}: none of {len(drives)} drives was kept; drive more, or in other scenes")
     with whole_file(folder / kept) as partial, open(partial, "wb") as file:

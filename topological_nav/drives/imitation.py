@@ -22,7 +22,6 @@ import optax
 from interactive_nav_common.config import to_dict
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.files import write_json, write_text
-from interactive_nav_common.jobs.progress import ALONE, Host
 from interactive_nav_common.rows import Rows, markdown
 from interactive_nav_common.runs.folder import claimed, run_epochs
 from topological_nav.config import PolicyConfig
@@ -115,7 +114,7 @@ def mirrored(sequences: Sequences, frames: int, config: PolicyConfig) -> Sequenc
     )
 
 
-def train_policy(frames: Frames, out: Path, config: PolicyConfig, host: Host = ALONE) -> dict[str, Any]:
+def train_policy(frames: Frames, out: Path, config: PolicyConfig) -> dict[str, Any]:
     """Train a policy, or continue the run at `out`; return the content of results.json."""
     if config.mirror and not frames.mirrored:
         raise FileError("mirror is set, but mirrored images were not embedded; embed them too or set mirror=false")
@@ -141,7 +140,7 @@ def train_policy(frames: Frames, out: Path, config: PolicyConfig, host: Host = A
             return epoch(learner, shown, {**truth, **weights, **phase}, key)
 
         key = jax.random.PRNGKey(config.seed)
-        learner = run_epochs(out, "policy", learner, one, config.epochs, key, host)
+        learner = run_epochs(out, "policy", learner, one, config.epochs, key)
         about = {
             "task": "policy",
             "hidden": config.hidden,
@@ -264,14 +263,14 @@ def _scores(
     return out
 
 
-def train_grid(frames: Frames, out: Path, config: PolicyConfig, host: Host = ALONE) -> list[dict[str, Any]]:
+def train_grid(frames: Frames, out: Path, config: PolicyConfig) -> list[dict[str, Any]]:
     """Train a policy in a folder under `out` for each pair of alpha and lambda; write and return the results."""
     rows = []
     grid = GRIDS[config.pairs]
     for alpha, lam in grid:
         one = dataclasses.replace(config, alpha=alpha, lam=lam)
-        host.show(f"alpha {alpha:g}, lambda {lam:g}: {len(rows) + 1} of {len(grid)}")
-        rows.append(train_policy(frames, out / f"alpha-{alpha:g}-lambda-{lam:g}", one, host))
+        print(f"alpha {alpha:g}, lambda {lam:g}: {len(rows) + 1} of {len(grid)}", flush=True)
+        rows.append(train_policy(frames, out / f"alpha-{alpha:g}-lambda-{lam:g}", one))
     write_json(out / "grid.json", rows)
     write_text(out / "grid.md", grid_table(rows))
     return rows

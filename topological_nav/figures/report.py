@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Wedge
+from sklearn.metrics.pairwise import euclidean_distances
 
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import FileError
@@ -23,7 +24,6 @@ from topological_nav.drives.driving import TrainedPolicy, load_policy
 from topological_nav.drives.imitation import classes
 from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
 from topological_nav.figures.maps import FREE, Driven, drive_episode, floor_plan, map_figure, save
-from topological_nav.learn.networks import squares_between
 from topological_nav.learn.training import load_trained
 from topological_nav.maps.build import judged_by
 
@@ -123,9 +123,9 @@ def round_figure(venue: ContestScene, node: int) -> Figure:
 
 def closest(queries: np.ndarray, seen: np.ndarray) -> tuple[int, int, float]:
     """Return which of embeddings [n, D] and which of [m, D] are nearest to each other, and their distance."""
-    squares = squares_between(queries.astype(float), seen.astype(float))
-    query, at = divmod(int(squares.argmin()), squares.shape[1])
-    return query, at, float(np.sqrt(max(squares[query, at], 0.0)))
+    away = euclidean_distances(queries.astype(float), seen.astype(float))
+    query, at = divmod(int(away.argmin()), away.shape[1])
+    return query, at, float(away[query, at])
 
 
 def episodes(venue: ContestScene, progress: Progress) -> Iterator[tuple[str, Figure]]:

@@ -11,6 +11,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from sklearn.metrics import pairwise_distances_argmin
 
 _EPSILON = 1e-6
 
@@ -144,11 +145,6 @@ def _norm(train: bool) -> Any:
     return nn.BatchNorm(use_running_average=not train, momentum=0.9, epsilon=1e-5)
 
 
-def squares_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the squared distances [n, m] of rows [n, D] and [m, D]."""
-    return (a**2).sum(-1)[:, None] + (b**2).sum(-1) - 2.0 * a @ b.T
-
-
 def in_words(scores: Mapping[str, float]) -> str:
     """Format scores of `localisation_scores`, or means of them."""
     return (
@@ -180,7 +176,7 @@ def localisation_scores(queries: Places, nodes: Places) -> dict[str, float]:
     xy_w, room = np.repeat(queries.xy_w, each, 0), np.repeat(queries.room, each)
     # In double precision: images of neighbouring nodes differ by less than single precision loses here.
     looked, shown = (of.embeddings.reshape(-1, of.embeddings.shape[-1]).astype(float) for of in (queries, nodes))
-    node = squares_between(looked, shown).argmin(1) // nodes.embeddings.shape[1]
+    node = pairwise_distances_argmin(looked, shown) // nodes.embeddings.shape[1]
     away = np.linalg.norm(xy_w[:, None] - nodes.xy_w, axis=-1)
     return {
         "node": float((node == away.argmin(1)).mean()),

@@ -23,7 +23,6 @@ from sklearn.metrics import confusion_matrix, f1_score
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import FileError, readable
 from interactive_nav_common.files import write_json
-from interactive_nav_common.jobs.progress import ALONE, Host
 from interactive_nav_common.runs.folder import claimed, run_epochs
 from topological_nav.config import PITCHES, DataConfig, NetworkTrainConfig
 from topological_nav.data.dataset import RoomImages, load_passages, load_rooms, logits_at, read_header
@@ -103,7 +102,7 @@ class _Work:
     """Index of the length that passages are scored by."""
 
 
-def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host: Host = ALONE) -> dict[str, Any]:
+def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig) -> dict[str, Any]:
     """Train a network for rooms or passages, or continue the run at `out`; return the content of results.json."""
     header, data = read_header(dataset)
     work = _work(task, dataset, config)
@@ -118,7 +117,7 @@ def train(task: str, dataset: Path, out: Path, config: NetworkTrainConfig, host:
             learner = learning.with_backbone(learner, donor.variables, f"init: {config.init} does not fit", about)
         epoch = learning.labelled_epoch(network, tx, config.batch, config.label_smoothing, config.augment, work.scored)
         one = learning.over(epoch, work.images, work.labels)
-        learner = run_epochs(out, "labels", learner, one, config.epochs, learning.phase_key(config.seed, 2), host)
+        learner = run_epochs(out, "labels", learner, one, config.epochs, learning.phase_key(config.seed, 2))
         about = {
             "task": task,
             "backbone": config.network,
@@ -147,12 +146,9 @@ def load_trained(run: Path) -> Trained:
     """Load the network of a finished run or of an export, with f32 weights."""
     run = Path(run)
     about = learning.read_description(run, "network", "TASK")
-    if about["task"] == "passages" and "lengths_m" not in about:
-        raise FileError(
-            f"{run}: does not say for which lengths it judges passages (lengths_m): it is of an older version; make "
-            "its dataset again and train it again"
-        )
     with readable(run / learning.DESCRIPTION, FileError, "train again"):
+        if about["task"] == "passages" and not about.get("lengths_m"):
+            raise ValueError("it names no lengths_m for which it judges passages")
         shape = (about["width"], about["hidden"], about["outputs"], about.get("first_stage", 2))
         network = Network(about["task"], about["backbone"], *shape)
         template = learning.variable_shapes(network, (about["data"]["height"], about["data"]["width"]))

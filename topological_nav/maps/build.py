@@ -16,6 +16,7 @@ from typing import Any, Protocol
 
 import jax
 import numpy as np
+from sklearn.metrics.pairwise import euclidean_distances
 
 from interactive_nav import get_robot, load_scene
 from interactive_nav.robots import RobotSpec
@@ -28,7 +29,7 @@ from topological_nav.config import DataConfig, MapConfig
 from topological_nav.data.dataset import headings
 from topological_nav.data.folders import renderer_of
 from topological_nav.learn.learning import DESCRIPTION
-from topological_nav.learn.networks import nearest_turn, squares_between
+from topological_nav.learn.networks import nearest_turn
 from topological_nav.learn.training import Networks, Trained, load_networks
 from topological_nav.maps.graph import TopologicalMap, assemble, lengths, place_nodes
 from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
@@ -89,9 +90,10 @@ class NetworkSight:
             out = np.empty((len(queries), len(nodes)))
             for k in np.unique(turn):
                 rows = turn == k
-                out[rows] = _apart(queries[rows], nodes[:, k])
+                out[rows] = euclidean_distances(queries[rows], nodes[:, k])
             return out
-        return _apart(queries, nodes.reshape(-1, nodes.shape[-1])).reshape(len(queries), -1, around).min(-1)
+        away = euclidean_distances(queries, nodes.reshape(-1, nodes.shape[-1]))
+        return away.reshape(len(queries), -1, around).min(-1)
 
     def passage(self, images: np.ndarray, ahead_m: np.ndarray | float) -> np.ndarray:
         return self._networks.detector.passage(images, ahead_m)
@@ -125,11 +127,6 @@ class TrueSight:
         least = np.minimum(self._margin_m, room[..., :1])
         free = ((room >= least - 1e-9) & (room > 0.0)).all(-1) & (room[..., -1] >= self._margin_m - 1e-9)
         return free.astype(float)
-
-
-def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the Euclidean distances [n, m] of rows [n, D] and [m, D] in double precision."""
-    return np.sqrt(np.maximum(squares_between(a, b), 0.0))
 
 
 class PassagePolicy:

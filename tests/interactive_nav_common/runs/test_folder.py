@@ -1,12 +1,14 @@
 """A run's folder is of one set of settings, and its epochs go on from the last checkpoint."""
 
+import signal
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from interactive_nav_common.errors import FileError
-from interactive_nav_common.jobs.progress import ALONE, Host, Stopped
+from interactive_nav_common.jobs.progress import Stopped
 from interactive_nav_common.records import METRICS, read_metrics
 from interactive_nav_common.runs.folder import (
     CHECKPOINT,
@@ -45,21 +47,22 @@ def test_a_state_is_read_back_in_its_types(tmp_path):
 
 def test_stopped_epochs_go_on_with_the_same_keys(tmp_path):
     def epoch(state, number, key):
+        if number == stop_at:
+            signal.raise_signal(signal.SIGTERM)
         state = state + jax.random.normal(key, state.shape) * (number + 1)
         return state, {"loss": jnp.abs(state).mean()}
 
-    key, shown = jax.random.PRNGKey(5), []
+    key, stop_at = jax.random.PRNGKey(5), None
     for name in ("whole", "part", "bad"):
         (tmp_path / name).mkdir()
-    whole = run_epochs(tmp_path / "whole", "count", jnp.zeros(4), epoch, 5, key, ALONE)
+    whole = run_epochs(tmp_path / "whole", "count", jnp.zeros(4), epoch, 5, key)
+    stop_at = 1
     with pytest.raises(Stopped):
-        run_epochs(tmp_path / "part", "count", jnp.zeros(4), epoch, 5, key, Host(shown.append, lambda: len(shown) > 1))
+        run_epochs(tmp_path / "part", "count", jnp.zeros(4), epoch, 5, key)
     assert [line["epoch"] for line in read_metrics(tmp_path / "part" / METRICS)] == [1, 2]
-    part = run_epochs(tmp_path / "part", "count", jnp.zeros(4), epoch, 5, key, ALONE)
+    part = run_epochs(tmp_path / "part", "count", jnp.zeros(4), epoch, 5, key)
     assert np.array_equal(whole, part) and (tmp_path / "part" / CHECKPOINT).is_file()
     losses = [[line["loss"] for line in read_metrics(tmp_path / name / METRICS)] for name in ("whole", "part")]
     assert losses[0] == losses[1] and len(losses[0]) == 5
     with pytest.raises(FileError, match="the loss of epoch 1 is nan; try a smaller learning_rate"):
-        run_epochs(
-            tmp_path / "bad", "count", jnp.zeros(1), lambda s, n, k: (s, {"loss": jnp.array(jnp.nan)}), 1, key, ALONE
-        )
+        run_epochs(tmp_path / "bad", "count", jnp.zeros(1), lambda s, n, k: (s, {"loss": jnp.array(jnp.nan)}), 1, key)

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import signal
 from typing import Any
 
 import jax
@@ -12,7 +13,7 @@ from PIL import Image
 
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.errors import ConfigError, FileError
-from interactive_nav_common.jobs.progress import Host, Stopped
+from interactive_nav_common.jobs.progress import Stopped
 from interactive_nav_common.records import read_metrics
 from interactive_nav_common.runs.folder import run_epochs
 from topological_nav import adaptation
@@ -117,13 +118,14 @@ def test_adapted_networks_are_runs_of_their_own(made, adapted, alexnet):
 
 
 @pytest.mark.heavy
-def test_a_stopped_adaptation_goes_on_to_the_same_weights(made, alexnet, adapted, tmp_path):
+def test_a_stopped_adaptation_goes_on_to_the_same_weights(made, alexnet, adapted, tmp_path, stop_after, capsys):
     out = tmp_path / "stopped"
     places = alexnet, made.data, made.data, out, SHORT
-    told = []
+    stop_after(1)
     with pytest.raises(Stopped):
-        adaptation.adapt_features(*places, Host(told.append, lambda: 2))
-    assert len(told) == 1 and "epoch 1 of 2" in told[0] and not (out / "network.json").exists()
+        adaptation.adapt_features(*places)
+    (told,) = capsys.readouterr().out.splitlines()
+    assert "epoch 1 of 2" in told and not (out / "network.json").exists()
     assert adaptation.adapt_features(*places) is not None
     assert same(weights(out), weights(adapted[0]))
     assert [line["epoch"] for line in read_metrics(out / "metrics.jsonl")] == [1, 2]
@@ -135,12 +137,14 @@ def counting(out, epochs, stop_after=None):
 
     def epoch(learner, number, key):
         del number, key
+        told.append(1)
+        if len(told) == stop_after:
+            signal.raise_signal(signal.SIGTERM)
         return {"n": 2 * learner["n"] + 1}, {"loss": learner["n"].astype(float)}
 
     start = {"n": np.array(1)}
-    stop = lambda: 15 * (len(told) == stop_after)  # noqa: E731
     try:
-        learner = run_epochs(out, "count", start, epoch, epochs, jax.random.PRNGKey(0), Host(told.append, stop))
+        learner = run_epochs(out, "count", start, epoch, epochs, jax.random.PRNGKey(0))
     except Stopped as stopped:
         return f"stopped by signal {stopped.args[0]}", len(told)
     return int(learner["n"]), len(told)
@@ -199,15 +203,13 @@ def test_what_learned_from_the_source_scores_there_as_before(made, tmp_path):
 
 
 @pytest.mark.heavy
-def test_a_stopped_fine_tuning_goes_on_to_the_same_weights(made, configurations, tmp_path):
+def test_a_stopped_fine_tuning_goes_on_to_the_same_weights(made, configurations, tmp_path, stop_after):
     out = tmp_path / "stopped"
     places = made.passages, made.data, out, SHORT
-    asked = []
-    with pytest.raises(Stopped):
-        adaptation.passage_configurations(*places, Host(signal=lambda: asked.append(1) is None))
-    seen = iter([0, 0, 15])
-    with pytest.raises(Stopped):
-        adaptation.passage_configurations(*places, Host(signal=lambda: next(seen)))
+    for epochs in (1, 4):  # the third after the one that the first sitting ran
+        stop_after(epochs)
+        with pytest.raises(Stopped):
+            adaptation.passage_configurations(*places)
     results = adaptation.passage_configurations(*places)
     assert results == configurations[1]
     assert same(weights(out), weights(configurations[0]))

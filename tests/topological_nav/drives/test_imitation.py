@@ -12,7 +12,7 @@ import pytest
 
 from interactive_nav_common.config import overridden
 from interactive_nav_common.errors import FileError
-from interactive_nav_common.jobs.progress import Host, Stopped
+from interactive_nav_common.jobs.progress import Stopped
 from interactive_nav_common.records import read_metrics
 from topological_nav.__main__ import main
 from topological_nav.config import PolicyConfig
@@ -36,9 +36,8 @@ def frames(made, driven):
 @pytest.fixture(scope="module")
 def run(frames, tmp_path_factory):
     out = tmp_path_factory.mktemp("policy") / "run"
-    told = []
-    assert imitation.train_policy(frames, out, CONFIG, Host(told.append)) is not None
-    assert len(told) == 10
+    assert imitation.train_policy(frames, out, CONFIG) is not None
+    assert len(read_metrics(out / "metrics.jsonl")) == 10
     return out
 
 
@@ -90,15 +89,15 @@ def test_alone_the_forward_model_leaves_the_policy_as_it_is(frames, consistent):
     assert all(jax.tree.leaves(same["policy"])) and not all(jax.tree.leaves(same["forward"]))
 
 
-def test_a_stopped_run_ends_where_an_uninterrupted_one_does(frames, run, tmp_path):
-    told = []
+def test_a_stopped_run_ends_where_an_uninterrupted_one_does(frames, run, tmp_path, stop_after):
     out = tmp_path / "run"
+    stop_after(4)
     with pytest.raises(Stopped):
-        imitation.train_policy(frames, out, CONFIG, Host(told.append, lambda: len(told) >= 4))
+        imitation.train_policy(frames, out, CONFIG)
+    assert len(read_metrics(out / "metrics.jsonl")) == 4
     with pytest.raises(FileError, match="holds no trained policy; finish it"):
         load_policy(out)
-    assert imitation.train_policy(frames, out, CONFIG, Host(told.append)) is not None
-    assert len(told) == 10
+    assert imitation.train_policy(frames, out, CONFIG) is not None
     assert (out / "weights.safetensors").read_bytes() == (run / "weights.safetensors").read_bytes()
     lines = [read_metrics(path / "metrics.jsonl") for path in (out, run)]
     strip = [[{k: v for k, v in line.items() if k != "seconds"} for line in one] for one in lines]
