@@ -87,7 +87,7 @@ def with_robot(words: Sequence[str], robot: str | None) -> list[str]:
 
 def apply_overrides(config: TrainConfig, words: Sequence[str]) -> TrainConfig:
     """Return the config with `dotted.name=value` words laid over it; values are read as YAML."""
-    return overlay(config, read_words(words), "override", elsewhere=list(flatten(TrainConfig())))
+    return from_dict(read_words(words), config, "override")
 
 
 def help_text() -> str:

@@ -48,14 +48,11 @@ def claim_lines(findings: Iterable[Finding]) -> str:
     return markdown(("claim", "compared", "difference [95 % interval], p", "here"), map(dataclasses.astuple, findings))
 
 
-def without_walls(rows: pa.Table) -> pa.Table:
-    """Return episodes in which the robot touched no wall; all where rows do not have the column."""
-    return rows.filter(pc.field("structure_steps") == 0) if "structure_steps" in rows.column_names else rows
-
-
 def effort_lines(rows: pa.Table, split: str | None) -> str:
     """Return the claims on effort without episodes that touched a wall; empty where none did."""
-    free = without_walls(rows)
+    if "structure_steps" not in rows.column_names:
+        return ""
+    free = rows.filter(pc.field("structure_steps") == 0)
     if len(free) == len(rows):
         return ""
     return claim_lines(

@@ -197,7 +197,7 @@ def collect(
 ) -> tuple[OffPolicyData, Any]:
     """Act for one update: take `steps_per_update` steps of every environment into the replay.
 
-    Return the new data, the steps without images, leaves [steps, envs, ...], and `sums` over ended episodes.
+    Return the new data, vectors and rewards of the steps, leaves [steps, envs, ...], and `sums` over ended episodes.
     """
     assert agent.config.steps_per_update, "the config must be resolved"
     at_random = learner.gradient_steps == 0
@@ -216,10 +216,7 @@ def collect(
         replay = insert(data.replay, stored(before), action, after.reward, done, truncated)
         collected = {
             "observation": networks.vector_part(before.obs),
-            "action": action,
             "reward": after.reward,
-            "done": done,
-            "truncation": truncated,
             "sums": episode_sums(after.info),
         }
         ended = done > 0

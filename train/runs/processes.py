@@ -1,11 +1,11 @@
 """Train one policy in several processes, joined by JAX: process 0 keeps the run folder, all stop together."""
 
 import contextlib
+import dataclasses
 import os
 import socket
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -97,9 +97,8 @@ class Together:
     def __init__(self, folder: Callbacks | None, stops: list[int], env_state_limit_mb: float):
         """Take the folder's callbacks (None: of another process) and the list that signals are collected in."""
         self.folder, self.stops, self.limit_mb = folder, stops, env_state_limit_mb
-        self.on_start = folder.on_start if folder else _ignore
-        self.on_update = folder.on_update if folder else _ignore
-        self.on_log = folder.on_log if folder else _ignore
+        for name in ("on_start", "on_update", "on_log"):  # which other processes leave to process 0
+            setattr(self, name, getattr(folder, name, lambda *_: None))
 
     def restore(self, template: Snapshot) -> Snapshot | None:
         """Return what process 0 restores, as all processes do."""
@@ -135,20 +134,11 @@ class Together:
     def on_checkpoint(self, snapshot: Snapshot) -> None:
         """Gather the environments of all processes, and save."""
         kept = megabytes(snapshot.env_state) <= self.limit_mb
-        env_state = gathered(snapshot.env_state) if kept else None
+        env_state = multihost_utils.process_allgather(snapshot.env_state, tiled=True) if kept else None
         if self.folder:
             self.folder.on_checkpoint(Snapshot(snapshot.env_steps, snapshot.learner, env_state))
 
     def on_diverged(self, before: Snapshot, update: Update) -> str:
         """Gather the batch, and save."""
-        update = Update(update.losses, update.episode_sums, update.finite, gathered(update.batch))
+        update = dataclasses.replace(update, batch=multihost_utils.process_allgather(update.batch, tiled=True))
         return self.folder.on_diverged(before, update) if self.folder else "the folder of process 0"
-
-
-def _ignore(*_: Any) -> None:
-    """Do nothing: another process keeps the folder."""
-
-
-def gathered(tree: Any) -> Any:
-    """Return arrays spread over processes as whole ones in each."""
-    return multihost_utils.process_allgather(tree, tiled=True)

@@ -84,21 +84,14 @@ def _wanted(folder: RunFolder | None, policies: Sequence[str], arguments: Evalua
     return dataclasses.replace(config, env=dataclasses.replace(config.env, scenes=scene_folders(arguments.scenes)))
 
 
-def _checked_seed(arguments: Evaluate) -> int:
-    """Return the seed of drawn episodes, once no word is without effect."""
-    seed = SEED if arguments.seed is None else arguments.seed
-    if arguments.episode_file:
-        refuse_unused(arguments, "--balanced --seed", "with --episode-file, whose episodes are fixed")
-    if arguments.dataset:
-        refuse_unused(arguments, "--out", "with --dataset, where each file has its name")
-    return seed
-
-
 def run(arguments: Evaluate, build_env: Callable[[EnvConfig], Any] | None, kept: dict[Path, str]) -> int:
     """Play and write; fill `kept` with what has been written: a run's file of rows -> how to say it."""
     console, build_env = SafeConsole(), build_env or runs.build_env
     arguments.settings = tuple(config_io.with_robot(arguments.settings, arguments.robot))
-    seed = _checked_seed(arguments)
+    if arguments.episode_file:
+        refuse_unused(arguments, "--balanced --seed", "with --episode-file, whose episodes are fixed")
+    if arguments.dataset:
+        refuse_unused(arguments, "--out", "with --dataset, where each file has its name")
     policies = _policies(arguments)
     for setting in arguments.settings:
         if not setting.startswith("env."):
@@ -124,7 +117,7 @@ def run(arguments: Evaluate, build_env: Callable[[EnvConfig], Any] | None, kept:
             scenes=tuple(Path(scene).name for scene in config.env.scenes),
             policies=policies,
             episodes=len(file.episodes) if file else arguments.episodes or EPISODES,
-            seed=file.seed if file else seed,
+            seed=file.seed if file else SEED if arguments.seed is None else arguments.seed,
             balanced=arguments.balanced and file is None,
             checkpoint=arguments.checkpoint,
             deterministic=not arguments.stochastic,
