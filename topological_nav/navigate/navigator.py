@@ -42,7 +42,7 @@ SLACK_S = 1e-3
 
 LOCALISE, FACE, SWING, LEAN, DRIVE, ARRIVED, STOPPED, TIMED_OUT = range(8)
 PHASES = ("localise", "face", "swing", "lean", "drive", "arrived", "stopped", "timed out")
-TURNING, OVER = (LOCALISE, FACE, SWING, LEAN), (ARRIVED, STOPPED, TIMED_OUT)
+TURNING = (LOCALISE, FACE, SWING, LEAN)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
