@@ -29,11 +29,11 @@ from converters.records.raw import (
     ATTRIBUTION,
     CATEGORY_LABELS,
     OTHER_PROP,
+    ColourCloud,
     RawScene,
     TexturedMesh,
     VisualMesh,
     at_origin,
-    joined_clouds,
 )
 from converters.structure.clean import LIFT_M, CutResult, cut_furniture, level_floor
 from converters.structure.fill import fill_holes, wall_planes
@@ -140,7 +140,8 @@ def _structure_visual(
     planes = wall_planes(level, raw.scan.faces[kept], raw.scan.labels)
     (points, faces), clouds = fill_holes(planes, plan, annotated, cloud, scan)
     whole = np.vstack([scan[0], points]), np.vstack([scan[1], faces + len(scan[0])])
-    return bake_structure(*whole, joined_clouds(cloud, *clouds), config.structure_texture)
+    joined = ColourCloud(*map(np.vstack, zip(cloud, *clouds, strict=True)))
+    return bake_structure(*whole, joined, config.structure_texture)
 
 
 def _light(raw: RawScene, points: np.ndarray, annotated: tuple[PlacedObject, ...], to_world_m: np.ndarray) -> Daylight:

@@ -10,7 +10,7 @@ import importlib.util
 import itertools
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -58,15 +58,13 @@ def has_browser_viewer() -> bool:
     return importlib.util.find_spec("mjviser") is not None
 
 
-def choose_viewer(
-    wanted: str, window: Callable[[], bool] = can_open_window, browser: Callable[[], bool] = has_browser_viewer
-) -> str:
+def choose_viewer(wanted: str) -> str:
     """Return 'window' or 'browser'; of `auto`, a window where there is a screen."""
-    if wanted in ("auto", "window") and window():
+    if wanted in ("auto", "window") and can_open_window():
         return "window"
     if wanted == "window":
         raise ViewError("no screen to open a window on; log in with one (ssh -X does), or use --viewer browser")
-    if browser():
+    if has_browser_viewer():
         return "browser"
     why = "no screen to open a window on, and " if wanted == "auto" else ""
     raise ViewError(why + missing("a view in the browser", "mjviser", "view"))

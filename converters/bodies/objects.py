@@ -209,39 +209,31 @@ def compare(
         solved = alignment.solve_alignment(annotation.keypoints_cad, annotation.keypoints_scan, annotation.symmetry)
     except alignment.AlignmentError as error:
         return row | {"solved": False, "reason": str(error)}
-    difference = pose_difference(solved, placed, pivot_cad, annotation.symmetry)
+    translation_m, yaw_rad, scale_ratio = pose_difference(solved, placed, pivot_cad, annotation.symmetry)
     return row | {
         "solved": True,
         "n_outliers": int(solved.outliers.sum()),
         "rms_m": round(solved.rms_m, 5),
-        "translation_difference_m": round(difference.translation_m, 5),
-        "yaw_difference_deg": round(math.degrees(difference.yaw_rad), 3),
-        "scale_ratio": [round(float(v), 4) for v in difference.scale_ratio],
+        "translation_difference_m": round(translation_m, 5),
+        "yaw_difference_deg": round(math.degrees(yaw_rad), 3),
+        "scale_ratio": [round(float(v), 4) for v in scale_ratio],
     }
-
-
-@dataclasses.dataclass(frozen=True)
-class PoseDifference:
-    """Hold the distance of one pose of a model from another, modulo the model's symmetry."""
-
-    translation_m: float
-    yaw_rad: float
-    """In [0, pi]."""
-    scale_ratio: np.ndarray
-    """(3,) first / second along the second's axes."""
 
 
 def pose_difference(
     one: alignment.Alignment, other: alignment.Alignment, pivot_cad: np.ndarray, symmetry: str
-) -> PoseDifference:
-    """Compare poses of a model at a pivot (3,), CAD frame, but for turns that the symmetry, Scan2CAD's word, allows."""
+) -> tuple[float, float, np.ndarray]:
+    """Compare poses of a model at a pivot (3,), CAD frame, but for turns that the symmetry, Scan2CAD's word, allows.
+
+    Return the translation, m, the yaw in [0, pi], and (3,) the ratio of scales, one / other, along the other's axes.
+    """
     period = alignment.SYMMETRY_PERIOD_RAD.get(symmetry, 2 * math.pi)
     at = [alignment.apply_alignment(a, pivot_cad[None])[0] for a in (one, other)]
     turn = wrap_angle(one.yaw - other.yaw)
     yaw = wrap_angle(turn, period) if period else 0.0
     swapped = period and round((turn - yaw) / (math.pi / 2)) % 2
     scale = one.scale[[1, 0, 2]] if swapped else one.scale
-    return PoseDifference(float(np.linalg.norm(at[0] - at[1])), abs(yaw), scale / other.scale)
+    return float(np.linalg.norm(at[0] - at[1])), abs(yaw), scale / other.scale
 
 
 def align_objects(raw: RawScene) -> tuple[list[alignment.Alignment], list[dict[str, Any]]]:

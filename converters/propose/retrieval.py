@@ -283,12 +283,9 @@ def compare_retrieval(
     ids = [cad_id for cad_id, _ in best.ranking]
     chosen = apply_alignment(best.pose, best.cad.vertices)
     rank = ids.index(annotation.cad_id) + 1 if annotation.cad_id in ids else 0
-    off = pose_difference(pose, reference, pivot, annotation.symmetry)
+    translation_m, yaw_rad, scale_ratio = pose_difference(pose, reference, pivot, annotation.symmetry)
     iou = box_iou(bounds(chosen), bounds(annotated_vertices(annotation, cads)))
     names, numbers = (annotation.cad_id[:6], best.cad.cad_id[:6]), (f"{iou:.2f}", f"{best.confidence:.2f}")
-    pose_words = (
-        f"{100 * off.translation_m:.1f}",
-        f"{math.degrees(off.yaw_rad):.1f}",
-        " ".join(f"{v:.2f}" for v in off.scale_ratio),
-    )
+    scales = " ".join(f"{v:.2f}" for v in scale_ratio)
+    pose_words = f"{100 * translation_m:.1f}", f"{math.degrees(yaw_rad):.1f}", scales
     return (annotation.category, *names, f"{rank}/{len(ids)}", *pose_words, *numbers)

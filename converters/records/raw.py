@@ -6,6 +6,7 @@ Frames: *scan frame* = the scan's, z up, floor anywhere; *CAD frame* = the libra
 
 import dataclasses
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -41,8 +42,7 @@ CATEGORY_LABELS = {category.name: category.labels for category in TABLE if categ
 """Category -> NYU40 ids."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ColourCloud:
+class ColourCloud(NamedTuple):
     """Coloured points of a surface."""
 
     points: np.ndarray
@@ -83,11 +83,6 @@ class VisualMesh:
     """(h, w, 3) uint8, first row at the top."""
     exact: bool = False
     """The image is the source's, and is written as it is."""
-
-
-def joined_clouds(*clouds: ColourCloud) -> ColourCloud:
-    """Join clouds into one."""
-    return ColourCloud(*(np.vstack([getattr(c, f.name) for c in clouds]) for f in dataclasses.fields(ColourCloud)))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -37,8 +37,6 @@ class FloorFit:
     """Of the plane at the centre."""
     slope: np.ndarray
     """(2,) rise a metre along x and y."""
-    support: float
-    """Share of the floor-labelled area that lies within `TOLERANCE_M` of the plane."""
 
     def height_at(self, points: np.ndarray) -> np.ndarray:
         """Return (n,) z of the plane under (n, 2+) points."""
@@ -90,7 +88,7 @@ def fit_floor(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray, near_
         height, *rise = np.linalg.lstsq(terms * root, points[:, 2] * root[:, 0], rcond=None)[0]
         height, slope = float(height), np.array(rise)
         best = np.abs(middle[:, 2] - height - (middle[:, :2] - centre) @ slope) < TOLERANCE_M
-    return FloorFit(centre, height, slope, float(weight[best].sum() / weight.sum()))
+    return FloorFit(centre, height, slope)
 
 
 def level_floor(vertices_w: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> np.ndarray:

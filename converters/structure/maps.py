@@ -201,16 +201,15 @@ def make_floor_plan(
     given: GivenMap | None,
     yaw: float,
     exact: bool = False,
-    resolution_m: float = RESOLUTION_M,
 ) -> FloorPlan:
     """Compute floor and obstacles from the cleaned scan (floor at z = 0, NYU40 labels) after the cut.
 
     `given` is the source's traversable map; `yaw` of the grid is the building's `main_direction`, rad.
     """
     used = (vertices_w[np.unique(faces)] @ yaw_matrix(yaw))[:, :2]
-    low = np.floor((used.min(axis=0) - PAD_M) / resolution_m) * resolution_m
-    columns, rows = np.ceil((used.max(axis=0) + PAD_M - low) / resolution_m).astype(int)
-    grid = Grid(yaw, (float(low[0]), float(low[1])), (int(rows), int(columns)), resolution_m)
+    low = np.floor((used.min(axis=0) - PAD_M) / RESOLUTION_M) * RESOLUTION_M
+    columns, rows = np.ceil((used.max(axis=0) + PAD_M - low) / RESOLUTION_M).astype(int)
+    grid = Grid(yaw, (float(low[0]), float(low[1])), (int(rows), int(columns)), RESOLUTION_M)
     shown = _shown(grid, vertices_w, faces, face_labels(labels, faces))
     floor_visible = shown.floor >= 2
     occupied = _drop_small(shown.solid >= 3, MIN_OBSTACLE_CELLS)
@@ -221,7 +220,7 @@ def make_floor_plan(
     under, swept = np.zeros((2, *grid.shape), bool)
     for placed in objects:
         for hull in placed.hulls_b:
-            grid.add_below(under, to_world(placed, hull.vertices), resolution_m / 2)
+            grid.add_below(under, to_world(placed, hull.vertices), RESOLUTION_M / 2)
         if placed.category == "door":
             swept |= swept_by_door(grid, placed, LEAF_MARGIN_M + BOXED_M * exact)
     # What is left of the door's scan in its sweep goes, walls stay.
@@ -234,21 +233,21 @@ def make_floor_plan(
     # What lies behind a line of obstacles (the inside of a wall, the far side of one that a chair's annotated
     # pose cuts) is no floor: it must connect to visible floor.
     floor = np.asarray(ndimage.binary_propagation(floor_visible & ~occupied, mask=closed & ~occupied), bool)
-    floor = _fill_holes(floor, occupied, resolution_m)
+    floor = _fill_holes(floor, occupied, RESOLUTION_M)
     if given is None and not exact:
-        floor = _bridge(floor, occupied, resolution_m)
+        floor = _bridge(floor, occupied, RESOLUTION_M)
     if given is None:
-        floor &= ~floor_outside(floor, occupied, under, resolution_m)
-    traversable = _drop_small(floor, math.ceil(MIN_FREE_M2 / resolution_m**2))
-    traversable = _without_insides(traversable, shown, resolution_m)
+        floor &= ~floor_outside(floor, occupied, under, RESOLUTION_M)
+    traversable = _drop_small(floor, math.ceil(MIN_FREE_M2 / RESOLUTION_M**2))
+    traversable = _without_insides(traversable, shown, RESOLUTION_M)
     if not traversable.any():
         raise SceneRejected(
             "scan: no traversable floor is left (no floor label below 1.2 m of free height); "
             "check the floor's labels and height"
         )
     height, leaf = _heights(shown, occupied, 1 if exact else 5), swept & (~traversable if exact else occupied)
-    unseen_m2 = float((traversable & ~floor_visible).sum()) * resolution_m**2
-    open_share = float(beyond_obstacles(occupied, resolution_m)[traversable].mean())
+    unseen_m2 = float((traversable & ~floor_visible).sum()) * RESOLUTION_M**2
+    open_share = float(beyond_obstacles(occupied, RESOLUTION_M)[traversable].mean())
     return FloorPlan(grid, floor, occupied, traversable, shown.wall_height_m, leaf, height, unseen_m2, open_share)
 
 

@@ -288,9 +288,7 @@ def draw_objects(
     for placed, cloud in zip(objects, clouds, strict=True):
         if len(cloud.points):
             turn = matrix_from_quat(placed.quaternion_w)
-            cloud_b = dataclasses.replace(
-                cloud, points=(cloud.points - placed.position_w) @ turn, normals=cloud.normals @ turn
-            )
+            cloud_b = cloud._replace(points=(cloud.points - placed.position_w) @ turn, normals=cloud.normals @ turn)
             done.append(Drawn(*bake_object(*mesh, first.face_colours, cloud_b, low, size), *loss))
             continue
         if unscanned is None:

@@ -98,11 +98,6 @@ class PictureCamera:
             lambda scene: SceneModel(world.robot, world.scenes[scene], world.small_objects, classes)
         )
 
-    @property
-    def engine(self) -> str:
-        """Return who draws RGB; auto until the first picture."""
-        return self._painter.engine
-
     def frame(
         self, state: Any, width: int = 512, height: int = 512, streams: tuple[str, ...] = ("rgb",), view: str = "robot"
     ) -> dict[str, np.ndarray]:
@@ -234,15 +229,13 @@ def robot_camera(view: SceneView, rows: int, columns: int, fov_deg: float | None
     return look_along(pos, forward), Lens(columns, rows, fov_deg or mount.fov_deg)
 
 
-def chase_camera(
-    robot_pos_w: np.ndarray, yaw_rad: float, rows: int, columns: int, distance_m: float = 3.6
-) -> tuple[CameraPose, Lens]:
+def chase_camera(robot_pos_w: np.ndarray, yaw_rad: float, rows: int, columns: int) -> tuple[CameraPose, Lens]:
     """Return a camera behind and above the robot, 40 degrees down."""
     pitch = math.radians(40)
     ahead = np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0])
     forward = math.cos(pitch) * ahead - np.array([0.0, 0.0, math.sin(pitch)])
     target = np.array([robot_pos_w[0], robot_pos_w[1], 0.15]) + 0.45 * ahead
-    return look_along(target - distance_m * forward, forward), Lens(columns, rows, 48.0)
+    return look_along(target - 3.6 * forward, forward), Lens(columns, rows, 48.0)
 
 
 def behind(model: SceneModel) -> CameraPose:

@@ -140,11 +140,6 @@ def stand(robot: RobotSpec, world: mujoco.MjSpec) -> tuple[mujoco.MjModel, mujoc
     return model, data
 
 
-def solid_geoms(model: mujoco.MjModel, body: int) -> list[int]:
-    """Return the geoms of a body that collide."""
-    return np.flatnonzero((model.geom_bodyid == body) & (model.geom_group == 3)).tolist()
-
-
 def half_extents(model: mujoco.MjModel, geom: int) -> np.ndarray:
     """Return (3,) half sizes of a box about the geom's origin that holds it, in its frame, m."""
     return np.abs(model.geom_aabb[geom, :3]) + model.geom_aabb[geom, 3:]

@@ -12,7 +12,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from interactive_nav.robots.build import Joint, WheeledBase, half_extents, solid_geoms
+from interactive_nav.robots.build import Joint, WheeledBase, half_extents
 from interactive_nav.robots.files import compiled, warn
 from interactive_nav.robots.spec import set_servo
 from interactive_nav_common.errors import FileError
@@ -61,7 +61,7 @@ def read_rounds(child: mujoco.MjSpec, path: Path, base_body: str) -> list[Round]
     mujoco.mj_kinematics(model, data)
     rounds = []
     for body in range(model.body(base_body).id + 1, model.nbody):
-        geoms = solid_geoms(model, body)
+        geoms = np.flatnonzero((model.geom_bodyid == body) & (model.geom_group == 3)).tolist()  # those that collide
         if len(geoms) != 1 or (kind := _GEOM(int(model.geom_type[geoms[0]]))) not in _ROUND:
             continue
         pos_m, (radius_m, length_m, _) = data.geom_xpos[geoms[0]].copy(), model.geom_size[geoms[0]].tolist()

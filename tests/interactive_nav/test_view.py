@@ -22,37 +22,42 @@ from tests.gl_program import drawn, need_gl
 ROOT = Path(__file__).parents[2]
 
 
-def yes() -> bool:
-    return True
+def offer(monkeypatch, window: bool, browser: bool) -> None:
+    monkeypatch.setattr(view, "can_open_window", lambda: window)
+    monkeypatch.setattr(view, "has_browser_viewer", lambda: browser)
 
 
-def no() -> bool:
-    return False
-
-
-def test_a_window_where_there_is_a_screen_else_the_browser():
-    assert view.choose_viewer("auto", yes, yes) == view.choose_viewer("auto", yes, no) == "window"
-    assert view.choose_viewer("auto", no, yes) == view.choose_viewer("browser", yes, yes) == "browser"
+@pytest.mark.parametrize(
+    ("wanted", "window", "browser", "chosen"),
+    [
+        ("auto", True, True, "window"),
+        ("auto", True, False, "window"),
+        ("auto", False, True, "browser"),
+        ("browser", True, True, "browser"),
+    ],
+)
+def test_a_window_where_there_is_a_screen_else_the_browser(monkeypatch, wanted, window, browser, chosen):
+    offer(monkeypatch, window, browser)
+    assert view.choose_viewer(wanted) == chosen
 
 
 @pytest.mark.parametrize(
     ("wanted", "has", "message"),
-    [("auto", no, "no screen to open a window on, and a view in the browser needs mjviser"),
-     ("browser", no, "^a view in the browser needs mjviser"),
-     ("window", yes, "no screen to open a window on; .* --viewer browser")],
+    [("auto", False, "no screen to open a window on, and a view in the browser needs mjviser"),
+     ("browser", False, "^a view in the browser needs mjviser"),
+     ("window", True, "no screen to open a window on; .* --viewer browser")],
 )  # fmt: skip
-def test_what_is_missing_is_said(wanted, has, message):
+def test_what_is_missing_is_said(monkeypatch, wanted, has, message):
+    offer(monkeypatch, window=False, browser=has)
     with pytest.raises(view.ViewError, match=message):
-        view.choose_viewer(wanted, no, has)
+        view.choose_viewer(wanted)
 
 
 def test_without_a_display_and_mjviser_the_command_says_so_in_one_line(room, monkeypatch, capsys):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.setattr(view, "has_browser_viewer", no)
+    monkeypatch.setattr(view, "has_browser_viewer", lambda: False)  # GLFW is really asked
     monkeypatch.setattr("sys.platform", "linux")
-    # The defaults of choose_viewer were bound at import: name them again, with GLFW really asked.
-    monkeypatch.setattr(view.choose_viewer, "__defaults__", (view.can_open_window, no))
     assert view.main([str(room), "--objects", "2"]) == 2
     error = capsys.readouterr().err.strip().splitlines()
     assert error == [
@@ -77,7 +82,7 @@ def test_bad_arguments_give_one_line(room, capsys, arguments, message):
 
 def test_the_chosen_viewer_is_given_the_model(room, monkeypatch):
     opened = []
-    monkeypatch.setattr(view.choose_viewer, "__defaults__", (no, yes))
+    offer(monkeypatch, window=False, browser=True)
     monkeypatch.setattr(view, "open_browser", lambda model, data, *where: opened.append((model.nbody, *where)))
     assert view.main([str(room), "--robot", "turtlebot", "--objects", "1", "--port", "9000"]) == 0
     # World, structure, the room's cube, robot with two wheels, one small object.
@@ -160,7 +165,7 @@ def test_a_window_opens_where_the_robot_is_in_sight(tmp_path, monkeypatch, scene
 @pytest.mark.parametrize(("name", "back_m", "high_m"), [("follow", 1.8, 1.8), ("eye", 2.6, 1.5)])
 def test_views_from_behind_look_at_the_robots_middle_as_films_do(two_rooms, monkeypatch, name, back_m, high_m):
     shown, robot = [], get_robot("turtlebot")
-    monkeypatch.setattr(view.choose_viewer, "__defaults__", (yes, no))
+    offer(monkeypatch, window=True, browser=False)
     monkeypatch.setattr(view, "open_window", lambda model, data: shown.append((model, data)))
     assert view.main([str(two_rooms), "--robot", "turtlebot", "--objects", "0", "--view", name]) == 0
     model, data = shown[0]

@@ -43,10 +43,6 @@ class Drawing:
     role: str = ""
     """Key of `roles` in `looks.yaml`, such as `office`: homes use the model only in groups that request the role."""
 
-    def draw(self) -> list[Part]:
-        """Return its parts."""
-        return drawn_parts(self.parts)
-
 
 def drawn_parts(rows: Iterable[list[Any]]) -> list[Part]:
     """Return the parts of rows as `Drawing.parts` has them."""
@@ -180,7 +176,7 @@ def cad_model(name: str) -> CadModel:
 def _empty(name: str) -> CadModel:
     """Return a model that holds nothing, without a tint."""
     drawing = LIBRARY[name]
-    parts = _library_parts(name) if name in _PACKAGED else on_floor(drawing.draw())
+    parts = _library_parts(name) if name in _PACKAGED else on_floor(drawn_parts(drawing.parts))
     points = np.concatenate([p.vertices for p in parts])
     low, high = points.min(axis=0), points.max(axis=0)
     unit_m = float(np.linalg.norm(high - low))

@@ -181,15 +181,14 @@ def leaf(base, tip, width, material, thick=0.008) -> Part:
     return hull([p + s * thick / 2 * up for p in rim for s in (-1, 1)], material)
 
 
-def four_legs(width, depth, height, thick, material, splay=0.0, square=True) -> list[Part]:
+def four_legs(width, depth, height, thick, material, square=True) -> list[Part]:
     """Build legs under the corners of a `width` x `depth` top whose underside is at `height`."""
     legs = []
     for sx in (-1, 1):
         for sz in (-1, 1):
             x, z = sx * (width / 2 - thick), sz * (depth / 2 - thick)
-            foot = (x + sx * splay, 0.0, z + sz * splay)
             sides, radius = (4, thick * 0.7) if square else (10, (thick * 0.4, thick * 0.6))
-            legs.append(bar(foot, (x, height, z), radius, material, sides))
+            legs.append(bar((x, 0.0, z), (x, height, z), radius, material, sides))
     return legs
 
 

@@ -24,6 +24,7 @@ PRINTS = np.stack([SKIES, LANDS], axis=1)
 ACCENTS = np.array([[0.80, 0.45, 0.25], [0.85, 0.66, 0.28], [0.62, 0.22, 0.24], [0.30, 0.50, 0.55], [0.78, 0.52, 0.50]])
 SKIRTING_M = 0.09
 """Height of the white board along the foot of painted walls."""
+BLUR_M = 0.0125
 WET = ("bathroom", "kitchen")
 SOFT = ("bedroom", "office")
 """Uses whose floors are carpets half of the time."""
@@ -59,16 +60,11 @@ def boards(p: np.ndarray, base: np.ndarray, along: int) -> np.ndarray:
     return base * (tone * grain * joint)[:, None]
 
 
-def tiles(
-    u: np.ndarray, v: np.ndarray, base: np.ndarray, side_m: float, chequered: bool = False, blur_m: float = 0.0
-) -> np.ndarray:
-    """Paint square tiles with grout, over a plane's two coordinates; a texel `blur_m` wide takes its share of grout."""
+def tiles(u: np.ndarray, v: np.ndarray, base: np.ndarray, side_m: float, chequered: bool = False) -> np.ndarray:
+    """Paint square tiles with grout, over a plane's two coordinates; a texel `BLUR_M` wide takes its share of grout."""
     i, j = np.floor(u / side_m), np.floor(v / side_m)
-    if blur_m:
-        off = np.minimum(*(np.minimum(np.mod(w, side_m), side_m - np.mod(w, side_m)) for w in (u, v)))
-        grout = np.clip((0.0035 + blur_m / 2 - off) / blur_m, 0, 1)
-    else:
-        grout = (np.mod(u, side_m) < 0.012) | (np.mod(v, side_m) < 0.012)
+    off = np.minimum(*(np.minimum(np.mod(w, side_m), side_m - np.mod(w, side_m)) for w in (u, v)))
+    grout = np.clip((0.0035 + BLUR_M / 2 - off) / BLUR_M, 0, 1)
     tone = 0.75 * grout + (1 - grout) * (0.96 + 0.06 * hashed(i, j))
     if chequered:
         tone = tone * np.where(np.mod(i + j, 2) < 1, 1.0, 0.62)
@@ -179,7 +175,7 @@ def _wall(room: Rect, use: str, rng: np.random.Generator, pictured: bool) -> Col
         if papered:
             out[np.mod(along, 2 * stripe) < stripe] = accent
         tile = (p[:, 2] < tiled_to) & (p[:, 2] > tiled_from)
-        out[tile] = tiles(along[tile], p[tile, 2], glaze, 0.15, blur_m=0.0125)
+        out[tile] = tiles(along[tile], p[tile, 2], glaze, 0.15)
         if tiled_from or not tiled_to:
             out[p[:, 2] < SKIRTING_M] = [0.95, 0.95, 0.94]
         return _hang(p, out, room, pictures, np.random.default_rng(seed))
@@ -196,7 +192,7 @@ def _floor(room: Rect, use: str, wood: np.ndarray, along: int, rugs: np.ndarray,
 
     def colour(p: np.ndarray) -> np.ndarray:
         if use in WET:
-            return tiles(p[:, 0], p[:, 1], tile, side_m, chequered, 0.0125)
+            return tiles(p[:, 0], p[:, 1], tile, side_m, chequered)
         if soft:
             return carpet * (0.9 + 0.16 * hashed(np.floor(p[:, 0] / 0.015), np.floor(p[:, 1] / 0.015)))[:, None]
         under = boards(p, wood, along)

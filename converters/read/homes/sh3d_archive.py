@@ -39,10 +39,8 @@ def unpack(path: Path, folder: Path, budget: list[int] | None = None) -> None:
             name = PurePosixPath(item.filename)
             if name.is_absolute() or ".." in name.parts or set('\\:*?"<>|\0') & set(item.filename):
                 raise SceneRejected(f"{path}: holds a file '{name}', which leads out of it; save the home again")
-            if item.is_dir() or item.filename == JAVAS:
-                continue
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_bytes(archive.read(item))
+            if item.filename != JAVAS:
+                archive.extract(item, folder)
 
 
 def read_xml(path: Path, folder: Path) -> ElementTree.Element:

@@ -15,8 +15,8 @@ from converters.generate.models.cad import (
     HOME_TEST_MODELS,
     HOME_TRAIN_MODELS,
     LIBRARY,
-    Drawing,
     cad_model,
+    drawn_parts,
 )  # fmt: skip
 from converters.generate.models.parts import (
     Part,
@@ -119,7 +119,7 @@ def stance(name: str) -> tuple[float, float]:
 @pytest.mark.parametrize("name", NEW)
 def test_a_model_stands_on_the_floor_has_its_categorys_size_and_few_parts(name):
     drawing = LIBRARY[name]
-    drawn = on_floor(drawing.draw())
+    drawn = on_floor(drawn_parts(drawing.parts))
     most = 100 if name == "shelf_builtin" else 40  # with its books
     assert name.startswith(f"{drawing.category}_") and 2 < len(drawn) <= most
     lowest = min(p.vertices[:, 1].min() for p in drawn)
@@ -199,7 +199,7 @@ def test_a_row_draws_what_its_shapes_are_called_to_draw():
         ["plate", ["oval", 0, 0, 0.2, 0.1, 8], 0, 0.3, "oak", ["rectangle", 0, 0, 0.5, 0.4]],
         ["turned", [0, 0, 0], [[0.1, 0], [0.2, 0.3], [0.1, 0.5]], "steel", {"sides": 6}],
     )
-    drawn = Drawing("bin", rows).draw()
+    drawn = drawn_parts(rows)
     outlines = oval(0, 0, 0.2, 0.1, 8), rectangle(0, 0, 0.5, 0.4)
     called = [plate(outlines[0], 0, 0.3, "oak", outlines[1]),
               *turned((0, 0, 0), [(0.1, 0), (0.2, 0.3), (0.1, 0.5)], "steel", 6)]  # fmt: skip

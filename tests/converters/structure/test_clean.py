@@ -40,7 +40,6 @@ def test_clutter_labelled_floor_does_not_move_the_plane():
     fit = fit_floor(vertices, faces, labels)
     assert fit.height_at(np.array([[2.0, 2.0]]))[0] == pytest.approx(truth, abs=0.002)
     assert tilt_deg(fit) == pytest.approx(1.0, abs=0.1)
-    assert 0.38 < fit.support < 0.5  # the 400 true ones, and what of the clutter lies as low
     level = level_floor(vertices - [0, 0, truth], faces, labels)
     true = np.repeat(np.arange(1000) >= 600, 4)
     np.testing.assert_array_equal(level[true, 2], LIFT_M)  # its tilt would leave +-3.5 cm
