@@ -201,16 +201,11 @@ def from_the_south(surfaces: Surfaces, maps: SceneMaps, low: np.ndarray, high: n
 
 
 def at_eye_height(
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    surfaces: Surfaces,
-    maps: SceneMaps,
-    shape: tuple[int, int],
-    eye_m: float = EYE_M,
+    model: mujoco.MjModel, data: mujoco.MjData, surfaces: Surfaces, maps: SceneMaps, shape: tuple[int, int]
 ) -> np.ndarray:
     """Draw a (rows, columns, 3) picture, `shape` large, of what somebody sees from where most is visible."""
     eye, heading = _vantage(model, data, surfaces, maps)
-    eye_w = np.array([*eye, eye_m])
+    eye_w = np.array([*eye, EYE_M])
     tall = math.degrees(2 * math.atan(math.tan(EYE_VIEW_RAD / 2) * shape[0] / shape[1]))
     lens = Lens(SHARP * shape[1], SHARP * shape[0], tall)
     picture = _taken(look_along(eye_w, np.array([*heading, -DOWN])), lens, surfaces)
