@@ -14,10 +14,10 @@ from converters.generate.models.cad import CLOTH, LOOKS, cad_model
 from converters.generate.surface.modelled import model_building
 from converters.generate.surface.scan import Scan, scan_building
 from converters.generate.surface.texture import make_atlas
-from converters.generate.surface.write import LICENCE, annotate_items, write_cad, write_json, write_png, write_scan
+from converters.generate.surface.write import LICENCE, annotate_items, write_cad, write_png, write_scan
 from converters.library.store import attribution, read_index
 from converters.records.raw import ATTRIBUTION, WINDOWS, VisualMesh
-from interactive_nav_common.files import part_folder, publish, write_text
+from interactive_nav_common.files import part_folder, publish, write_json, write_text
 
 __all__ = ["Building", "GenerationError", "HomeConfig", "design_building", "generate_building"]
 

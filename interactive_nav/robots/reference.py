@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import inspect
-import json
 import os
 import shutil
 from collections.abc import Callable, Mapping
@@ -14,7 +13,7 @@ from interactive_nav.robots.factory import Facts, from_file
 from interactive_nav.robots.files import warn
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav_common.errors import ConfigError, UserError
-from interactive_nav_common.files import write_text, writing
+from interactive_nav_common.files import write_json, writing
 from interactive_nav_common.imports import import_function
 from interactive_nav_common.records import Reader
 
@@ -116,7 +115,7 @@ def record_robot(robot: str, folder: Path) -> None:
         folder.mkdir(parents=True)
         for file in _files(path) if alone else ():
             shutil.copyfile(file, folder / file.name)
-    write_text(folder / "reference.json", json.dumps(dataclasses.asdict(record), indent=1) + "\n")
+    write_json(folder / "reference.json", dataclasses.asdict(record))
 
 
 def recorded_robot(folder: Path) -> tuple[str, str] | None:

@@ -3,7 +3,6 @@
 The scan is z up; the annotations' world is y up (the scan's `trs` turns -90 degrees about x and centres it).
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -84,11 +83,6 @@ def _part_lines(model: CadModel, drawn: bool) -> str:
         lines += _rows("v %.6f %.6f %.6f\n", part.vertices) + _rows("f %d %d %d\n", part.faces + base)
         base += len(part.vertices)
     return lines
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON, floats in full."""
-    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 SCAN_TO_WORLD = Rotation.from_euler("x", -90, degrees=True)
