@@ -146,10 +146,8 @@ def attribution(models: Sequence[Model]) -> str:
     return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)]) + "\n"
 
 
-@functools.cache
-def _archive(path: Path) -> zipfile.ZipFile:
-    """Open an archive for good: its table of members takes as long to read as a model."""
-    return zipfile.ZipFile(path)
+_archive = functools.cache(zipfile.ZipFile)
+"""Opens an archive for good: its table of members takes as long to read as a model."""
 
 
 def _member(path: Path, name: str) -> bytes:

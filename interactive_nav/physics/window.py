@@ -75,7 +75,8 @@ class PhysicsWindow:
         self._nearness = Nearness(world)
         self._reach_m = world.robot.footprint_radius_m + REACH_M
         limits["walls"] = config.active_walls
-        measured = widths_at(self.needs_at_rest) if None in limits.values() else {}
+        # What is needed with the robot at random places, everything at rest.
+        measured = widths_at(self._nearness.counts(self._reach_m)) if None in limits.values() else {}
         self.widths = {kind: measured[kind] if limit is None else limit for kind, limit in limits.items()}
         """Kind of slot, and `walls` -> how many at a time; 0: all."""
         there = {kind: len(slots) for kind, slots in self._slots.items()} | {"walls": len(layout.wall_geoms)}
@@ -93,11 +94,6 @@ class PhysicsWindow:
                 first += width
         self._tables = self._build_tables()
         self._owners = _owners(layout, world.models[0]), _owners(self.layout, self.model)
-
-    @functools.cached_property
-    def needs_at_rest(self) -> dict[str, np.ndarray]:
-        """Return [P] of each kind of slot, and of walls: needed with the robot at random places, everything at rest."""
-        return self._nearness.counts(self._reach_m)
 
     @functools.cached_property
     def awake_at_rest(self) -> int:
