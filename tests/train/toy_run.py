@@ -6,6 +6,9 @@ import sys
 import time
 from typing import Any
 
+if __name__ == "__main__":
+    sys.modules["torch"] = None  # type: ignore[assignment]  # tensorboardX would import it, which takes seconds
+
 from rich.console import Console
 
 from tests.train.toy_env import ToyConfig, ToyEnv
