@@ -13,8 +13,8 @@ _came: list[BaseException] = []
 """What the handlers of `interrupts_heard` have recorded, whether they raised it or not."""
 
 
-def number_of(stop: KeyboardInterrupt) -> int:
-    """Return the signal that raised it."""
+def number_of(stop: BaseException) -> int:
+    """Return the signal that raised a KeyboardInterrupt or a `Stopped`."""
     return stop.args[0] if stop.args else signal.SIGINT
 
 

@@ -4,7 +4,6 @@ Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when 
 """
 
 import importlib
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ from interactive_nav_common.commands import Command, Flag, Words, option, parse,
 from interactive_nav_common.config import settings_help
 from interactive_nav_common.errors import reports_errors
 from interactive_nav_common.jobs.progress import Stopped
+from interactive_nav_common.signals import STOPS, interrupts_heard, number_of
 from topological_nav import config as configs
 from topological_nav.config import DATASET, RUNS
 from topological_nav.data.domains import AdaptConfig
@@ -192,6 +192,7 @@ COMMANDS = {kind.__name__.lower(): kind for kind in KINDS}
 
 
 @reports_errors("topological_nav")
+@interrupts_heard(*STOPS)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command."""
     arguments = parse(COMMANDS, "python -m topological_nav", argv)
@@ -200,9 +201,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         module = "exploration" if isinstance(arguments, Explore) else "commands"
         run = f"run_{type(arguments).__name__.lower()}"
         getattr(importlib.import_module(f"topological_nav.{module}"), run)(arguments)
-    except (Stopped, KeyboardInterrupt) as stopped:  # the latter: before the work began, or at a second Ctrl-C
+    except (Stopped, KeyboardInterrupt) as stopped:  # the latter: outside of loops that stop between two steps
         print("topological_nav: stopped; the same command goes on", file=sys.stderr)
-        return 128 + (stopped.args[0] if isinstance(stopped, Stopped) else signal.SIGINT)
+        return 128 + number_of(stopped)
     return 0
 
 

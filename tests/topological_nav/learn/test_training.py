@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import signal
 
 import jax
 import numpy as np
@@ -11,6 +12,7 @@ from interactive_nav_common.config import overridden
 from interactive_nav_common.errors import FileError
 from interactive_nav_common.jobs.progress import Stopped
 from interactive_nav_common.records import read_metrics
+from topological_nav.__main__ import main
 from topological_nav.config import NetworkTrainConfig
 from topological_nav.data.dataset import load_passages, load_rooms
 from topological_nav.learn import training
@@ -104,6 +106,22 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(made, whole, tmp_pat
     lines = [read_metrics(run / "metrics.jsonl") for run in (out, whole[0])]
     strip = [[{k: v for k, v in line.items() if k != "seconds"} for line in run] for run in lines]
     assert strip[0] == strip[1]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_stop_while_scoring_is_one_line_and_the_same_command_scores(
+    made, whole, tmp_path, capsys, monkeypatch, number
+):
+    """No epoch is run again."""
+    command = ["train", "rooms", "--data", str(made.data), "-o", str(tmp_path / "run"), *WORDS]
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "_scores", lambda *_: signal.raise_signal(number))
+        assert main(command) == 128 + number
+    assert capsys.readouterr().err == "topological_nav: stopped; the same command goes on\n"
+    assert not (tmp_path / "run" / "results.json").exists()
+    assert main(command) == 0 and "epoch" not in capsys.readouterr().out
+    results = [json.loads((run / "results.json").read_text()) for run in (tmp_path / "run", whole[0])]
+    assert results[0] == results[1] and len(read_metrics(tmp_path / "run" / "metrics.jsonl")) == 2
 
 
 def test_a_finished_run_is_left_as_it_is(made, whole, capsys):
