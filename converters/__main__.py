@@ -27,7 +27,7 @@ from interactive_nav_common.config import AtLeastOne, read_words, refuse_unused
 from interactive_nav_common.errors import ConfigError, UserError, printable, readable, reports_errors
 from interactive_nav_common.jobs.progress import SafeConsole, stage_progress, warn_once
 from interactive_nav_common.signals import STOPS, interrupts_heard, number_of
-from scenes_mjcf.sets import installed
+from scenes_mjcf.sets import existing
 
 if TYPE_CHECKING:
     from converters.records.errors import Gate
@@ -199,7 +199,7 @@ class Check(generating.Command):
         """Run the command."""
         from converters.check.gates import check_folder
 
-        manifest, gates = check_folder(installed(self.scene))
+        manifest, gates = check_folder(existing(self.scene))
         for gate in gates:
             verdict = "PASS" if gate.passed else "FAIL"
             print(
@@ -227,7 +227,7 @@ class Preview(generating.Command):
         """Run the command."""
         from converters.check.preview import preview
 
-        preview(installed(self.scene), self.output, self.source)
+        preview(existing(self.scene), self.output, self.source)
         console.print(f"{self.output}: picture of {self.scene}", soft_wrap=True)
 
 
@@ -243,7 +243,7 @@ class Export(generating.Command):
         """Run the command."""
         from converters.write.sh3d import export_sh3d
 
-        for line in export_sh3d(installed(self.scene), self.output):
+        for line in export_sh3d(existing(self.scene), self.output):
             console.print(f"{self.output}: {line}", soft_wrap=True, highlight=False)
 
 

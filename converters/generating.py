@@ -2,7 +2,6 @@
 
 import functools
 import os
-import shlex
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -11,6 +10,7 @@ from rich.console import Console
 from interactive_nav_common.commands import Command as AnyCommand
 from interactive_nav_common.commands import Flag, OnCluster, Words, option, word
 from interactive_nav_common.config import AtLeastOne, Positive, read_words, refuse_unused
+from interactive_nav_common.errors import typed
 from interactive_nav_common.jobs.progress import stage_progress
 from scenes_mjcf import sets
 
@@ -87,7 +87,7 @@ class Generate(Command):
             _, seed = with_seeds(self.seed, lambda seed: generate_building(self.out, seed, report, config))
         console.print(
             f"{self.out}: building of {seed}; convert it with "
-            f"'python -m converters convert {shlex.quote(str(self.out))} SCENE_DIR'"
+            f"'python -m converters convert {typed(self.out)} SCENE_DIR'"
         )
 
 

@@ -26,7 +26,7 @@ from converters.read.source import root_of
 from converters.recipes import Recipes, chosen, load_recipes, make_scenes, parse_recipes
 from converters.records.errors import StageFailed
 from interactive_nav_common.config import nearest
-from interactive_nav_common.errors import ConfigError, FileError, UserError, readable
+from interactive_nav_common.errors import ConfigError, FileError, UserError, readable, typed
 from interactive_nav_common.files import check_name, write_text
 from interactive_nav_common.jobs.processes import LOST, Job, Launcher, run_jobs
 from interactive_nav_common.rows import write_parquet
@@ -293,7 +293,7 @@ def make_packaged(
         rest = wanted_set(out=out, recipes=folder / RECIPES, only=todo, overwrite=bool(others))
         failed += generate_scenes(rest, report, log)
         for scene in (n for n in todo if n not in failed and not sets.is_listed(out / n, wanted[n])):
-            command = f"python -m converters generate-scenes FOLDER --recipes {folder / RECIPES} --only {scene}"
+            command = f"python -m converters generate-scenes FOLDER --recipes {typed(folder / RECIPES)} --only {scene}"
             log(f"{scene}: not the scene that the set {name} lists; as a scene of your own: {command}")
             failed.append(scene)
     return failed

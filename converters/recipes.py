@@ -25,7 +25,7 @@ from converters.generate.models.cad import MODELS
 from converters.pipeline import ConvertConfig, Converted, convert
 from converters.records.errors import StageFailed
 from interactive_nav_common.config import Natural, nearest
-from interactive_nav_common.errors import ConfigError, UserError, readable
+from interactive_nav_common.errors import ConfigError, UserError, readable, typed
 from interactive_nav_common.files import check_name, part_folder, publish
 from interactive_nav_common.records import Reader
 from interactive_nav_common.untrusted.reading import read_bytes
@@ -195,11 +195,11 @@ def make_scene(
         config = ConvertConfig(format="gibson", split=recipe.split, jobs=jobs, keep=False, **conversion)
         (result, seed), scene = _generated(recipe, config, work, report), work / recipe.name
         report("drawing", GENERATE + CONVERT)
-        undrawn, again = "", f"python -m converters preview {folder} -o {folder / 'preview.png'}"
+        undrawn, again = "", f"python -m converters preview {typed(folder, '-o', folder / 'preview.png')}"
         try:
             preview(scene, scene / "preview.png")
         except (ValueError, ArithmeticError, LookupError, RuntimeError, UserError) as error:  # the scene itself is fine
-            undrawn = f"; no preview: {type(error).__name__}: {' '.join(str(error).split())}; try again with '{again}'"
+            undrawn = f"; no preview: {type(error).__name__}: {' '.join(str(error).split())}; try again with: {again}"
         publish({scene: folder})
     report("done", 1.0)
     return [g.name for g in result.gates if not g.passed], seed, undrawn

@@ -1,7 +1,6 @@
 """Run the commands of `python -m converters` that label and annotate scans."""
 
 import json
-import shlex
 import signal
 import threading
 from collections.abc import Iterator
@@ -17,7 +16,7 @@ from converters.generating import Command
 from converters.records.errors import SceneRejected
 from interactive_nav_common.commands import Flag, Words, option, word
 from interactive_nav_common.config import AtLeastOne
-from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.errors import ConfigError, typed
 from interactive_nav_common.files import write_arrays, write_text
 from interactive_nav_common.jobs.progress import stage_progress
 from interactive_nav_common.signals import number_of
@@ -134,7 +133,7 @@ def propose_unproposed(arguments: Any, console: Console) -> Path | None:
 
 
 def _annotate(source: Path) -> str:
-    return f"'python -m converters annotate {shlex.quote(str(source))} -o DIR'"
+    return f"'python -m converters annotate {typed(source)} -o DIR'"
 
 
 def next_step(arguments: Any, layout: str) -> str:

@@ -36,7 +36,7 @@ from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav_common.commands import Command, option, parse, word
 from interactive_nav_common.config import AtLeastOne, Natural, refuse_unused
-from interactive_nav_common.errors import ConfigError, reports_errors
+from interactive_nav_common.errors import ConfigError, reports_errors, typed
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.jobs.progress import SafeConsole, progress_bar
 from interactive_nav_common.rotations import yaw_from_quat
@@ -293,7 +293,7 @@ class Record(Picture):
             return self.replay
         path = replay_path(self.replay, self.policy, self.episode)
         if not path.is_file():
-            words = f"{self.replay} --episode {self.episode} --policy {self.policy} -o {self.out}"
+            words = typed(self.replay, "--episode", self.episode, "--policy", self.policy, "-o", self.out)
             raise ReplayError(f"{path}: no such replay; play the episode and draw it: python -m train.record {words}")
         return path
 

@@ -29,7 +29,7 @@ from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav.scenes.slots import bodies_by_name
 from interactive_nav_common.commands import Command, option, parse, word
 from interactive_nav_common.config import AtLeastOne
-from interactive_nav_common.errors import ConfigError, reports_errors
+from interactive_nav_common.errors import ConfigError, reports_errors, typed
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.rotations import matrix_from_quat, yaw_from_quat
 
@@ -158,7 +158,7 @@ def _files(sources: Sequence[str]) -> list[Path]:
             folder = source / "replays" if (source / "replays").is_dir() else source
             inside = sorted(folder.glob("*.npz"), key=lambda p: (p.stem.rpartition("-episode")[2].zfill(9), p.stem))
             if not inside:
-                raise ReplayError(f"{source}: holds no replays; record some: python -m train.replay {source}")
+                raise ReplayError(f"{source}: holds no replays; record some: python -m train.replay {typed(source)}")
             files += inside
         else:
             files.append(source)

@@ -7,6 +7,7 @@ import importlib
 import io
 import os
 import select
+import shlex
 import stat
 import sys
 from collections.abc import Callable, Iterator
@@ -21,6 +22,11 @@ Arguments = ParamSpec("Arguments")
 def printable(text: str) -> str:
     """Return the text with control characters escaped: names in files must not steer the reader's terminal."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def typed(*words: object) -> str:
+    """Return words, such as paths with spaces, as they are typed into a shell."""
+    return shlex.join(map(str, words))
 
 
 MOST_LETTERS = 1_900

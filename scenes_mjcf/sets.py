@@ -18,6 +18,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from interactive_nav_common.errors import typed
 from interactive_nav_common.files import cache_folder, check_name, write_text
 from interactive_nav_common.records import Reader
 from scenes_mjcf.schema import SPLITS, SceneError, load_maps
@@ -136,6 +137,17 @@ def meant(word: str) -> str:
     return f", did you mean {places[near[0]]!r}?" if near else ""
 
 
+def existing(word: str | Path) -> Path:
+    """Return the folder of a scene, as `installed` does; raise `SceneError` if there is none."""
+    folder = installed(word)
+    if not folder.exists():
+        raise SceneError(
+            f"{folder}: no such file; expected a scene folder or a set ({', '.join(PACKAGED)}){meant(str(word))}; "
+            "'python -m converters scenes list' shows them, 'python -m converters convert SRC OUT' makes one"
+        )
+    return folder
+
+
 def _members(word: str) -> list[str] | None:
     """Folders of a set or of a set's split; None where the word names neither."""
     head, _, last = word.rstrip("/").rpartition("/")
@@ -161,7 +173,7 @@ def _members(word: str) -> list[str] | None:
             )
         if what:
             own = next((f"scenes make {name}" for name, folder in PACKAGED.items() if folder == root), None)
-            command = own or f"generate-scenes {os.path.relpath(root)}"
+            command = own or f"generate-scenes {typed(os.path.relpath(root))}"
             raise SceneError(f"{word}: {what}; make them with 'python -m converters {command}'")
         return [os.path.relpath(p) if Path.cwd() in p.absolute().parents else str(p) for p in places.values()]
     return None

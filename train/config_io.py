@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from interactive_nav_common.config import flatten, nearest, overlay, read_words, settings_help, to_dict
-from interactive_nav_common.errors import ConfigError, readable
+from interactive_nav_common.errors import ConfigError, readable, typed
 from interactive_nav_common.records import Reader
 from scenes_mjcf.sets import scene_folders
 from train.config import AUTO as AUTO_SIZES
@@ -64,7 +64,7 @@ def load_config(name_or_path: str, overrides: Sequence[str] = ()) -> TrainConfig
     path, plain = read_file(name_or_path, PRESET_DIR, "preset", "--config: ")
     if isinstance(plain, dict) and {"preset", "grid"} & plain.keys():
         raise ConfigError(
-            f"--config: {path.name} is a sweep, expected one run; python -m train.sweep {path} trains all"
+            f"--config: {path.name} is a sweep, expected one run; python -m train.sweep {typed(path)} trains all"
         )
     config = apply_overrides(from_dict(plain, where=path.name), overrides)
     if not config.run.name:

@@ -12,7 +12,7 @@ from interactive_nav.config import TaskRules
 from interactive_nav.geodesic import CornerGraph, corner_graph, navigation_grid
 from interactive_nav.navigation.lookup import geodesic_at, goal_field
 from interactive_nav.navigation.placement import CLEARANCE_M
-from interactive_nav.scenes.many import check_fits, for_each_home
+from interactive_nav.scenes.many import check_device_memory, for_each_home
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.world import World, world_poses
 from interactive_nav.types import SceneTables
@@ -251,6 +251,6 @@ def build_tables(world: World, rules: TaskRules) -> SceneTables:
         num_clutter=i32([len(p[3]) for p in places]),
         fallback_pairs_xy_w=f32(np.zeros((len(places), 1, 2, 2))),
     )
-    check_fits("homes", len(places), tables)
+    check_device_memory("homes", len(places), tables)
     tables = jax.device_put(tables)
     return tables.replace(fallback_pairs_xy_w=jax.device_put(f32(_fallback_pairs(world, tables, rules))))

@@ -17,7 +17,7 @@ from interactive_nav.scenes.world import world_poses
 from interactive_nav.task.env import InteractiveNav
 from interactive_nav.task.rollout import HostPolicy, Player, PolicyFn, Recorder
 from interactive_nav.types import EpisodeStart
-from interactive_nav_common.errors import UserError
+from interactive_nav_common.errors import UserError, typed
 from interactive_nav_common.files import write_arrays
 from interactive_nav_common.untrusted.reading import read_npz
 from scenes_mjcf.categories import MaskClasses
@@ -190,7 +190,7 @@ def load_replay(path: str | Path) -> Replay:
         if "policies" in stored.files:
             raise ReplayError(
                 f"{path}: holds paths that an evaluation recorded, expected a replay, which has the poses of all "
-                f"bodies; draw the paths (python -m train.figures {path.parent}), or play the episode again "
+                f"bodies; draw the paths (python -m train.figures {typed(path.parent)}), or play the episode again "
                 "(python -m train.replay RUN_DIR)"
             )
         header = json.loads(str(stored["header"]))

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 
 import mujoco
 
-from interactive_nav_common.errors import ConfigError
+from interactive_nav_common.errors import ConfigError, typed
 from interactive_nav_common.untrusted.reading import check_named
 
 _FLOATS = ("floating", "planar")
@@ -47,9 +47,8 @@ def read_file(path: Path, base_body: str = "") -> mujoco.MjSpec:
     if re.search(r'\$[({]|/xacro"', text):
         out = path.name.removesuffix(".xacro")
         out = out if out != path.name and out.endswith(".urdf") else f"{path.stem}_plain.urdf"
-        raise ConfigError(
-            f"robot file {path}: is written in xacro, expected plain URDF; run xacro first: xacro {path.name} -o {out}"
-        )
+        again = typed("xacro", path.name, "-o", out)
+        raise ConfigError(f"robot file {path}: is written in xacro, expected plain URDF; run xacro first: {again}")
     if root.tag not in ("robot", "mujoco"):
         raise ConfigError(
             f"robot file {path}: its root element is <{root.tag}>, expected <robot> (URDF) or <mujoco> (MJCF); "

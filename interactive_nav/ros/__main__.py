@@ -17,7 +17,7 @@ from interactive_nav_common.config import Positive, overridden, settings_help
 from interactive_nav_common.errors import UserError, reports_errors
 from interactive_nav_common.jobs.progress import say
 from interactive_nav_common.signals import stop_signals
-from scenes_mjcf.sets import installed
+from scenes_mjcf.sets import existing
 
 DEFAULTS = {"observations": ("depth", "segmentation", "rgb"), "episode_steps": 10**8, "backend": "native"}
 """Of `simulate`, where they differ from the environment's."""
@@ -104,8 +104,7 @@ def _pose(text: str, name: str) -> tuple[float, ...]:
 def _simulate(arguments: Simulate, stops: list[int]) -> None:
     config = overridden(make_config(**DEFAULTS), arguments.settings)
     start = _pose(arguments.start, "--start") if arguments.start else ()
-    if not (installed(arguments.scene) / "scene.json").is_file():  # before what takes long to import
-        raise UserError(f"{arguments.scene}: no scene folder (no scene.json); see 'python -m converters scenes list'")
+    existing(arguments.scene)  # before what takes long to import
     need_ros("interactive_nav.ros")
     from interactive_nav import make
     from interactive_nav.ros import messages as ros

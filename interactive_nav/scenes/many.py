@@ -35,7 +35,7 @@ def free_bytes() -> int:
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
-def check_fits(what: str, count: int, arrays: Any, devices: int = 1) -> None:
+def check_device_memory(what: str, count: int, arrays: Any, devices: int = 1) -> None:
     """Raise `ConfigError` where these arrays, or shapes, of `count` homes or environments exceed `free_bytes`.
 
     Each device holds an equal share. What a step needs besides is not counted: what passes may still not fit.

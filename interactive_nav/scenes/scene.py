@@ -21,7 +21,7 @@ from scenes_mjcf.categories import MaskClasses, class_id
 from scenes_mjcf.look import geom_mesh
 from scenes_mjcf.robot_facts import SMALLEST
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
-from scenes_mjcf.sets import PACKAGED, installed, meant
+from scenes_mjcf.sets import existing, installed
 
 MASS_KG = (1e-3, 1e4)
 FRICTION = (1e-3, 10.0)
@@ -318,12 +318,7 @@ def _files(folder: Path) -> list[Any]:
 
 def _read_scene(folder: str | Path, _files: object = None) -> Scene:
     """Do `load_scene` without its warning; `_files` only tells states of the folder apart in a cache."""
-    folder, word = installed(folder), str(folder)
-    if not folder.exists():
-        raise SceneError(
-            f"{folder}: no such file; expected a scene folder or a set ({', '.join(PACKAGED)}){meant(word)}; "
-            "'python -m converters scenes list' shows them, 'python -m converters convert SRC OUT' makes one"
-        )
+    folder = existing(folder)
     manifest, maps = load_manifest(folder), load_maps(folder)
     xml = folder / "scene.xml"
     if not xml.is_file():

@@ -261,10 +261,11 @@ def test_a_scene_whose_preview_fails_is_kept_and_its_line_names_the_error(tmp_pa
         draw(folder, target)
 
     monkeypatch.setattr(recipes, "preview", fail)
-    assert make_scenes(chosen(quick, tmp_path), {}, tmp_path, log=lines.append) == {"hut": [], "shed": []}
-    assert [p.name for p in sorted((tmp_path / "hut").iterdir())] == ["scene.json"]
-    assert (tmp_path / "shed" / "preview.png").read_text() == "drawn"
-    again = f"try again with 'python -m converters preview {tmp_path}/hut -o {tmp_path}/hut/preview.png'"
+    out = tmp_path / "my homes"
+    assert make_scenes(chosen(quick, out), {}, out, log=lines.append) == {"hut": [], "shed": []}
+    assert [p.name for p in sorted((out / "hut").iterdir())] == ["scene.json"]
+    assert (out / "shed" / "preview.png").read_text() == "drawn"
+    again = f"try again with: python -m converters preview '{out}/hut' -o '{out}/hut/preview.png'"
     assert lines == [
         f"hut: train, seed 1, every gate passes; no preview: {type(error).__name__}: a cannot be b; {again}",
         "shed: test, seed 2, every gate passes",

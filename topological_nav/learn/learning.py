@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from interactive_nav_common.errors import FileError
+from interactive_nav_common.errors import FileError, typed
 from interactive_nav_common.files import write_json
 from interactive_nav_common.records import Reader
 from interactive_nav_common.runs import weights
@@ -222,7 +222,8 @@ def read_description(run: Path, kind: str, task: str) -> dict[str, Any]:
     """Return the content of a finished run's network.json."""
     path = run / DESCRIPTION
     if not path.is_file():
-        raise FileError(f"{run}: holds no trained {kind}; finish it: python -m topological_nav train {task} -o {run}")
+        again = f"python -m topological_nav train {task} -o {typed(run)}"
+        raise FileError(f"{run}: holds no trained {kind}; finish it: {again}")
     reader = Reader(FileError, "train again", finite=False)
     about = reader.json(path)
     reader.record(about, _Description, str(path), others=True)

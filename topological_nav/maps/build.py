@@ -158,7 +158,7 @@ class PassagePolicy:
 CHUNK = 252
 """Images rendered between two reports: fourteen calls of the renderer."""
 CPU_SUPERSAMPLE = 2
-"""Limit on a CPU, where rendering dominates; the networks answer nearly the same (docs/topological.md)."""
+"""Limit on a CPU, where rendering dominates; the networks answer nearly the same (docs/topological-transfer.md)."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from interactive_nav import get_robot, load_scene
-from interactive_nav_common.errors import ConfigError, FileError
+from interactive_nav_common.errors import ConfigError, FileError, typed
 from interactive_nav_common.files import whole_folder, write_json
 from interactive_nav_common.jobs.progress import Progress, say
 from interactive_nav_common.records import Reader
@@ -65,7 +65,8 @@ def export(
     runs = {"rooms": localiser, "passages": detector} | ({"policy": policy} if policy else {})
     files = sorted(maps.glob("*.npz")) if maps else []
     if maps and not files:
-        raise FileError(f"{maps}: holds no map; make some: python -m topological_nav map SCENE -o {maps}/SCENE.npz")
+        again = f"python -m topological_nav map SCENE -o {typed(maps / 'SCENE.npz')}"
+        raise FileError(f"{maps}: holds no map; make some: {again}")
     networks = load_networks(runs["rooms"], runs["passages"], classifies=True)
     driver = load_policy(policy, localiser, detector) if policy else None
     pictures = level_images(images, networks, config.places, progress)

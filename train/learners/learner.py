@@ -12,7 +12,7 @@ import numpy as np
 from brax.envs import Env
 
 from interactive_nav.physics import compiler_options
-from interactive_nav.scenes.many import check_fits
+from interactive_nav.scenes.many import check_device_memory
 from interactive_nav_common.errors import UserError
 from train.config import RunConfig
 
@@ -110,7 +110,7 @@ def reset_envs(agent: Any, env: Env, key: jax.Array) -> PyTree:
     # A program of several processes takes an array of none of their devices.
     begin = np.asarray(key) if jax.process_count() > 1 else key
     start = jax.jit(reset)
-    check_fits("environments", number, jax.eval_shape(start, begin), getattr(env, "num_devices", 1))
+    check_device_memory("environments", number, jax.eval_shape(start, begin), getattr(env, "num_devices", 1))
     return start(begin)
 
 

@@ -21,7 +21,7 @@ from interactive_nav.task.privileged import PrivilegedEnv
 from interactive_nav.task.wrappers import AutoResetEnv, ShardedEnv
 from interactive_nav.types import FAILURES
 from interactive_nav_common.config import flatten, replace
-from interactive_nav_common.errors import ConfigError, UserError
+from interactive_nav_common.errors import ConfigError, UserError, typed
 from interactive_nav_common.files import locked, write_json, writing
 from interactive_nav_common.jobs.progress import progress_bar
 from interactive_nav_common.records import cut_metrics, mean_over_episodes
@@ -113,11 +113,6 @@ class FolderCallbacks:
             path, meta = checkpoint.find(self.folder.checkpoints, self.resume_from)
         for warning in passed_over:
             self.console.print(str(warning.message), style="yellow", markup=False)
-        if not checkpoint.is_whole(path):
-            raise CheckpointError(
-                f"{path}: holds the policy alone, as `train.sweep --export` writes it, expected all of the learner to "
-                "go on from; train into another folder (run.out_dir, run.name)"
-            )
         checkpoint.check_fits(meta, path, self.config.env, self.env)
         for name, digest in meta.scenes.items():
             if self._scenes.get(name, digest) != digest:
@@ -259,6 +254,15 @@ def with_policy_of_init(template: Snapshot, config: TrainConfig, env: Any) -> Sn
     return dataclasses.replace(template, learner=learner)
 
 
+def check_resumable(folder: RunFolder) -> None:
+    """Raise `CheckpointError` if the folder holds an exported run: its checkpoints are of the policy alone."""
+    if not all(map(checkpoint.is_whole, folder.checkpoints.glob("[0-9]*"))):
+        init = [f"run.init={folder.path}"] * (folder.read_config().algorithm in ("ppo", "clone"))
+        again = typed("python", "-m", "train", "--config", folder.config, "run.name=NEW", *init)
+        got = f"{folder.path}: holds the policy alone, as `train.sweep --export` writes it"
+        raise CheckpointError(f"{got}, expected all of the learner to go on from; start a new run: {again}")
+
+
 def train_run(
     config: TrainConfig, console: Console, build_env: Callable[[EnvConfig], Any] = build_env, resume_from: str = "last"
 ) -> tuple[TrainResult, RunFolder, int | None]:
@@ -286,6 +290,7 @@ def train_run(
             if config.algorithm == "clone" and not clone.teacher and not Path(clone.demonstrations).is_file():
                 got = f"clone.demonstrations is {clone.demonstrations!r}, expected the file that"
                 raise ConfigError(f"{got} python -m train.evaluate --demonstrations FILE wrote; or set clone.teacher")
+            check_resumable(folder)
             env = build_env(config.env)
             config = resolve(config, env.backend)
             if config.run.init and not folder.config.is_file():

@@ -22,6 +22,7 @@ from converters.read.files import SourceFolder, check_mesh
 from converters.read.obj import join_textures, read_texture, textured_by_face, use_named, wrapped
 from converters.records.errors import NUMBERS, PIXELS, SceneRejected, check_count
 from converters.records.raw import TexturedMesh
+from interactive_nav_common.errors import typed
 from interactive_nav_common.records import Reader
 from interactive_nav_common.rotations import transformed
 
@@ -103,7 +104,7 @@ class _File:
         for name in sorted((set(self.tree.get("extensionsUsed", [])) if absent else required) & COMPRESSED.keys()):
             raise SceneRejected(
                 f"{self.path}: is compressed with {COMPRESSED[name]}; export it without compression, or convert it "
-                f"with 'npx @gltf-transform/cli copy {self.path.name} plain.glb'"
+                f"with 'npx @gltf-transform/cli copy {typed(self.path.name)} plain.glb'"
             )
         if required - READ:
             raise SceneRejected(

@@ -66,8 +66,8 @@ def test_homes_and_environments_that_exceed_the_memory_are_refused(homes, monkey
     monkeypatch.setattr(many, "free_bytes", lambda: 40)
     shapes = {"a": jax.ShapeDtypeStruct((3, 4), np.float32)}
     with pytest.raises(ConfigError, match=r"^3 homes take 4.8e-08 GB of each device, .* take 2 homes or fewer$"):
-        many.check_fits("homes", 3, shapes)
-    many.check_fits("homes", 3, shapes, devices=2)
+        many.check_device_memory("homes", 3, shapes)
+    many.check_device_memory("homes", 3, shapes, devices=2)
     with pytest.raises(ConfigError, match=r"^2 homes take .* take 0 homes or fewer$"):
         make(homes)
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shlex
 import shutil
+from pathlib import Path
 from typing import Any
 
 import flax.serialization
@@ -19,6 +21,7 @@ from rich.console import Console
 from interactive_nav_common.runs import weights
 from tests.train.toy_pixels import SMALL, ToyPixels
 from tests.train.toy_run import build_toy, toy_config
+from train import config_io
 from train.config import EnvConfig, TrainConfig, resolve
 from train.learners.algorithms import ALGORITHMS
 from train.learners.learner import Snapshot
@@ -131,7 +134,7 @@ def test_foreign_and_damaged_files_are_told(tmp_path):
         checkpoint.load_learner(kept, ALGORITHMS["sac"].template(ToyPixels(), config))
 
 
-def test_training_does_not_go_on_from_it(tmp_path):
+def test_training_does_not_go_on_from_it_but_starts_from_it(tmp_path):
     config = toy_config(tmp_path, updates=2)
     _, folder, _ = train_run(config, Console(quiet=True), build_env=build_toy)
     path, _ = checkpoint.find(folder.checkpoints, "last")
@@ -139,6 +142,15 @@ def test_training_does_not_go_on_from_it(tmp_path):
     shutil.rmtree(path)
     (tmp_path / "kept").rename(path)
     assert json.loads((path / checkpoint.META).read_text())["env_steps"] == 512
-    longer = dataclasses.replace(config, run=dataclasses.replace(config.run, num_timesteps=2048))
-    with pytest.raises(CheckpointError, match="holds the policy alone"):
-        train_run(longer, Console(quiet=True), build_env=build_toy)
+    home = Path(shutil.move(folder.path, tmp_path / "my copy"))
+    resumed = dataclasses.replace(config, run=dataclasses.replace(config.run, name=home.name, num_timesteps=2048))
+    with pytest.raises(CheckpointError, match="holds the policy alone") as refused:
+        train_run(resumed, Console(quiet=True), build_env=build_toy)
+    # The command that it says to type starts a run with that policy.
+    words = shlex.split(str(refused.value).rpartition("start a new run: ")[2])
+    assert words[:5] == ["python", "-m", "train", "--config", str(home / "config.yaml")]
+    new = config_io.load_config(words[4], words[5:])
+    assert new.run.init == str(home) and new.run.name == "NEW"
+    _, started, _ = train_run(new, Console(quiet=True), build_env=build_toy)
+    assert started.path == folder.path.parent / "NEW"
+    assert checkpoint.find(started.checkpoints, "last")[1].env_steps == 512
