@@ -15,17 +15,17 @@ class CameraView(Settings):
     """One of several cameras; it sits where the robot's camera does, and what it does not say is as there."""
 
     name: str = ""
-    """Its images have the keys `pixels/<name>/...`."""
+    """Name of the camera: its images have the keys `pixels/<name>/...`."""
     yaw_deg: float = 0.0
-    """It looks so far to the left of its body's x axis."""
+    """Angle to the left of its body's x axis, in degrees."""
     pitch_deg: float | None = None
-    """Positive looks down."""
+    """Angle below the horizontal in degrees; auto: the robot's camera's."""
     pos_m: tuple[float, float, float] | None = None
-    """In the frame of the body that carries it."""
+    """Position in the frame of the body that carries it, in m; auto: the robot's camera's."""
     fov_deg: FovDeg = None
-    """Vertical; none: `image_fov_deg`."""
+    """Vertical field of view in degrees; auto: `image_fov_deg`."""
     size: ImageSide | None = None
-    """Side of its square images, pixels; none: `image_size`."""
+    """Side of its square images in pixels; auto: `image_size`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,27 +33,27 @@ class CameraNoise(Settings):
     """Errors of cameras, drawn in each step; 0: none. Formulas and sources: `docs/sensors.md`."""
 
     rgb_exposure: NotNegative = 0.0
-    """Standard deviation of a frame's exposure, stops: its colours times 2 to that power, cut at 1."""
+    """Standard deviation of a frame's exposure in stops: colours are multiplied by 2 to that power and cut at 1."""
     rgb_blur_px: Annotated[float, Bounds(0, 16)] = 0.0
-    """Standard deviation of a Gaussian blur, pixels."""
+    """Standard deviation of a Gaussian blur in pixels."""
     rgb_noise: NotNegative = 0.0
-    """Standard deviation of each colour of a pixel whatever it reads (read noise), of 1."""
+    """Standard deviation of a pixel's colours (0 to 1) at any brightness (read noise)."""
     rgb_shot_noise: NotNegative = 0.0
-    """Standard deviation at full brightness of the error that grows with the root of brightness (shot noise), of 1."""
+    """Standard deviation of a pixel's colours (0 to 1) at full brightness; it grows with the root of brightness."""
     rgb_dropout: Share = 0.0
     """Share of pixels whose colour reads 0."""
     depth_disparity_noise: NotNegative = 0.0
-    """Standard deviation of 1 / depth, 1/m: that of depth is this times its square (a Kinect's: 0.0014)."""
+    """Standard deviation of 1 / depth in 1/m: that of depth is this times its square (0.0014: a Kinect's)."""
     depth_disparity_step: NotNegative = 0.0
-    """Steps that 1 / depth is read in, 1/m (a Kinect's: 0.0028)."""
+    """Step in which 1 / depth is read, in 1/m (0.0028: a Kinect's)."""
     depth_grazing_deg: Annotated[float, Bounds(0, 90)] = 0.0
-    """Depth reads 0 on surfaces viewed at less than this angle to them."""
+    """Least angle in degrees between a surface and the line of sight; at smaller ones depth reads 0."""
     depth_edge_m: NotNegative = 0.0
-    """Depth reads 0 where a pixel beside is nearer by more than this."""
+    """Difference of depth in m to a nearer pixel beside, from which depth reads 0."""
     depth_min_m: NotNegative = 0.0
-    """Nearer surfaces read 0."""
+    """Least depth in m; nearer surfaces read 0."""
     depth_max_m: NotNegative = 0.0
-    """Farther surfaces read 0; 0: no limit."""
+    """Largest depth in m; farther surfaces read 0; 0: no limit."""
     frame_dropout: Share = 0.0
     """Share of a camera's frames that are lost: all its images are 0."""
 

@@ -28,79 +28,78 @@ class TaskRules(Settings):
     """What the task is: goals, rewards, objects, what an action commands, and how episodes are scored."""
 
     control_mode: str = "native"
-    """What an action commands: a control mode of the robot; `native` is the original benchmark's."""
+    """Control mode of the robot, which decides what an action commands; `native` is the original benchmark's."""
     symmetric_actions: bool = False
-    """Action 0 commands nothing; the original's ranges are lopsided (TurtleBot's wheels: -12.5 to 25 rad/s)."""
+    """Let action 0 command nothing; the original's ranges are lopsided (TurtleBot's wheels: -12.5 to 25 rad/s)."""
     hook_force_n: NotNegative = 0.0
-    """Largest force, N, of a hook at a wheeled robot's front (100 pulls doors and chairs): one more action, above 0 to
-    couple to what stands within 0.1 m, below 0 to let go. 0: no hook."""
+    """Largest force in N of a hook at a wheeled robot's front (100 pulls doors and chairs); 0: no hook. It adds one
+    action: above 0 couples it to an object within 0.1 m, below 0 lets go."""
     num_objects: Natural = 10
-    """Small objects strewn about at random each episode."""
+    """Number of small objects that lie on the floor, at random places in each episode."""
     small_objects: Literal["train", "test"] = "train"
-    """Set of the small objects' models: train, or test (in no training episode)."""
+    """Models of the small objects: train, or test (these occur in no training episode)."""
     objects: tuple[str, ...] = ()
-    """Folders of `python -m converters object`, relative to the current folder: they are the small objects in place of
-    the built-in ones, in turn until there are num_objects."""
+    """Folders of small objects that `python -m converters object` wrote, relative to the current folder. They replace
+    the built-in ones and take turns until there are num_objects."""
     doors_shut: Annotated[tuple[float, float], Bounds(0, 1)] = (0.0, 0.0)
-    """How far the doors of rooms are shut at first: 0 as built, 1 at the end of their range that is farther away. Doors
-    that are built at an end stay there; the others are spread over this range, each the same in every episode."""
+    """Range of how far doors of rooms are shut at the start: 0 as built, 1 at the farther end of the door's range.
+    Doors that are built at an end stay there; the others are spread over the range, the same in every episode."""
     k_int: NotNegative = 0.1
     """Interaction penalty per control step in which the robot touches a movable object."""
     success_reward: float = 10.0
-    """Reward of reaching the goal."""
+    """Reward for reaching the goal."""
     episode_steps: AtLeastOne = 1000
-    """Control steps before an episode is cut."""
+    """Number of control steps after which an episode ends."""
     success_distance_m: Positive | None = None
-    """Planar distance to the goal that counts as success; none: the original code's, 0.333 m for a TurtleBot."""
+    """Distance to the goal in m that counts as success; auto: the original code's, 0.333 m for a TurtleBot."""
     min_goal_distance_m: float = 1.0
-    """Least planar distance between start and goal."""
+    """Least straight distance between start and goal on the floor in m."""
     max_goal_distance_m: float = math.inf
-    """Largest geodesic distance between start and goal; infinite: any."""
+    """Largest length of the shortest path from start to goal in m; inf: any."""
     num_waypoints: AtLeastOne = 10
-    """Waypoints along the shortest path in the observation."""
+    """Number of waypoints along the shortest path that the robot observes."""
     waypoint_spacing_m: Positive = 0.2
-    """Arc length between waypoints."""
+    """Distance along the path between two waypoints in m."""
     nav_cell_m: Positive = 0.1
-    """Cell side of the navigation grid."""
+    """Side of a cell of the navigation grid in m."""
     success_in_3d: bool = False
-    """Success by the distance in space to the goal on the floor, as the original's code; else in the plane."""
+    """Measure the distance to the goal in space, as the original code does, instead of on the floor."""
     fail_when_lifted: bool = False
-    """End the episode as a failure when the base rises 0.2 m above its standing height; it is counted anyway."""
+    """End the episode as a failure when the base rises 0.2 m above its standing height; rows count it anyway."""
     interaction_with: Literal["movables", "anything"] = "movables"
-    """Touches that cost k_int: movables (any part of the robot) or anything (walls too, but wheels exempt)."""
+    """Contacts that cost k_int: of any part with movable objects, or with anything (walls too, wheels exempt)."""
     kinematic_sum: Literal["all", "touched"] = "all"
-    """Objects in the kinematic effort: all, or touched (each from the step of its first touch on)."""
+    """Objects that count in the kinematic effort: all, or touched ones (each from its first touch on)."""
     force_part: Literal["full", "normal"] = "full"
-    """Force in the dynamic effort: full contact force, or normal (without friction, wheels exempt)."""
+    """Force in the dynamic effort: the full contact force, or its normal part (no friction, wheels exempt)."""
     force_sum: Literal["vector", "contacts", "last_substep"] = "vector"
-    """F_t: norm of the vector sum (vector) or sum of the contacts' norms (contacts), mean over the substeps; or the
-    vector sum of the last_substep only."""
+    """Force F_t of a control step: the norm of the vector sum (vector) or the sum of the contacts' norms (contacts),
+    averaged over substeps, or the vector sum of the last substep."""
     score_gravity_m_s2: Positive = 9.81
-    """g in the dynamic effort."""
+    """Gravity g in the dynamic effort, in m/s^2."""
     robot_mass: Literal["total", "links", "base"] = "total"
-    """m_0 in the scores: total, links (all but the root link) or base (the root link alone)."""
+    """Mass m_0 in the scores: of all links (total), all but the root link (links), or the root link (base)."""
     clip_path_efficiency: bool = True
-    """P_eff at most 1."""
+    """Limit the path efficiency P_eff to 1."""
     effort_on_failure: bool = True
-    """E_eff counts on failures; else it is 0 there, as the original's log had it."""
+    """Count the effort efficiency E_eff of failures too; otherwise it is 0 there, as in the original's log."""
     waypoint_style: Literal["ahead", "grid"] = "ahead"
-    """ahead: at equal arc length ahead; grid: from the robot's cell, as the original's code."""
+    """Place of waypoints: at equal distances ahead, or from the robot's grid cell, as in the original code."""
     potential: Literal["continuous", "quantised"] = "continuous"
-    """Geodesic distance from the robot's position, or quantised: from the centre of its cell."""
+    """Start of the shortest path in the reward: the robot's position, or the centre of its cell (quantised)."""
     potential_round: Positive | None = None
-    """For training: the potential's path also avoids furniture, where it stood at the start, whose friction exceeds
-    this share of the robot's weight (1: too heavy to push), if such a path exists. Scores do not use this path;
-    waypoints do with waypoints_round."""
+    """Let the path in the reward avoid furniture, where it stood at the start, whose friction exceeds this share of the
+    robot's weight (1: too heavy to push), if such a path exists; auto: no. Scores ignore it."""
     waypoints_round: bool = False
-    """Waypoints also avoid the furniture of potential_round, as if it stood on the robot's map."""
+    """Let waypoints avoid the furniture of potential_round too, as if it stood on the robot's map."""
     scene_choice: Literal["episode", "slot"] = "episode"
-    """Each episode draws a scene, or each environment of a batch keeps one (slot; `AutoResetEnv`)."""
+    """Draw a scene for each episode, or keep one for each environment of a batch (slot; `AutoResetEnv`)."""
     goal_clear: bool = True
-    """Goals are free of contact for the robot; else only of structure."""
+    """Keep goals free of contact with anything; otherwise only with structure."""
     random_object_yaw: bool = True
-    """Small objects are turned at random; else they all have yaw 0."""
+    """Turn small objects at random; otherwise they all have yaw 0."""
     bootstrap_at_time_limit: bool = True
-    """The time limit is a truncation, at which learners bootstrap; else it looks like any other end."""
+    """Let learners bootstrap at the time limit; otherwise it looks like any other end."""
 
     IDLE = (
         ("small_objects objects", "num_objects above 0", lambda c: c.num_objects > 0),
@@ -143,39 +142,39 @@ class PhysicsConfig(Settings):
     """How the world is simulated. With backend auto, settings of all backends may stand side by side."""
 
     backend: Literal["auto", "warp", "jax", "native"] = "auto"
-    """Physics: warp (MJX-Warp, NVIDIA), jax (MJX-JAX), native (C MuJoCo on CPU threads), or auto."""
+    """Physics: warp (MJX-Warp, NVIDIA GPUs), jax (MJX-JAX), native (C MuJoCo on CPU threads), or auto."""
     control_dt_s: Positive = 0.1
-    """Control period."""
+    """Control period in s."""
     sim_dt_s: Positive = 0.02
-    """Physics timestep; must divide the control period."""
+    """Time step of the physics in s; it must divide the control period."""
     collision: Literal["boxes", "hulls"] = "boxes"
-    """Furniture collides as boxes (any backend, any mix of scenes) or hulls (native, one scene)."""
+    """Collision shapes of furniture: boxes (any backend, any mix of scenes) or hulls (native, one scene)."""
     solver_iterations: AtLeastOne = 10
-    """Newton iterations of the constraint solver per physics step."""
+    """Number of Newton iterations of the constraint solver in a physics step."""
     contact_time_constant_s: Positive = 0.05
-    """Time constant of contacts (MuJoCo's solref); MuJoCo raises it to twice the timestep where it is less. This one
-    lets 0.02 s stay within 10 % of a fine reference in pushes (docs/fidelity.md)."""
+    """Time constant of contacts in s (MuJoCo's solref); MuJoCo raises it to at least two time steps. With 0.05 s, steps
+    of 0.02 s stay within 10 % of a fine reference in pushes (docs/fidelity.md)."""
     cone: Literal["pyramidal", "elliptic"] = "pyramidal"
     """Friction cones: pyramidal, or elliptic (native only: MJX-Warp's Newton solver fails on them)."""
     contacts_per_env: Natural = 0
-    """MJX-Warp contact slots per env; 0: measured when the environment is built, with head room."""
+    """Contact slots of each environment in MJX-Warp; 0: measured at the start, with a margin."""
     constraints_per_env: Natural = 0
-    """MJX-Warp constraint rows per env; 0: measured likewise."""
+    """Constraint rows of each environment in MJX-Warp; 0: measured at the start, with a margin."""
     active_furniture: Natural | None = None
-    """MJX backends: pieces of furniture near the robot that are simulated (auto: measured in these scenes; 0: all)."""
+    """Most pieces of furniture near the robot that MJX simulates (auto: measured in these scenes; 0: all)."""
     active_small: Natural | None = None
-    """MJX backends: small objects simulated at a time (auto: likewise; 0: all)."""
+    """Most small objects that MJX simulates at a time (auto: measured in these scenes; 0: all)."""
     active_doors: Natural | None = None
-    """MJX backends: doors simulated at a time (auto: likewise; 0: all)."""
+    """Most doors that MJX simulates at a time (auto: measured in these scenes; 0: all)."""
     active_walls: Natural | None = None
-    """MJX backends: wall boxes that can be met at a time (auto: likewise; 0: all)."""
+    """Most wall boxes that MJX checks for contact at a time (auto: measured in these scenes; 0: all)."""
     active_dofs: Natural | None = None
-    """MJX-Warp: degrees of freedom that are awake at a time, the robot's among them, if objects at rest sleep (auto:
-    measured in these scenes; 0: all)."""
+    """Most degrees of freedom that are awake at a time in MJX-Warp if objects at rest sleep, including the robot's
+    (auto: measured in these scenes; 0: all)."""
     sleep: bool = True
-    """Native and warp: objects at rest sleep until touched."""
+    """Let objects at rest sleep until something touches them (native and warp)."""
     threads: Natural = 0
-    """Native backend: threads; 0: all cores."""
+    """Number of threads of the native backend; 0: all cores."""
 
     IDLE = (
         (" ".join(WINDOW), "backend auto, jax or warp, or 0 (all)", lambda c: c.backend != "native"),
@@ -217,12 +216,12 @@ class SensorConfig(CameraNoise):
     """Set what the robot perceives, and how noisily."""
 
     observations: tuple[str, ...] = OBSERVATIONS
-    """Parts of the observation; the vector keeps the original's order: waypoints, goal, velocity, then localisation,
+    """Parts of the observation. The vector has this order: waypoints, goal, velocity (the original's), localisation,
     odometry, collision, joints, lidar, trail. With images (depth, segmentation, rgb, normals) it is a dict."""
     renderer: Literal["auto", "warp", "rays"] = "auto"
-    """Renderer: warp (MJX-Warp's), rays (plain JAX), or auto: warp beside physics on warp, rays elsewhere."""
+    """Renderer: warp (MJX-Warp's), rays (plain JAX), or auto: warp with physics on warp, otherwise rays."""
     image_geometry: Literal["boxes", "meshes"] = "boxes"
-    """Images show collision boxes, or visual meshes with textures (rendered by Warp, with any physics)."""
+    """Geometry in images: collision boxes, or visual meshes with textures (drawn by Warp, with any physics)."""
     cameras: Sequence[Mapping[str, Any]] = ()
     """Cameras that replace the robot's, each a mapping of settings of `CameraView`."""
     robot_visible: bool = False
@@ -230,35 +229,35 @@ class SensorConfig(CameraNoise):
     random_colours: NotNegative = 0.0
     """Standard deviation of the logarithm of the red, green and blue factors of each object class in each episode."""
     random_light: NotNegative = 0.0
-    """Standard deviation of the sun's direction (before normalisation) and of the brightness, in stops, by episode."""
+    """Standard deviation of the sun's direction (before normalisation) and of the brightness in stops, by episode."""
     image_size: ImageSide = 68
-    """Side of the square images, pixels."""
+    """Side of the square images in pixels."""
     image_fov_deg: FovDeg = None
-    """Field of view; none: the robot's camera's (120 degrees)."""
+    """Field of view in degrees; auto: the robot's camera's (120 degrees)."""
     image_dtype: Literal["float32", "float16", "uint8"] = "float32"
-    """Type of images: float32 or float16 in [0, 1], or uint8, 255 times that; normals are in [-1, 1], never uint8."""
+    """Type of images: float32 or float16 from 0 to 1, or uint8 from 0 to 255; normals are in [-1, 1], never uint8."""
     depth_range_m: Positive = 5.0
-    """Depth is clipped at this value and divided by it."""
+    """Depth in m at which it is clipped and by which it is divided."""
     segmentation_classes: MaskClasses = 4
-    """Furniture classes: 4 as in the original's code (desk and table are one), the paper's 5, or all categories."""
+    """Furniture classes: 4 as in the original code (desk and table are one), the paper's 5, or all categories."""
     depth_dropout: Share = 0.0
     """Share of depth pixels that read 0, drawn in each step."""
     depth_noise: NotNegative = 0.0
     """Standard deviation of depth, as a share of it."""
     lidar_rays: AtLeastOne = 228
-    """Beams of the planar scan, evenly over `lidar_fov_deg` from the right; by default the TurtleBot's Hokuyo."""
+    """Number of beams of the planar scan, evenly over `lidar_fov_deg` from the right (228: the TurtleBot's Hokuyo)."""
     lidar_fov_deg: Annotated[Positive, Bounds(0, 360)] = 240.0
-    """Angle of the scan, centred straight ahead."""
+    """Angle of the scan in degrees, centred straight ahead."""
     lidar_range_m: Positive = 5.6
-    """Distances are divided by it; 1 if nothing is nearer."""
+    """Range of the scan in m, by which distances are divided; a beam reads 1 if nothing is nearer."""
     lidar_pos_m: tuple[float, float, float] = (0.0, 0.0, 0.37)
-    """Scanner in the robot's base frame."""
+    """Position of the scanner in the frame of the robot's base, in m."""
     lidar_dropout: Share = 0.0
     """Share of beams that read 1, drawn in each step."""
     lidar_noise: NotNegative = 0.0
     """Standard deviation of a beam's distance, as a share of it."""
     odometry_noise: NotNegative = 0.0
-    """Standard deviation of each step's distance and angle in odometry, as a share of them."""
+    """Standard deviation of the distance and the angle of each step in odometry, as a share of them."""
 
     IDLE = (
         _only_with(_OF_IMAGES, *IMAGES),
@@ -293,17 +292,17 @@ class RandomDynamics(Settings):
     """Set ranges (low, high) from which each episode draws its dynamics uniformly; the defaults change nothing."""
 
     random_mass: tuple[Positive, Positive] = (1.0, 1.0)
-    """Factor of the mass of all movable objects, drawn by episode: low,high."""
+    """Range (low,high) of a factor on the mass of all movable objects, drawn in each episode."""
     random_friction: tuple[Positive, Positive] = (1.0, 1.0)
-    """Factor of the friction of all movable objects, which holds on the floor, by episode: low,high."""
+    """Range of a factor on the friction of all movable objects with the floor, drawn in each episode."""
     random_motor_gain: tuple[NotNegative, NotNegative] = (1.0, 1.0)
-    """Velocity of the base that the motors execute, as a share of the commanded one, by episode: low,high."""
+    """Range of the share of the commanded base velocity that motors execute, drawn in each episode."""
     random_wheel_slip: tuple[Share, Share] = (0.0, 0.0)
-    """Share of their speed that the wheels of a side lose, by episode and side: low,high."""
+    """Range of the share of their speed that the wheels of a side lose, drawn in each episode for each side."""
     random_motor_delay_steps: tuple[_Steps, _Steps] = (0, 0)
-    """Control steps from an action to its execution, by episode: low,high. Before that, commands are 0."""
+    """Range of the control steps from an action to its execution, drawn in each episode; commands are 0 until then."""
     random_sensor_delay_steps: tuple[_Steps, _Steps] = (0, 0)
-    """Age of observations in control steps, by episode: low,high. The first one repeats at the start."""
+    """Range of the age of observations in control steps, drawn in each episode; the first one repeats at the start."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

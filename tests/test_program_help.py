@@ -7,6 +7,7 @@ import importlib
 import re
 import sys
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,11 @@ import pytest
 from docs.package_map import read_sources
 from docs.program_help import help_of
 from interactive_nav.__main__ import PROGRAMS, main
+from interactive_nav.ros.__main__ import Simulate
 from interactive_nav_common.commands import TYPED
+from topological_nav.__main__ import KINDS, Listed
+from train.__main__ import Train
+from train.sweep.__main__ import Sweep
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "commands.md"
@@ -77,3 +82,38 @@ def test_every_program_prints_its_version(module, capsys, monkeypatch):
         program.main()
     number = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert capsys.readouterr().out == f"interactive-nav {number}\n"
+
+
+UNITS = {"m": "m", "s": "s", "deg": "degrees", "px": "pixels", "gb": "GB", "mb": "MB", "mib": "MiB", "n": "N"}
+UNITS |= {"m_s": "m/s", "rad_s": "rad/s", "m_s2": "m/s^2", "rad_s2": "rad/s^2"}
+"""Ending of a setting's name -> its unit in the text."""
+
+
+def badly_told(texts: Iterable[tuple[str, str]]) -> list[str]:
+    """Settings whose text is no sentence or lacks the unit of the name; `features: ...` says what it is for."""
+
+    def fits(name: str, text: str) -> bool:
+        said = re.sub(r"^(features|passages|map): (.)", lambda match: match[2].upper(), text)
+        unit = next((UNITS[end] for end in sorted(UNITS, key=len, reverse=True) if name.endswith(f"_{end}")), "")
+        return said[:1].isupper() and said.endswith(".") and unit in re.split(r"[ (),;:]+|\.$", said)
+
+    return sorted(f"{name}: {text}" for name, text in set(texts) if not fits(name, text))
+
+
+def listed(text: str) -> list[tuple[str, str]]:
+    """Settings that a program lists below its options, each with its text and without its choices."""
+    found = re.findall(r"^  ([\w.]+)(?:=|: )\S* *(\S.*)$", text, re.MULTILINE)
+    return [(name, re.sub(r" \[[^\[\]]*\]$", "", said)) for name, said in found]
+
+
+def test_lists_of_settings_are_sentences_with_units():
+    kinds = (Train, Sweep, Simulate, *(kind for kind in KINDS if issubclass(kind, Listed)))
+    texts = [pair for kind in kinds for pair in listed(kind.epilog())]
+    assert {"env.hook_force_n", "ppo.num_envs", "launch.grace_s", "run_s", "fine_tune"} <= {name for name, _ in texts}
+    assert badly_told(texts) == []
+    wrong = [("c.x", "of all."), ("d_m", "Length."), ("d_s", "Time in ms.")]
+    assert badly_told([*wrong, ("d_m", "Length in m."), ("e_m_s2", "Gravity in m/s^2.")]) == [
+        "c.x: of all.",
+        "d_m: Length.",
+        "d_s: Time in ms.",
+    ]

@@ -22,19 +22,19 @@ class CameraConfig(Settings):
     """Set the camera, and how its images are stored."""
 
     seed: Seed = 0
-    """Seed of positions, splits, passages and drives."""
+    """Random seed of positions, splits, passages and drives."""
     robot: str = "ttbot"
     """Robot whose camera is used."""
     engine: Literal["warp", "gl"] = "warp"
     """Renderer: MJX-Warp's ray tracer (CPU or GPU), or MuJoCo's (needs EGL or OSMesa)."""
     width: Annotated[int, Bounds(16, 2048)] = 128
-    """Width of a stored image, pixels."""
+    """Width of a stored image in pixels."""
     height: Annotated[int, Bounds(16, 2048)] = 96
-    """Height of a stored image, pixels."""
+    """Height of a stored image in pixels."""
     supersample: Annotated[int, Bounds(1, 16)] = 5
     """Images are rendered this many times larger along each side and averaged: 5 x 128 x 96 is 640 x 480."""
     fov_deg: Annotated[float | None, Bounds(1.0, 170.0)] = None
-    """Vertical field of view; auto: the robot's camera's."""
+    """Vertical field of view in degrees; auto: the robot's camera's."""
     quality: Annotated[int, Bounds(1, 100)] = 90
     """WebP quality of stored images; 100 is lossless."""
 
@@ -44,41 +44,41 @@ class DataConfig(CameraConfig):
     """Set the images of each scene; `preset=report` has the report's values."""
 
     room_method: Literal["kmeans", "gmm", "spectral"] = "gmm"
-    """How free positions are clustered into rooms."""
+    """Method that clusters free positions into rooms."""
     num_rooms: Annotated[int | None, Bounds(1, 10**6)] = None
-    """Rooms per scene; auto: as recorded for the scene, else chosen by BIC (gmm) or silhouette."""
+    """Number of rooms per scene; auto: as recorded for it, otherwise by BIC (gmm) or silhouette."""
     positions: Count = 100
-    """Free positions to draw in a scene for room images."""
+    """Number of free positions to draw in a scene for room images."""
     clearance_m: Annotated[float, Bounds(0.0, 10.0)] = 0.2
-    """Least distance of positions from obstacles."""
+    """Least distance of positions from obstacles in m."""
     max_per_room: Count = 10
     """Most positions to keep in a room."""
     least_per_room: Natural = 0
-    """Rooms with fewer positions than this have no images."""
+    """Least number of positions of a room that gets images."""
     test_share: Annotated[float, Bounds(0, 1, open=True)] = 0.2
     """Share of a room's positions (and of its passages' sources) for testing only."""
     headings: int = 18
-    """Images around a position, for each pitch; a multiple of 3, because testing takes every third."""
+    """Number of images around a position for each pitch, a multiple of 3: testing takes every third."""
     pitch_deg: Annotated[float, Bounds(0.0, 80.0)] = 20.0
-    """How far up and down the camera looks; the third pitch is level."""
+    """Angle in degrees by which the camera looks up and down; the third pitch is level."""
     passage_sources: Count = 10
-    """Sources of passage images per room."""
+    """Number of sources of passage images per room."""
     passage_targets: Count = 10
-    """Directions per source, evenly spaced from a random one."""
+    """Number of directions per source, evenly spaced from a random one."""
     passage_clearance_m: Annotated[float, Bounds(0.0, 10.0)] = 0.3
-    """Least distance of sources from obstacles."""
+    """Least distance of sources from obstacles in m."""
     passage_length_m: Annotated[float, Bounds(0.05, 100.0)] = 2.0
-    """Length of the segment to classify: passages are balanced and detectors scored by it."""
+    """Length in m of the segment to classify, by which passages are balanced and detectors scored."""
     passage_lengths_m: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 2.5)
-    """Lengths that passages are labelled for, ascending, including `passage_length_m`."""
+    """Lengths in m that passages are labelled for, ascending, including `passage_length_m`."""
     passage_points: Annotated[int, Bounds(2, 10**4)] = 50
-    """Points of the segment to check on the map, both ends included."""
+    """Number of points of the segment to check on the map, including both ends."""
     passage_margin_m: Annotated[float, Bounds(0.0, 10.0)] = 0.225
-    """Least distance of each point from obstacles: half of TTbot's width; 0: it may touch them."""
+    """Least distance of each point from obstacles in m: half of TTbot's width; 0: it may touch them."""
     objects: Annotated[int, Bounds(0, 100)] = 0
-    """Small objects that lie on the floor in passage images, at most: each source has a layout of its own."""
+    """Most small objects on the floor in passage images; each source has a layout of its own."""
     shard: Count = 10
-    """Sheets of images per file: the most that an interrupted rendering loses."""
+    """Number of sheets of images per file: the most that an interrupted rendering loses."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -104,9 +104,9 @@ class NetworkTrainConfig(Settings):
     """Set a network and its training."""
 
     seed: Seed = 0
-    """Seed of weights, order and augmentation."""
+    """Random seed of weights, order and augmentation."""
     network: Literal["resnet18", "alexnet"] = "resnet18"
-    """Backbone."""
+    """Backbone of the network."""
     width: Count = 64
     """Channels of the backbone's first stage; 64 is the original."""
     hidden: Natural = 512
@@ -142,25 +142,25 @@ class MapConfig(Settings):
     """Set the positions of nodes, and the edges that join them."""
 
     seed: Seed = 0
-    """Seed of random nodes."""
+    """Random seed of random nodes."""
     clearance_m: Annotated[float, Bounds(0.0, 10.0)] = 0.4
-    """Least distance of nodes from obstacles, for turning: TTbot's corners reach 0.33 m."""
+    """Least distance of nodes from obstacles in m, for turning: TTbot's corners reach 0.33 m."""
     min_per_room: Annotated[int, Bounds(1, 1000)] = 3
     """Least nodes per room."""
     spacing_m: Annotated[float, Bounds(0.1, 100.0)] = 0.9
-    """Largest distance of a room's free places from their nearest node."""
+    """Largest distance of a room's free places from their nearest node in m."""
     nodes: Literal["covering", "random"] = "covering"
-    """How nodes are chosen: greedily, by the uncovered places that they cover, or at random."""
+    """Choice of nodes: greedily, by the uncovered places that they cover, or at random."""
     edge_m: Annotated[float, Bounds(0.1, 100.0)] = 2.5
-    """Nodes nearer than this are joined in both directions."""
+    """Largest distance in m between two nodes that are joined, in both directions."""
     edge_image: Literal["exact", "nearest"] = "exact"
     """Image that judges an edge: rendered along it, or the nearest of the node's images."""
     connect: bool = True
     """Add nodes until free edges join every free place that the robot can reach."""
     asked_m: Annotated[float | None, Bounds(0.05, 100.0)] = None
-    """Length for which the detector judges an edge; auto: the edge's length."""
+    """Length in m for which the detector judges an edge; auto: the edge's length."""
     passable: Share = 0.5
-    """Probability from which edges count as open in reports of connectedness."""
+    """Least probability of an edge that counts as open in reports of connectedness."""
     supersample: Annotated[int | None, Bounds(1, 16)] = None
     """Images are drawn this many times larger along each side; auto: as for the networks, on a CPU at most 2."""
     check: Annotated[int, Bounds(0, 10**6)] = 0
@@ -172,52 +172,52 @@ class NavigatorConfig(Settings):
     """Set how the navigator localises, turns and drives; `preset=report` has the report's values."""
 
     images: Annotated[int, Bounds(1, 1000)] = 18
-    """Images per localisation, evenly spaced; a divisor of the map's images per node."""
+    """Number of images per localisation, evenly spaced; a divisor of the map's images per node."""
     goal_images: Annotated[int | None, Bounds(1, 1000)] = None
-    """Images of the goal, evenly spaced from a random heading; auto: as `images`, from the world's x axis."""
+    """Number of images of the goal, evenly spaced from a random heading; auto: `images`, from the world's x axis."""
     match: Literal["aligned", "nearest"] = "aligned"
     """An image is compared with the nodes' images of the same heading, and all are summed (aligned); or with all of
     them, and the nearest of all decides (nearest)."""
     asked_m: Annotated[float | None, Bounds(0.05, 100.0)] = None
-    """Length for which the detector always answers; auto: an edge's, by `ahead_m`, `slack_m` and `clear_m`."""
+    """Length in m for which the detector always answers; auto: an edge's, by `ahead_m`, `slack_m` and `clear_m`."""
     passable: Share = 0.5
-    """Probability from which the passage detector agrees."""
+    """Least probability at which the passage detector agrees."""
     swing_deg: Annotated[float, Bounds(1.0, 180.0)] = 15.0
-    """Step of the swing left and right."""
+    """Step of the swing left and right in degrees."""
     swings: Annotated[int, Bounds(1, 1000)] = 4
-    """Steps to each side before an edge counts as blocked."""
+    """Number of steps to each side before an edge counts as blocked."""
     ahead_m: Annotated[float, Bounds(0.05, 100.0)] = 2.0
-    """The path must be free for an edge's length less `slack_m`, at most this far: as far as a run leads at 0.4 m/s."""
+    """Distance in m that must be free, at most an edge's length less `slack_m`: a run at 0.4 m/s leads as far."""
     slack_m: Annotated[float, Bounds(0.0, 100.0)] = 0.3
-    """Allowance for the robot's distance from its node; at most half of the edge's length."""
+    """Allowance in m for the robot's distance from its node; at most half of the edge's length."""
     clear_m: Annotated[float, Bounds(0.05, 100.0)] = 1.0
-    """How far the way must be free for the baseline policy to drive on (it takes this to stop and turn) and where the
-    map has no way; and of which heading is the most open."""
+    """Free distance in m that the baseline policy needs to drive on (it takes this to stop and turn), also where the
+    map has no path, and by which it finds the most open heading."""
     tolerance_deg: Annotated[float, Bounds(0.1, 45.0)] = 3.0
-    """A heading is reached if the error is smaller."""
+    """Error in degrees below which a heading is reached."""
     runs: Annotated[int, Bounds(1, 1000)] = 12
-    """Runs of the local policy between two localisations."""
+    """Number of runs of the local policy between two localisations."""
     run_s: Annotated[float, Bounds(0.1, 1e6)] = 5.0
-    """Length of a run."""
+    """Length of a run in s."""
     glance: bool = True
     """After each run, check by the image ahead whether the robot is at its node or a neighbour, and replan."""
     watch_s: Annotated[float, Bounds(0.0, 1e6)] = 0.5
-    """How often to look, within a run, whether the edge's head is passed (nearest of all, and getting farther), which
-    ends the run; 0: never. Needs `glance`."""
+    """Time in s between two checks within a run whether the robot has passed the edge's head (nearest of all, and
+    getting farther), which ends the run; 0: no checks. It needs `glance`."""
     metre_cost: Annotated[float, Bounds(0.0, 1e6)] = 0.3
     """Added to an edge's cost, -log p, per metre, so that the shorter of free paths wins; 0: the report's."""
     retry_cost: Annotated[float, Bounds(0.0, 1e6)] = 1.0
     """Added to the cost of an edge each time that driving it did not bring the robot nearer to its head."""
     limit_s: Annotated[float, Bounds(0.1, 1e6)] = 1800.0
-    """Time after which an episode fails."""
+    """Time in s after which an episode fails."""
     kp: Annotated[float, Bounds(0.0, 100.0)] = 2.0
     """Proportional gain of turning, 1/s."""
     ki: Annotated[float, Bounds(0.0, 100.0)] = 0.2
-    """Integral gain, 1/s^2."""
+    """Integral gain of turning, 1/s^2."""
     kd: Annotated[float, Bounds(0.0, 100.0)] = 0.05
-    """Derivative gain."""
+    """Derivative gain of turning, without unit."""
     max_turn_rad_s: Annotated[float, Bounds(0.01, 10.0)] = 1.0
-    """Fastest turn on the spot."""
+    """Fastest turn on the spot in rad/s."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -225,23 +225,23 @@ class EvaluationConfig(GapConfig, NavigatorConfig):
     """Set the navigator, its robot, its episodes and their scoring."""
 
     seed: Seed = 0
-    """Seed of the episodes."""
+    """Random seed of the episodes."""
     episodes: Annotated[int | None, Bounds(1, 10**6)] = None
-    """Episodes per scene; auto: one for every 2 square metres of floor, 25 to 60."""
+    """Number of episodes per scene; auto: one for every 2 square metres of floor, 25 to 60."""
     min_goal_m: Annotated[float, Bounds(0.0, 1000.0)] = 2.5
-    """Start and goal are in different rooms and farther apart than this."""
+    """Least distance in m between start and goal, which are in different rooms."""
     success_m: Annotated[float, Bounds(0.0, 1000.0)] = 1.5
-    """A run that ends nearer to the goal than this succeeds."""
+    """Distance to the goal in m below which the end of an episode is a success."""
     clearance_m: Annotated[float, Bounds(0.0, 1000.0)] = 0.35
-    """Least distance of starts and goals from obstacles; TTbot's corners reach 0.33 m."""
+    """Least distance of starts and goals from obstacles in m; TTbot's corners reach 0.33 m."""
     thinned: Annotated[float, Bounds(0.01, 1.0)] = 0.4
     """Share of each room's nodes that the sparse map of the ablation keeps."""
     batch: Annotated[int | None, Bounds(1, 10**6)] = None
-    """Episodes to play at a time; auto: all of a scene on an accelerator, 8 on a CPU."""
+    """Number of episodes to play at a time; auto: all of a scene on an accelerator, 8 on a CPU."""
     backend: Literal["auto", "warp", "jax", "native"] = "auto"
     """Physics: as in `interactive_nav`."""
     objects: Annotated[int, Bounds(0, 100)] = 0
-    """Small objects on the floor; images of goals and maps do not show them."""
+    """Number of small objects on the floor; images of goals and maps do not show them."""
     blocked: bool = False
     """Put the widest small object at the narrowest place of the shortest path, to block a passage."""
     supersample: Annotated[int | None, Bounds(1, 16)] = None
@@ -253,25 +253,25 @@ class ExpertConfig(Settings):
     """Set the expert: its velocities, its horizon and its weights."""
 
     linear_m_s: Annotated[float, Bounds(0.01, 100.0)] = 0.5
-    """Fastest forward; it never reverses."""
+    """Fastest forward velocity in m/s; it never reverses."""
     angular_rad_s: Annotated[float, Bounds(0.01, 100.0)] = 0.5
-    """Fastest turn, either way."""
+    """Fastest turn in rad/s, either way."""
     linear_samples: Annotated[int, Bounds(2, 101)] = 5
-    """Forward velocities to try, evenly from 0 to the fastest, clipped to those reachable in a control period."""
+    """Number of forward velocities to try, from 0 to the fastest, clipped to those within reach of a control period."""
     angular_samples: Annotated[int, Bounds(2, 101)] = 11
-    """Turning velocities to try, likewise; an odd number includes straight ahead."""
+    """Number of turning velocities to try, likewise; an odd number includes straight ahead."""
     acceleration_m_s2: Annotated[float, Bounds(0.01, 100.0)] = 1.0
-    """Largest change of the forward velocity."""
+    """Largest acceleration in m/s^2."""
     angular_acceleration_rad_s2: Annotated[float, Bounds(0.01, 100.0)] = 4.0
-    """Largest change of the turning velocity."""
+    """Largest angular acceleration in rad/s^2."""
     horizon_s: Annotated[float, Bounds(0.1, 100.0)] = 1.6
-    """Time to look ahead for each pair of velocities."""
+    """Time in s to look ahead for each pair of velocities."""
     horizon_steps: Annotated[int, Bounds(1, 1000)] = 8
-    """Poses to check within the horizon."""
+    """Number of poses to check within the horizon."""
     margin_m: Annotated[float, Bounds(0.0, 100.0)] = 0.04
-    """Least gap between the footprint and any obstacle."""
+    """Least gap between the footprint and any obstacle in m."""
     caution_m: Annotated[float, Bounds(0.001, 10.0)] = 0.25
-    """Smaller gaps have a cost."""
+    """Gap in m below which an obstacle has a cost."""
     weigh_progress: Annotated[float, Bounds(0.0, 100.0)] = 1.0
     """Weight of the distance to go at the horizon, relative to the longest drive until then."""
     weigh_heading: Annotated[float, Bounds(0.0, 100.0)] = 1.2
@@ -279,19 +279,19 @@ class ExpertConfig(Settings):
     weigh_gap: Annotated[float, Bounds(0.0, 100.0)] = 0.4
     """Weight of a gap of 0, falling to nothing at `caution_m`."""
     lidar_rays: Annotated[int, Bounds(1, 1000)] = 135
-    """Beams of the scan."""
+    """Number of beams of the scan."""
     lidar_fov_deg: Annotated[float, Bounds(1.0, 360.0)] = 270.0
-    """Angle of the scan."""
+    """Angle of the scan in degrees."""
     lidar_range_m: Annotated[float, Bounds(0.1, 100.0)] = 4.0
-    """Range of the scanner."""
+    """Range of the scanner in m."""
     radius_m: Annotated[float, Bounds(0.001, 10.0)] = 0.27
-    """Least distance of the planned path from obstacles."""
+    """Least distance of the planned path from obstacles in m."""
     near_m: Annotated[float, Bounds(0.001, 10.0)] = 0.3
-    """Range beyond `radius_m` in which obstacles raise the cost of a metre, by up to `near_cost`."""
+    """Range in m beyond `radius_m` in which obstacles raise the cost of a metre, by up to `near_cost`."""
     near_cost: Annotated[float, Bounds(0.0, 100.0)] = 3.0
-    """Metres added to a metre beside an obstacle."""
+    """Most metres that a metre beside an obstacle counts in addition."""
     reached_m: Annotated[float, Bounds(0.001, 10.0)] = 0.35
-    """A node is passed within this distance."""
+    """Distance in m within which a node is passed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -301,9 +301,9 @@ class DriveConfig(ExpertConfig, CameraConfig):
     backend: Literal["auto", "warp", "jax", "native"] = "auto"
     """Physics: as in `interactive_nav`."""
     batch: Count = 256
-    """Drives at once: the most that an interrupted simulation loses."""
+    """Number of drives at once: the most that an interrupted simulation loses."""
     drives: Count = 400
-    """Drives to start in each scene."""
+    """Number of drives to start in each scene."""
     driver: str = ""
     """Run folder of a local policy that drives, while the expert labels its states (DAgger)."""
     expert_share: Share = 0.0
@@ -311,25 +311,25 @@ class DriveConfig(ExpertConfig, CameraConfig):
     legs: Count = 3
     """Most edges of a drive; each next one is random among those that turn less than `turn_deg`."""
     turn_deg: Annotated[float, Bounds(0.0, 180.0)] = 30.0
-    """Sharpest turn between edges, because only the images show the policy where to go."""
+    """Sharpest turn between edges in degrees, because only the images show the policy where to go."""
     edge_m: Annotated[float, Bounds(0.1, 1000.0)] = 2.5
-    """Longest edge, as in maps."""
+    """Longest edge in m, as in maps."""
     least_edge_m: Annotated[float, Bounds(0.0, 100.0)] = 1.0
-    """Shortest first edge of a drive."""
+    """Shortest first edge of a drive in m."""
     detour: Annotated[float, Bounds(1.0, 100.0)] = 2.0
     """Largest ratio of an edge's planned path, where a metre near obstacles counts more, to its length."""
     start_off_m: Annotated[float, Bounds(0.0, 10.0)] = 0.3
-    """Largest distance of a drive's start from its node."""
+    """Largest distance of a drive's start from its node in m."""
     start_turn_deg: Annotated[float, Bounds(0.0, 180.0)] = 15.0
-    """Largest initial angle from the edge, as after turning by the compass."""
+    """Largest initial angle from the edge in degrees, as after turning by the compass."""
     start_clear_m: Annotated[float, Bounds(0.0, 10.0)] = 0.36
-    """Least distance of the start from obstacles: the robot's corners swing within 0.34 m."""
+    """Least distance of the start from obstacles in m: the robot's corners swing within 0.34 m."""
     leg_s: Annotated[float, Bounds(0.1, 1000.0)] = 12.0
-    """Time per edge after which a drive fails."""
+    """Time in s per edge after which a drive fails."""
     test_share: Annotated[float, Bounds(0, 1, open=True)] = 0.1
     """Share of the nodes whose drives are for testing only."""
     shard: Count = 10
-    """Drives per file of images."""
+    """Number of drives per file of images."""
     IDLE = (("expert_share", "driver=RUN", lambda c: bool(c.driver)),)
 
 
@@ -338,7 +338,7 @@ class PolicyConfig(Settings):
     """Set the local policy and its training; `preset=report` has the report's values."""
 
     seed: Seed = 0
-    """Seed of weights, order and thinning."""
+    """Random seed of weights, order and thinning."""
     hidden: Count = 500
     """Size of the memory of each of the two GRU cells."""
     projection: Annotated[int, Bounds(0, 10**6)] = 0
@@ -346,15 +346,15 @@ class PolicyConfig(Settings):
     forward_hidden: Count = 512
     """Units of each of the forward model's two layers."""
     linear_classes: Annotated[int, Bounds(2, 1000)] = 3
-    """Forward velocities, evenly from 0 to the expert's fastest."""
+    """Number of forward velocities, evenly from 0 to the expert's fastest."""
     angular_classes: Annotated[int, Bounds(2, 1000)] = 5
-    """Turning velocities, evenly from the fastest right to the fastest left."""
+    """Number of turning velocities, evenly from the fastest right to the fastest left."""
     steps: Annotated[int, Bounds(2, 1000)] = 50
-    """Control steps per sequence."""
+    """Number of control steps per sequence."""
     overlap_s: Annotated[float, Bounds(0.0, 1e6)] = 4.0
-    """Longest overlap of two sequences of a drive."""
+    """Longest overlap of two sequences of a drive in s."""
     straight_share: Share = 0.2
-    """A sequence is nearly straight if it turns in less than this share of its steps."""
+    """Share of steps with a turn below which a sequence is nearly straight."""
     straight_kept: Share = 0.3
     """Share of the nearly straight sequences to keep."""
     mirror: bool = True
@@ -362,7 +362,7 @@ class PolicyConfig(Settings):
     alpha: Annotated[float, Bounds(0.0, 1e6)] = 10.0
     """Weight of the commands' cross-entropies."""
     lam: Annotated[float, Bounds(0.0, 1e6)] = 0.5
-    """Weight of forward consistency: lambda."""
+    """Weight of forward consistency, lambda."""
     lam_alone: bool = False
     """Include forward consistency also while only the forward model is trained, as in the report's equation 1."""
     predicts: Literal["change", "next"] = "change"
@@ -384,9 +384,9 @@ class ExportConfig(Settings):
     """Set the limits of an export."""
 
     limit_mib: Annotated[float, Bounds(0.001, 1e6)] = 8.0
-    """Largest size of the folder."""
+    """Largest size of the folder in MiB."""
     places: Count = 24
-    """Places whose images compare exported networks with the runs'."""
+    """Number of places whose images compare exported networks with the runs'."""
     tolerance: Annotated[float, Bounds(0.0, 10.0)] = 0.02
     """Largest difference of a passage's probability, or of an embedding (of length 1.41)."""
     commit: str | None = None

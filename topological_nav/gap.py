@@ -14,19 +14,19 @@ class GapConfig(Settings):
     """Set how a robot differs from the one that the navigator commands; the defaults change nothing."""
 
     linear_gain: Annotated[float, Bounds(0.0, 10.0)] = 1.0
-    """Forward velocity that the robot executes, for each commanded m/s."""
+    """Forward velocity that the robot executes per commanded m/s."""
     angular_gain: Annotated[float, Bounds(0.0, 10.0)] = 1.0
-    """Turning velocity that it executes, for each commanded rad/s."""
+    """Turning velocity that the robot executes per commanded rad/s."""
     slip: Annotated[float, Bounds(0.0, 10.0)] = 0.0
-    """Standard deviation of the speed of the wheels of each side, as a share of it, drawn in every control step."""
+    """Standard deviation of the speed of each side's wheels, as a share of it, drawn in every control step."""
     delay_steps: Annotated[int, Bounds(0, 1000)] = 0
-    """Control steps (of 0.1 s) between a command and its execution."""
+    """Number of control steps (of 0.1 s) between a command and its execution."""
     image_steps: Annotated[int, Bounds(1, 1000)] = 1
-    """Control steps between two images; in between the navigator looks at the last one."""
+    """Number of control steps between two images; in between, the navigator uses the last one."""
     compass_deg: Annotated[float, Bounds(-180.0, 180.0)] = 0.0
-    """Error of the heading that the navigator is given."""
+    """Error of the compass in degrees."""
     compass_drift_deg: Annotated[float, Bounds(-3600.0, 3600.0)] = 0.0
-    """Change of that error in a minute."""
+    """Change of the compass error in degrees per minute."""
 
 
 class Gap:

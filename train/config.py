@@ -22,7 +22,7 @@ class EnvConfig(NavConfig):
     robot: str = "turtlebot"
     """Robot to drive: a name, a URDF or MJCF file, or path.py:function."""
     scenes: tuple[str, ...] = ()
-    """Scene folders, relative to the current folder, or sets of them (`sparse/train`); each episode draws one."""
+    """Scene folders, relative to the current folder, or sets (`sparse/train`); each episode draws one scene."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,27 +30,27 @@ class NetworkConfig(Settings):
     """Encoders of observations with images (reference benchmark, section 8.1), and memory; a vector needs neither."""
 
     conv_channels: tuple[AtLeastOne, ...] = (32, 64, 64)
-    """Channels of the convolutions."""
+    """Number of channels of each convolution."""
     conv_kernels: tuple[AtLeastOne, ...] = (8, 4, 3)
-    """Sides of their kernels, pixels."""
+    """Side of each convolution's kernel in pixels."""
     conv_strides: tuple[AtLeastOne, ...] = (4, 2, 1)
-    """Their strides, pixels."""
+    """Stride of each convolution in pixels."""
     image_features: AtLeastOne = 256
-    """Width of the layer behind the convolutions."""
+    """Width of the layer after the convolutions."""
     state_features: AtLeastOne = 256
     """Width of the layer that takes the vector."""
     action_features: AtLeastOne = 256
-    """Width of the layer that takes the action of a critic."""
+    """Width of the layer that takes a critic's action."""
     share_encoder: bool = False
-    """Actor and critic look through one encoder; SAC and DDPG train it with the critic."""
+    """Share one encoder between actor and critic; SAC and DDPG train it with the critic."""
     critic_inputs: Literal["all", "state", "privileged"] = "all"
-    """What the critic takes: all that the actor sees, the vector alone, or the vector and the true state (ppo only)."""
+    """Inputs of the critic: all that the actor has, the vector alone, or the vector and the true state (ppo only)."""
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     """Arithmetic of the image encoder; parameters stay float32."""
     memory: Literal["none", "gru"] = "none"
-    """gru: a recurrent layer between encoder and head; not for clone."""
+    """Recurrent layer between encoder and head (gru), or none; not for clone."""
     memory_size: AtLeastOne = 128
-    """Numbers that the recurrent layer keeps from step to step, for actor and critic each."""
+    """Size of the state that the recurrent layer keeps from step to step, for actor and critic each."""
 
     IDLE = (("memory_size", "memory 'gru'", lambda c: c.memory == "gru"),)
 
@@ -75,41 +75,41 @@ class PPOConfig(Settings):
     """Proximal policy optimisation; names as in Brax's `ppo.train`."""
 
     num_envs: AtLeastOne | None = None
-    """Environments stepped together."""
+    """Number of environments that step together."""
     unroll_length: AtLeastOne | None = None
-    """Steps of one environment in one training sequence."""
+    """Number of steps of one environment in a training sequence."""
     batch_size: AtLeastOne | None = None
-    """Sequences in one minibatch."""
+    """Number of sequences in a minibatch."""
     num_minibatches: AtLeastOne | None = None
-    """Minibatches in one pass over the collected data."""
+    """Number of minibatches in a pass over the collected data."""
     num_updates_per_batch: AtLeastOne = 4
-    """Passes over the collected data."""
+    """Number of passes over the collected data."""
     learning_rate: Positive = 3e-4
     """Adam's step size."""
     final_learning_rate: NotNegative | None = None
-    """Adam's step size at run.num_timesteps, which it approaches in equal steps; none: it stays the same."""
+    """Adam's step size at run.num_timesteps, approached in equal steps; auto: it stays the same."""
     discounting: Share = 0.99
-    """Discount of one control step."""
+    """Discount factor of one control step."""
     gae_lambda: Share = 0.95
     """Lambda of the generalised advantage estimate."""
     entropy_cost: NotNegative = 5e-3
     """Weight of the entropy bonus."""
     reward_scaling: Positive = 1.0
-    """Factor on every reward inside the loss."""
+    """Factor on every reward in the loss."""
     clipping_epsilon: Positive = 0.2
     """Clip range of the probability ratio."""
     vf_loss_coefficient: NotNegative = 0.5
     """Weight of the value loss."""
     max_grad_norm: Positive = 1.0
-    """Gradients are scaled down to this global norm."""
+    """Global norm to which larger gradients are scaled down."""
     normalize_observations: bool = True
-    """Normalise observations by their running mean and deviation."""
+    """Normalise observations by their running mean and standard deviation."""
     normalize_advantage: bool = True
     """Normalise advantages within a minibatch."""
     policy_hidden_layer_sizes: tuple[AtLeastOne, ...] = (256, 256)
-    """Widths of the policy network, behind its encoder if there are images."""
+    """Widths of the policy network's layers, after its encoder if there are images."""
     value_hidden_layer_sizes: tuple[AtLeastOne, ...] = (256, 256)
-    """Widths of the value network, behind its encoder if there are images."""
+    """Widths of the value network's layers, after its encoder if there are images."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,37 +117,37 @@ class OffPolicyConfig(Settings):
     """What SAC and DDPG share: many environments, a replay on the device, a few large gradient steps an update."""
 
     num_envs: AtLeastOne | None = None
-    """Environments stepped together."""
+    """Number of environments that step together."""
     steps_per_update: AtLeastOne | None = None
-    """Steps of every environment in one update."""
+    """Number of steps of every environment in one update."""
     grad_steps_per_update: AtLeastOne | None = None
-    """Gradient steps in one update."""
+    """Number of gradient steps in one update."""
     batch_size: AtLeastOne | None = None
-    """Transitions in one gradient step."""
+    """Number of transitions in a gradient step."""
     min_replay_size: AtLeastOne | None = None
-    """Transitions to collect before learning begins; a run that never learned acts at random until then."""
+    """Number of transitions to collect, at random in a new run, before learning starts."""
     max_replay_size: AtLeastOne | None = None
-    """Transitions to keep, rounded down to the same number for each environment."""
+    """Number of transitions to keep, rounded down to the same number for each environment."""
     replay_limit_gb: Positive = 16.0
-    """A replay that would take more device memory (1e9 bytes) is refused."""
+    """Largest replay in GB (1e9 bytes) of device memory; larger ones are refused."""
     n_steps: AtLeastOne = 1
-    """Rewards summed before the critic's estimate takes over."""
+    """Number of rewards to sum before the critic's estimate."""
     unroll_length: AtLeastOne = 16
-    """Transitions of a sequence, with memory; a batch holds batch_size / unroll_length, rounded down, at least one."""
+    """Transitions in a sequence, with memory; a batch has batch_size / unroll_length sequences, at least one."""
     burn_in: Annotated[int, Bounds(0)] = 8
-    """Steps before each sequence that bring stored memory up to the newest parameters."""
+    """Number of steps before each sequence that bring stored memory up to the newest parameters."""
     discounting: Share = 0.99
-    """Discount of one control step."""
+    """Discount factor of one control step."""
     reward_scaling: Positive = 1.0
-    """Factor on every reward inside the loss."""
+    """Factor on every reward in the loss."""
     normalize_observations: bool = True
-    """Normalise observations by their running mean and deviation."""
+    """Normalise observations by their running mean and standard deviation."""
     policy_hidden_layer_sizes: tuple[AtLeastOne, ...] = (256, 256)
-    """Widths of the policy network, behind its encoder if there are images."""
+    """Widths of the policy network's layers, after its encoder if there are images."""
     q_hidden_layer_sizes: tuple[AtLeastOne, ...] = (256, 256)
-    """Widths of each critic, behind its encoder if there are images."""
+    """Widths of each critic's layers, after its encoder if there are images."""
     q_layer_norm: bool = False
-    """Layer normalisation in the critics' hidden layers: they stay stable at larger steps."""
+    """Normalise the layers of critics: they stay stable at larger step sizes."""
 
     @property
     def replay_slots(self) -> int:
@@ -171,11 +171,11 @@ class SACConfig(OffPolicyConfig):
     alpha_learning_rate: Positive = 3e-4
     """Adam's step size for the temperature."""
     tau: Share = 0.005
-    """Share of the critics in their targets at each gradient step."""
+    """Share of the critics that is mixed into their targets at each gradient step."""
     initial_alpha: Positive = 0.01
-    """Initial temperature; 1 in the original, but rewards are a few centimetres of progress a step here."""
+    """Initial temperature; 1 in the original, but here rewards are a few centimetres of progress a step."""
     target_entropy_per_action: Annotated[float, Bounds(-1e6, 1e6)] = -1.0
-    """Entropy that the temperature aims at, times the number of actions: -1 in the original, -0.5 in Brax."""
+    """Target of the policy's entropy per action: -1 in the original, -0.5 in Brax."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,17 +187,17 @@ class DDPGConfig(OffPolicyConfig):
     critic_learning_rate: Positive = 1e-3
     """Adam's step size for the critic, and for a shared encoder."""
     tau: Share = 0.05
-    """Share of the networks in their targets at each target update."""
+    """Share of the networks that is mixed into their targets at each target update."""
     target_update_period: AtLeastOne = 5
-    """Gradient steps between two target updates."""
+    """Number of gradient steps between two target updates."""
     num_critics: AtLeastOne = 1
-    """Critics; the least of several makes the target, the first leads the policy."""
+    """Number of critics; the least of their values is the target, the first trains the policy."""
     noise: Literal["ou", "gaussian"] = "ou"
-    """Exploration: an Ornstein-Uhlenbeck process for each environment, or a new Gaussian at each step."""
+    """Exploration noise: an Ornstein-Uhlenbeck process for each environment, or a new Gaussian in each step."""
     noise_sd: tuple[NotNegative, ...] = (0.2,)
-    """Deviation of what a step adds to the noise: one, or least and largest, spread evenly over environments."""
+    """Standard deviation that a step adds to the noise: one, or least and largest, spread over environments."""
     noise_damping: Share = 0.15
-    """Share of the Ornstein-Uhlenbeck noise that a step takes away."""
+    """Share of the Ornstein-Uhlenbeck noise that a step removes."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -210,31 +210,31 @@ class CloneConfig(Settings):
     """Behavioural cloning: PPO's policy network learns recorded actions, or a teacher's, by maximum likelihood."""
 
     demonstrations: str = ""
-    """Parquet file of `python -m train.evaluate --demonstrations`."""
+    """Parquet file that `python -m train.evaluate --demonstrations` wrote."""
     teacher: str = ""
-    """Who labels the states that the student visits (DAgger): avoider, namo:W, follower, or a run folder."""
+    """Policy that labels the states that the student visits (DAgger): avoider, namo:W, follower, or a run folder."""
     student_share: Share = 1.0
     """Share of control steps that the student drives; the teacher drives the others."""
     buffer_steps: AtLeastOne = 100_000
-    """Newest labelled control steps to keep."""
+    """Number of the newest labelled control steps to keep."""
     episodes: Literal["successful", "all"] = "successful"
     """Episodes to learn from."""
     num_envs: AtLeastOne | None = None
-    """Environments stepped together, to score the policy on the way."""
+    """Number of environments that step together, to score the policy during training."""
     unroll_length: AtLeastOne | None = None
-    """Steps of every environment between two updates."""
+    """Number of steps of every environment between two updates."""
     grad_steps_per_update: AtLeastOne | None = None
-    """Gradient steps in one update."""
+    """Number of gradient steps in one update."""
     batch_size: AtLeastOne | None = None
-    """Recorded steps in one gradient step."""
+    """Number of recorded steps in a gradient step."""
     learning_rate: Positive = 1e-3
     """Adam's step size."""
     max_grad_norm: Positive = 1.0
-    """Gradients are scaled down to this global norm."""
+    """Global norm to which larger gradients are scaled down."""
     normalize_observations: bool = True
-    """Normalise observations by their mean and deviation in the file."""
+    """Normalise observations by their mean and standard deviation in the file."""
     policy_hidden_layer_sizes: tuple[AtLeastOne, ...] = (256, 256)
-    """Widths of the policy network, behind its encoder if there are images."""
+    """Widths of the policy network's layers, after its encoder if there are images."""
 
     IDLE = (
         ("student_share buffer_steps", "a teacher", lambda c: c.teacher),
@@ -249,33 +249,33 @@ class RunConfig(Settings):
     out_dir: str = "runs"
     """Folder of all runs."""
     name: str = ""
-    """Folder of this run inside out_dir; empty: <config name>-seed<seed>."""
+    """Folder of this run in out_dir; empty: <config name>-seed<seed>."""
     seed: Seed = 0
-    """Seed of networks, environments and sampling."""
+    """Random seed of networks, environments and sampling."""
     init: str = ""
-    """Run folder (ppo or clone) whose best policy a new run starts from; critic and optimiser are new."""
+    """Run folder (ppo or clone) whose best policy a new run starts with; critic and optimiser are new."""
     curriculum: tuple[NotNegative, NotNegative, Share] = (0.0, 0.0, 0.8)
-    """Largest path from start to goal at first (m; 0: any), that from which any is drawn, success at which it grows."""
+    """Largest path to the goal at first in m (0: any), largest before any is drawn, and success at which it grows."""
     devices: AtLeastOne = 1
-    """Devices that share environments and minibatches, with a process per GPU; ppo only."""
+    """Number of devices that share environments and minibatches, with a process per GPU; ppo only."""
     num_timesteps: AtLeastOne = 20_000_000
-    """Environment steps to train for, rounded up to whole updates."""
+    """Number of environment steps to train for, rounded up to whole updates."""
     log_every_steps: AtLeastOne = 100_000
-    """Environment steps between two lines of metrics."""
+    """Number of environment steps between two lines of metrics."""
     checkpoint_every_steps: AtLeastOne = 1_000_000
-    """Environment steps between two checkpoints."""
+    """Number of environment steps between two checkpoints."""
     keep_checkpoints: AtLeastOne = 3
-    """Newest checkpoints to keep; the best one is kept as well."""
+    """Number of newest checkpoints to keep; the best one is kept as well."""
     best_metric: str = "ins_0.5"
-    """Episode score whose mean over a checkpoint interval makes the best checkpoint."""
+    """Episode score whose mean between two checkpoints decides which one is best."""
     env_state_limit_mb: NotNegative = 256.0
-    """Checkpoints include the environments' state up to this size; beyond it, resuming starts new episodes."""
+    """Largest state of environments in MB that checkpoints include; beyond it, resuming starts new episodes."""
     tensorboard: bool = True
     """Write TensorBoard events beside metrics.jsonl."""
     wandb: bool = False
     """Log to Weights & Biases as well (WANDB_MODE=offline keeps it here)."""
     wandb_project: str = "interactive-nav"
-    """Project there."""
+    """Project at Weights & Biases."""
 
     IDLE = (("wandb_project", "wandb true", lambda c: c.wandb),)
 
@@ -295,7 +295,7 @@ class TrainConfig(Settings):
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
     """The task."""
     algorithm: Literal[tuple(AUTO)] = "ppo"  # type: ignore[valid-type]
-    """Learner; the section of its name holds its settings."""
+    """Learning algorithm; the section of its name holds its settings."""
     network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
     """Encoders of images."""
     ppo: PPOConfig = dataclasses.field(default_factory=PPOConfig)

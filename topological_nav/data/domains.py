@@ -66,39 +66,39 @@ class AdaptConfig(Settings):
     """Set how networks are taken to another domain; `preset=report` has the report's values."""
 
     seed: Seed = 0
-    """Of weights, order and splits."""
+    """Random seed of weights, order and splits."""
     domain: Literal[tuple(PRESETS)] = "camera"  # type: ignore[valid-type]
-    """The camera that target images are seen by; `camera` is all the others at once."""
+    """Camera that takes target images; `camera` is all the others at once."""
     epochs: Count = 20
     """features: passes over the target images."""
     batch: Count = 50
-    """features: images of each domain an update."""
+    """features: images of each domain per update."""
     learning_rate: Annotated[float, Bounds(1e-9, 10.0)] = 1e-4
-    """features: Adam's, of the extractor."""
+    """features: Adam's step size for the extractor."""
     critic_learning_rate: Annotated[float, Bounds(1e-9, 10.0)] = 1e-3
-    """features: Adam's, of the critic."""
+    """features: Adam's step size for the critic."""
     hidden: Count = 512
     """features: units of each of the critic's two layers."""
     fine_tune: Annotated[int, Bounds(2, 10**6)] = 252
-    """passages: target images to learn from, at most."""
+    """passages: most target images to learn from."""
     fine_tune_free: Annotated[int | None, Bounds(1, 10**6)] = None
-    """passages: of them free; auto: half."""
+    """passages: number of free images to learn from; auto: half."""
     test: Annotated[int, Bounds(2, 10**6)] = 108
-    """passages: target images to test, at most."""
+    """passages: most target images to test on."""
     test_free: Annotated[int | None, Bounds(1, 10**6)] = None
-    """passages: of them free; auto: half."""
+    """passages: number of free images to test on; auto: half."""
     fine_tune_epochs: Count = 20
-    """passages: passes over them."""
+    """passages: passes over the images."""
     fine_tune_batch: Count = 32
-    """passages: images an update."""
+    """passages: images per update."""
     fine_tune_augment: bool = True
     """passages: vary brightness, contrast and colour, and shift and mirror images."""
     fine_tune_learning_rate: Annotated[float, Bounds(1e-9, 10.0)] = 1e-4
-    """passages: Adam's."""
+    """passages: Adam's step size."""
     edge_m: Annotated[float, Bounds(0.1, 100.0)] = 2.5
-    """map: nodes nearer than this are joined, both ways."""
+    """map: largest distance in m between joined nodes, in both directions."""
     passable: Share = 0.5
-    """map: edges with at least this probability count as open."""
+    """map: least probability of an edge that counts as open."""
 
 
 def as_seen(images: np.ndarray, config: DomainConfig, stream: int = 0) -> np.ndarray:

@@ -36,23 +36,23 @@ class EvaluateConfig(Settings):
     """The fixed episodes that every trained run plays; see `python -m train.evaluate --help`."""
 
     scenes: tuple[str, ...] = ()
-    """Scene folders; empty: those that the run was trained on."""
+    """Scene folders to play in; empty: those that the run was trained in."""
     episodes: AtLeastOne = 1000
-    """Episodes of each run."""
+    """Number of episodes that each run plays."""
     seed: Natural = 1_000_000
-    """Which episodes."""
+    """Random seed of the fixed episodes."""
     balanced: bool = True
-    """Scenes take turns; otherwise each episode draws one."""
+    """Let scenes take turns; otherwise each episode draws one."""
     checkpoint: str = "best"
-    """best, last or a number of env steps."""
+    """Checkpoint to play: best, last or a number of environment steps."""
     stochastic: bool = True
-    """Sample actions instead of taking their mode."""
+    """Sample actions instead of taking the most likely ones."""
     record: Natural = 8
-    """First episodes whose paths are kept for pictures."""
+    """Number of episodes whose paths are recorded."""
     episode_files: tuple[str, ...] = ()
-    """Files of fixed episodes to play instead of drawn ones; `{robot}` stands for that of each run."""
+    """Files of fixed episodes to play instead of drawn ones; `{robot}` stands for each run's robot."""
     batch: AtLeastOne | None = None
-    """Episodes played at a time; auto: by backend."""
+    """Number of episodes to play in parallel; auto: depends on the backend."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -65,19 +65,19 @@ class LaunchConfig(Settings):
     """How runs share a machine."""
 
     runs_per_gpu: AtLeastOne = 1
-    """Runs that share a GPU; one that runs out of memory is tried again with twice the share."""
+    """Number of runs that share a GPU; one that runs out of memory is tried again with twice the share."""
     gpu_memory_gb: Positive | None = None
-    """Memory that one run needs: on GPUs too small for runs_per_gpu of them fewer are packed; auto: not looked at."""
+    """Memory in GB that one run needs: smaller GPUs run fewer than runs_per_gpu; auto: no check."""
     jax_memory_share: Annotated[float, Bounds(0.01, 1.0)] = 0.6
     """Part of a run's share of the GPU that JAX reserves; the rest is for Warp, the renderer and CUDA."""
     slots: AtLeastOne = 1
-    """Runs at a time on a machine without a GPU; each gets its part of the cores."""
+    """Number of runs at a time on a machine without a GPU; they share the cores."""
     cpus_per_run: AtLeastOne = 1
-    """CPU cores that a run reserves on a Ray cluster."""
+    """Number of CPU cores that a run reserves on a Ray cluster."""
     retries: Natural = 2
-    """Times that a crashed run is started again by one command; a refused config or diverged numbers are not."""
+    """Number of times that one command restarts a crashed run, but not a refused config or diverged numbers."""
     grace_s: NotNegative = 300.0
-    """Time that stopped runs have to write their checkpoints (a compilation under way is not interrupted)."""
+    """Time in s that stopped runs have to write their checkpoints; compilations are not interrupted."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,16 +95,16 @@ class SweepConfig(Settings):
     """A sweep as its file says it."""
 
     name: str = ""
-    """Folder of the sweep inside out_dir; empty: the file's name."""
+    """Folder of the sweep in out_dir; empty: the file's name."""
     out_dir: str = "sweeps"
     """Folder of all sweeps."""
     preset: str = ""
-    """What every run starts from: a preset or a YAML file of `python -m train`; {algorithm}, {env.robot} and the like
-    stand for the run's value."""
+    """Preset or YAML file of `python -m train` from which every run starts; {algorithm}, {env.robot} and the like stand
+    for the run's value."""
     grid: Mapping[str, Sequence[Any]] = dataclasses.field(default_factory=dict)
-    """Dotted setting -> its values; every combination is a run, the last one varies fastest."""
+    """Values of each dotted setting; every combination is a run, and the last setting varies fastest."""
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Settings of every run, laid over the preset."""
+    """Settings of every run, which override the preset."""
     overrides: Sequence[Any] = ()
     """Settings of some runs: {where: {setting: value or values}, settings: {...}, launch: {...}}."""
     skip: Sequence[Any] = ()
