@@ -83,16 +83,18 @@ class NativePhysics(Physics):
         self._config = config
         self._contacts = sensor_addresses(world.models[0]) if config.needs_contacts else None
         self._slots = world.layout.num_slots
-        self._robot, self._layout = world.robot, world.layout
-        slots = find_slots(world.scenes, world.small_objects)
+        slots, self._robot = find_slots(world.scenes, world.small_objects), world.robot
         self._models = tuple(with_feet_apart(world, slots, scene, config) for scene in range(len(world.scenes)))
+        # The feet's bodies stand between those of the slots.
+        slot_body = np.array([self._models[0].body(slot.name).id for slot in slots], np.int32)
+        self._layout = dataclasses.replace(world.layout, slot_body=slot_body)
         self._iterations = int(world.models[0].opt.iterations)
         for model in self._models:
             # A failed state must show, not be silently replaced by the model's default.
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
             if self._config.sleep:
                 model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
-        self._scaled = base.make_scaling(self._models[0], world.layout)
+        self._scaled = base.make_scaling(self._models[0], self._layout)
         self.hook = Hook(world, config) if config.hook_force_n else None
         self._pools: dict[int, list[_Pool]] = {}
         self._lock = threading.Lock()

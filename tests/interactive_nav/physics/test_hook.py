@@ -28,8 +28,8 @@ FRONT_M, GAP_M, LEAF_M = 0.2865, 0.05, 0.7
 
 @pytest.fixture(scope="module")
 def make_env(tmp_path_factory):
-    def make(mass_kg=10.0, door=False, **settings):
-        blocks = () if door else (("chair", 0.0, 0.0, mass_kg, FRICTION),)
+    def make(mass_kg=10.0, door=False, others=(), **settings):
+        blocks = others if door else (*others, ("chair", 0.0, 0.0, mass_kg, FRICTION))
         folder = write_room(tmp_path_factory.mktemp("hook") / "room", (6.0, 4.0), blocks, door=door)
         return interactive_nav.make("freight", [folder], **{"backend": "native", **SETTINGS, **settings})
 
@@ -169,6 +169,18 @@ def test_a_door_that_opens_towards_the_robot_is_pulled_open(make_env):
     at = int(env.world.layout.slot_qpos[0])
     assert float(state.pipeline_state.qpos[at]) > np.radians(60) and int(state.pipeline_state.hook[0]) == 0
     assert float(state.info["nav"].memory["object_path_m"][0]) > 0.3  # the kinematic effort has it
+
+
+def test_it_pulls_what_it_holds_among_others(make_env):
+    """The last of three boxes: each body but the first has another number in the stepped model."""
+    env = make_env(others=(("chair", 2.0, 1.2, 10.0, FRICTION), ("chair", 2.0, -1.2, 10.0, FRICTION)))
+    state = _before_the_box(env)
+    before_m = np.asarray(state.info["nav"].object_pos_w)
+    state = _run(env, jax.jit(env.step), state, (1, 0.0, 0.0, 1.0), (20, -0.3, 0.0, 0.0))
+    assert int(state.pipeline_state.hook[0]) == 2
+    moved_m = np.asarray(state.info["nav"].object_pos_w) - before_m
+    assert moved_m[2, 0] < -0.3
+    np.testing.assert_allclose(moved_m[:2], 0.0, atol=1e-3)
 
 
 @pytest.mark.parametrize(

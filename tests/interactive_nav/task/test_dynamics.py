@@ -299,6 +299,25 @@ def test_the_model_of_a_native_environment_is_a_scaled_copy(world):
     assert acceleration(changed) == pytest.approx(10.0 / KG, rel=1e-3)
 
 
+def test_all_objects_of_a_native_environment_are_scaled_and_the_robot_is_not(tmp_path):
+    """In the stepped model, the bodies of feet stand between those of the objects."""
+    blocks = tuple(("basket", x_m, 1.0, KG, FRICTION) for x_m in (-1.0, 0.0, 1.0))
+    scene = load_scene(write_room(tmp_path / "three", (4.0, 4.0), blocks, door=True))
+    config = NavConfig.of(backend="native", num_objects=1)
+    world = build_world(get_robot("turtlebot"), (scene,), config)
+    physics = make_physics(world, config)
+    assert isinstance(physics, NativePhysics)
+    pool = physics._take_pool(np.zeros((1, physics.nq), np.float32))
+    physics._set_models(pool, np.zeros(1, int), np.array([[2.0, 1.0]]))
+    plain, changed = physics._models[0], pool.models[0]
+    assert len(world.layout.slot_body) == 5
+    for slot_body in world.layout.slot_body:
+        name = world.models[0].body(slot_body).name
+        assert changed.body(name).mass[0] == pytest.approx(2 * world.models[0].body(name).mass[0]), name
+    for body in world.layout.robot_bodies:
+        assert changed.body(body).mass == plain.body(body).mass == world.models[0].body(body).mass
+
+
 def test_given_fields_hold_where_scenes_fill_nothing(world):
     window = PhysicsWindow(world, NavConfig.of(num_objects=0))
     state = PhysicsState(
