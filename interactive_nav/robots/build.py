@@ -28,7 +28,7 @@ from interactive_nav_common.records import read_packaged
 from interactive_nav_common.rotations import apply_axes
 
 FOLDER = Path(__file__).parent / "mjcf"
-_OPTIONS = ("timestep", "integrator", "cone", "solver", "iterations", "ls_iterations", "gravity")
+_OPTIONS = ("timestep", "integrator", "cone", "impratio", "solver", "iterations", "ls_iterations", "gravity")
 """A robot's file may set them; the world's hold."""
 FLOOR = "floor"
 """The world's floor geom."""

@@ -1,8 +1,8 @@
 """Build a robot that `make` accepts from a user's MJCF or URDF and a few facts (see `docs/add-a-robot.md`).
 
 Missing facts are inferred from the file's shapes. `repair.py` adds what physics needs, with a warning for each change.
-Refused are colliding meshes, links without inertia or shape, and joints of arms without torque limits. Control modes
-come from `build.py`.
+Refused are links without inertia or shape, and joints of arms without torque limits. Control modes come from
+`build.py`.
 """
 
 import dataclasses

@@ -1,6 +1,7 @@
 """Parse a robot's URDF or MJCF file; a URDF is brought into the form that MuJoCo's reader expects."""
 
 import math
+import os
 import re
 import warnings
 from pathlib import Path
@@ -61,6 +62,11 @@ def read_file(path: Path, base_body: str = "") -> mujoco.MjSpec:
             return mujoco.MjSpec.from_file(str(path))
         _simplify(root, path, base_body)
         [float(limit.get("velocity", 0)) for limit in root.iter("limit")]  # MuJoCo does not read it
+        settings = root
+        for tag in ("mujoco", "compiler"):
+            found = settings.find(tag)
+            settings = ElementTree.SubElement(settings, tag) if found is None else found
+        settings.attrib |= {"strippath": "false", "discardvisual": "false"}
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
     except ValueError as error:
         raise _refused(path, error) from error
@@ -73,6 +79,20 @@ def _ends(joint: ElementTree.Element) -> tuple[str, ...]:
     return tuple(getattr(joint.find(end), "attrib", {}).get("link", "") for end in ("parent", "child"))
 
 
+def _mesh_file(path: Path, name: str) -> Path:
+    """Return the file that a URDF's mesh names; a package is the folder of the URDF or one above it."""
+    name = re.sub(r"^\w+://", "", name)
+    places = [folder / part for folder in path.parents[:3] for part in (name, name.partition("/")[2])]
+    return next((place for place in places if os.path.isfile(place)), path.parent / name)
+
+
+def names_files(path: Path) -> bool:
+    """Return whether a robot's file refers to others: any in an MJCF, meshes that are there in a URDF."""
+    text = path.read_bytes()
+    meshes = re.findall(rb'filename="([^"]+)"', text)
+    return b"file=" in text or any(os.path.isfile(_mesh_file(path, name.decode(errors="replace"))) for name in meshes)
+
+
 def _simplify(root: ElementTree.Element, path: Path, base_body: str) -> None:
     """Drop what MuJoCo cannot read and the massless links above the base; refuse what it would misread."""
     for kind in ("link", "joint"):
@@ -82,9 +102,17 @@ def _simplify(root: ElementTree.Element, path: Path, base_body: str) -> None:
                 raise ConfigError(f"robot file {path}: {names.count(name)} {kind}s are named '{name}', expected one")
     links = {link.get("name", ""): link for link in root.findall("link")}
     for name, link in links.items():
-        for visual in link.findall("visual"):
-            if visual.find("geometry/mesh") is not None:
-                link.remove(visual)
+        for shape in [*link.findall("visual"), *link.findall("collision")]:
+            if (mesh := shape.find("geometry/mesh")) is not None:
+                file = _mesh_file(path, mesh.get("filename", ""))
+                if file.suffix.lower() not in (".stl", ".obj") or not os.path.isfile(file):
+                    if shape.tag == "collision":
+                        raise ConfigError(
+                            f"robot file {path}: link '{name}' collides as '{mesh.get('filename')}', expected an STL "
+                            "or OBJ file that exists"
+                        )
+                    link.remove(shape)
+                mesh.set("filename", str(file))
         for mass in link.findall("inertial/mass"):
             if not 0 <= float(mass.get("value", "nan")) < math.inf:
                 raise ConfigError(f"robot file {path}: link '{name}' has mass {mass.get('value')}, expected kilograms")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from interactive_nav.robots.factory import Facts, from_file
-from interactive_nav.robots.files import warn
+from interactive_nav.robots.files import names_files, warn
 from interactive_nav.robots.spec import RobotSpec
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.files import write_json, writing
@@ -109,7 +109,7 @@ def record_robot(robot: str, folder: Path) -> None:
     if not is_reference(robot) or folder.exists():
         return
     path, function = _split(robot)
-    alone = path.suffix != ".py" and b"file=" not in path.read_bytes()
+    alone = path.suffix != ".py" and not names_files(path)
     record = _Record(path.name if alone else f"{path}{function}", identity(robot))
     with writing(folder, "make room, or set run.out_dir"):
         folder.mkdir(parents=True)

@@ -1,7 +1,7 @@
 """Adapt a user's parsed robot file to the task's physics; every change produces a warning.
 
-Wheels become spheres that roll on the floor only, with a box for contact with furniture; cylinders become boxes; links
-without inertia take that of their shapes; driven joints get a servo. Actuators, sensors and options are removed.
+Wheels become spheres that roll on the floor only, with a box for contact with furniture; cylinders and meshes become
+boxes; links without inertia take that of their shapes; driven joints get a servo. Actuators, sensors and options go.
 """
 
 import dataclasses
@@ -16,6 +16,7 @@ from interactive_nav.robots.build import Joint, WheeledBase, half_extents
 from interactive_nav.robots.files import compiled, warn
 from interactive_nav.robots.spec import set_servo
 from interactive_nav_common.errors import FileError
+from interactive_nav_common.rotations import matrix_from_quat
 
 _GEOM = mujoco.mjtGeom
 _ROUND = (_GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE)
@@ -25,6 +26,8 @@ _WHEEL_FRICTION = 1.0
 _G_M_S2 = 9.81
 _STIFFNESS_PER_EFFORT = 10.0
 """Position servo of a joint: its torque limit is reached at an error of 0.1 rad (m)."""
+_CLEAR_M = 0.005
+"""Boxes of the base are this high above the floor at least."""
 FLOOR_M = 0.02
 """A wheel of a joint that nothing drives rolls on the floor when it comes this near to it."""
 
@@ -121,15 +124,38 @@ def strip(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
     for k, geom in enumerate(list(child.geoms)):
         if not geom.name:
             geom.name = f"{geom.parent.name}_geom_{k}"
-        if _solid(geom) and geom.type == _GEOM.mjGEOM_MESH:
-            raise FileError(
-                f"robot file {path}: geom '{geom.name}' of body '{geom.parent.name}' collides as a mesh, expected "
-                "boxes, capsules, spheres or cylinders; replace it (meshes may stay as visuals)"
-            )
         if _solid(geom):
             geom.group, geom.contype, geom.conaffinity = 3, 1, 0
         else:
             geom.group, geom.mass = 2, 0.0
+    for mesh in child.meshes:
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # a flat one has no volume
+    meshes = [g for g in child.geoms if g.group == 3 and g.type == _GEOM.mjGEOM_MESH]
+    if meshes:
+        warn(path, f"{len(meshes)} meshes now collide as the boxes around them, or as wheels")
+        model = compiled(child, path)
+        for geom in meshes:
+            _replace_mesh(geom, model)
+
+
+def _replace_mesh(geom, model: mujoco.MjModel) -> None:
+    """Replace a colliding mesh by the box around it along its body's axes.
+
+    A link's only shape becomes a cylinder about the link's only hinge, one without limits, if that box is square there.
+    """
+    i, body, quat = model.geom(geom.name).id, model.body(geom.parent.name), np.array([1.0, 0.0, 0.0, 0.0])
+    start, count = model.mesh_vertadr[model.geom_dataid[i]], model.mesh_vertnum[model.geom_dataid[i]]
+    points_m = model.mesh_vert[start : start + count] @ matrix_from_quat(model.geom_quat[i]).T + model.geom_pos[i]
+    low_m, high_m = points_m.min(0), points_m.max(0)
+    geom.type, geom.meshname, geom.size, j = _GEOM.mjGEOM_BOX, "", (high_m - low_m) / 2, body.jntadr[0]
+    alone = sum(g.group == 3 for g in geom.parent.geoms) == body.jntnum[0] == 1
+    if alone and model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE and not model.jnt_limited[j]:
+        k = abs(model.jnt_axis[j]).argmax()
+        least, most = sorted(np.delete(geom.size, k))
+        if least > 0.95 * most:
+            geom.type, geom.size = _GEOM.mjGEOM_CYLINDER, [most, geom.size[k], 0.0]
+            mujoco.mju_quatZ2Vec(quat, np.eye(3)[k])
+    place(geom, (low_m + high_m) / 2, quat)
 
 
 def _replace_wheel(child: mujoco.MjSpec, wheel: Round, base_body: str) -> None:
@@ -193,14 +219,14 @@ def _fix_masses(child: mujoco.MjSpec, path: Path, base_body: str) -> None:
         body.fullinertia = [math.nan] * 6
 
 
-def place(body, pos, quat) -> None:
-    """Set a body's pose in its parent's frame."""
-    body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-    body.pos, body.quat = pos, quat
+def place(part, pos, quat) -> None:
+    """Set the pose of a body in its parent's frame, or of a geom in its body's."""
+    part.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    part.pos, part.quat = pos, quat
 
 
-def turn_freely(joint, path: Path, slip_n_m: float) -> None:
-    """Take a driven wheel's position limits away, and bound its torque by that of a wheel that carries the robot."""
+def turn_freely(joint, path: Path, slip_n_m: float, speed_rad_s: float) -> None:
+    """Take away a wheel's position limits, torque beyond its grip, and damping and friction beyond its torque."""
     if joint.limited and joint.range[0] < joint.range[1]:
         warn(path, f"wheel joint '{joint.name}' has position limits {joint.range.tolist()}; it turns without")
     joint.limited, joint.range = False, [0, 0]
@@ -214,6 +240,10 @@ def turn_freely(joint, path: Path, slip_n_m: float) -> None:
             f"{slip_n_m:.3g} N m, at which a wheel that carries the whole robot slips",
         )
         joint.actfrcrange = [-slip_n_m, slip_n_m]
+    lost_n_m = float(joint.damping[0]) * speed_rad_s + joint.frictionloss
+    if lost_n_m > joint.actfrcrange[1]:
+        warn(path, f"wheel joint '{joint.name}' would lose {lost_n_m:.3g} N m to damping and friction; it has none")
+        joint.damping, joint.frictionloss = 0.0 * joint.damping, 0.0
 
 
 def hold(
@@ -309,15 +339,24 @@ def complete(
             joint.axis = [-v for v in joint.axis]
     for name in casters:
         for geom in [g for g in find(child, path, "body", name).geoms if g.group == 3]:
-            if geom.type != _GEOM.mjGEOM_SPHERE:
-                raise FileError(f"robot file {path}: caster '{name}' is no sphere, expected one")
+            if geom.type not in _ROUND:
+                raise FileError(f"robot file {path}: caster '{name}' is not round, expected a sphere or a cylinder")
+            geom.type = _GEOM.mjGEOM_SPHERE
             geom.contype, geom.condim, geom.friction = 0, 1, [0.0, 0.0, 0.0]
+    model = compiled(child, path)
+    mujoco.mj_kinematics(model, data := mujoco.MjData(model))
+    for geom in [g for g in child.geoms if g.contype and g.type == _GEOM.mjGEOM_BOX]:
+        i, body = model.geom(geom.name).id, model.body(geom.parent.name)
+        clear_m = data.geom_xpos[i, 2] - abs(data.geom_xmat[i, 6:]) @ half_extents(model, i) - bottom_m
+        if clear_m < _CLEAR_M and body.weldid == model.body(base_body).id:
+            warn(path, f"'{geom.name}' would drag on the floor; it is lifted by {100 * (_CLEAR_M - clear_m):.2g} cm")
+            geom.pos += data.xmat[body.id].reshape(3, 3)[2] * (_CLEAR_M - clear_m)
     for geom in [g for g in child.geoms if g.group == 3 and g.type == _GEOM.mjGEOM_CYLINDER]:
         warn(path, f"cylinder '{geom.name}' now collides as four boxes, an octagon")
         _replace_cylinder(child, geom)
     # The torque at which a wheel that carries the whole robot slips.
-    slip_n_m = _WHEEL_FRICTION * _G_M_S2 * float(sum(compiled(child, path).body_mass)) * base.wheel_radius_m
+    slip_n_m = _WHEEL_FRICTION * _G_M_S2 * float(sum(model.body_mass)) * base.wheel_radius_m
     for joint in base.joints:
         if joint.side:
-            turn_freely(child.joint(joint.name), path, slip_n_m)
+            turn_freely(child.joint(joint.name), path, slip_n_m, joint.max_speed)
         add_servo(child, path, joint)

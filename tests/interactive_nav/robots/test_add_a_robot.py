@@ -187,7 +187,7 @@ def test_an_mjcf_with_its_own_actuators_and_degrees_drives(tmp_path, registry):
          "joint 'mast' has no torque limit"),
         (URDF.replace('rpy="1.5708 0 0"/><axis', 'rpy="0 0 0"/><axis'), {}, "expected its y axis"),
         (URDF.replace('cylinder radius="0.07" length="0.04"', 'box size="0.1 0.1 0.04"'), {}, "no round one"),
-        (URDF.replace('sphere radius="0.03"', 'box size="0.1 0.1 0.04"'), {}, "caster 'front_caster' is no sphere"),
+        (URDF.replace('sphere radius="0.03"', 'box size="0.1 0.1 0.04"'), {}, "caster 'front_caster' is not round"),
         (URDF, {"left_wheels": "left_wheel_joint"}, "left_wheels is 'left_wheel_joint', expected a list"),
         (URDF, {"right_wheels": ("left_wheel_joint",)}, "'left_wheel_joint' is on both sides"),
         (

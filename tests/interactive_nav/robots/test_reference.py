@@ -2,6 +2,7 @@
 
 import shutil
 import warnings
+from pathlib import Path
 
 import pytest
 
@@ -189,10 +190,11 @@ def test_a_run_keeps_the_files_of_its_robot(tmp_path):
         reference.recorded_robot(tmp_path / "moved" / "robot")
 
 
-def test_a_run_refers_to_a_python_function_and_to_files_with_includes(tmp_path):
+def test_a_run_refers_to_a_python_function_and_to_files_that_name_others(tmp_path):
     places = (
         write(tmp_path, MODULE, "mine.py") + ":made",
         write(tmp_path, '<mujoco><include file="x"/></mujoco>', "a.xml"),
+        write(tmp_path, f'<robot><mesh filename="package://x/{Path(write(tmp_path, "", "a.stl")).name}"/></robot>'),
     )
     for k, place in enumerate(places):
         reference.record_robot(place, tmp_path / f"robot{k}")

@@ -183,6 +183,55 @@ def test_a_byte_order_mark_line_ends_and_a_space_are_read(tmp_path):
     assert robot.mass_kg == pytest.approx(13.2, abs=1e-6) and not told
 
 
+def write_box(path, half_m, centre_m=(0.0, 0.0, 0.0)):
+    """An OBJ file of a box."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half_m + centre_m
+    quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+    lines = [f"v {x} {y} {z}" for x, y, z in corners] + ["f " + " ".join(str(i + 1) for i in quad) for quad in quads]
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("\n".join(lines))
+
+
+@pytest.mark.parametrize("place", ["package://cart/meshes/", "file://meshes/", "./meshes/"])
+def test_meshes_collide_as_boxes_and_wheels(tmp_path, place):
+    write_box(tmp_path / "meshes" / "hull.obj", (0.2, 0.15, 0.05), (0.01, 0.02, 0.1))
+    write_box(tmp_path / "meshes" / "wheel.obj", (0.07, 0.07, 0.02))
+    text = cart().replace('<cylinder radius="0.07" length="0.04"/>', f'<mesh filename="{place}wheel.obj"/>')
+    mesh = f'<geometry><mesh filename="{place}hull.obj"/></geometry>'
+    text = text.replace('<origin xyz="0 0 0.1"/><geometry><box size="0.4 0.3 0.1"/></geometry>', mesh, 1)
+    robot, told = build(
+        tmp_path, text.replace('<link name="base_link">', f'<link name="base_link"><visual>{mesh}</visual>')
+    )
+    assert told == ["3 meshes now collide as the boxes around them, or as wheels"]
+    model, data = drive(robot)
+    solid = [
+        i for i in range(model.ngeom) if model.geom_contype[i] and model.geom_type[i] != mujoco.mjtGeom.mjGEOM_PLANE
+    ]
+    sizes = {model.geom(i).name: model.geom_size[i] for i in solid}
+    np.testing.assert_allclose(sizes["cart_left_wheel_guard"], [0.049, 0.02, 0.049], atol=1e-6)
+    (hull,) = [i for i in solid if "guard" not in model.geom(i).name]
+    np.testing.assert_allclose(model.geom_size[hull], [0.2, 0.15, 0.05], atol=1e-6)
+    np.testing.assert_allclose(model.geom_pos[hull], [0.01, 0.02, 0.1], atol=1e-6)
+    assert (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).sum() == 1 and robot.mass_kg == pytest.approx(13.2, abs=1e-3)
+    assert data.qpos[0] == pytest.approx(5 * 0.07 * 2, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (cart(base=link("base_link", HULL, 12, "0 0 0.05")), "would drag on the floor; it is lifted by 0.5 cm"),
+        (cart().replace("<axis", '<dynamics damping="9" friction="3"/><axis'), "would lose 93 N m to damping"),
+        (cart().replace('<sphere radius="0.03"/>', '<cylinder radius="0.03" length="0.02"/>'), ""),
+    ],
+    ids=["a box on the floor", "stiff wheels", "cylinders as casters"],
+)
+def test_what_would_stop_a_robot_is_taken_away(tmp_path, text, said):
+    robot, told = build(tmp_path, text)
+    assert all(said in line for line in told) and bool(told) == bool(said)
+    model, data = drive(robot)
+    assert data.qpos[0] == pytest.approx(5 * 0.07 * 2, abs=0.02) and model.npair == 4
+
+
 TRANSMISSION = (
     '<transmission name="t"><joint name="left_joint"><hardwareInterface>x</hardwareInterface></joint></transmission>'
 )
@@ -235,6 +284,8 @@ def test_names_with_spaces_are_names(tmp_path):
         (cart(link("keel", HULL, 1) + joint("k", "floating", "keel", "base_link")), "c.urdf",
          "'k' from 'keel' to 'base_link' is floating, expected the robot below it: give base_body='base_link'"),
         (cart("<joint name='k' type='fixed'/>"), "c.urdf", "cannot read it"),
+        (cart().replace('<sphere radius="0.03"/>', '<mesh filename="x.stl"/>'), "c.urdf",
+         "link 'front_caster' collides as 'x.stl', expected an STL or OBJ file that exists"),
         (cart().replace('<sphere radius="0.03"/>', '<sphere radius="-1"/>'), "c.urdf", "cannot read it"),
     ],
 )  # fmt: skip
