@@ -16,6 +16,8 @@ class CameraView(Settings):
 
     name: str = ""
     """Name of the camera: its images have the keys `pixels/<name>/...`."""
+    body: str = ""
+    """Body of the robot that carries it, such as fetch_gripper (then give pos_m); empty: its camera's."""
     yaw_deg: float = 0.0
     """Angle to the left of its body's x axis, in degrees."""
     pitch_deg: float | None = None

@@ -241,6 +241,8 @@ def _mode(base: WheeledBase, mode: str, limits: list[tuple[Any, float]]) -> tupl
     if mode in ("whole_body", "hand") and base.gripper:
         fingers = [names.index(name) for name in base.gripper]
         low, high = limits[fingers[0]][0] or (0.0, 0.0)
+        if low == high:
+            raise ConfigError(f"finger joint '{base.gripper[0]}' has no range, expected one; give limits")
         actions.append(_Action("finger opening m", low, high, alone[fingers].sum(0)))
     return servos, actions
 
@@ -308,6 +310,7 @@ def wheeled_robot(
         camera=dataclasses.replace(camera, body=f"{prefix}{camera.body}"),
         home_qpos=tuple((f"{prefix}{j.name}", j.home) for j in joints if j.home),
         rolling_bodies=tuple(f"{prefix}{name}" for name in wheels),
+        hand=base.hand and f"{prefix}{base.hand}",
         control_mode=control_mode,
         control_modes=base.modes,
         control=_law(base, control_mode, child, actions),

@@ -118,6 +118,8 @@ class RobotSpec(Figures):
     """Joint -> position at the start of an episode; joints that are not named start at their model's zero."""
     rolling_bodies: tuple[str, ...] = ()
     """Wheels and casters: bodies whose contacts the original's code did not count."""
+    hand: str = ""
+    """Body that mode `hand` moves; empty: it has none."""
     root_link_kg: float = 0.0
     """Mass of the original URDF's root link, which one of its scores leaves out; 0: a massless footprint."""
     control_mode: str = "native"

@@ -24,6 +24,7 @@ PARTS = {
     "joints": ("rad or m, rad/s or m/s", "joint", "positions in the robot model's order, then velocities"),
     "lidar": ("m", "scanner", "distances, beams from right to left"),
     "trail": ("m", "base", "x, y of where the robot was about 1, 2, 4, ..., 64 s ago"),
+    "hand": ("m, 1", "base", "grip, opening, gap, touched, class, offset"),
     "hook": ("1, m", "base", "whether the hook holds something, and x, y, z of the coupled point"),
     "depth": ("m", "camera", "distance along the optical axis; 0: nothing is met"),
     "segmentation": ("class id", "camera", "as docs/sensors.md numbers them"),
@@ -70,7 +71,7 @@ def describe(env: Any) -> dict[str, Any]:
         "robot": {"name": robot.name, "control_mode": robot.control_mode, "rate_hz": rate_hz, **placed},
         "inputs": {name: describe_input(name, x, config) | {"rate_hz": rate_hz} for name, x in inputs.items()},
         "outputs": {name: {"shape": [len(of["names"])], "dtype": "float32"} | of for name, of in outputs.items()},
-        "cameras": [_camera(camera, robot.camera.body) for camera in env.sensors.cameras],
+        "cameras": [_camera(*of, robot) for of in zip(env.sensors.cameras, config.views, strict=False)],
     }
     if "waypoints" in about["inputs"]:
         about["inputs"]["waypoints"]["spacing_m"] = config.waypoint_spacing_m
@@ -104,11 +105,11 @@ def describe_input(name: str, value: Any, config: Any) -> dict[str, Any]:
     }
 
 
-def _camera(camera: Any, body: str) -> dict[str, Any]:
+def _camera(camera: Any, view: Any, robot: RobotSpec) -> dict[str, Any]:
     x, y, z = map(float, camera.mount.forward_b)
     return {
         "inputs": f"pixels/{camera.prefix}",
-        "body": body,
+        "body": view.body or robot.camera.body,
         "pos_m": camera.mount.pos_b.tolist(),
         "yaw_deg": math.degrees(math.atan2(y, x)),
         "pitch_down_deg": math.degrees(-math.asin(z)),

@@ -141,6 +141,7 @@ class Sensors:
             "joints": 2 * len(self._joints[0]),
             "lidar": config.lidar_rays,
             "trail": 2 * len(TRAIL),
+            "hand": 10,
         }
         self.sizes = {name: size for name, size in sizes.items() if name in config.observations} | dict(extra or {})
         """Parts of the vector in order -> their lengths."""
@@ -163,7 +164,7 @@ class Sensors:
     ) -> jax.Array | dict[str, jax.Array]:
         """Return one environment's observation; noise uses the episode's key `rng` without consuming it.
 
-        `remembered` has the observed values among `odometry`, `trail` and the `extra` parts.
+        `remembered` has the observed values among `odometry`, `trail`, `hand` and the `extra` parts.
         """
         vector = self._vector(physics, nav, rng, remembered or {})
         if not self._images:
@@ -252,7 +253,8 @@ def _cameras(world: World, config: SensorConfig, renderer: Renderer) -> tuple[Se
         if lens not in drawn:
             drawn[lens] = renderer.through(lens)
         pitch = robot_camera.pitch_rad if view.pitch_deg is None else math.radians(view.pitch_deg)
-        seat = dataclasses.replace(robot_camera, pos_m=view.pos_m or robot_camera.pos_m, pitch_rad=pitch)
+        place = {"body": view.body or robot_camera.body, "pos_m": view.pos_m or robot_camera.pos_m}
+        seat = dataclasses.replace(robot_camera, pitch_rad=pitch, **place)
         mount = make_mount(world.models[0], world.robot.base_body, seat, math.radians(view.yaw_deg))
         out.append(SensorCamera(f"{view.name}/" if view.name else "", mount, lens, drawn[lens]))
     return tuple(out)

@@ -37,7 +37,7 @@ from interactive_nav.sensing.observation import waypoints_in_body
 from interactive_nav.sensing.sensors import Sensors
 from interactive_nav.task.dynamics import Dynamics
 from interactive_nav.task.privileged import PRIVILEGED_SIZE, privileged_state
-from interactive_nav.task.terms import HOOK_TERMS, TERMS, Moment, Step, Term
+from interactive_nav.task.terms import HOOK_TERMS, TERMS, Moment, Step, Term, hand_term
 from interactive_nav.types import Detour, EpisodeStart, GoalField, NavInfo
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import matrix_from_quat
@@ -82,6 +82,7 @@ class InteractiveNav(Env):
         self.metric_names = tuple(t.key for t in self.terms if t.kind == "metric")
         self.reward_names = tuple(t.key for t in self.terms if t.kind == "reward")
         extra = {t.name: t.size for t in terms if t.kind == "observation"}
+        self.terms += (hand_term(self),) if "hand" in observed else ()
         self.sensors = Sensors(self.world, config, self.physics.name, extra)
         self.success_distance_m = config.success_distance_m or robot.body_width_m
         total, base = self.world.robot_mass_kg, self.world.models[0].body_mass[self.world.layout.robot_bodies[0]]

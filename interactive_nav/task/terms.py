@@ -18,17 +18,21 @@ from interactive_nav.physics import PhysicsState, StepSignals
 from interactive_nav.physics.base import TOUCH_FORCE_N
 from interactive_nav.physics.hook import TORN
 from interactive_nav.reward import interactive_navigation_reward
-from interactive_nav.sensing.boxes import CLEAR_M
+from interactive_nav.robots.links import make_links, repeated
+from interactive_nav.sensing.boxes import CLEAR_M, box_gaps_m2, box_poses
 from interactive_nav.sensing.observation import advance_odometry, waypoints_in_body
 from interactive_nav.sensing.sensors import TRAIL, TRAIL_STEPS, stream
 from interactive_nav.types import NavInfo, SceneTables
 from interactive_nav_common.errors import ConfigError
-from interactive_nav_common.rotations import wrap_angle
+from interactive_nav_common.rotations import apply_axes, wrap_angle
+from scenes_mjcf.categories import SEGMENTATIONS
 
 STILL_M = 1e-4
 """A centre of mass that moves less than this in a control step (1 mm/s) counts as at rest: solver noise."""
 SETTLE_STEPS = 5
 """Small objects that come to rest in an episode's first control steps, untouched, have not been moved."""
+HAND_REACH_M = 0.05
+"""What a hand touches is within this distance of its grip, in the plane and in height."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -288,5 +292,35 @@ HOOK_TERMS = (
            lambda step: _whole(step, step.physics.hook[0] == TORN)),
 )  # fmt: skip
 """The terms of a robot with a hook."""
+
+
+def hand_term(env: Any) -> Term:
+    """Return what an environment whose robot has a hand observes of it (`docs/add-a-robot.md`)."""
+    world, robot = env.world, env.robot
+    if not robot.hand:
+        raise ConfigError(f"observations has 'hand', expected a robot with a hand; robot '{robot.name}' has none")
+    model, bodies = world.models[0], world.layout.robot_bodies.tolist()
+    links, hand = make_links(model, bodies), bodies.index(model.body(robot.hand).id)
+    grip_b = model.site_pos[model.site_bodyid == bodies[hand]].sum(0)  # its only site; without one, its origin
+    fingers = model.jnt_qposadr[model.body_parentid[model.jnt_bodyid] == bodies[hand]]
+
+    def value(touched: jax.Array, at: Moment) -> jax.Array:
+        scene, qpos, boxes = at.nav.scene_index, at.physics.qpos, env.sensors.boxes
+        origin, axes = links.frames(qpos)[hand]
+        place = origin + apply_axes(axes, repeated(qpos, grip_b))
+        gaps_m2 = box_gaps_m2(boxes, scene, qpos, place[:2], (place[2] - HAND_REACH_M, place[2] + HAND_REACH_M))
+        gaps_m2 = jnp.where(boxes.body < world.layout.num_slots, gaps_m2, CLEAR_M**2)
+        box, gap_m = jnp.argmin(gaps_m2), jnp.minimum(jnp.sqrt(gaps_m2.min()), CLEAR_M)
+        touches = jnp.append(touched, False)[jnp.asarray(boxes.body)[box]] & (gap_m <= HAND_REACH_M)
+        kind = boxes.class_id[scene, box] / SEGMENTATIONS[boxes.classes].divisor
+        middle = (box_poses(boxes, scene, qpos)[0][box] - place) @ at.rotation
+        seen = jnp.where(gap_m < CLEAR_M, jnp.stack([touches, kind, *middle]), 0.0)
+        return jnp.stack([*((place - at.nav.robot_pos_w) @ at.rotation), qpos[fingers].sum(), gap_m, *seen])
+
+    doc = "Hand, m; opening, m; of the nearest movable body gap, m, touched, class, and middle from the hand, m."
+    start, update = lambda nav: jnp.zeros(len(nav.object_pos_w), bool), lambda _, step: ~step.broken & step.touches
+    return Term("hand", doc, "observation", value, start, update, 10)
+
+
 EPISODE_METRICS = tuple(term.key for term in TERMS if term.kind == "metric")
 REWARD_TERMS = tuple(term.key for term in TERMS if term.kind == "reward")
