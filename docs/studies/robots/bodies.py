@@ -13,21 +13,22 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.objects import VISUAL_GROUP
 from interactive_nav_common.errors import MissingPackage
 
-_WHITE, _GREY, _BLUE = (0.9, 0.9, 0.9, 1.0), (0.356, 0.361, 0.376, 1.0), (0.086, 0.506, 0.767, 1.0)
-_COLOURS: dict[str, tuple[float, ...]] = {
-    **dict.fromkeys(("base", "head_pan", "wheel_left", "wheel_right"), _GREY),
-    **dict.fromkeys(("torso_fixed", "head_tilt", "shoulder_lift", "elbow_flex", "wrist_flex"), _BLUE),
-}
-_JOINTS = "head_pan head_tilt shoulder_pan shoulder_lift upperarm_roll elbow_flex forearm_roll wrist_flex wrist_roll"
-_FETCH = {name: f"{name}_link_collision" for name in _JOINTS.split()} | {
-    "base": "base_link_collision",
-    "torso_fixed": "torso_fixed_link",
-    "torso": "torso_lift_link_collision",
-    "wheel_left": "l_wheel_link_collision",
-    "wheel_right": "r_wheel_link_collision",
-    "gripper": "gripper_link",
-}
-"""Body -> its mesh."""
+_WHITE, _GREY, _BLUE, _DARK = (0.9, 0.9, 0.9), (0.356, 0.361, 0.376), (0.086, 0.506, 0.767), (0.12, 0.12, 0.12)
+_FETCH = (
+    (_GREY, "base:base_link_collision wheel_left:l_wheel_link_collision wheel_right:r_wheel_link_collision"),
+    (_GREY, "head_pan:head_pan_link_collision"),
+    (_BLUE, " ".join(f"{x}:{x}_link_collision" for x in ("head_tilt", "shoulder_lift", "elbow_flex", "wrist_flex"))),
+    (_BLUE, "torso_fixed:torso_fixed_link"),
+    (_WHITE, "torso:torso_lift_link_collision gripper:gripper_link shoulder_pan:shoulder_pan_link_collision"),
+    (_WHITE, " ".join(f"{x}:{x}_link_collision" for x in ("upperarm_roll", "forearm_roll", "wrist_roll"))),
+)
+"""Colour, and body:mesh."""
+_HUSKY = (
+    (_DARK, "base:base_link base:user_rail:0.272:0.245 base:bumper:0.48:0.091 base:bumper:-0.48:0.091"),
+    (_DARK, " ".join(f"wheel_{end}_{side}:wheel" for end in ("front", "rear") for side in ("left", "right"))),
+    ((0.8, 0.75, 0.1), "base:top_plate"),
+)
+"""Colour, and body:mesh:x:z (m)."""
 
 
 def _folder(package: str, name: str) -> Path:
@@ -40,26 +41,38 @@ def _folder(package: str, name: str) -> Path:
     return Path(found.submodule_search_locations[0])
 
 
-def fetch(control_mode: str) -> RobotSpec:
-    """Fetch with the meshes of its maker for pictures, and for `rgb` with `image_geometry=meshes`."""
-    folder = _folder("gymnasium_robotics", "gymnasium-robotics") / "envs" / "assets" / "stls" / "fetch"
-    plain = robots.get_robot("fetch", control_mode)
+def _dressed(name: str, control_mode: str, folder: Path, parts, up_m: float = 0.0) -> RobotSpec:
+    """Return a packaged robot with visual meshes; its base's lie `up_m` higher than their files say."""
+    plain = robots.get_robot(name, control_mode)
 
     def add_to(world: mujoco.MjSpec) -> None:
         plain.add_to(world)
-        for body, mesh in _FETCH.items():
-            link = world.body(f"fetch_{body}")
+        rows = [(colour, *row.split(":"), "0", "0") for colour, listed in parts for row in listed.split()]
+        for link in {row[1]: world.body(f"{name}_{row[1]}") for row in rows}.values():
             for geom in [g for g in link.geoms if g.group == VISUAL_GROUP]:
                 world.delete(geom)
-            name = f"fetch_{mesh}"
-            world.add_mesh(
-                name=name, file=str(folder / f"{mesh}.stl"), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-            )
-            shape = link.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, group=VISUAL_GROUP, mass=0.0)
-            shape.contype = shape.conaffinity = 0
-            shape.rgba = _COLOURS.get(body, _WHITE)
+        for mesh in dict.fromkeys(row[2] for row in rows):
+            shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+            world.add_mesh(name=f"{name}_{mesh}", file=str(folder / f"{mesh}.stl"), inertia=shell)
+        for colour, body, mesh, x, z, *_ in rows:
+            shape = world.body(f"{name}_{body}").add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"{name}_{mesh}")
+            shape.group, shape.mass, shape.contype, shape.conaffinity = VISUAL_GROUP, 0.0, 0, 0
+            shape.pos, shape.rgba = [float(x), 0.0, float(z) + up_m * (body == "base")], [*colour, 1.0]
+            if float(x) < 0:
+                shape.quat = [0.0, 0.0, 0.0, 1.0]
 
-    return dataclasses.replace(plain, name="fetch_meshes", add_to=add_to)
+    return dataclasses.replace(plain, name=f"{name}_meshes", add_to=add_to)
+
+
+def fetch(control_mode: str) -> RobotSpec:
+    """Fetch with its maker's meshes in pictures, and in `rgb` with `image_geometry=meshes`."""
+    folder = _folder("gymnasium_robotics", "gymnasium-robotics") / "envs" / "assets" / "stls" / "fetch"
+    return _dressed("fetch", control_mode, folder, _FETCH)
+
+
+def husky(control_mode: str) -> RobotSpec:
+    """Husky likewise, with the meshes in PyBullet's data."""
+    return _dressed("husky", control_mode, _folder("pybullet_data", "pybullet") / "husky" / "meshes", _HUSKY, 0.14493)
 
 
 def _robosuite(name: str) -> mujoco.MjSpec:
@@ -89,7 +102,7 @@ def stretch() -> Callable[[str], RobotSpec]:
 
 
 def tiago() -> Callable[[str], RobotSpec]:
-    """Tiago, whose wheels are fixed and whose links have one inertia for all in robosuite's file."""
+    """Tiago; robosuite's file has fixed wheels and one inertia for all."""
     spec = _robosuite("tiago")
     spec.compiler.boundinertia = 1e-6
     for body in spec.bodies:
@@ -107,7 +120,7 @@ def tiago() -> Callable[[str], RobotSpec]:
 
 
 def spot() -> Callable[[str], RobotSpec]:
-    """Spot on two hidden wheels: its legs hold still, and its feet slide. `from_file` has no gaits."""
+    """Spot on two hidden wheels: its legs hold still, and its feet slide."""
     spec = _robosuite("spot")
     legs = ("fl", "fr", "hl", "hr")
     home = {f"{leg}_{joint}_leg_joint": angle for leg in legs for joint, angle in (("hy", 0.8), ("kn", -1.6))}

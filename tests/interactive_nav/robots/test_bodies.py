@@ -59,17 +59,23 @@ def test_it_drives_and_the_follower_reaches_its_goal(tmp_path, make, mass_kg, wi
     assert state.metrics["success"] == 1.0
 
 
-@_needs("gymnasium_robotics")
-def test_fetch_with_meshes_moves_as_without():
+@pytest.mark.parametrize(
+    ("name", "meshes"),
+    [
+        pytest.param("fetch", 15, marks=_needs("gymnasium_robotics")),
+        pytest.param("husky", 9, marks=_needs("pybullet_data")),
+    ],
+)
+def test_with_meshes_a_robot_moves_as_without(name, meshes):
     seen = []
-    for robot in (robots.get_robot("fetch", "twist"), bodies.fetch("twist")):
+    for robot in (robots.get_robot(name, "twist"), getattr(bodies, name)("twist")):
         model, data = stage(robot)
         data.ctrl[:2] = 5.0, 8.0
         for _ in range(200):
             mujoco.mj_step(model, data)
         seen.append(data.qpos.copy())
     np.testing.assert_array_equal(*seen)
-    assert (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).sum() == len(bodies._FETCH)
+    assert (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).sum() == meshes
 
 
 def test_without_its_package_a_robot_names_the_remedy(monkeypatch):
