@@ -4,8 +4,6 @@ Exit codes: 0 done, 1 a gate failed (`convert` has written the scene anyway), 2 
 130 or 143 interrupted.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools
@@ -33,13 +31,13 @@ if TYPE_CHECKING:
     from converters.records.errors import Gate
 
 
-def bounds(gate: Gate) -> str:
+def bounds(gate: "Gate") -> str:
     """Return a gate's limits in words."""
     pairs = ((">=", gate.limit.least), ("<=", gate.limit.most))
     return " ".join(f"{word} {value:g}" for word, value in pairs if value is not None)
 
 
-def gate_table(gates: tuple[Gate, ...]) -> Table:
+def gate_table(gates: "tuple[Gate, ...]") -> Table:
     """Return a table of one row a gate."""
     table = Table("gate", "value", "limit", "", title="Gates")
     for gate in gates:

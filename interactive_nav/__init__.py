@@ -7,8 +7,6 @@
 Importing the package is cheap: JAX and MuJoCo are imported with what is first used of it.
 """
 
-from __future__ import annotations
-
 import importlib
 import os
 from collections.abc import Sequence
@@ -58,8 +56,8 @@ def __getattr__(name: str) -> Any:
 
 
 def make(
-    robot: str | RobotSpec, scenes: Sequence[str | Path], terms: Sequence[Term] = (), **settings: Any
-) -> InteractiveNav:
+    robot: "str | RobotSpec", scenes: Sequence[str | Path], terms: "Sequence[Term]" = (), **settings: Any
+) -> "InteractiveNav":
     """Build a `brax.envs.Env` with pure `reset` and `step` for one environment; batch it with `jax.vmap`.
 
     Args:

@@ -4,8 +4,6 @@ A setting's type says what it may be: `Literal` for choices, `Annotated` with `B
 dataclass may be composed of others: in files and on the command line they are sections (`ppo.learning_rate`).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import functools

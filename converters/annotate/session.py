@@ -1,7 +1,5 @@
 """Hold a person's annotations of a scan, and read and write them; actions return a new `Session`."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json
@@ -86,46 +84,46 @@ class Session:
             raise alignment.AlignmentError("there is no object yet; add one first")
         return self.items[self.at]
 
-    def changed(self, **what: Any) -> Session:
+    def changed(self, **what: Any) -> "Session":
         """Change the object that is worked on."""
         items, undo = list(self.items), (*self.undo, (self.at, self.item))[-MAX_UNDO:]
         items[self.at] = dataclasses.replace(self.item, **what)
         return dataclasses.replace(self, items=tuple(items), undo=undo)
 
-    def chose(self, cad: CadModel) -> Session:
+    def chose(self, cad: CadModel) -> "Session":
         """Take a model: points that were clicked on another one are dropped with it, and its class is taken."""
         model = self.item.model if self.item.cad_id == cad.cad_id else ()
         return self.changed(cad_id=cad.cad_id, category=cad.category, model=model, state="open")
 
-    def clicked(self, side: Literal["scan", "model"], point: np.ndarray) -> Session:
+    def clicked(self, side: Literal["scan", "model"], point: np.ndarray) -> "Session":
         """Add a point; a second one on a side whose last point has no partner yet takes that one's place."""
         points, other = (self.item.scan, self.item.model)[:: 1 if side == "scan" else -1]
         kept = points[:-1] if len(points) > len(other) else points
         return self.changed(**{side: (*kept, _point(point))}, state="open")
 
-    def accepted(self) -> Session:
+    def accepted(self) -> "Session":
         """Accept the fit and go on to the next open object."""
         if not self.item.cad_id:
             raise alignment.AlignmentError("no model is chosen; choose one, then click pairs")
         self.item.fit()
         return self.changed(state="accepted").next_open()
 
-    def skipped(self) -> Session:
+    def skipped(self) -> "Session":
         """Leave the object out and go on to the next open one."""
         return self.changed(state="skipped").next_open()
 
-    def next_open(self) -> Session:
+    def next_open(self) -> "Session":
         """Go to the next object that is neither accepted nor skipped; stay where there is none."""
         order = [(self.at + k) % len(self.items) for k in range(len(self.items))]
         return dataclasses.replace(self, at=next((k for k in order if self.items[k].state == "open"), self.at))
 
-    def added(self, category: str, centre: np.ndarray) -> Session:
+    def added(self, category: str, centre: np.ndarray) -> "Session":
         """Add an object that nobody proposed, and work on it."""
         item = Item(category, _point(centre), (1.0, 1.0, 1.0), 0.0, 0)
         undo = (*self.undo, (len(self.items), None))[-MAX_UNDO:]
         return dataclasses.replace(self, items=(*self.items, item), at=len(self.items), undo=undo)
 
-    def undone(self) -> Session:
+    def undone(self) -> "Session":
         """Take the last action back; without one nothing changes."""
         if not self.undo:
             return self

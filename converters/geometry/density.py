@@ -1,7 +1,5 @@
 """Measure how much of a home is behind furniture, on rasters of square cells: (rows, columns) bool, True if free."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -22,7 +20,7 @@ class Ways(NamedTuple):
     """(rows, columns) int: region that the disc's middle may be in, from 1; 0 where it does not fit."""
 
     @classmethod
-    def of(cls, static_free: np.ndarray, cell_m: float, radius_m: float) -> Ways:
+    def of(cls, static_free: np.ndarray, cell_m: float, radius_m: float) -> "Ways":
         """Return those of a floor with nothing on it but what is fixed."""
         return cls(radius_m, label(clearance(static_free, cell_m) >= radius_m)[0])
 

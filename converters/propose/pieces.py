@@ -1,7 +1,5 @@
 """Group labelled points into connected pieces of one class, merged, and split at necks, in rows and by tops."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools
@@ -100,7 +98,7 @@ class Piece:
         """Return (k, 3) int: each occupied voxel once."""
         return np.unique(self.index, axis=0)
 
-    def part(self, chosen: np.ndarray) -> Piece:
+    def part(self, chosen: np.ndarray) -> "Piece":
         """Return the piece of some of its points."""
         return Piece(self.label, self.points[chosen], self.index[chosen])
 

@@ -4,8 +4,6 @@ trimesh reads referenced files through `SourceResolver`: only within the source 
 reported. Only COLLADA files state their unit and up axis.
 """
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 import math

@@ -4,8 +4,6 @@ Wall planes are fitted by RANSAC, as the levelled floor's is. A raster of each p
 reaches under the scan's border on all sides, so that no crack is visible; it never collides.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -163,7 +161,7 @@ class Shown:
     """Of the rearmost, along the plane's normal; infinite where there is none."""
 
     @classmethod
-    def of(cls, plane: Plane, points: np.ndarray, low: np.ndarray, shape: tuple[int, int], cell_m: float) -> Shown:
+    def of(cls, plane: Plane, points: np.ndarray, low: np.ndarray, shape: tuple[int, int], cell_m: float) -> "Shown":
         """Rasterise (n, 3) points, half a cell apart."""
         column, row = np.floor((plane.flatten(points) - low) / cell_m).astype(int).T
         inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])

@@ -4,8 +4,6 @@ The grid is turned to the building's main direction for fewer and flatter wall b
 axis-aligned map.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math
@@ -175,7 +173,7 @@ def _bridge(floor: np.ndarray, occupied: np.ndarray, resolution_m: float) -> np.
     return floor
 
 
-def _without_insides(free: np.ndarray, shown: _Shown, resolution_m: float) -> np.ndarray:
+def _without_insides(free: np.ndarray, shown: "_Shown", resolution_m: float) -> np.ndarray:
     """Return the pieces of floor to stand on: the largest, and others that are not inside closed solids.
 
     The walls of a room face it; the sides of a solid face away from its inside.

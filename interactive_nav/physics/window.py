@@ -4,8 +4,6 @@ MJX steps every body of its model, and its cost grows with bodies, contacts and 
 empty slots and walls, which each environment fills at every control step with the bodies nearest to its robot.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

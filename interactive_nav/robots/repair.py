@@ -308,8 +308,7 @@ def add_servo(child: mujoco.MjSpec, path: Path, joint: Joint) -> None:
         stiff = _STIFFNESS_PER_EFFORT * effort
         damp = 0.12 * stiff
         least = 2e-4 * stiff
-    if driven.armature < least:
-        driven.armature = least
+    driven.armature = max(driven.armature, least)
     actuator = child.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     set_servo(actuator, (stiff, damp), None)
 

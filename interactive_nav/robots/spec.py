@@ -1,7 +1,5 @@
 """Define what the environment needs of a robot in one frozen record."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -142,12 +140,12 @@ class RobotSpec(Figures):
     def action_size(self) -> int:
         return len(self.action_low)
 
-    def symmetric(self) -> RobotSpec:
+    def symmetric(self) -> "RobotSpec":
         """Return the robot with action 0 meaning no command: each range widened to plus and minus its larger end."""
         largest = tuple(max(abs(a), abs(b)) for a, b in zip(self.action_low, self.action_high, strict=True))
         return dataclasses.replace(self, action_low=tuple(-x for x in largest), action_high=largest)
 
-    def hooked(self) -> RobotSpec:
+    def hooked(self) -> "RobotSpec":
         """Return a wheeled robot with one more command, its hook's: positive couples, negative lets go, 0 neither."""
         if self.kind != "wheeled":
             raise ConfigError(

@@ -3,8 +3,6 @@
 Box renderers compute depth, class, normal and colour from the box that each pixel shows.
 """
 
-from __future__ import annotations
-
 import abc
 import copy
 import functools
@@ -73,7 +71,7 @@ class Renderer(abc.ABC):
     lens: Lens
     tables: BoxTables
 
-    def through(self, lens: Lens) -> Renderer:
+    def through(self, lens: Lens) -> "Renderer":
         """Return a renderer of the same through another lens; what does not depend on that is shared."""
         other = copy.copy(self)
         other.lens = lens

@@ -10,8 +10,6 @@ Environments are independent: devices exchange nothing in `reset` and `step`. Of
 calls `start_distributed` before anything else uses JAX.
 """
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -102,7 +100,7 @@ def step_all(
 
 def wrap_for_brax_training(
     env: Any, episode_length: int | None = None, action_repeat: int = 1, randomization_fn: Any = None
-) -> AutoResetEnv:
+) -> "AutoResetEnv":
     """Wrap an environment as Brax's learners' `wrap_env_fn`, as MuJoCo Playground has it: every episode is newly drawn.
 
     `episode_length` is at least the environment's `episode_steps`, which ends its episodes. On backend `jax`,

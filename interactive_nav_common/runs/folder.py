@@ -1,7 +1,5 @@
 """Keep a run's folder: its settings, versions and metrics, and epochs that go on from a checkpoint."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import time
@@ -66,9 +64,9 @@ def run_epochs(
     out: Path,
     phase: str,
     state: State,
-    epoch: Callable[[State, int, jax.Array], tuple[State, dict[str, jax.Array]]],
+    epoch: "Callable[[State, int, jax.Array], tuple[State, dict[str, jax.Array]]]",
     epochs: int,
-    key: jax.Array,
+    key: "jax.Array",
     checkpoint: str = CHECKPOINT,
 ) -> State:
     """Run and print the epochs of one phase of a run that the checkpoint does not hold, and return the state.

@@ -5,8 +5,6 @@ A node is a position with embeddings of the images around it. Edges join nodes n
 planner may add `metre_cost`. Edges have an absolute angle and a length, so that driving needs no positions.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import json
@@ -110,7 +108,7 @@ class TopologicalMap:
         """Return groups of nodes that reach each other by edges of at least this probability, the largest first."""
         return parts_of(self.edges[self.p >= passable], len(self.xy_w), both_ways=True)
 
-    def thinned(self, share: float, seed: int) -> TopologicalMap:
+    def thinned(self, share: float, seed: int) -> "TopologicalMap":
         """Return the map with a random share of each room's nodes, at least one; it may be disconnected."""
         rng = np.random.default_rng([seed, 11])
         kept = []

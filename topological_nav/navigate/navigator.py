@@ -15,8 +15,6 @@
 never sees a position, and judges images only by `maps.build.Sight`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 
@@ -118,7 +116,7 @@ class State(Events):
     hidden: Any
     """State of the local policy."""
 
-    def take(self, rows: np.ndarray) -> State:
+    def take(self, rows: np.ndarray) -> "State":
         return jax.tree.map(lambda x: np.asarray(x)[rows], self)
 
     @property

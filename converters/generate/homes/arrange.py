@@ -6,8 +6,6 @@ above, 0 if it faces along v. Rooms, places and groups follow the databases of P
 Apache-2.0).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools
@@ -159,7 +157,7 @@ class Arrangement:
     front: tuple[float, float, float, float] | None
     """u0, v0, u1, v1 of the floor that stays free."""
 
-    def mirrored(self) -> Arrangement:
+    def mirrored(self) -> "Arrangement":
         """Return the same with left and right exchanged."""
         pieces = tuple(dataclasses.replace(p, u=-p.u, turn_rad=-p.turn_rad) for p in self.pieces)
         front = None if self.front is None else (-self.front[2], self.front[1], -self.front[0], self.front[3])

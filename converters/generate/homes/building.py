@@ -3,8 +3,6 @@
 Frame: x, y of the scan (z up), metres, heights above the floor. Horizontal coordinates are whole centimetres.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Iterable, Sequence
@@ -33,7 +31,7 @@ class Rect:
     y1: float
 
     @classmethod
-    def across(cls, axis: int, low: float, high: float, start: float, end: float) -> Rect:
+    def across(cls, axis: int, low: float, high: float, start: float, end: float) -> "Rect":
         """Return the rectangle from `low` to `high` along an axis and from `start` to `end` along the other."""
         return cls(low, start, high, end) if axis == 0 else cls(start, low, end, high)
 
@@ -61,11 +59,11 @@ class Rect:
         """Return it as a polygon."""
         return shapely.box(self.x0, self.y0, self.x1, self.y1)
 
-    def grown(self, x_m: float, y_m: float) -> Rect:
+    def grown(self, x_m: float, y_m: float) -> "Rect":
         """Return a rectangle that reaches so much farther along x and y, both ways."""
         return Rect(self.x0 - x_m, self.y0 - y_m, self.x1 + x_m, self.y1 + y_m)
 
-    def overlaps(self, other: Rect) -> bool:
+    def overlaps(self, other: "Rect") -> bool:
         """Return whether the two have floor in common."""
         return self.x0 < other.x1 and other.x0 < self.x1 and self.y0 < other.y1 and other.y0 < self.y1
 
@@ -86,7 +84,7 @@ class PlanBox:
     high: tuple[float, float, float]
 
     @classmethod
-    def over(cls, rect: Rect, low_m: float, high_m: float) -> PlanBox:
+    def over(cls, rect: Rect, low_m: float, high_m: float) -> "PlanBox":
         """Return the box above a rectangle between two heights."""
         return cls((rect.x0, rect.y0, low_m), (rect.x1, rect.y1, high_m))
 

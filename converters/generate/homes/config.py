@@ -1,7 +1,5 @@
 """Define what a generated home is like besides its seed (`HomeConfig`), and the tiers of homes."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints

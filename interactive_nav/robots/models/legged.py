@@ -143,7 +143,6 @@ ROWS = {row.legs.name: row for row in read_packaged(Path(__file__).with_suffix("
 
 def _ant_trot(phase, command, base, xp):
     """Trot, offsets from home [..., 8]: diagonal pairs swing half a cycle apart; a leg in swing lifts its ankle."""
-    del base
     # Five figures by a random search for tracking; gains are over the kinematic sweep: servos lag and feet slip.
     lift_rad, press, stride_gain, turn_gain, reach_m = 0.325, 0.1, 1.07, 1.16, 0.104
     forward, turn = command[..., 0], command[..., 1]
@@ -252,7 +251,6 @@ _LEGS = (("front_left", 1, 1), ("back_left", -1, 1), ("front_right", 1, -1), ("b
 
 def _minitaur_trot(phase, command, base, xp):
     """Trot, with offsets from home [..., 8]: diagonal legs together; strides of left and right differ in a turn."""
-    del base
     # Figures as Ant's; the sweep leads the lift by `lag_rad` of the phase.
     lift_rad, press, lag_rad, stride_gain, turn_gain = 0.285, 0.17, 0.47, 0.615, 4.63
     forward, turn = command[..., 0], command[..., 1]
@@ -341,7 +339,6 @@ def legged_robot(name: str, control_mode: str = "native", **figures: Any) -> Rob
 
 def _leg_angles(command, state, xp):
     """Convert swing, then extension of each leg, [..., 8] in [-1, 1], to motor angles: the original's coordinates."""
-    del state
     swing, extension = command[..., :4], command[..., 4:]
     middle = math.pi - 0.25 * math.pi * (extension + 1.5)
     angles = xp.stack([middle + 0.25 * math.pi * swing, middle - 0.25 * math.pi * swing], -1)
