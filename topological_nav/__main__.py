@@ -16,7 +16,7 @@ from interactive_nav_common.jobs.progress import Stopped
 from interactive_nav_common.signals import STOPS, interrupts_heard, number_of
 from topological_nav import config as configs
 from topological_nav.config import DATASET, RUNS
-from topological_nav.data.domains import AdaptConfig
+from topological_nav.data.domains import PRESETS, AdaptConfig
 
 
 class Listed(Command):
@@ -50,7 +50,7 @@ class _Driving(UsesNetworks):
     """Folder of maps, SCENE.npz (default: maps beside the networks; missing maps are built)."""
     policy: Annotated[str | None, option(metavar="RUN")] = None
     """Local policy: a run folder, or passage, a rule without learning (default: the networks', if you name none)."""
-    domain: Annotated[str, option(metavar="NAME")] = "clean"
+    domain: Annotated[Literal[tuple(PRESETS)], option(metavar="NAME")] = "clean"  # type: ignore[valid-type]
     """Camera of all images: clean, lens, light, noise, blur or camera. `adapt map` builds maps for a domain."""
     truth: Flag = False
     """Build maps from the floor plan, and replace both networks by the ground truth."""

@@ -33,7 +33,7 @@ from interactive_nav_common.rows import digest_of
 from interactive_nav_common.runs.folder import claimed, run_epochs
 from topological_nav.config import PITCHES
 from topological_nav.data.dataset import PassageImages, RoomImages, balanced, load_passages, load_rooms, read_header
-from topological_nav.data.domains import AdaptConfig, as_seen, preset
+from topological_nav.data.domains import PRESETS, AdaptConfig, as_seen
 from topological_nav.learn import learning
 from topological_nav.learn.networks import Network, Places, in_words, joined, localisation_scores, normalised
 from topological_nav.learn.training import (
@@ -159,13 +159,13 @@ def adapt_features(run: Path, source: Path, target: Path, out: Path, config: Ada
 
 def adapted_about(trained: Trained, config: AdaptConfig) -> dict[str, Any]:
     """Return the network.json of a network adapted from a trained one."""
-    return {**trained.about, "adapted_from": trained.about["digest"], "domain": to_dict(preset(config.domain))}
+    return {**trained.about, "adapted_from": trained.about["digest"], "domain": to_dict(PRESETS[config.domain])}
 
 
 def target_rooms(folder: Path, config: AdaptConfig) -> RoomImages:
     """Return the room images of a dataset as the target's camera sees them."""
     rooms = load_rooms(folder)
-    return dataclasses.replace(rooms, images=as_seen(rooms.images, preset(config.domain), ROOMS_STREAM))
+    return dataclasses.replace(rooms, images=as_seen(rooms.images, PRESETS[config.domain], ROOMS_STREAM))
 
 
 def localisation_between(
@@ -249,7 +249,7 @@ def collected_map(scene_folder: Path | None, target: Path, localiser: Path, dete
     room = label - rooms.label[here].min()
     if not len(pairs := near_pairs(xy, config.edge_m)):
         raise FileError(f"no two positions of '{scene.name}' in {target} are within {config.edge_m} m; collect more")
-    about = {"settings": to_dict(config), "data": header["settings"], "domain": to_dict(preset(config.domain))}
+    about = {"settings": to_dict(config), "data": header["settings"], "domain": to_dict(PRESETS[config.domain])}
     if scene_folder:
         space = free_space(scene, get_robot(data.robot).height_m)
     else:  # nothing but floor, a metre about the places
@@ -285,7 +285,7 @@ def labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> t
             f"make it again with passage_lengths_m=[{lengths}]"
         )
     scored = passages.free[:, passages.scored]
-    images = as_seen(passages.images, preset(config.domain), PASSAGES_STREAM)
+    images = as_seen(passages.images, PRESETS[config.domain], PASSAGES_STREAM)
     rng, parts = np.random.default_rng([config.seed, 4]), []
     for held, most, free in (
         (False, config.fine_tune, config.fine_tune_free),

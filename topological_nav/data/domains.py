@@ -13,7 +13,6 @@ import numpy as np
 from scipy.ndimage import convolve1d, map_coordinates
 
 from interactive_nav_common.config import Bounds, Count, Seed, Settings, Share
-from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.records import read_packaged
 
 _GAMMA = 2.2
@@ -52,13 +51,6 @@ class DomainConfig(Settings):
 
 PRESETS = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, DomainConfig])
 """Named cameras; `camera` is all of them at once. Sizes in pixels are meant for images of 64 x 48."""
-
-
-def preset(name: str) -> DomainConfig:
-    """Return a named camera."""
-    if name not in PRESETS:
-        raise ConfigError(f"domain is '{name}', expected one of {', '.join(PRESETS)}")
-    return PRESETS[name]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -33,7 +33,7 @@ from interactive_nav_common.rows import Columns, digest_of, read_rows, write_par
 from interactive_nav_common.untrusted.reading import read_npz
 from interactive_nav_common.versions import versions
 from topological_nav.config import PASSAGE_POLICY, DataConfig, EvaluationConfig, MapConfig
-from topological_nav.data.domains import as_seen_from, preset
+from topological_nav.data.domains import PRESETS, as_seen_from
 from topological_nav.data.folders import lens_of, renderer_of
 from topological_nav.drives.driving import local_policy
 from topological_nav.evaluate.evaluation import (
@@ -104,7 +104,7 @@ class Contest:
             raise ConfigError("blocked=true needs a small object to block the way with; set objects=1 or more")
         if "ppo" in self.contenders and self.ppo is None:
             raise ConfigError("contender ppo needs the run folder of a trained policy: --ppo RUN")
-        if preset(self.domain) != preset("clean") and self.truth:
+        if PRESETS[self.domain] != PRESETS["clean"] and self.truth:
             raise ConfigError(f"--domain {self.domain} is of images, --truth has none; leave one of them out")
         names = [Path(s).resolve().name for s in self.scenes]
         if len(set(names)) < len(names):
@@ -156,7 +156,7 @@ class ContestScene:
             return lambda xy_w, yaw_rad, _=None: np.column_stack([xy_w, yaw_rad])  # what `TrueSight` looks at
         world = self.player.env.world
         plain = scene_camera(renderer_of(self.scene, self.drawn, world.small_objects), self.robot, world)
-        domain = preset(self.contest.domain)
+        domain = PRESETS[self.contest.domain]
         return lambda xy, yaw, qpos=None: as_seen_from(plain(xy, yaw, qpos), domain, xy, yaw)
 
     @property
@@ -223,7 +223,7 @@ class ContestScene:
             if "export" in self.networks.localiser.about:
                 request["localiser"] = self.networks.localiser.stored
             if self.contest.domain != "clean":
-                request["domain"] = to_dict(preset(self.contest.domain))
+                request["domain"] = to_dict(PRESETS[self.contest.domain])
             drawn, learned_from = self.drawn, self.networks.camera
             if drawn != learned_from:
                 # The size only where it differs, so that older rows still count.

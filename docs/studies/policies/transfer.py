@@ -15,7 +15,7 @@ from pathlib import Path
 from interactive_nav_common.records import read_metrics
 from topological_nav.config import PITCHES
 from topological_nav.data.dataset import load_rooms
-from topological_nav.data.domains import as_seen, preset
+from topological_nav.data.domains import PRESETS, as_seen
 from topological_nav.figures.learning import features_figure
 from topological_nav.figures.maps import save
 
@@ -29,7 +29,7 @@ def main() -> None:
     words.add_argument("-o", "--output", type=Path, required=True)
     given = words.parse_args()
     images = load_rooms(given.data).images[:, PITCHES.index("level"), 0]
-    seen = as_seen(images, preset(given.domain))
+    seen = as_seen(images, PRESETS[given.domain])
     results = json.loads((given.run / "results.json").read_text(encoding="utf-8"))
     save(
         features_figure(images, seen, read_metrics(given.run / "metrics.jsonl"), results),

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from interactive_nav_common.errors import ConfigError
-from topological_nav.data.domains import PRESETS, DomainConfig, as_seen, as_seen_from, preset, smeared
+from topological_nav.data.domains import PRESETS, AdaptConfig, DomainConfig, as_seen, as_seen_from, smeared
 
 
 def flat(level, count=1, height=12, width=16):
@@ -114,6 +114,6 @@ def test_chance_may_follow_from_where_an_image_was_taken():
 
 def test_unknown_cameras_and_impossible_ones_are_refused():
     with pytest.raises(ConfigError, match="domain is 'fog', expected one of clean, lens, light, noise, blur, camera"):
-        preset("fog")
+        AdaptConfig(domain="fog")
     with pytest.raises(ConfigError, match="zoom is 0.5, expected between 1 and 10"):
         DomainConfig(zoom=0.5)

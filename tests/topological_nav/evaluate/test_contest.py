@@ -16,7 +16,7 @@ from scenes_mjcf.look import Lens
 from tests.topological_nav.conftest import Made
 from topological_nav.__main__ import main
 from topological_nav.config import DataConfig, EvaluationConfig
-from topological_nav.data.domains import as_seen_from, preset
+from topological_nav.data.domains import PRESETS, as_seen_from
 from topological_nav.drives.driving import local_policy
 from topological_nav.evaluate import contest as rows
 from topological_nav.evaluate.contest import Contest, contest_scenes
@@ -181,7 +181,7 @@ def test_everything_that_the_navigator_sees_goes_through_the_other_camera(contes
     journeys, rng = venue.episodes, np.random.default_rng(0)
     xy, yaw = rng.uniform(-1, 1, (3, 2)), rng.uniform(-3, 3, 3)
     plain, seen = clean.camera(xy, yaw), venue.camera(xy, yaw)
-    assert (seen == as_seen_from(plain, preset("camera"), xy, yaw)).all() and (seen != plain).mean() > 0.5
+    assert (seen == as_seen_from(plain, PRESETS["camera"], xy, yaw)).all() and (seen != plain).mean() > 0.5
     # Who else is looked at does not matter.
     assert (venue.camera(xy[1:2], yaw[1:2]) == seen[1:2]).all()
     navigator, looked = venue.navigator("dense"), []
@@ -189,7 +189,7 @@ def test_everything_that_the_navigator_sees_goes_through_the_other_camera(contes
     player = NavigatorPlayer(venue.player, CONFIG, navigator, venue.camera)
     player.begin(journeys)
     goals = as_seen_from(
-        clean.camera(journeys.goal_xy_w, np.zeros(2)), preset("camera"), journeys.goal_xy_w, np.zeros(2)
+        clean.camera(journeys.goal_xy_w, np.zeros(2)), PRESETS["camera"], journeys.goal_xy_w, np.zeros(2)
     )
     assert looked[0].shape == (2, 6, 32, 32, 3) and (looked[0][:, 0] == goals).all()
     assert rows._stem(clean, "dense") != rows._stem(venue, "dense")
