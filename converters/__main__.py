@@ -6,7 +6,6 @@ Exit codes: 0 done, 1 a gate failed (`convert` has written the scene anyway), 2 
 
 import contextlib
 import dataclasses
-import functools
 import glob
 import os
 import signal
@@ -119,12 +118,11 @@ class Convert(OnCluster, segmenting.MeshFile, segmenting.WithLibrary, generating
             refuse_unused(self, "--annotations", "with --into: a file is of one scan")
             jobs = min(self.jobs, len(places))
             launcher, side_by_side = make_launcher(self.launcher, self.ray_address, jobs, len(places))
-            log = functools.partial(console.print, soft_wrap=True, highlight=False)
             sources = [Path(place) for place in places]
             with stage_progress(console) as report:
-                failed = convert_many(sources, self.into, config, launcher, side_by_side, report, log)
+                failed = convert_many(sources, self.into, config, launcher, side_by_side, report, console.print)
             if failed:
-                log(f"not converted, or with gates that fail: {', '.join(failed)}")
+                console.print(f"not converted, or with gates that fail: {', '.join(failed)}")
             return 1 if failed else 0
         if len(places) != 2:
             raise ConfigError(f"convert: got {len(places)} folders, expected SRC OUT, or SRC... --into DIR")
@@ -143,21 +141,20 @@ class Convert(OnCluster, segmenting.MeshFile, segmenting.WithLibrary, generating
             for warning in result.manifest.warnings:
                 warn(warning)
         times = ", ".join(f"{k} {v:.1f}" for k, v in results[0].stage_s.items())
-        console.print(f"Seconds: {times}", soft_wrap=True)
+        console.print(f"Seconds: {times}")
         for result in results:
             for row in result.manifest.alignment:
                 if "note" in row:
-                    console.print(f"{row['name']}: {row['note']}", soft_wrap=True)
+                    console.print(f"{row['name']}: {row['note']}")
             failed = [g.name for g in result.gates if not g.passed]
             console.print(
                 f"{result.folder}: {len(result.manifest.objects)} movable objects, {result.n_walls} wall boxes, "
                 f"{result.manifest.floor_area_m2:.1f} m² traversable; "
                 + (f"gates that fail: {', '.join(failed)}" if failed else "every gate passes"),
-                soft_wrap=True,
             )
         layout, moves = results[0].manifest.source["format"], any(result.manifest.objects for result in results)
         if not moves and (word := segmenting.next_step(self, layout)):
-            console.print(word, soft_wrap=True, highlight=False)
+            console.print(word)
         return 0 if all(g.passed for result in results for g in result.gates) else 1
 
 
@@ -183,7 +180,6 @@ class Object(generating.ObjectConfig):
             f"{about['n_hulls']} hulls ({about['hull_source']}); at rest it drifts "
             f"{1000 * about['rest']['drift_hulls_m']:.2f} mm with hulls, "
             f"{1000 * about['rest']['drift_boxes_m']:.2f} mm with boxes",
-            soft_wrap=True,
         )
 
 
@@ -226,7 +222,7 @@ class Preview(generating.Command):
         from converters.check.preview import preview
 
         preview(existing(self.scene), self.output, self.source)
-        console.print(f"{self.output}: picture of {self.scene}", soft_wrap=True)
+        console.print(f"{self.output}: picture of {self.scene}")
 
 
 class Export(generating.Command):
@@ -242,7 +238,7 @@ class Export(generating.Command):
         from converters.write.sh3d import export_sh3d
 
         for line in export_sh3d(existing(self.scene), self.output):
-            console.print(f"{self.output}: {line}", soft_wrap=True, highlight=False)
+            console.print(f"{self.output}: {line}")
 
 
 def _lines(place: str) -> list[str]:

@@ -68,7 +68,6 @@ class Compositor:
         """Columns and rows of a frame."""
         robot = get_robot(replay.robot)
         self._middle_m = 0.6 * robot.height_m
-        self._goal_radius_m = replay.success_distance_m
         self._view = SceneView(robot, scene, replay.small, replay.segmentation_classes)
         yaw = np.unwrap(yaw_from_quat(replay.body_quat_w[:, 0]))
         self._yaw = gaussian_filter1d(yaw, _CAMERA_LAG_S / replay.control_dt_s, mode="nearest")
@@ -81,7 +80,7 @@ class Compositor:
         """Draw [rows, columns, 3] u8: the state after `step` control steps."""
         replay, height = self.replay, self.height
         self._place(step)
-        paint = FloorPaint(replay.goal_xy_w, self._goal_radius_m, _dense(replay.robot_xy_w[: step + 1]))
+        paint = FloorPaint(replay.goal_xy_w, replay.success_distance_m, _dense(replay.robot_xy_w[: step + 1]))
         if self.views:
             panes = [self._view.textured(*self._camera(v, step), (*SCENE, ROBOT), paint) for v in self.views]
             return np.concatenate([np.concatenate(panes, 1), self._caption(step)], 0)

@@ -192,11 +192,9 @@ def _empty_spec(name: str) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = name
     spec.compiler.degree = False
-    spec.compiler.autolimits = True
     spec.meshdir = spec.texturedir = "assets"
     spec.option.timestep = TIMESTEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     for name, collides, group, rgba in (
         ("visual", 0, 2, None),
         ("hull", 1, 3, (0.3, 0.6, 0.9, 0.5)),

@@ -177,10 +177,8 @@ def _empty_spec(robot: RobotSpec, config: NavConfig) -> mujoco.MjSpec:
     spec.compiler.degree = False
     option = spec.option
     option.timestep = config.sim_dt_s
-    option.gravity = [0, 0, -9.81]
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone = getattr(mujoco.mjtCone, f"mjCONE_{config.cone.upper()}")
-    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.iterations = config.solver_iterations
     option.ls_iterations = 20
     plane = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [0, 0, 0.1], "friction": [FLOOR_FRICTION, 0.005, 0.0001]}

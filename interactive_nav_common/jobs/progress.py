@@ -107,7 +107,7 @@ def bar(signals: list[int] | None = None) -> Iterator[Progress]:
                 tenths, (began, before), left = done * 10 // total, first, ""
                 if done > before:
                     left = f", {(time.perf_counter() - began) / (done - before) * (total - done):.0f} s left"
-                console.print(f"{what}: {done:,} of {total:,}{left}", highlight=False, soft_wrap=True)
+                console.print(f"{what}: {done:,} of {total:,}{left}")
             if stops and done < total:
                 raise Stopped(stops[0])
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,25 +29,15 @@ class VelocityCommand(NamedTuple):
     """The episode is over, and the robot stands still."""
 
 
-class Driver(Protocol):
-    """Drive one episode; `step` is called for each image."""
-
-    @property
-    def lens(self) -> Lens | None:
-        """Return the lens that its pictures must have; None: any."""
-
-    def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> VelocityCommand:
-        """Return the next command, by a level image [H, W, 3] u8 straight ahead and the yaw in the map's frame."""
-        ...
-
-
 class PilotDriver:
     """Drive one robot by the navigator until it reaches the goal or runs out of time."""
 
-    def __init__(self, navigator: Navigator, state: State, lens: Lens):
+    def __init__(self, navigator: Navigator, state: State, lens: Lens | None):
+        """Begin an episode from its first state; `lens` is the one that pictures must have, None: any."""
         self._navigator, self._state, self.lens = navigator, state, lens
 
     def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> VelocityCommand:
+        """Return the next command, by a level image [H, W, 3] u8 straight ahead and the yaw in the map's frame."""
         now = image[None], np.array([heading_rad]), np.array([time_s])
         self._state = state = self._navigator.step(self._state, *now)
         done = bool(state.arrived[0]) or bool(state.timed_out[0])

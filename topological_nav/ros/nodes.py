@@ -13,7 +13,7 @@ from std_msgs.msg import Bool
 from interactive_nav.ros import messages as ros
 from interactive_nav.ros.driving import DrivingNode
 from interactive_nav.ros.nodes import Say
-from topological_nav.ros.drivers import Driver
+from topological_nav.ros.drivers import PilotDriver
 
 SILENCE_S = 1.0
 """Wall-clock time without an image or a heading after which the node stops the robot."""
@@ -33,7 +33,7 @@ class NavigatorNode(DrivingNode):
     def __init__(
         self,
         node: Node,
-        driver: Driver,
+        driver: PilotDriver,
         heading_from: str = "imu",
         heading_offset_rad: float = 0.0,
         say: Say = lambda _: None,

@@ -80,7 +80,7 @@ def together(simulator, navigator):
 
 def test_an_episode_in_lockstep_has_one_command_for_each_picture(bus):
     simulator = SimulatorNode(bus.simulator, Robot(), Pace(lockstep=True, recorded=True))  # type: ignore[arg-type]
-    tally, done = together(simulator, NavigatorNode(bus.navigator, Turning(math.pi / 2)))
+    tally, done = together(simulator, NavigatorNode(bus.navigator, Turning(math.pi / 2)))  # type: ignore[arg-type]
     # 20 steps of 0.05 m along the world's y; half of them and more beyond 0.5 m, where the robot touches something.
     assert done and tally.done
     assert (tally.seconds, tally.path_m, tally.structure_s) == pytest.approx((2.0, 1.0, 0.0))
@@ -188,7 +188,7 @@ class Watcher:
 def test_pictures_have_the_drivers_lens_and_headings_are_in_the_maps_frame(bus):
     driver = Watcher(Lens(4, 3, 90.0))
     simulator = SimulatorNode(bus.simulator, Robot(), Pace(lockstep=True))  # type: ignore[arg-type]
-    navigator = NavigatorNode(bus.navigator, driver, "odom", heading_offset_rad=-0.5)
+    navigator = NavigatorNode(bus.navigator, driver, "odom", heading_offset_rad=-0.5)  # type: ignore[arg-type]
     tally, done = together(simulator, navigator)
     assert done and tally.seconds == pytest.approx(0.1)
     assert [image.shape for image, _, _ in driver.shown] == [(3, 4, 3)] * 2

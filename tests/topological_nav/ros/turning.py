@@ -29,4 +29,4 @@ class Turning:
 
 if __name__ == "__main__":
     with ros_node("navigator") as node:
-        sys.exit(0 if NavigatorNode(node, Turning()).run(lambda: False) else 1)
+        sys.exit(0 if NavigatorNode(node, Turning()).run(lambda: False) else 1)  # type: ignore[arg-type]
