@@ -6,7 +6,6 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from interactive_nav_common.config import nearest
@@ -26,7 +25,13 @@ def import_function(place: str, word: str, expected: str, kind: type[UserError])
     if folder not in sys.path:
         sys.path.insert(0, folder)
     try:
-        loaded = _import_file(Path(module)) if is_file else importlib.import_module(module)
+        if is_file:
+            spec = importlib.util.spec_from_file_location(f"file_{Path(module).stem}", module)
+            assert spec and spec.loader
+            loaded = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+            spec.loader.exec_module(loaded)
+        else:
+            loaded = importlib.import_module(module)
     except (Exception, SystemExit) as error:
         raise kind(f"{word}: cannot import {module} ({first_line(error)}); {expected}") from error
     function = getattr(loaded, name, None)
@@ -36,11 +41,3 @@ def import_function(place: str, word: str, expected: str, kind: type[UserError])
         got = f"{name!r} of type {type(function).__name__}" if has else f"no {name!r}{nearest(name, names)}"
         raise kind(f"{word}: {module} has {got}; expected one of its functions: {', '.join(names) or 'it has none'}")
     return function
-
-
-def _import_file(path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(f"file_{path.stem}", path)
-    assert spec and spec.loader
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module

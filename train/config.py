@@ -354,20 +354,9 @@ def validate(config: TrainConfig) -> None:
             raise ConfigError(f"{got}, expected algorithm {' or '.join(able)}; change one of the two")
     if isinstance(section, OffPolicyConfig):
         _validate_replay(config.algorithm, section, config.run.num_timesteps, remembers)
-    ppo = config.ppo
-    if config.run.devices > 1:
-        _validate_devices(config.algorithm, ppo, config.run.devices)
-    collected = (ppo.batch_size or 0) * (ppo.num_minibatches or 0)
-    if ppo.num_envs and collected % ppo.num_envs:
-        raise ConfigError(
-            f"ppo.batch_size * ppo.num_minibatches is {collected} sequences, expected a multiple of "
-            f"ppo.num_envs ({ppo.num_envs}); change one of the three"
-        )
-
-
-def _validate_devices(name: str, ppo: PPOConfig, devices: int) -> None:
-    if name != "ppo":
-        got = f"run.devices is {devices}, expected 1 with algorithm {name}"
+    ppo, devices = config.ppo, config.run.devices
+    if devices > 1 and config.algorithm != "ppo":
+        got = f"run.devices is {devices}, expected 1 with algorithm {config.algorithm}"
         raise ConfigError(f"{got}: its replay stays on one device; set run.devices=1, or algorithm=ppo")
     for key, value in (("num_envs", ppo.num_envs), ("batch_size", ppo.batch_size)):
         if value and value % devices:
@@ -375,6 +364,12 @@ def _validate_devices(name: str, ppo: PPOConfig, devices: int) -> None:
                 f"ppo.{key} is {value}, expected a multiple of run.devices ({devices}), since devices take equal "
                 f"shares; take {devices * max(1, value // devices)}"
             )
+    collected = (ppo.batch_size or 0) * (ppo.num_minibatches or 0)
+    if ppo.num_envs and collected % ppo.num_envs:
+        raise ConfigError(
+            f"ppo.batch_size * ppo.num_minibatches is {collected} sequences, expected a multiple of "
+            f"ppo.num_envs ({ppo.num_envs}); change one of the three"
+        )
 
 
 def _validate_replay(name: str, config: OffPolicyConfig, num_timesteps: int, remembers: bool) -> None:

@@ -58,12 +58,6 @@ def collide_with(spec: mujoco.MjSpec, shape: str) -> mujoco.MjModel:
     return spec.compile()
 
 
-def run(model: mujoco.MjModel, data: mujoco.MjData, seconds: float) -> None:
-    """Step for so long at the model's timestep."""
-    for _ in range(round(seconds / model.opt.timestep)):
-        mujoco.mj_step(model, data)
-
-
 def started_over(data: mujoco.MjData) -> bool:
     """Return whether MuJoCo reset the simulation after a bad position, velocity or acceleration."""
     bad = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
@@ -92,7 +86,8 @@ def physical_values(model: mujoco.MjModel, named: dict[str, str] | None = None) 
     bodies = movable_bodies(model)
     start_com, start_quat = data.xipos[bodies].copy(), data.xquat[bodies].copy()
     start_pos, depth = data.xpos[bodies].copy(), deepest_contact(model, data)
-    run(model, data, DRIFT_S)
+    for _ in range(round(DRIFT_S / model.opt.timestep)):
+        mujoco.mj_step(model, data)
     mujoco.mj_forward(model, data)
     moved = np.maximum(
         np.linalg.norm(data.xipos[bodies] - start_com, axis=1), np.linalg.norm(data.xpos[bodies] - start_pos, axis=1)

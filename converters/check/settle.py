@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 import mujoco
 import numpy as np
 
-from converters.check.gates import collide_with, run, started_over
+from converters.check.gates import collide_with, started_over
 from converters.check.opening import STEPS, blocked_fronts
 from converters.records.errors import StageFailed
 from converters.write.emit import SceneParts, build_spec
@@ -154,7 +154,8 @@ def _simulate(parts: SceneParts, shape: str, seconds: float) -> SceneParts:
         model.dof_damping[dof : dof + 3] = DAMP_PER_S * model.body_mass[body]
         model.dof_damping[dof + 3 : dof + 6] = DAMP_PER_S * model.body_inertia[body].mean()
     data = mujoco.MjData(model)
-    run(model, data, seconds)
+    for _ in range(round(seconds / model.opt.timestep)):
+        mujoco.mj_step(model, data)
     if started_over(data) or not np.isfinite(data.qpos).all():
         raise StageFailed(
             f"settle: MuJoCo started the simulation over (its numbers became too large with {shape} geoms); "

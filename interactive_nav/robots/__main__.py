@@ -3,7 +3,6 @@
 import sys
 from typing import Annotated
 
-from rich.console import Console
 from rich.table import Table
 
 from interactive_nav.robots import get_robot, robot_names
@@ -27,9 +26,11 @@ class Robots(Command):
         return (*listed, *self.files)
 
 
-def _print_table(names: tuple[str, ...], console: Console) -> None:
+@reports_errors("interactive_nav.robots")
+def main(argv: list[str] | None = None) -> int:
+    arguments = parse(Robots, "python -m interactive_nav.robots", argv)
     table = Table("robot", "kg", "L x W x H m", "drive", "native action", "modes", "camera", "success m", "sources")
-    for name in names:
+    for name in arguments.names():
         robot = get_robot(name)
         size = " x ".join(f"{v:.3g}" for v in robot.size_m) if robot.size_m else "-"
         ranges = sorted({(low, high) for low, high in zip(robot.action_low, robot.action_high, strict=True)})
@@ -47,14 +48,7 @@ def _print_table(names: tuple[str, ...], console: Console) -> None:
             f"{robot.body_width_m:g}",
             robot.source or "-",
         )
-    console.print(table)
-
-
-@reports_errors("interactive_nav.robots")
-def main(argv: list[str] | None = None) -> int:
-    arguments = parse(Robots, "python -m interactive_nav.robots", argv)
-    console = SafeConsole(width=None if sys.stdout.isatty() else 220)
-    _print_table(arguments.names(), console)
+    SafeConsole(width=None if sys.stdout.isatty() else 220).print(table)
     return 0
 
 

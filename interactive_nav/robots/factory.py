@@ -150,13 +150,6 @@ def _base(facts: Facts, name: str, wheels: Mapping[str, Round], speed_rad_s: flo
     )
 
 
-def _largest_speeds(child: mujoco.MjSpec, path: Path) -> dict[str, float]:
-    """Return the largest speeds of joints, rad/s, as velocity servos or a URDF's limits declare them."""
-    servos = {a.target: float(a.ctrlrange[1]) for a in child.actuators if a.biasprm[2] < 0 and not a.biasprm[1]}
-    limits = {j.get("name", ""): j.find("limit") for j in ElementTree.parse(path).getroot().iter("joint")}
-    return servos | {name: float(x.get("velocity", 0)) for name, x in limits.items() if x is not None}
-
-
 def from_file(path: str | Path, **facts: Any) -> Callable[[str], RobotSpec]:
     """Return (control mode) -> spec, for `register`, of a wheeled robot's MJCF or URDF. Frame: x forward, y left, z up.
 
@@ -171,7 +164,10 @@ def from_file(path: str | Path, **facts: Any) -> Callable[[str], RobotSpec]:
     base_body = given.base_body or (tops[0].name if len(tops) == 1 else "")
     for joint in (*given.left_wheels, *given.right_wheels, *given.joints, *given.home, *given.torque_limits):
         find(child, path, "joint", joint)
-    speeds = _largest_speeds(child, path)
+    # The largest speeds of joints, rad/s, as velocity servos or a URDF's limits declare them.
+    speeds = {a.target: float(a.ctrlrange[1]) for a in child.actuators if a.biasprm[2] < 0 and not a.biasprm[1]}
+    limits = {j.get("name", ""): j.find("limit") for j in ElementTree.parse(path).getroot().iter("joint")}
+    speeds |= {name: float(x.get("velocity", 0)) for name, x in limits.items() if x is not None}
     strip(child, path, base_body)
     for joint, limit in given.torque_limits.items():
         child.joint(joint).actfrcrange = [-limit, limit]

@@ -74,11 +74,6 @@ def read_file(path: Path, base_body: str = "") -> mujoco.MjSpec:
     return spec
 
 
-def _ends(joint: ElementTree.Element) -> tuple[str, ...]:
-    """Return the names of a joint's parent and child link."""
-    return tuple(getattr(joint.find(end), "attrib", {}).get("link", "") for end in ("parent", "child"))
-
-
 def _mesh_file(path: Path, name: str) -> Path:
     """Return the file that a URDF's mesh names; a package is the folder of the URDF or one above it."""
     name = re.sub(r"^\w+://", "", name)
@@ -117,7 +112,10 @@ def _simplify(root: ElementTree.Element, path: Path, base_body: str) -> None:
             if not 0 <= float(mass.get("value", "nan")) < math.inf:
                 raise ConfigError(f"robot file {path}: link '{name}' has mass {mass.get('value')}, expected kilograms")
     while True:
-        ends = {joint: _ends(joint) for joint in root.findall("joint")}
+        ends = {
+            joint: [getattr(joint.find(end), "attrib", {}).get("link", "") for end in ("parent", "child")]
+            for joint in root.findall("joint")
+        }
         children = [pair[1] for pair in ends.values()]
         top = next((name for name in links if name not in children), None)
         below = [joint for joint, pair in ends.items() if pair[0] == top]

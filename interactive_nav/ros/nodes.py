@@ -260,13 +260,12 @@ def recording(node: Node, path: Path, topics: Mapping[str, Any] = ros.TOPICS) ->
             writer.close()
 
 
-def wait_for(news: threading.Condition, ready: Callable[[], bool], stop: Stop, lacking: Callable[[], str]) -> bool:
-    """Wait until it is ready (True) or `stop` returns True (False); raise `RosError` after `PATIENCE_S`."""
+def wait_for(news: threading.Condition, ready: Callable[[], bool], stop: Stop, lacking: Callable[[], str]) -> None:
+    """Wait until it is ready or `stop` returns True; raise `RosError` after `PATIENCE_S`."""
     until = time.monotonic() + PATIENCE_S
     with news:
         while not news.wait_for(ready, 0.05):
             if stop():
-                return False
+                return
             if time.monotonic() > until:
                 raise RosError(f"waited {PATIENCE_S:.0f} s: {lacking()}")
-    return True

@@ -170,8 +170,8 @@ def decode(data: bytes, count: int, height: int, width: int) -> np.ndarray:
     return tiles.reshape(-1, height, width, 3)[:count]
 
 
-def write_shard(path: Path, sheets: list[np.ndarray], quality: int) -> int:
-    """Write groups of images [n_i, H, W, 3] atomically as sheets of one npz file; return its bytes."""
+def write_shard(path: Path, sheets: list[np.ndarray], quality: int) -> None:
+    """Write groups of images [n_i, H, W, 3] atomically as sheets of one npz file."""
     coded = [np.frombuffer(encode(images, quality), np.uint8) for images in sheets]
     arrays = {
         "data": np.concatenate(coded),
@@ -181,7 +181,6 @@ def write_shard(path: Path, sheets: list[np.ndarray], quality: int) -> int:
     }
     with whole_file(path) as partial, open(partial, "wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
-    return path.stat().st_size
 
 
 def read_arrays(path: Path, command: str = "data") -> dict[str, np.ndarray]:

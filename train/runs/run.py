@@ -108,7 +108,13 @@ class FolderCallbacks:
         """Return the newest intact checkpoint of the folder, or the one that was requested; None: there is none."""
         checkpoint.remove_partial(self.folder.checkpoints)
         if self.resume_from == "last" and not any(self.folder.checkpoints.glob("[0-9]*")):
-            return with_policy_of_init(template, self.config, self.env) if self.config.run.init else None
+            if not self.config.run.init:
+                return None
+            config, path = check_init(self.config, self.env)
+            old = checkpoint.load_learner(path, ALGORITHMS[config.algorithm].template(self.env, config))
+            params = old.params.replace(value=template.learner.params.value)
+            learner = template.learner.replace(params=params, normalizer_params=old.normalizer_params)
+            return dataclasses.replace(template, learner=learner)
         with warnings.catch_warnings(record=True) as passed_over:
             path, meta = checkpoint.find(self.folder.checkpoints, self.resume_from)
         for warning in passed_over:
@@ -243,15 +249,6 @@ def check_init(config: TrainConfig, env: Any) -> tuple[TrainConfig, Path]:
     path, meta = checkpoint.find(folder.checkpoints, "best")
     checkpoint.check_fits(meta, path, config.env, env)
     return old, path
-
-
-def with_policy_of_init(template: Snapshot, config: TrainConfig, env: Any) -> Snapshot:
-    """Return the template with the policy and the normaliser of the run `run.init`."""
-    config, path = check_init(config, env)
-    old, new = checkpoint.load_learner(path, ALGORITHMS[config.algorithm].template(env, config)), template.learner
-    params = old.params.replace(value=new.params.value)
-    learner = new.replace(params=params, normalizer_params=old.normalizer_params)
-    return dataclasses.replace(template, learner=learner)
 
 
 def check_resumable(folder: RunFolder) -> None:

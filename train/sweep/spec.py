@@ -236,13 +236,11 @@ def _matches(wanted: Mapping[str, list[Any]], values: Mapping[str, Any]) -> bool
 
 
 def _filled(preset: str, values: Mapping[str, Any], where: str) -> str:
-    def value_of(match: re.Match[str]) -> str:
-        if match[1] not in values:
-            near = nearest(match[1], list(values))
-            raise ConfigError(f"{where}: preset: {{{match[1]}}} is no axis of the grid{near}")
-        return str(values[match[1]])
-
-    return PLACEHOLDER.sub(value_of, preset)
+    for axis in PLACEHOLDER.findall(preset):
+        if axis not in values:
+            near = nearest(axis, list(values))
+            raise ConfigError(f"{where}: preset: {{{axis}}} is no axis of the grid{near}")
+    return PLACEHOLDER.sub(lambda match: str(values[match[1]]), preset)
 
 
 def _run_name(config: SweepConfig, values: Mapping[str, Any]) -> str:

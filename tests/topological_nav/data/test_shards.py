@@ -34,9 +34,8 @@ def test_lossy_images_stay_near_and_in_order():
 def test_a_file_holds_sheets_of_different_lengths(tmp_path):
     path = tmp_path / "rooms-000.npz"
     images = smooth(30)
-    size = shards.write_shard(path, [images[:18], images[18:25], images[25:]], 100)
+    shards.write_shard(path, [images[:18], images[18:25], images[25:]], 100)
     assert (shards.read_shard(path) == images).all()
-    assert size == path.stat().st_size
     assert [p.name for p in tmp_path.iterdir()] == ["rooms-000.npz"]
 
 
@@ -69,7 +68,8 @@ def test_a_stop_leaves_whole_files_only(tmp_path, monkeypatch):
     monkeypatch.setattr(shards, "THREADS", 1)
     tasks = (functools.partial(shards.write_shard, tmp_path / f"{k}.npz", [smooth(20)], 100) for k in range(50))
     with contextlib.closing(shards.in_order(tasks, 2)) as written:
-        assert next(written) and next(written)
+        next(written)
+        next(written)
     there = sorted(tmp_path.iterdir())
     assert 2 <= len(there) < 10
     assert all(len(images) == 20 for images in shards.read_shards(there))
