@@ -27,6 +27,9 @@ ORIGINAL_CODE: dict[str, Any] = VARIANTS["code"]
 class TaskRules(Settings):
     """What the task is: goals, rewards, objects, what an action commands, and how episodes are scored."""
 
+    task: Literal["reach", "open", "clear", "fetch"] = "reach"
+    """reach a place; open a door by 60 degrees or a drawer by 0.2 m; clear: reach a place behind a door that must be
+    pulled; fetch: touch a piece of furniture of a category. In open and clear all doors are shut at first."""
     control_mode: str = "native"
     """Control mode of the robot, which decides what an action commands; `native` is the original benchmark's."""
     symmetric_actions: bool = False
@@ -103,6 +106,7 @@ class TaskRules(Settings):
 
     IDLE = (
         ("small_objects objects", "num_objects above 0", lambda c: c.num_objects > 0),
+        ("doors_shut", "task reach or fetch", lambda c: c.task in ("reach", "fetch")),
         ("waypoints_round", "potential_round", lambda c: c.potential_round is not None),
     )
 
@@ -126,6 +130,11 @@ class TaskRules(Settings):
                 f"min_goal_distance_m is {self.min_goal_distance_m!r}, expected 0 or more and less than "
                 f"max_goal_distance_m ({self.max_goal_distance_m})"
             )
+
+    @property
+    def doors_shut_at_first(self) -> tuple[float, float]:
+        """Return `doors_shut`, or (1, 1) where the task shuts all doors."""
+        return (1.0, 1.0) if self.task in ("open", "clear") else self.doors_shut
 
     @property
     def needs_contacts(self) -> bool:

@@ -14,6 +14,26 @@ OF_OBJECTS = ("object_path_m", "object_contact_steps", "object_force_sum_n")
 
 
 @flax.struct.dataclass
+class Targets:
+    """Hold what a task with targets (`NavConfig.task`) draws episodes from; S scenes, k pairs, M movable slots."""
+
+    slot: jax.Array
+    """[S, k] i32 the target of each pair."""
+    pair_xy_w: jax.Array
+    """[S, k, 2, 2] f32 start and goal, m, by the length of the path between them."""
+    path_m: jax.Array
+    """[S, k] f32 that length."""
+    hinge_w: jax.Array
+    """[S, M, 3] f32 a point of the hinge; without one, the centre of mass at rest."""
+    span: jax.Array
+    """[M] f32 rad or m that count as open."""
+    address: jax.Array
+    """[M] i32 of the joint in qpos; -1: none."""
+    category: jax.Array
+    """[S, M + 1] i32 number in `interactive_nav.task.targets.CATEGORIES`; the last is the walls'."""
+
+
+@flax.struct.dataclass
 class SceneTables:
     """Hold constants of all scenes on the device; S scenes, M movable slots, padded alike.
 
@@ -56,6 +76,8 @@ class SceneTables:
     """[S] i32."""
     fallback_pairs_xy_w: jax.Array
     """[S, k, 2, 2] f32 starts and goals (middles of fine cells) as far apart as required, where drawing finds none."""
+    targets: Targets | None = None
+    """None: the task is `reach`."""
     cell_m: float = flax.struct.field(pytree_node=False, default=0.1)
     """Side of a navigation cell."""
     fine_m: float = flax.struct.field(pytree_node=False, default=0.05)
@@ -124,6 +146,8 @@ class NavInfo:
     """With `potential_round`: what the geodesic round heavy furniture needs to know, and [] bool whether it counts."""
     dynamics: EpisodeDynamics | None = None
     """With random dynamics."""
+    target: jax.Array | None = None
+    """[] i32 slot of the target, in tasks with one."""
 
 
 @flax.struct.dataclass
@@ -144,3 +168,5 @@ class EpisodeStart:
     """(num_objects,) f32."""
     small_placed: jax.Array
     """(num_objects,) bool; False: parked."""
+    target: jax.Array | None = None
+    """[] i32 slot of the target, in tasks with one."""

@@ -135,7 +135,13 @@ def draw_episode(
     if scene is None:
         scene = jax.random.randint(key_scene, (), 0, tables.rest_qpos.shape[0])
     most_m = rules.max_goal_distance_m if limit_m is None else jnp.minimum(limit_m, rules.max_goal_distance_m)
-    start_xy, goal_xy = _draw_pair(key_start, key_goal, tables, scene, rules.min_goal_distance_m, most_m)
+    targets, target = tables.targets, None
+    if targets is None:
+        start_xy, goal_xy = _draw_pair(key_start, key_goal, tables, scene, rules.min_goal_distance_m, most_m)
+    else:
+        near = jnp.maximum((targets.path_m[scene] <= most_m).sum(), 1)
+        pair = jax.random.randint(key_start, (), 0, near)
+        (start_xy, goal_xy), target = targets.pair_xy_w[scene, pair], targets.slot[scene, pair]
     kept_free = [start_xy, goal_xy] if rules.goal_clear else [start_xy]
     small_xy, small_placed = place_small(key_place, tables, scene, small_radius_m, kept_free, robot_radius_m)
     turn = jax.random.uniform(key_turn, small_radius_m.shape, minval=-jnp.pi, maxval=jnp.pi)
@@ -147,4 +153,5 @@ def draw_episode(
         small_xy_w=small_xy,
         small_yaw_rad=turn if rules.random_object_yaw else jnp.zeros_like(turn),
         small_placed=small_placed,
+        target=target,
     )

@@ -37,6 +37,7 @@ from interactive_nav.sensing.observation import waypoints_in_body
 from interactive_nav.sensing.sensors import Sensors
 from interactive_nav.task.dynamics import Dynamics
 from interactive_nav.task.privileged import PRIVILEGED_SIZE, privileged_state
+from interactive_nav.task.targets import achieved, build_targets, target_terms
 from interactive_nav.task.terms import HOOK_TERMS, TERMS, Moment, Step, Term, hand_term
 from interactive_nav.types import Detour, EpisodeStart, GoalField, NavInfo
 from interactive_nav_common.errors import ConfigError
@@ -66,12 +67,14 @@ class InteractiveNav(Env):
         self.robot, self.scenes, self.config = robot, scenes, config
         self.world = build_world(robot, scenes, config)
         self.tables = build_tables(self.world, config)
+        if config.task != "reach":
+            self.tables = self.tables.replace(targets=build_targets(self.world, config, self.tables))
         limit = config.potential_round
         self._round = round_tables(self.world, self.tables, config, limit) if limit else None
         self.physics = make_physics(self.world, config)
         self.dynamics = Dynamics(config, robot)
         self.hook: Hook | None = self.physics.hook
-        terms = (*terms, *(HOOK_TERMS if self.hook else ()))
+        terms = (*terms, *(HOOK_TERMS if self.hook else ()), *target_terms(config.task))
         observed = config.observations
         self.terms = (*(t for t in TERMS if t.kind != "observation" or t.name in observed), *terms)
         keys = [t.key for t in self.terms]
@@ -164,6 +167,7 @@ class InteractiveNav(Env):
             shortest_path_m=geodesic_at(self.tables, scene, goal, pos_w[:2]),
             objects_dropped=jnp.sum(~start.small_placed).astype(jnp.int32),
             round_field=detour,
+            target=start.target,
             **self._at_start(scene, physics, geodesic_m),
         )
         zero = jnp.zeros(())
@@ -284,8 +288,11 @@ class InteractiveNav(Env):
         flies = self.robot.kind == "flying"
         goal_w = jnp.concatenate([nav.goal_xy_w, jnp.full(1, self.robot.spawn_height_m if flies else 0.0)])
         away = (goal_w - pos_w)[: 3 if self.config.success_in_3d or flies else 2]
-        success = (jnp.linalg.norm(away) < self.success_distance_m) & ~broken & (signals.overflow == 0)
+        at_goal = jnp.linalg.norm(away) < self.success_distance_m
         touches = (self.tables.mass_kg[scene, 1:] > 0) & (signals.slot_force_n > TOUCH_FORCE_N)
+        task, by_place = self.config.task, self.config.task in ("reach", "clear")
+        achieved_ = at_goal if by_place else achieved(task, self.tables, nav, physics.qpos, touches)
+        success = achieved_ & ~broken & (signals.overflow == 0)
         hits_structure = signals.structure_force_n > TOUCH_FORCE_N
         lifted = pos_w[2] - self.robot.spawn_height_m > LIFT_M
         gaps_m2 = box_gaps_m2(self.sensors.boxes, scene, physics.qpos, pos_w[:2], (LOW_M, self.robot.height_m))
