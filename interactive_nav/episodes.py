@@ -13,7 +13,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -54,8 +54,9 @@ class EpisodeFile:
     of inertia, centre of mass and hulls too."""
     episodes: tuple[dict[str, Any], ...]
     """scene (index into scenes), start_xy_w, start_yaw_rad, goal_xy_w, objects ([x, y, yaw] each, or null for one
-    that got no place), shortest_path_m and push_needed: whether there is no way round everything that can be moved;
-    metres and radians, world frame."""
+    that got no place), shortest_path_m, push_needed: whether there is no way round everything that can be moved, and
+    target, of a task with one; metres and radians, world frame."""
+    task: str = "reach"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +70,8 @@ class _Episode:
     objects: tuple[tuple[float, float, float] | None, ...]
     shortest_path_m: NotNegative
     push_needed: bool
+    target: str | None = None
+    """Name of the target's body."""
 
 
 class EpisodeFileError(UserError):
@@ -106,6 +109,8 @@ def draw_episode_file(env: InteractiveNav, episodes: int, seed: int) -> EpisodeF
                 "push_needed": not ways.exists(scene, qpos[i], start, goal),
             }
         )
+        if starts.target is not None:
+            rows[-1]["target"] = env.world.slots.names[scene][starts.target[i]]
     return EpisodeFile(
         robot=env.robot.name,
         seed=seed,
@@ -113,6 +118,7 @@ def draw_episode_file(env: InteractiveNav, episodes: int, seed: int) -> EpisodeF
         objects=tuple(o.category for o in env.world.small_objects),
         objects_digest=_objects_digest(env),
         episodes=tuple(rows),
+        task=env.config.task,
     )
 
 
@@ -141,6 +147,10 @@ def _check_fits(file: EpisodeFile, env: InteractiveNav, where: str) -> dict[str,
         raise EpisodeFileError(
             f"{where}: made for robot '{file.robot}', the environment's is '{env.robot.name}'; "
             "make the episodes again for it"
+        )
+    if file.task != env.config.task:
+        raise EpisodeFileError(
+            f"{where}: made for task '{file.task}', expected {env.config.task}; set task={file.task}"
         )
     ours = {scene.task_digest: i for i, scene in enumerate(env.scenes)}
     by_name = {scene.name: scene for scene in env.scenes}
@@ -172,7 +182,7 @@ def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -
     rows, count = file.episodes, len(file.objects)
     small = [[o or [0.0, 0.0, 0.0] for o in row["objects"]] for row in rows]
     poses = np.asarray(small, np.float32).reshape(len(rows), count, 3)
-    scene = [scene_of_digest[file.scenes[row["scene"]][1]] for row in rows]
+    scene, names = [scene_of_digest[file.scenes[row["scene"]][1]] for row in rows], env.world.slots.names
 
     def f32(name: str) -> jax.Array:
         return jnp.asarray([row[name] for row in rows], jnp.float32)
@@ -185,6 +195,9 @@ def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -
         small_xy_w=jnp.asarray(poses[..., :2]),
         small_yaw_rad=jnp.asarray(poses[..., 2]),
         small_placed=jnp.asarray([[o is not None for o in row["objects"]] for row in rows], bool),
+        target=jnp.asarray([names[s].index(row["target"]) for s, row in zip(scene, rows, strict=True)], jnp.int32)
+        if file.task != "reach"
+        else None,
     )
     _, lengths = signals_wait()(jax.jit(jax.vmap(lambda start: _with_length(env, start))))(starts)
     wrong = np.abs(np.asarray(lengths) - np.asarray(f32("shortest_path_m"))) > LENGTH_TOLERANCE_M
@@ -234,7 +247,7 @@ def load_episode_files(paths: Sequence[str | Path]) -> tuple[EpisodeFile, str]:
     files = [load_episode_file(path) for path in paths]
     first = files[0]
     for path, other in zip(paths, files, strict=True):
-        if (other.robot, other.objects_digest) != (first.robot, first.objects_digest):
+        if (other.robot, other.objects_digest, other.task) != (first.robot, first.objects_digest, first.task):
             raise EpisodeFileError(
                 f"{path}: made for robot '{other.robot}' with {len(other.objects)} small objects, {paths[0]} for "
                 f"'{first.robot}' with {len(first.objects)} or other models; play them one by one"
@@ -261,6 +274,8 @@ class Make(Command):
     """Random seed of the episodes."""
     num_objects: Natural = 10
     """Number of small objects in each episode."""
+    task: Literal["reach", "open", "clear", "fetch"] = "reach"
+    """What the robot must do, as the setting `env.task`."""
     objects: Annotated[tuple[str, ...], option(metavar="OBJECT_DIR")] = ()
     """Folders of small objects to use (default: the built-in ones)."""
 
@@ -277,6 +292,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         backend="native",
         num_objects=arguments.num_objects,
         objects=arguments.objects,
+        task=arguments.task,
     )
     file = draw_episode_file(env, arguments.episodes, arguments.seed)
     save_episode_file(file, arguments.out)

@@ -20,6 +20,7 @@ def write_room(
     resolution_m: float = 0.05,
     split: str = "train",
     half_m: tuple[float, float, float] = (0.2, 0.2, 0.2),
+    door_rad: tuple[float, float] = (-1.5, 1.5),
 ) -> Path:
     """A rectangular room centred on the origin, with cubes of 0.4 m as furniture.
 
@@ -33,6 +34,7 @@ def write_room(
         resolution_m: of the map.
         split: train or test.
         half_m: half sizes of the furniture, where it is no cube.
+        door_rad: range of the leaf's hinge; at 0 it lies along the lower wall.
     """
     folder = Path(folder)
     (folder / "assets").mkdir(parents=True)
@@ -90,7 +92,7 @@ def write_room(
         movable(category, [x, y, half_m[2]], [((0, 0, 0), half_m)], mass, friction)
     if door:
         leaf = [((0.4, 0, 0.5), (0.4, 0.02, 0.49))]
-        movable("door", [-1.0, -ly / 2 + 0.1, 0.0], leaf, 8.0, 0.4, reach=(-1.5, 1.5))
+        movable("door", [-1.0, -ly / 2 + 0.1, 0.0], leaf, 8.0, 0.4, reach=door_rad)
     if kitchen:
         front = [((0, 0, 0), (0.25, 0.01, 0.1)), ((0, 0.2, 0), (0.22, 0.18, 0.08))]
         movable("drawer", [0.0, ly / 2 - 0.39, 0.3], front, 5.0, 0.4, reach=(0, 0.35), axis=(0, -1, 0))

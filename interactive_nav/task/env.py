@@ -37,7 +37,7 @@ from interactive_nav.sensing.observation import waypoints_in_body
 from interactive_nav.sensing.sensors import Sensors
 from interactive_nav.task.dynamics import Dynamics
 from interactive_nav.task.privileged import PRIVILEGED_SIZE, privileged_state
-from interactive_nav.task.targets import achieved, build_targets, target_terms
+from interactive_nav.task.targets import TERMS_OF_TASKS, achieved, build_targets
 from interactive_nav.task.terms import HOOK_TERMS, TERMS, Moment, Step, Term, hand_term
 from interactive_nav.types import Detour, EpisodeStart, GoalField, NavInfo
 from interactive_nav_common.errors import ConfigError
@@ -74,7 +74,7 @@ class InteractiveNav(Env):
         self.physics = make_physics(self.world, config)
         self.dynamics = Dynamics(config, robot)
         self.hook: Hook | None = self.physics.hook
-        terms = (*terms, *(HOOK_TERMS if self.hook else ()), *target_terms(config.task))
+        terms = (*terms, *(HOOK_TERMS if self.hook else ()), *TERMS_OF_TASKS[config.task])
         observed = config.observations
         self.terms = (*(t for t in TERMS if t.kind != "observation" or t.name in observed), *terms)
         keys = [t.key for t in self.terms]
@@ -290,9 +290,10 @@ class InteractiveNav(Env):
         away = (goal_w - pos_w)[: 3 if self.config.success_in_3d or flies else 2]
         at_goal = jnp.linalg.norm(away) < self.success_distance_m
         touches = (self.tables.mass_kg[scene, 1:] > 0) & (signals.slot_force_n > TOUCH_FORCE_N)
-        task, by_place = self.config.task, self.config.task in ("reach", "clear")
-        achieved_ = at_goal if by_place else achieved(task, self.tables, nav, physics.qpos, touches)
-        success = achieved_ & ~broken & (signals.overflow == 0)
+        done, task = at_goal, self.config.task
+        if task in ("open", "fetch"):
+            done = achieved(task, self.tables, nav, physics.qpos, touches)
+        success = done & ~broken & (signals.overflow == 0)
         hits_structure = signals.structure_force_n > TOUCH_FORCE_N
         lifted = pos_w[2] - self.robot.spawn_height_m > LIFT_M
         gaps_m2 = box_gaps_m2(self.sensors.boxes, scene, physics.qpos, pos_w[:2], (LOW_M, self.robot.height_m))
