@@ -28,8 +28,8 @@ class TaskRules(Settings):
     """What the task is: goals, rewards, objects, what an action commands, and how episodes are scored."""
 
     task: Literal["reach", "open", "clear", "fetch"] = "reach"
-    """reach a place; open a door by 60 degrees or a drawer by 0.2 m; clear: reach a place behind a door that must be
-    pulled; fetch: touch a piece of furniture of a category. In open and clear all doors are shut at first."""
+    """What to do: reach a place; open a door by 60 degrees or a drawer by 0.2 m; clear: reach a place behind a door
+    that must be pulled; fetch: touch a piece of furniture of a category. Open and clear begin with all doors shut."""
     control_mode: str = "native"
     """Control mode of the robot, which decides what an action commands; `native` is the original benchmark's."""
     symmetric_actions: bool = False
@@ -130,11 +130,6 @@ class TaskRules(Settings):
                 f"min_goal_distance_m is {self.min_goal_distance_m!r}, expected 0 or more and less than "
                 f"max_goal_distance_m ({self.max_goal_distance_m})"
             )
-
-    @property
-    def doors_shut_at_first(self) -> tuple[float, float]:
-        """Return `doors_shut`, or (1, 1) where the task shuts all doors."""
-        return (1.0, 1.0) if self.task in ("open", "clear") else self.doors_shut
 
     @property
     def needs_contacts(self) -> bool:

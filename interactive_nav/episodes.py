@@ -143,15 +143,9 @@ def _short(digest: str) -> str:
 
 def _check_fits(file: EpisodeFile, env: InteractiveNav, where: str) -> dict[str, int]:
     """Return digest -> index of the environment's scenes; refuse another robot, other scenes or small objects."""
-    if file.robot != env.robot.name:
-        raise EpisodeFileError(
-            f"{where}: made for robot '{file.robot}', the environment's is '{env.robot.name}'; "
-            "make the episodes again for it"
-        )
-    if file.task != env.config.task:
-        raise EpisodeFileError(
-            f"{where}: made for task '{file.task}', expected {env.config.task}; set task={file.task}"
-        )
+    if (of_file := (file.robot, file.task)) != (of_env := (env.robot.name, env.config.task)):
+        made, here = (f"robot '{robot}' and task '{task}'" for robot, task in (of_file, of_env))
+        raise EpisodeFileError(f"{where}: made for {made}, the environment has {here}; make the episodes again for it")
     ours = {scene.task_digest: i for i, scene in enumerate(env.scenes)}
     by_name = {scene.name: scene for scene in env.scenes}
     for name, digest in file.scenes:
@@ -182,7 +176,13 @@ def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -
     rows, count = file.episodes, len(file.objects)
     small = [[o or [0.0, 0.0, 0.0] for o in row["objects"]] for row in rows]
     poses = np.asarray(small, np.float32).reshape(len(rows), count, 3)
-    scene, names = [scene_of_digest[file.scenes[row["scene"]][1]] for row in rows], env.world.slots.names
+    scene = [scene_of_digest[file.scenes[row["scene"]][1]] for row in rows]
+    known, has = env.world.slots.names, file.task != "reach"
+    wrong = [i for i, s in enumerate(scene) if has and rows[i].get("target") not in known[s]]
+    if wrong:
+        raise EpisodeFileError(
+            f"{where}: episode {wrong[0]}: target is no body of its scene, expected one; make it again"
+        )
 
     def f32(name: str) -> jax.Array:
         return jnp.asarray([row[name] for row in rows], jnp.float32)
@@ -195,8 +195,8 @@ def starts_of(file: EpisodeFile, env: InteractiveNav, where: str = "episodes") -
         small_xy_w=jnp.asarray(poses[..., :2]),
         small_yaw_rad=jnp.asarray(poses[..., 2]),
         small_placed=jnp.asarray([[o is not None for o in row["objects"]] for row in rows], bool),
-        target=jnp.asarray([names[s].index(row["target"]) for s, row in zip(scene, rows, strict=True)], jnp.int32)
-        if file.task != "reach"
+        target=jnp.asarray([known[s].index(rows[i]["target"]) for i, s in enumerate(scene)], jnp.int32)
+        if has
         else None,
     )
     _, lengths = signals_wait()(jax.jit(jax.vmap(lambda start: _with_length(env, start))))(starts)

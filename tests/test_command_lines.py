@@ -22,7 +22,7 @@ PROGRAMS = (
     *(f"interactive_nav.{name}" for name in ("view", "record", "topdown", "episodes", "robots", "ros")),
     *("train", "train.sweep", "train.evaluate", "train.export", "train.figures", "train.figures.report"),
     *("train.record", "train.replay"),
-    *("converters", "topological_nav", "topological_nav.ros", "benchmarks.steps_per_second", "benchmarks.startup"),
+    *("converters", "topological_nav", "topological_nav.ros", "benchmarks.steps_per_second"),
 )
 SCENE = "scenes_mjcf/apartment_0"
 

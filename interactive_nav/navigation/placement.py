@@ -139,8 +139,7 @@ def draw_episode(
     if targets is None:
         start_xy, goal_xy = _draw_pair(key_start, key_goal, tables, scene, rules.min_goal_distance_m, most_m)
     else:
-        near = jnp.maximum((targets.path_m[scene] <= most_m).sum(), 1)
-        pair = jax.random.randint(key_start, (), 0, near)
+        pair = jax.random.randint(key_start, (), 0, jnp.maximum((targets.path_m[scene] <= most_m).sum(), 1))
         (start_xy, goal_xy), target = targets.pair_xy_w[scene, pair], targets.slot[scene, pair]
     kept_free = [start_xy, goal_xy] if rules.goal_clear else [start_xy]
     small_xy, small_placed = place_small(key_place, tables, scene, small_radius_m, kept_free, robot_radius_m)

@@ -326,7 +326,7 @@ def build_world(robot: RobotSpec, scenes: tuple[Scene, ...], config: NavConfig) 
     layout = find_layout(models[0], robot, [(slot.name, slot.kind) for slot in slots])
     parked = _parked(models[0], layout, robot)
     calls: list[tuple] = [(model, *parked) for model in models]
-    if any(shares := config.doors_shut_at_first):
+    if any(shares := (1.0, 1.0) if config.task in ("open", "clear") else config.doors_shut):
         calls = [(*call, _turned_doors(slots, i, layout, shares)) for i, call in enumerate(calls)]
     rest = for_each_home(_settle, calls, "settling homes")
     for scene, qpos in zip(scenes, rest, strict=True):

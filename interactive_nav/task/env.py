@@ -290,10 +290,9 @@ class InteractiveNav(Env):
         away = (goal_w - pos_w)[: 3 if self.config.success_in_3d or flies else 2]
         at_goal = jnp.linalg.norm(away) < self.success_distance_m
         touches = (self.tables.mass_kg[scene, 1:] > 0) & (signals.slot_force_n > TOUCH_FORCE_N)
-        done, task = at_goal, self.config.task
-        if task in ("open", "fetch"):
-            done = achieved(task, self.tables, nav, physics.qpos, touches)
-        success = done & ~broken & (signals.overflow == 0)
+        if self.config.task in ("open", "fetch"):
+            at_goal = achieved(self.config.task, self.tables, nav, physics.qpos, touches)
+        success = at_goal & ~broken & (signals.overflow == 0)
         hits_structure = signals.structure_force_n > TOUCH_FORCE_N
         lifted = pos_w[2] - self.robot.spawn_height_m > LIFT_M
         gaps_m2 = box_gaps_m2(self.sensors.boxes, scene, physics.qpos, pos_w[:2], (LOW_M, self.robot.height_m))

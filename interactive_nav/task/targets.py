@@ -31,12 +31,10 @@ PAIRS = 1024
 OPENING_REWARD = 5.0
 """Sum of the rewards of opening a target."""
 CATEGORIES = SEGMENTATIONS["all"].names
-Offer = tuple[int, np.ndarray, np.ndarray]
-"""Slot of a target, and the start and goal places [n, 2] of its episodes, m."""
 
 
-def _offers(world: World, config: NavConfig, s: int, places: np.ndarray) -> Iterator[Offer]:
-    """Yield what a scene offers to a task; the robot fits at `places` [p, 2]."""
+def _offers(world: World, config: NavConfig, s: int, places: np.ndarray) -> Iterator[tuple]:
+    """Yield a scene's targets: slot, and start and goal places [n, 2] among those where the robot fits, [p, 2] m."""
     scene, radius_m, poses = world.scenes[s], world.robot.footprint_radius_m, rest_poses(world, s)
     fine_m, maps = config.nav_cell_m / FINE_CELLS, scene.maps
     doors = {body.name: poses[body.name] for body in scene.movables if body.category == "door"}
@@ -78,11 +76,10 @@ def build_targets(world: World, config: NavConfig, tables: SceneTables) -> Targe
     """Return a task's targets in every scene; raise `SceneError` for a scene that offers none."""
     slots, rng, rows = world.slots, np.random.default_rng(0), []
 
-    @jax.jit
-    def paths_m(scene: int, pairs: jax.Array) -> jax.Array:
-        fields = jax.vmap(lambda pair: goal_field(tables, scene, pair[1]))(pairs)  # pyright: ignore[reportArgumentType]
-        return jax.vmap(lambda field, pair: geodesic_at(tables, scene, field, pair[0]))(fields, pairs)  # pyright: ignore[reportArgumentType]
+    def path_m_of(scene: int, pair: jax.Array) -> jax.Array:
+        return geodesic_at(tables, scene, goal_field(tables, scene, pair[1]), pair[0])  # pyright: ignore[reportArgumentType]
 
+    paths_m = jax.jit(jax.vmap(path_m_of, (None, 0)))
     for s, scene in enumerate(world.scenes):
         places = np.asarray(tables.start_xy_w[s, : tables.num_starts[s]])
         offers = [offer for offer in _offers(world, config, s, places) if len(offer[1]) and len(offer[2])]
