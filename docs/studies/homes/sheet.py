@@ -1,4 +1,4 @@
-"""Draw homes from where most of them is visible, at 1.5 m on the left and at 0.4 m on the right, one a row.
+"""Draw homes from where most of them is visible to a person, one a row.
 
 python -m docs.studies.homes.sheet GENERATED... DRAWN... -o sheet.png
 """
@@ -14,8 +14,8 @@ from converters.check import pictures
 from scenes_mjcf.look import spec_for_people
 from scenes_mjcf.schema import load_maps
 
-SHAPE, HEIGHTS_M = (360, 600), (1.5, 0.4)
-"""Rows and columns of one view, and where the eyes are."""
+SHAPE = (360, 600)
+"""Rows and columns of one view."""
 
 
 def main() -> None:
@@ -30,7 +30,7 @@ def main() -> None:
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         about = model, data, pictures.world_surfaces(model, data), load_maps(folder), SHAPE
-        rows.append(np.hstack([pictures.at_eye_height(*about, eye_m) for eye_m in HEIGHTS_M]))
+        rows.append(pictures.at_eye_height(*about))
     Image.fromarray(np.vstack(rows)).save(args.output)
 
 
