@@ -28,8 +28,8 @@ class TaskRules(Settings):
     """What the task is: goals, rewards, objects, what an action commands, and how episodes are scored."""
 
     task: Literal["reach", "open", "clear", "fetch"] = "reach"
-    """What to do: reach a place; open a door by 60 degrees or a drawer by 0.2 m; clear: reach a place behind a door
-    that must be pulled; fetch: touch a piece of furniture of a category. Open and clear begin with all doors shut."""
+    """Task: reach a place, open (a door by 60 degrees or a drawer by 0.2 m), clear (reach a place behind a door that
+    must be pulled) or fetch (touch furniture of a given category). Open and clear start with all doors shut."""
     control_mode: str = "native"
     """Control mode of the robot, which decides what an action commands; `native` is the original benchmark's."""
     symmetric_actions: bool = False

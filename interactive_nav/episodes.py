@@ -275,7 +275,7 @@ class Make(Command):
     num_objects: Natural = 10
     """Number of small objects in each episode."""
     task: Literal["reach", "open", "clear", "fetch"] = "reach"
-    """What the robot must do, as the setting `env.task`."""
+    """Task of the episodes (the setting `env.task`)."""
     objects: Annotated[tuple[str, ...], option(metavar="OBJECT_DIR")] = ()
     """Folders of small objects to use (default: the built-in ones)."""
 

@@ -45,7 +45,7 @@ _SOLID, _FLOOR, _CEILING = 1, 2, 4
 AT_END_RAD = 0.03
 """A door within this angle of an end of its range stands at that end."""
 GOLDEN = (math.sqrt(5) - 1) / 2
-"""Its multiples modulo 1 spread evenly over [0, 1). A home's doors count in sevens: those of the next homes differ."""
+"""Its multiples modulo 1 spread evenly over [0, 1). Door k of home i takes multiple i + 7 k."""
 CEILING_M = 1.2
 """Height of the ceiling that flying robots meet: just below the tops of walls, which are cut above ground robots."""
 FLOOR_FRICTION = 0.05

@@ -32,7 +32,7 @@ STILL_M = 1e-4
 SETTLE_STEPS = 5
 """Small objects that come to rest in an episode's first control steps, untouched, have not been moved."""
 HAND_REACH_M = 0.05
-"""What a hand touches is within this distance of its grip, in the plane and in height."""
+"""An object counts as touched by the hand at most this far from its grip, in the plane and in height."""
 
 
 @dataclasses.dataclass(frozen=True)
