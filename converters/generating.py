@@ -85,10 +85,8 @@ class Generate(Command):
         config = building_of(self.tier, settings, self.split, "settings")
         with stage_progress(console) as report:
             _, seed = with_seeds(self.seed, lambda seed: generate_building(self.out, seed, report, config))
-        console.print(
-            f"{self.out}: building of {seed}; convert it with "
-            f"'python -m converters convert {typed(self.out)} SCENE_DIR'"
-        )
+        again = f"python -m converters convert {typed(self.out)} SCENE_DIR"
+        console.print(f"{self.out}: building of {seed}; convert it with: {again}")
 
 
 class GenerateScenes(OnCluster, Command):

@@ -127,13 +127,13 @@ def propose_unproposed(arguments: Any, console: Console) -> Path | None:
     unfit = [name for name in UNFIT if counts[NAMES.index(name)] >= MIN_VOXELS]
     lines = given_up([p for p, model in pairs if model is None], ())
     lines += (f"labelled, and never given a model: {', '.join(unfit)}",) if unfit else ()
-    for line in (*lines, *((f"{_annotate(source)} places models by hand",) if lines else ())):
+    for line in (*lines, *((f"place models by hand with: {_annotate(source)}",) if lines else ())):
         console.print(f"{source}: {line}")
     return target
 
 
 def _annotate(source: Path) -> str:
-    return f"'python -m converters annotate {typed(source)} -o DIR'"
+    return f"python -m converters annotate {typed(source)} -o DIR"
 
 
 def next_step(arguments: Any, layout: str) -> str:
@@ -144,7 +144,7 @@ def next_step(arguments: Any, layout: str) -> str:
     if layout not in ("mesh", "gibson") or people:
         return ""
     first = "" if arguments.segment else "add --segment to recognise furniture in the scan, or "
-    return f"no movable object: {first}place models by hand with {_annotate(arguments.source)}"
+    return f"no movable object: {first}place models by hand with: {_annotate(arguments.source)}"
 
 
 def _label(arguments: Any, target: Path, weights: Path | None, console: Console) -> None:

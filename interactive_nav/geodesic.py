@@ -23,12 +23,7 @@ from interactive_nav_common.grids import (
 )
 
 
-def distance_field(
-    traversable,
-    resolution: float,
-    goal_xy,
-    origin: tuple[float, float] = (0.0, 0.0),
-):
+def distance_field(traversable, resolution: float, goal_xy, origin: tuple[float, float] = (0.0, 0.0)):
     """Return the geodesic distance (m) of every cell centre to a goal: [rows, columns] f32, inf where unreachable.
 
     Paths consist of `MOVES_32` over free cells of `traversable`, [rows along y, columns along x] bool, whose outer

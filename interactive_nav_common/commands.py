@@ -27,8 +27,6 @@ Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 """False unless its option is given."""
 Repeated: TypeAlias = UseAppendAction[tuple[str, ...]]
 """One value each time that its option is given."""
-Commands: TypeAlias = "Mapping[str, type[Command] | Commands]"
-"""Name of a command -> its class, or its own commands."""
 
 
 def option(*aliases: str, name: str | None = None, metavar: str | None = None) -> Any:

@@ -121,15 +121,16 @@ def installed(path: str | Path) -> Path:
     member = packaged_set(name).scenes.get(place.name) if name else None
     if member and not is_listed(place, member):
         raise SceneError(
-            f"{place}: not the scene that the set {name} lists; make it again with 'python -m converters scenes make "
-            f"{place.name}'"
+            f"{place}: not the scene that the set {name} lists; make it again: python -m converters scenes make "
+            f"{place.name}"
         )
     return place
 
 
-def meant(word: str) -> str:
-    """`, did you mean 'X'?` for the package's scene or set that a wrong word looks like, or nothing."""
-    places = {name: name for sets in PACKAGED for name in (sets, *(f"{sets}/{split}" for split in SPLITS))}
+def meant(word: str, or_set: bool) -> str:
+    """`, did you mean 'X'?` for the package's scene, or set, that a wrong word looks like, or nothing."""
+    names = [name for sets in PACKAGED for name in (sets, *(f"{sets}/{split}" for split in SPLITS))] if or_set else []
+    places = dict(zip(names, names, strict=True))
     scenes = {HERE / name for name in os.listdir(HERE) if (HERE / name / "scene.json").is_file()}
     scenes |= {PACKAGED[name] / scene for name in PACKAGED for scene in packaged_set(name).scenes}
     places |= {scene.name: scene.relative_to(HERE.parent).as_posix() for scene in sorted(scenes)}
@@ -137,12 +138,16 @@ def meant(word: str) -> str:
     return f", did you mean {places[near[0]]!r}?" if near else ""
 
 
-def existing(word: str | Path) -> Path:
-    """Return the folder of a scene, as `installed` does; raise `SceneError` if there is none."""
+def existing(word: str | Path, or_set: bool = False) -> Path:
+    """Return the folder of a scene, as `installed` does; raise `SceneError` if there is none.
+
+    `or_set`: a set could be named in its place.
+    """
     folder = installed(word)
     if not folder.exists():
+        of_set = f" or a set ({', '.join(PACKAGED)})" if or_set else ""
         raise SceneError(
-            f"{folder}: no such file; expected a scene folder or a set ({', '.join(PACKAGED)}){meant(str(word))}; "
+            f"{folder}: no such file; expected a scene folder{of_set}{meant(str(word), or_set)}; "
             "'python -m converters scenes list' shows them, 'python -m converters convert SRC OUT' makes one"
         )
     return folder
@@ -174,7 +179,7 @@ def _members(word: str) -> list[str] | None:
         if what:
             own = next((f"scenes make {name}" for name, folder in PACKAGED.items() if folder == root), None)
             command = own or f"generate-scenes {typed(os.path.relpath(root))}"
-            raise SceneError(f"{word}: {what}; make them with 'python -m converters {command}'")
+            raise SceneError(f"{word}: {what}; make them: python -m converters {command}")
         return [os.path.relpath(p) if Path.cwd() in p.absolute().parents else str(p) for p in places.values()]
     return None
 

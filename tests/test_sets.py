@@ -17,6 +17,7 @@ from scenes_mjcf.sets import (
     COMMITTED,
     Member,
     SceneSet,
+    existing,
     installed,
     read_set,
     scene_digest,
@@ -129,7 +130,7 @@ def test_own_sets_and_scenes_stand_side_by_side(own: Path, monkeypatch: pytest.M
 def test_what_is_missing_is_named_with_the_command(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(own)
     (own / "homes" / "three" / "scene.json").unlink()
-    with pytest.raises(SceneError, match="1 of 2 scenes .*'three'.*generate-scenes homes'"):
+    with pytest.raises(SceneError, match="1 of 2 scenes .*'three'.*generate-scenes homes$"):
         scene_folders(["homes/train"])
     assert scene_folders(["homes/test"]) == ("homes/two",)
 
@@ -234,9 +235,9 @@ def test_what_is_not_the_listed_scene_is_not_found_and_is_made_again(
     shutil.copytree(ROOT / "scenes_mjcf" / ("birch" if left == "another" else "alder"), cached / "one")
     for path in (cached / "one").iterdir() if left == "empty" else [cached / "one" / "scene.xml"] * (left[:2] == "no"):
         shutil.rmtree(path) if path.is_dir() else path.unlink()
-    with pytest.raises(SceneError, match="1 of 1 .*'one'.*not those that the set lists.* scenes make furnished'"):
+    with pytest.raises(SceneError, match="1 of 1 .*'one'.*not those that the set lists.* scenes make furnished$"):
         scene_folders(["furnished"])
-    with pytest.raises(SceneError, match="not the scene that the set furnished lists; .* scenes make one'"):
+    with pytest.raises(SceneError, match="not the scene that the set furnished lists; .* scenes make one$"):
         installed("package/furnished/one")
     assert main(["scenes", "list"]) == 0
     assert "one             in the cache is another scene" in capsys.readouterr().out
@@ -301,6 +302,22 @@ def test_a_wrong_name_is_told_the_nearest(word: str, right: str) -> None:
 def test_a_name_like_none_is_told_the_sets() -> None:
     with pytest.raises(SceneError, match=r"yscen: no such file; expected a scene folder or a set \(sparse, furnished"):
         load_scene("yscen")
+
+
+def test_a_set_is_not_offered_where_one_scene_is_meant() -> None:
+    for word in ("cluttered", "clutered"):
+        with pytest.raises(
+            SceneError, match=f"{word}: .* expected a scene folder, did you mean 'scenes_mjcf/cluttered/"
+        ):
+            existing(word)
+
+
+def test_a_set_whose_folder_has_a_space_is_made_by_the_command_that_is_shown(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_set(SceneSet("sparse", {"shed": Member("train", 1)}), Path("my homes/set.json"))
+    with pytest.raises(SceneError) as missing:
+        scene_folders(["my homes"])
+    assert str(missing.value).endswith("make them: python -m converters generate-scenes 'my homes'")
 
 
 def test_a_name_longer_than_a_file_may_have_names_no_scene():

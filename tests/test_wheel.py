@@ -70,7 +70,7 @@ def test_what_it_knows_by_name(bare):
     assert run(bare, "check", "scenes_mjcf/alder").stdout.endswith("alder: 25 of 25 gates pass\n")
     missing = run(bare, "train", "--config", "demo", "env.scenes=[cluttered/train]")
     assert missing.returncode == 2
-    assert "make them with 'python -m converters scenes make cluttered'" in missing.stderr.replace("\n", "")
+    assert "make them: python -m converters scenes make cluttered" in missing.stderr.replace("\n", "")
 
 
 def test_a_word_that_is_no_command(bare):

@@ -287,10 +287,7 @@ def labelled(target: Path, lengths_m: Sequence[float], config: AdaptConfig) -> t
     scored = passages.free[:, passages.scored]
     images = as_seen(passages.images, PRESETS[config.domain], PASSAGES_STREAM)
     rng, parts = np.random.default_rng([config.seed, 4]), []
-    for held, most, free in (
-        (False, config.fine_tune, config.fine_tune_free),
-        (True, config.test, config.test_free),
-    ):
+    for held, most, free in ((False, config.fine_tune, config.fine_tune_free), (True, config.test, config.test_free)):
         rows = np.flatnonzero(passages.test == held)
         rows = rows if free else balanced(rows, scored, rng)
         free = free or most // 2

@@ -101,12 +101,8 @@ def least_squares(
         both = math.hypot(b - d, a + e) / (power[0] + power[1])
         horizontal = (both, both)
     else:
-        form = np.array(
-            [
-                [a * a / power[0] + e * e / power[1], a * b / power[0] - d * e / power[1]],
-                [a * b / power[0] - d * e / power[1], b * b / power[0] + d * d / power[1]],
-            ]
-        )
+        mixed = a * b / power[0] - d * e / power[1]
+        form = [[a * a / power[0] + e * e / power[1], mixed], [mixed, b * b / power[0] + d * d / power[1]]]
         c, s = np.linalg.eigh(form)[1][:, -1]
         if c * a + s * b < 0:
             c, s = -c, -s

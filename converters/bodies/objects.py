@@ -54,8 +54,7 @@ def to_world(placed: PlacedObject, points_b: np.ndarray) -> np.ndarray:
 
 def flatten_feet(hull: Hull) -> Hull:
     """Make a hull level at z = 0 (body frame): cut off what is below, and extend it down if it ends within `FOOT_M`."""
-    points = hull.vertices * [1.0, 1.0, 1.0]
-    points[:, 2] = np.maximum(points[:, 2], 0.0)
+    points = np.maximum(hull.vertices, [-np.inf, -np.inf, 0.0])
     feet = points[points[:, 2] < FOOT_M] * [1.0, 1.0, 0.0]
     return convex_hull(np.vstack([points, feet]))
 
@@ -113,8 +112,7 @@ def place_object(
     vertices, look = cad.vertices * pose.scale, cad.surface
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     base = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
-    hulls = tuple(convex_hull(h.vertices * pose.scale - base) for h in hulls_cad)
-    hulls = tuple(flatten_feet(h) for h in hulls)
+    hulls = tuple(flatten_feet(convex_hull(h.vertices * pose.scale - base)) for h in hulls_cad)
     if cad.pieces is None and annotation.hinge is None and annotation.category != "door":
         hulls = with_feet(hulls, vertices - base)
     # Exact pieces have exact boxes; coacd's hulls are rough, and stored scenes have theirs along the walls.

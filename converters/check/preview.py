@@ -189,10 +189,7 @@ def _placed(scene: _Scene) -> tuple[PlacedObject, ...]:
         names = [f"{item.name}_hull_{i}" for i in range(item.n_hulls)]
         hulls = [geom_mesh(scene.model, scene.model.geom(name).id)[0] for name in names]
         body = scene.model.body(item.name).id
-        mesh, pose = (
-            (vertices, faces, np.zeros_like(faces, np.uint8)),
-            (scene.data.xpos[body].copy(), scene.data.xquat[body].copy()),
-        )
+        mesh, pose = (vertices, faces, np.zeros_like(faces, np.uint8)), (scene.data.xpos[body], scene.data.xquat[body])
         solids = tuple(convex_hull(h) for h in hulls)
         placed.append(PlacedObject(item.name, item.category, item.cad_id, *mesh, solids, (), *pose))
     return tuple(placed)

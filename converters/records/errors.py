@@ -1,5 +1,6 @@
 """Define the errors that a user can act on, and limits: of what a source may hold, and of a scene's gates."""
 
+import contextlib
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -46,12 +47,10 @@ def check_count(where: object, count: float, most: float, what: str, remedy: str
 def check_image(path: Path) -> None:
     """Refuse a file whose header declares too large an image; what is no image passes."""
     try:
-        with Image.open(path):
-            pass
+        with contextlib.suppress(OSError, ValueError, SyntaxError):
+            Image.open(path).close()
     except Image.DecompressionBombError as error:
         raise SceneRejected(f"{path}: {error}; scale the image down") from error
-    except (OSError, ValueError, SyntaxError):
-        return
 
 
 @dataclasses.dataclass(frozen=True)

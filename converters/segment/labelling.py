@@ -34,8 +34,6 @@ WEIGHTS = Path(__file__).with_name("weights.safetensors")
 """The packaged ones."""
 TILE, MARGIN = 160, 16
 """Voxels of a tile's side, and of its border, which is left to the next tile."""
-MULTIPLE = 8
-"""Sides of a tile are multiples of this many voxels."""
 
 
 class VoxelNet(nn.Module):
@@ -46,7 +44,7 @@ class VoxelNet(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Return the scores of every voxel; sides are multiples of `MULTIPLE`."""
+        """Return the scores of every voxel; sides are multiples of 8."""
         x, skips = _fold(x.astype(self.dtype)), []
         for level, width in enumerate(self.widths):
             if level:

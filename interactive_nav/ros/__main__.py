@@ -135,6 +135,8 @@ def _drive(arguments: Drive, stops: list[int]) -> None:
     if arguments.robot not in (None, name):
         raise UserError(f"{arguments.policy}: the policy is for robot '{name}', expected '{arguments.robot}'")
     path = scene_path(policy.about, arguments.map) if arguments.map else None
+    if path and (avoided := policy.about["inputs"].get("waypoints", {}).get("avoids")):
+        say(f"policy: its waypoints avoided {avoided}, which paths in --map do not; send such paths on /plan")
     limits = arguments.max_linear, arguments.max_angular
     pilot = Pilot(policy, limits, _pose(arguments.odom_in_map, "--odom-in-map"), path)
     need_ros("interactive_nav.ros")

@@ -6,7 +6,7 @@ Frame names follow REP 105, topics Nav2.
 
 import array
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -291,6 +291,14 @@ def transform(
     """Return where the child's frame is in another one; without a quaternion it is not turned."""
     placed = Transform(translation=_vector(np.asarray(pos_m)), rotation=quat or yaw_quat(0.0))
     return TransformStamped(header=header(time_s, frame), child_frame_id=child, transform=placed)
+
+
+def camera_links(poses: Mapping[str, tuple[np.ndarray, float, float]], time_s: float = 0.0) -> list[TransformStamped]:
+    """Return where cameras are in the base's frame: (3,) m, yaw and pitch, rad, by the prefix of their images."""
+    return [
+        transform(BASE, camera_frames(prefix)[0], pos_m, yaw_quat(yaw, pitch), time_s)
+        for prefix, (pos_m, yaw, pitch) in poses.items()
+    ]
 
 
 def _vector(values: np.ndarray) -> Vector3:

@@ -119,7 +119,10 @@ class SimulatorNode:
         return tally
 
     def begin(self, now: Sensed, cameras: CameraPoses, stop: Stop) -> None:
-        """Create publishers of what is sensed, wait in lockstep for the other nodes, and publish fixed frames."""
+        """Create publishers of what is sensed, wait in lockstep for the other nodes, and publish fixed frames.
+
+        `cameras` are fixed to the base.
+        """
         topics, lossless = ros.FROM_ROBOT | ros.camera_topics(now.images), self._pace.recorded
         self._out = {
             name: self._node.create_publisher(kind, name, ros.qos(name, lossless=lossless))
@@ -127,11 +130,9 @@ class SimulatorNode:
         }
         if self._pace.lockstep or lossless:
             self._wait_for_others(stop)
-        links = [ros.transform(ros.BASE, ros.LIDAR, self._robot.lidar_pos_m)]
-        for prefix, (pos_m, yaw, pitch) in cameras.items():
-            camera, optical = ros.camera_frames(prefix)
-            links.append(ros.transform(ros.BASE, camera, pos_m, ros.yaw_quat(yaw, pitch)))
-            links.append(ros.transform(camera, optical, np.zeros(3), ros.OPTICAL_QUAT))
+        links = [ros.transform(ros.BASE, ros.LIDAR, self._robot.lidar_pos_m), *ros.camera_links(cameras)]
+        for prefix in (*cameras, *now.cameras):
+            links.append(ros.transform(*ros.camera_frames(prefix), np.zeros(3), ros.OPTICAL_QUAT))
         links.append(ros.transform(ros.MAP, ros.ODOM, np.zeros(3)))
         self._send({ros.TF_STATIC: ros.TFMessage and ros.TFMessage(transforms=links)})
 
@@ -202,7 +203,7 @@ class SimulatorNode:
         self._send(
             {
                 ros.CLOCK: Clock(clock=ros.stamp(now.time_s)),
-                ros.TF: ros.TFMessage and ros.TFMessage(transforms=[link]),
+                ros.TF: ros.TFMessage and ros.TFMessage(transforms=[link, *ros.camera_links(now.cameras, now.time_s)]),
                 ros.MOVABLE: Bool(data=now.touches_movable),
                 ros.STRUCTURE: Bool(data=now.touches_structure),
                 ros.FORCE: Float32(data=now.force_n),

@@ -44,7 +44,7 @@ class RosPolicy(HostPolicy):
         one = jax.tree.map(operator.itemgetter(0), jax.tree.map(np.asarray, state))
         now = self._sensors.read(one, self._steps * self._sensors.dt_s)
         if not self._steps:
-            self._topics.begin(now, self._sensors.camera_poses(one), self._stop)
+            self._topics.begin(now, self._sensors.camera_poses(one, moving=False), self._stop)
         if step == 0:
             x, y = map(float, one.info["nav"].goal_xy_w)
             pose = ros.Pose(position=ros.Point(x=x, y=y), orientation=ros.yaw_quat(0.0))

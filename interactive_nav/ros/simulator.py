@@ -51,6 +51,8 @@ class Sensed:
     """Mean over the last control step of what the robot pushes with."""
     truth_w: np.ndarray
     """(3,) x, y (m), yaw (rad), world: no sensor measures it."""
+    cameras: CameraPoses = dataclasses.field(default_factory=dict)
+    """Of those that joints move."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,13 +113,15 @@ class RosSensors:
         self.lidar_pos_m, self.dt_s = config.lidar_pos_m, env.dt
         self.lenses = {"": env.sensors.lens} | {camera.prefix: camera.lens for camera in env.sensors.cameras}
 
-    def camera_poses(self, state: Any) -> CameraPoses:
-        """Return the poses of the robot's cameras in a state."""
+    def camera_poses(self, state: Any, moving: bool) -> CameraPoses:
+        """Return the poses of the robot's cameras in a state: those that joints move, or those fixed to its base."""
         sensors, qpos = self._env.sensors, np.asarray(state.pipeline_state.qpos)
         at = self._env.world.layout.robot_qpos
         into_base = np.asarray(matrix_from_quat(qpos[at + 3 : at + 7])).T
         poses = {}
         for prefix, mount in {"": sensors.mount, **{c.prefix: c.mount for c in sensors.cameras}}.items():
+            if any(link.joints for link in mount.links.rest) != moving:
+                continue
             pose = mount.pose(jnp.asarray(qpos))
             x, y, z = into_base @ np.asarray(pose.axes_w)[:, 0]
             place = into_base @ (np.asarray(pose.pos_w) - qpos[at : at + 3])
@@ -143,6 +147,7 @@ class RosSensors:
             touches_structure=structure,
             force_n=force_n,
             truth_w=truth_w,
+            cameras=self.camera_poses(state, moving=True),
         )
 
     def _image(self, name: str, value: np.ndarray) -> np.ndarray:
@@ -174,7 +179,7 @@ class RosSimulator(RosSensors):
         self._state = jax.jit(env.reset_to)(begin, jax.random.fold_in(key, 1))
         self._force_before = 0.0
         self._origin_w = np.array([*begin.start_xy_w, begin.start_yaw_rad])
-        self.cameras = self.camera_poses(self._state)
+        self.cameras = self.camera_poses(self._state, moving=False)
         jax.block_until_ready(self._step(self._state, jnp.zeros(env.action_size)))  # compiled before it counts
 
     def step(self, linear_mps: float, angular_radps: float) -> Sensed:

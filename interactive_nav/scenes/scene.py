@@ -318,7 +318,7 @@ def _files(folder: Path) -> list[Any]:
 
 def _read_scene(folder: str | Path, _files: object = None) -> Scene:
     """Do `load_scene` without its warning; `_files` only tells states of the folder apart in a cache."""
-    folder = existing(folder)
+    folder = existing(folder, or_set=True)
     manifest, maps = load_manifest(folder), load_maps(folder)
     xml = folder / "scene.xml"
     if not xml.is_file():

@@ -32,7 +32,7 @@ PARTS = {
     "normals": ("1", "camera", "unit vectors: right, up, towards the viewer; 0: nothing is met"),
 }
 """Part of an observation -> its unit, its frame (base: x forward, y left, z up) and its numbers."""
-COMPARED = ("shape", "dtype", "unit", "scale", "frame")
+COMPARED = ("shape", "dtype", "unit", "scale", "frame", "spacing_m", "avoids")
 """Properties of an input that must agree with the file, besides the rate."""
 
 
@@ -126,5 +126,5 @@ def difference(file: Mapping[str, Any], here: Mapping[str, Any]) -> str:
     shared = [name for name in here["inputs"] if name in file["inputs"]]
     groups += [(f"input {name}", file["inputs"][name], here["inputs"][name], COMPARED) for name in shared]
     groups += [("command", file["outputs"]["command"], here["outputs"]["command"], ("names", "low", "high"))]
-    facts = [(f"{key} of {what}", a[key], b[key]) for what, a, b, keys in groups for key in keys]
+    facts = [(f"{key} of {what}", a.get(key), b.get(key)) for what, a, b, keys in groups for key in keys]
     return next((f"{name} in the file: {a!r}, in the environment: {b!r}" for name, a, b in facts if a != b), "")

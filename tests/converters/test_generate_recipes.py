@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import shlex
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -338,8 +339,9 @@ def test_a_home_of_a_seed_that_gives_none_is_another_seeds_and_says_so(tmp_path,
             raise GenerationError(f"seed {seed}: no room" if tried[0] < 9 else "OUT is there")
 
     monkeypatch.setattr(generate, "generate_building", refuse)
-    assert main(["generate", str(tmp_path / "a"), "--seed", "5", "--tier", "furnished"]) == 0
+    assert main(["generate", str(tmp_path / "a b"), "--seed", "5", "--tier", "furnished"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
+    assert shlex.split(printed.partition("with: ")[2])[2:] == ["converters", "convert", f"{tmp_path}/a b", "SCENE_DIR"]
     assert tried == [5, 1_000_005, 2_000_005] and "building of seed 2000005 in place of 5 (no room); convert" in printed
     tried.clear()
     assert main(["generate", str(tmp_path / "a"), "--seed", "9", "--tier", "furnished"]) == 2 and tried == [9]

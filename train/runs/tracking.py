@@ -9,10 +9,6 @@ import uuid
 from pathlib import Path
 from typing import Any
 
-from tensorboardX.proto.event_pb2 import Event, SessionLog
-from tensorboardX.record_writer import RecordWriter
-from tensorboardX.summary import scalar
-
 from interactive_nav.robots import robot_name
 from interactive_nav_common.config import flatten
 from interactive_nav_common.errors import ConfigError, missing, optional
@@ -34,21 +30,24 @@ class Events:
     """
 
     def __init__(self, folder: Path, env_steps: int):
-        self._folder = folder
+        from tensorboardX import record_writer, summary  # imports PyTorch where there is one, which takes seconds
+        from tensorboardX.proto.event_pb2 import Event, SessionLog
+
+        self._folder, self._event, self._scalar = folder, Event, summary.scalar
         with writing(folder, GOES_ON):
             folder.mkdir(parents=True, exist_ok=True)
-            self._file = RecordWriter(str(folder / f"events.out.tfevents.{time.time():.6f}"))
+            self._file = record_writer.RecordWriter(str(folder / f"events.out.tfevents.{time.time():.6f}"))
             self._add(file_version="brain.Event:2")
             self._add(step=env_steps + 1, session_log=SessionLog(status=SessionLog.START))
 
     def _add(self, **content: Any) -> None:
-        self._file.write(Event(wall_time=time.time(), **content).SerializeToString())
+        self._file.write(self._event(wall_time=time.time(), **content).SerializeToString())
 
     def log(self, env_steps: int, metrics: dict[str, float]) -> None:
         """Write the means of a log interval, on disk afterwards."""
         with writing(self._folder, GOES_ON):
             for name, value in metrics.items():
-                self._add(step=env_steps, summary=scalar(name if "/" in name else f"run/{name}", value))
+                self._add(step=env_steps, summary=self._scalar(name if "/" in name else f"run/{name}", value))
             self._file.flush()
 
     def close(self) -> None:

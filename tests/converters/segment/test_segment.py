@@ -264,10 +264,10 @@ def test_a_scene_in_which_nothing_moves_names_the_next_step_and_segment_what_it_
     monkeypatch.setattr(retrieval, "read_index", lambda: few)  # each model that is fitted takes a second
     monkeypatch.setattr(retrieval, "MIN_CONFIDENCE", 1.0)  # of two models one is likelier than of all
     words = ["convert", str(room), str(tmp_path / "scene"), "structure_texture=64", "--overwrite"]
-    hand = f"'python -m converters annotate {room} -o DIR'"
+    hand = f"python -m converters annotate {room} -o DIR"
     assert main(words) == 0
     last = capsys.readouterr().out.splitlines()[-1]
-    first = "no movable object: add --segment to recognise furniture in the scan, or place models by hand with "
+    first = "no movable object: add --segment to recognise furniture in the scan, or place models by hand with: "
     assert last == first + hand
     x, _, z = read_source(room).scan.vertices.T
     labels = np.where(z < z.min() + 0.05, 2, 1)
@@ -278,8 +278,8 @@ def test_a_scene_in_which_nothing_moves_names_the_next_step_and_segment_what_it_
     said = capsys.readouterr().out.splitlines()
     for line in ("no sure model, so part of the structure: 1 chair", "labelled, and never given a model: bed"):
         assert f"{room}: {line}" in said
-    assert f"{room}: {hand} places models by hand" in said
-    assert said[-1] == f"no movable object: place models by hand with {hand}"
+    assert f"{room}: place models by hand with: {hand}" in said
+    assert said[-1] == f"no movable object: place models by hand with: {hand}"
 
 
 @pytest.mark.heavy

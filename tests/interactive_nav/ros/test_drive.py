@@ -15,7 +15,7 @@ import pytest
 import interactive_nav
 from interactive_nav.interop.onnx_file import OnnxError, OnnxFile
 from interactive_nav.ros import driving as shared
-from interactive_nav.ros import messages, nodes
+from interactive_nav.ros import messages, nodes, pilot
 from interactive_nav.ros.__main__ import main
 from interactive_nav.ros.drive import DriveNode
 from interactive_nav.ros.nodes import SimulatorNode, ros_node
@@ -172,6 +172,18 @@ def test_bytes_are_rounded():
 def test_other_policies_are_refused(about, line):
     with pytest.raises(OnnxError, match=line):
         Pilot(recording(about))
+
+
+def test_paths_of_a_map_that_lack_what_the_policy_avoided_are_said(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(pilot, "scene_path", lambda about, scene: None if about is None else lambda goal, xy: xy)
+    for avoided in ({}, {"avoids": "heavy furniture"}):
+        about = changed()
+        about["inputs"]["waypoints"] |= avoided
+        words = [str(write_policy(tmp_path / "policy.onnx", about)), "--map", "home", "--odom-in-map", "1,2"]
+        assert main(["drive", *words]) == 2  # for the pose
+        assert ("waypoints avoided heavy furniture, which paths in --map do not" in capsys.readouterr().err) == bool(
+            avoided
+        )
 
 
 def test_mistakes_are_one_line(tmp_path, capsys):

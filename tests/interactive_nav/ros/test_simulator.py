@@ -4,6 +4,8 @@ import math
 import sys
 from types import SimpleNamespace
 
+import jax
+import mujoco
 import numpy as np
 import pytest
 from rclpy.publisher import Publisher
@@ -12,7 +14,7 @@ from std_msgs.msg import Bool
 import interactive_nav
 from interactive_nav.ros import nodes
 from interactive_nav.ros.__main__ import main
-from interactive_nav.ros.simulator import NEEDED, RosSimulator, compose
+from interactive_nav.ros.simulator import NEEDED, RosSensors, RosSimulator, compose
 from interactive_nav_common.errors import UserError
 from tests.toys import write_room
 
@@ -109,6 +111,26 @@ def test_pictures_span_the_field_of_view_of_the_settings(room):
 def test_a_start_in_a_wall_is_refused(env):
     with pytest.raises(UserError, match=r"start \(-3.0, 0.5\) is not where the robot has room"):
         RosSimulator(env, start=(-3.0, 0.5, 0.0))
+
+
+def test_a_camera_on_the_arm_is_where_c_mujoco_has_its_link(room):
+    views = ({"name": "base"}, {"name": "hand", "body": "fetch_gripper", "pos_m": (0.05, 0.0, 0.0), "pitch_deg": 0.0})
+    fixed = {"observations": ("depth", *NEEDED), "image_size": 32, "num_objects": 0, "cameras": views}
+    env = interactive_nav.make("fetch", [room], backend="native", **fixed)
+    sensors, model = RosSensors(env), env.world.models[0]
+    state, data = jax.jit(env.reset)(jax.random.PRNGKey(0)), mujoco.MjData(model)
+    elbow, places = model.joint("fetch_elbow_flex").qposadr[0], []
+    for angle in (0.5, 1.5):
+        qpos = state.pipeline_state.qpos.at[elbow].set(angle)
+        state = state.replace(pipeline_state=state.pipeline_state.replace(qpos=qpos))
+        data.qpos[:] = np.asarray(qpos)
+        mujoco.mj_kinematics(model, data)
+        base, hand = data.body(env.robot.base_body), data.body("fetch_gripper")
+        there = hand.xpos + hand.xmat.reshape(3, 3) @ [0.05, 0.0, 0.0] - base.xpos
+        places.append(sensors.read(state, 0.0).cameras["hand/"][0])
+        assert places[-1] == pytest.approx(base.xmat.reshape(3, 3).T @ there, abs=1e-4)
+    assert np.linalg.norm(places[1] - places[0]) > 0.2
+    assert "hand/" not in sensors.camera_poses(state, moving=False)
 
 
 def test_poses_are_composed():

@@ -106,7 +106,10 @@ def test_frames_hang_together(bus, monkeypatch):
     robot.cameras |= {"left/": (np.array([0.0, 0.2, 0.9]), math.pi / 2, 0.4)}
     robot.lenses |= {"left/": Lens(4, 3, 60.0)}
     sense = robot.sense
-    robot.sense = lambda: dataclasses.replace(sense(), images={"left/rgb": np.zeros((3, 4, 3), np.uint8)})
+    moving = {"hand/": (np.array([0.5, 0.0, 0.7]), 0.0, 0.1)}
+    robot.sense = lambda: dataclasses.replace(
+        sense(), images={"left/rgb": np.zeros((3, 4, 3), np.uint8)}, cameras=moving
+    )
     node = SimulatorNode(bus.simulator, robot, Pace(factor=0.0, limit_s=0.0))  # type: ignore[arg-type]
     monkeypatch.setattr(
         node,
@@ -118,20 +121,26 @@ def test_frames_hang_together(bus, monkeypatch):
     assert [(t.header.frame_id, t.child_frame_id) for t in fixed] == [
         ("base_link", "lidar_link"),
         ("base_link", "camera_link"),
-        ("camera_link", "camera_optical_frame"),
         ("base_link", "left_camera_link"),
+        ("camera_link", "camera_optical_frame"),
         ("left_camera_link", "left_camera_optical_frame"),
+        ("hand_camera_link", "hand_camera_optical_frame"),
         ("map", "odom"),
     ]
+    (moment,) = sent[messages.TF]  # with each one where the hand's camera is
+    assert [(t.header.frame_id, t.child_frame_id) for t in moment.transforms] == [
+        ("odom", "base_link"),
+        ("base_link", "hand_camera_link"),
+    ]
+    place = moment.transforms[1].transform.translation
+    assert (place.x, place.y, place.z) == (0.5, 0.0, 0.7) and moment.transforms[1].header.stamp == messages.stamp(0.0)
     # The left camera's x axis points to the left and 0.4 rad down.
-    quat = fixed[3].transform.rotation
+    quat = fixed[2].transform.rotation
     x, y, z, w = quat.x, quat.y, quat.z, quat.w
     ahead = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)
     assert ahead == pytest.approx((0.0, math.cos(0.4), -math.sin(0.4)))
     (picture,) = sent["/camera/left/image_raw"]
     assert picture.header.frame_id == "left_camera_optical_frame"
-    (moving,) = sent[messages.TF][0].transforms
-    assert (moving.header.frame_id, moving.child_frame_id) == ("odom", "base_link")
 
 
 def test_a_command_is_driven_for_half_a_second_and_no_longer(bus):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import struct
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -27,6 +28,11 @@ from train.runs.run import train_run
 
 def quiet() -> Console:
     return Console(file=io.StringIO())
+
+
+def test_a_run_is_imported_without_tensorboard_which_would_bring_pytorch():
+    script = "import sys, train.runs.run; print(sorted({'tensorboardX', 'torch'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
 def scalars(path: Path) -> dict[tuple[int, str], float]:
@@ -53,7 +59,7 @@ def test_events_hold_each_value_at_its_step(tmp_path):
 def test_events_that_meet_a_full_disk_are_one_error_and_the_run_can_be_begun_again(tmp_path, monkeypatch):
     config = toy_config(tmp_path, updates=1)
     with monkeypatch.context() as full:
-        full.setattr(tracking, "RecordWriter", lambda _: RecordWriter("/dev/full"))
+        full.setattr("tensorboardX.record_writer.RecordWriter", lambda _: RecordWriter("/dev/full"))
         with pytest.raises(FileError, match=r"tensorboard: cannot be written \(No space left on device\); make room"):
             train_run(config, quiet(), build_env=build_toy)
     result, folder, _ = train_run(config, quiet(), build_env=build_toy)
