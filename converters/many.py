@@ -112,11 +112,8 @@ def convert_many(
                 write_parquet(pa.Table.from_pylist(list(rows.values()), SCHEMA), path)
                 line = row.get("error")
                 if line is None:
-                    verdict = (
-                        f"gates that fail: {', '.join(row['gates_failed'])}"
-                        if row["gates_failed"]
-                        else "every gate passes"
-                    )
+                    failed = ", ".join(row["gates_failed"])
+                    verdict = f"gates that fail: {failed}" if failed else "every gate passes"
                     line = f"{row['area_m2']:.1f} m² traversable in {row['seconds']:.0f} s, {verdict}"
                 log(f"{name}: {line}")
                 bad += [name] if code else []

@@ -261,10 +261,8 @@ def _judge(
         rows.append(row | settled | shown | ({} if hinge is None else {"hinge_assumed": hinge.assumed}))
     spec = mujoco.MjSpec.from_file(str(folder / "scene.xml"))
     gates = evaluate(spec, placed.maps, scene_objects(parts), drawn_shares(rows), shares)
-    area_m2, fallbacks = float(plan.traversable.sum()) * plan.grid.resolution_m**2, placed.decomposed.fallbacks
-    manifest = make_manifest(
-        placed.raw, config.split, parts, area_m2, rows, gates, config.search, fallbacks, placed.maps
-    )
+    area_m2, single = float(plan.traversable.sum()) * plan.grid.resolution_m**2, placed.decomposed.fallbacks
+    manifest = make_manifest(placed.raw, config.split, parts, area_m2, rows, gates, config.search, single, placed.maps)
     rounded = {name: round(share, 4) for name, share in shares.items()}
     manifest = dataclasses.replace(manifest, floor_unseen_m2=round(plan.unseen_m2, 3), **rounded)
     save_manifest(manifest, folder)

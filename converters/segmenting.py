@@ -63,13 +63,11 @@ def _beside(source: Path, ending: str) -> Path:
     return beside(source, ending) if source.is_file() else (source / MESH).with_suffix(f".{ending}")
 
 
-def _read(arguments: Any) -> Any:
+def _read(command: Any) -> Any:
     from converters.read.source import read_source
 
     words = {"layout": "format", "strict": "strict", "up": "up", "unit": "unit", "within": "root", "mirror": "mirror"}
-    return read_source(
-        arguments.source, **{k: getattr(arguments, w) for k, w in words.items() if hasattr(arguments, w)}
-    )
+    return read_source(command.source, **{k: getattr(command, w) for k, w in words.items() if hasattr(command, w)})
 
 
 class Segment(MeshFile):

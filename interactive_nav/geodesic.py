@@ -13,14 +13,7 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 
-from interactive_nav_common.grids import (
-    MOVES_32,
-    clearance,
-    crossed_cells,
-    largest_component,
-    nearest_cell,
-    sampled_clearance,
-)
+from interactive_nav_common import grids
 
 
 def distance_field(traversable, resolution: float, goal_xy, origin: tuple[float, float] = (0.0, 0.0)):
@@ -43,8 +36,8 @@ def distance_field(traversable, resolution: float, goal_xy, origin: tuple[float,
     def shifted(array, move, fill):
         return jnp.pad(array, 3, constant_values=fill)[3 + move[0] :, 3 + move[1] :][:rows, :columns]
 
-    moves = [(sign * r, sign * c) for r, c in MOVES_32 for sign in (1, -1)]
-    allowed = [jnp.stack([shifted(free, cell, False) for cell in crossed_cells(move)]).all(0) for move in moves]
+    moves = [(sign * r, sign * c) for r, c in grids.MOVES_32 for sign in (1, -1)]
+    allowed = [jnp.stack([shifted(free, cell, False) for cell in grids.crossed_cells(move)]).all(0) for move in moves]
 
     def sweep(carry):
         field, _ = carry
@@ -64,7 +57,7 @@ def navigation_grid(traversable: np.ndarray, resolution_m: float, radius_m: floa
     `traversable` is [rows, columns] bool, the result [ceil(rows * resolution / cell), ...] with the same origin.
     Erosion uses the map's resolution, so that a coarse grid does not widen walls.
     """
-    return largest_component(sampled_clearance(traversable, resolution_m, cell_m) >= max(radius_m, 1e-6))
+    return grids.largest_component(grids.sampled_clearance(traversable, resolution_m, cell_m) >= max(radius_m, 1e-6))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,7 +184,7 @@ def _nodes(room: np.ndarray, ratio: int) -> tuple[np.ndarray, np.ndarray]:
     r, c = np.nonzero(has_node)
     chosen = best[has_node]
     points = np.stack([c * ratio + chosen % ratio + 0.5, r * ratio + chosen // ratio + 0.5], -1)
-    nearest = nearest_cell(has_node)
+    nearest = grids.nearest_cell(has_node)
     index = np.full(has_node.shape, -1, np.int64)
     index[has_node] = np.arange(len(points))
     return index[nearest[0], nearest[1]], points
@@ -205,10 +198,10 @@ def corner_graph(free: np.ndarray, fine_m: float, cell_m: float, origin_w: tuple
     ratio = round(cell_m / fine_m)
     if ratio < 1 or abs(cell_m / fine_m - ratio) > 1e-6:
         raise ValueError(f"cell_m is {cell_m}, expected a whole multiple of fine_m ({fine_m})")
-    free = largest_component(_without_pinches(np.asarray(free, bool)))
+    free = grids.largest_component(_without_pinches(np.asarray(free, bool)))
     if not free.any():
         raise ValueError("free has no free cell, expected at least one")
-    room = clearance(free, 1.0)
+    room = grids.clearance(free, 1.0)
     node_of_cell, points = _nodes(room, ratio)
     corners, into = _corners(free)
     count = len(corners)

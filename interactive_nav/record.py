@@ -19,16 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
-from interactive_nav.pictures.camera import (
-    BEHIND_M,
-    OUTSIDE,
-    FloorPaint,
-    SceneView,
-    chase_camera,
-    depth_picture,
-    mask_picture,
-    robot_camera,
-)
+from interactive_nav.pictures import camera as drawing
 from interactive_nav.pictures.replay import Replay, ReplayError, load_replay, replay_path
 from interactive_nav.pictures.rerun_file import need_rerun, write_recording
 from interactive_nav.pictures.scene_model import ROBOT, SCENE, clear_way
@@ -68,11 +59,11 @@ class Compositor:
         """Columns and rows of a frame."""
         robot = get_robot(replay.robot)
         self._middle_m = 0.6 * robot.height_m
-        self._view = SceneView(robot, scene, replay.small, replay.segmentation_classes)
+        self._view = drawing.SceneView(robot, scene, replay.small, replay.segmentation_classes)
         yaw = np.unwrap(yaw_from_quat(replay.body_quat_w[:, 0]))
         self._yaw = gaussian_filter1d(yaw, _CAMERA_LAG_S / replay.control_dt_s, mode="nearest")
         self._target = gaussian_filter1d(replay.body_pos_w[:, 0], 0.2 / replay.control_dt_s, axis=0, mode="nearest")
-        self._cameras = {view: self._positions(view) for view in self.views if view in BEHIND_M}
+        self._cameras = {view: self._positions(view) for view in self.views if view in drawing.BEHIND_M}
         # Pillow's font has spaces of 0.2 em, which round to nothing between some letters of small sizes.
         self._font = ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf"), height / 28)
 
@@ -80,22 +71,19 @@ class Compositor:
         """Draw [rows, columns, 3] u8: the state after `step` control steps."""
         replay, height = self.replay, self.height
         self._place(step)
-        paint = FloorPaint(replay.goal_xy_w, replay.success_distance_m, _dense(replay.robot_xy_w[: step + 1]))
+        paint = drawing.FloorPaint(replay.goal_xy_w, replay.success_distance_m, _dense(replay.robot_xy_w[: step + 1]))
         if self.views:
             panes = [self._view.textured(*self._camera(v, step), (*SCENE, ROBOT), paint) for v in self.views]
             return np.concatenate([np.concatenate(panes, 1), self._caption(step)], 0)
-        camera = chase_camera(self._target[step], float(self._yaw[step]), height, self._columns)
-        behind = self._view.render(*camera, OUTSIDE, paint)["rgb"]
+        camera = drawing.chase_camera(self._target[step], float(self._yaw[step]), height, self._columns)
+        behind = self._view.render(*camera, drawing.OUTSIDE, paint)["rgb"]
         side = height // 3
-        cameras = [robot_camera(self._view, n, n, replay.image_fov_deg) for n in (side, CAMERA_PIXELS)]
+        cameras = [drawing.robot_camera(self._view, n, n, replay.image_fov_deg) for n in (side, CAMERA_PIXELS)]
         colour, image = self._view.render(*cameras[0], SCENE)["rgb"], self._view.render(*cameras[1], SCENE)
         depth_m, mask = image["depth"], image["segmentation"]
-        small = [depth_picture(depth_m), mask_picture(mask, depth_m, replay.segmentation_classes)]
-        column = [
-            colour,
-            *(np.asarray(Image.fromarray(x).resize((side, side), Image.Resampling.NEAREST)) for x in small),
-        ]
-        picture = np.concatenate([behind, np.concatenate(column, 0)], 1)
+        small = [drawing.depth_picture(depth_m), drawing.mask_picture(mask, depth_m, replay.segmentation_classes)]
+        large = (Image.fromarray(x).resize((side, side), Image.Resampling.NEAREST) for x in small)
+        picture = np.concatenate([behind, np.concatenate([colour, *map(np.asarray, large)], 0)], 1)
         return np.concatenate([picture, self._caption(step)], 0)
 
     def _place(self, step: int) -> None:
@@ -103,7 +91,7 @@ class Compositor:
 
     def _positions(self, view: str) -> np.ndarray:
         """Return [T + 1, 3] m: behind the robot and in front of walls and furniture, without jerks."""
-        back_m, up_m = BEHIND_M[view]
+        back_m, up_m = drawing.BEHIND_M[view]
         steps = _CAMERA_LAG_S / self.replay.control_dt_s
         # Behind where it goes, not where it looks: a robot turns on the spot.
         ahead = gaussian_filter1d(np.gradient(self._target[:, :2], axis=0), 2 * steps, axis=0, mode="nearest")
@@ -129,22 +117,16 @@ class Compositor:
         replay, (columns, _) = self.replay, self.size
         strip = Image.new("RGB", (columns, self._strip), (24, 28, 36))
         draw = ImageDraw.Draw(strip)
-        scores = replay.metrics
-        at = max(step - 1, 0)
-        touch = "touches " + (
-            "an object" if replay.touches_movable[at] else "a wall" if replay.touches_structure[at] else "nothing"
-        )
-        lines = [
-            f"{replay.policy}  episode {replay.episode}  {Path(replay.scene).name}  {replay.label}",
-            f"{step * replay.control_dt_s:5.1f} s   reward {replay.reward[:step].sum():6.2f}   "
-            f"force {replay.force_n[at] if step else 0.0:5.1f} N   {touch if step else ''}",
-        ]
+        scores, at = replay.metrics, max(step - 1, 0)
+        touched = "an object" if replay.touches_movable[at] else "a wall" if replay.touches_structure[at] else "nothing"
+        about = f"reward {replay.reward[:step].sum():6.2f}   force {replay.force_n[at] if step else 0.0:5.1f} N   "
+        about += f"touches {touched}" * bool(step)
         if step == replay.num_steps:
-            end = "reached the goal" if scores["success"] else "did not reach the goal"
-            lines[1] = (
-                f"{step * replay.control_dt_s:5.1f} s   {end}   P_eff {scores['path_efficiency']:.2f}   "
-                f"E_eff {scores['effort_efficiency']:.2f}   INS_0.5 {scores['ins_0.5']:.2f}"
-            )
+            about = "reached the goal" if scores["success"] else "did not reach the goal"
+            for name, key in (("P_eff", "path_efficiency"), ("E_eff", "effort_efficiency"), ("INS_0.5", "ins_0.5")):
+                about += f"   {name} {scores[key]:.2f}"
+        where = f"{replay.policy}  episode {replay.episode}  {Path(replay.scene).name}  {replay.label}"
+        lines = where, f"{step * replay.control_dt_s:5.1f} s   {about}"
         for i, line in enumerate(lines):
             draw.text((self._strip // 5, self._strip * (1 + 4 * i) // 9), line, font=self._font, fill=(235, 238, 242))
         return np.asarray(strip)

@@ -81,9 +81,7 @@ def place_discs(scene: Scene, radii_m: Sequence[float], height_m: float, rng: np
         for xy, other in zip(places, radii_m, strict=False):
             free = free[np.linalg.norm(free - xy, axis=-1) > radius + other + GAP_M]
         if not len(free):
-            raise ViewError(
-                f"{scene.name}: no free place for object {k} of radius {radius:.2f} m; ask for fewer --objects"
-            )
+            raise ViewError(f"{scene.name}: no place for object {k} of radius {radius:.2f} m; ask for fewer --objects")
         places.append(free[rng.integers(len(free))])
     return np.array(places).reshape(-1, 2)
 
@@ -107,10 +105,8 @@ def build_model(folder: Path, robot: RobotSpec | None, small: Sequence[SmallObje
             eye = np.array([-back_m, 0.0, high_m - robot.spawn_height_m])
             pose = look_along(eye, [0.0, 0.0, robot.height_m / 2 - robot.spawn_height_m] - eye)
             camera = spec.body(robot.base_body).add_camera(name=view, pos=eye, fovy=60.0)
-            camera.alt.type, camera.alt.xyaxes = (
-                mujoco.mjtOrientation.mjORIENTATION_XYAXES,
-                pose.axes_w[:, 1:].T.ravel(),
-            )
+            camera.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
+            camera.alt.xyaxes = pose.axes_w[:, 1:].T.ravel()
     for name, obj, xy in zip(body_names(small), small, places[len(radii) :], strict=True):
         put(name, xy, 0.0)
         add_shapes(spec.body(name), obj, name)

@@ -173,9 +173,7 @@ def _members(word: str) -> list[str] | None:
         what = f"the set has no scene to {split} in" if not names else None
         if missing:
             what = f"{len(missing)} of {len(names)} scenes are missing (the first is '{missing[0]}')"
-            what += (
-                ", or not those that the set lists" if any(cached[n].exists() for n in missing if n in cached) else ""
-            )
+            what += ", or not those that the set lists" * any(cached[n].exists() for n in missing if n in cached)
         if what:
             own = next((f"scenes make {name}" for name, folder in PACKAGED.items() if folder == root), None)
             command = own or f"generate-scenes {typed(os.path.relpath(root))}"

@@ -304,7 +304,7 @@ def test_a_name_like_none_is_told_the_sets() -> None:
         load_scene("yscen")
 
 
-def test_a_set_is_not_offered_where_one_scene_is_meant() -> None:
+def test_a_set_is_no_scene() -> None:
     for word in ("cluttered", "clutered"):
         with pytest.raises(
             SceneError, match=f"{word}: .* expected a scene folder, did you mean 'scenes_mjcf/cluttered/"
@@ -312,7 +312,7 @@ def test_a_set_is_not_offered_where_one_scene_is_meant() -> None:
             existing(word)
 
 
-def test_a_set_whose_folder_has_a_space_is_made_by_the_command_that_is_shown(tmp_path, monkeypatch) -> None:
+def test_the_command_for_a_folder_with_a_space_can_be_typed(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     write_set(SceneSet("sparse", {"shed": Member("train", 1)}), Path("my homes/set.json"))
     with pytest.raises(SceneError) as missing:

@@ -175,9 +175,8 @@ def localisation_between(
     rows = localisation(node_network, node_rooms, query_network, query_rooms)
     if not rows:
         raise FileError("source and target have no scene in common with positions for training and for testing")
-    places = sum(
-        int((mine & query_rooms.test).sum()) for name, mine in rows_by_scene(query_rooms).items() if name in rows
-    )
+    scored = (mine for name, mine in rows_by_scene(query_rooms).items() if name in rows)
+    places = sum(int((mine & query_rooms.test).sum()) for mine in scored)
     return {**rows, "queries": places * len(range(0, query_rooms.images.shape[2], 3))}
 
 
@@ -201,9 +200,8 @@ def passage_configurations(run: Path, target: Path, out: Path, config: AdaptConf
         network, tx = trained.network, optax.adam(config.fine_tune_learning_rate)
         shape = (trained.about["data"]["height"], trained.about["data"]["width"])
         fresh = learning.Learner.start(learning.initial(learning.variable_shapes(network, shape), config.seed), tx)
-        epoch = learning.labelled_epoch(
-            network, tx, config.fine_tune_batch, 0.0, config.fine_tune_augment, learned.scored
-        )
+        how = config.fine_tune_batch, 0.0, config.fine_tune_augment
+        epoch = learning.labelled_epoch(network, tx, *how, learned.scored)
         one = learning.over(epoch, learned.images, learned.free.astype(np.int32))
         keys = learning.phase_key(config.seed, 3)
         results: dict[str, Any] = {"fine_tuned_on": len(learned.images), "tested_on": len(tested.images)}
@@ -253,10 +251,8 @@ def collected_map(scene_folder: Path | None, target: Path, localiser: Path, dete
     if scene_folder:
         space = free_space(scene, get_robot(data.robot).height_m)
     else:  # nothing but floor, a metre about the places
-        cells = np.ceil(np.ptp(xy, axis=0) / 0.1).astype(int) + 20
-        space = FreeSpace(
-            np.pad(np.ones(cells[::-1]), 1), 0.1, (float(xy[:, 0].min()) - 1.0, float(xy[:, 1].min()) - 1.0)
-        )
+        (x, y), cells = xy.min(0).tolist(), np.ceil(np.ptp(xy, axis=0) / 0.1).astype(int) + 20
+        space = FreeSpace(np.pad(np.ones(cells[::-1]), 1), 0.1, (x - 1.0, y - 1.0))
     built = judged_map(scene, space, xy, room, shown, networks, config.edge_m, config.passable, about)
     for start, end, opened in first.get("by_hand", ()):
         ends = [first["places"].index(place) if place in first["places"] else -1 for place in (start, end)]

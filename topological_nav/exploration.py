@@ -126,9 +126,7 @@ class Explorer(HostPolicy):
             self._nodes.append((xy_w, images, embeddings))
             self._unexplored.append(p * (p >= self._how.passable))
         if not np.any(self._unexplored[0]) and not away.size:
-            raise ConfigError(
-                f"no heading is open for {OPEN_M:g} m at the start; choose another seed, or less passable"
-            )
+            raise ConfigError(f"no heading is open for {OPEN_M:g} m at the start; choose another seed or less passable")
         if self._left and self._left[0] != here and (self._left[0], here) not in self._edges:
             node, angle = self._left
             length_m = float(np.linalg.norm(self._nodes[node][0] - self._nodes[here][0]))

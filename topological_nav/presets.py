@@ -23,8 +23,6 @@ def configured(base: Config, words: Sequence[str], part: str) -> Config:
     if name := preset_of(words):
         if part not in PRESETS.get(name, {}):
             of_part = ", ".join(known for known, parts in PRESETS.items() if part in parts)
-            raise ConfigError(
-                f"preset is '{name}', expected one with settings of '{part}': {of_part or 'there is none'}"
-            )
+            raise ConfigError(f"preset is '{name}', expected one with settings of '{part}': {of_part or 'none'}")
         base = overlay(base, PRESETS[name][part], f"preset {name}")
     return overridden(base, [word for word in words if not word.startswith("preset=")])

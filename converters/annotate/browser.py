@@ -128,9 +128,7 @@ class Page:
         self._steps, self._progress = gui.add_markdown(""), gui.add_progress_bar(0)
         self._object = gui.add_dropdown("Object", ["-"])
         self._class = gui.add_dropdown("Class", classes)
-        self._symmetry = gui.add_dropdown(
-            "Symmetry", list(SYMMETRIES), hint="turns after which the model looks the same"
-        )
+        self._symmetry = gui.add_dropdown("Symmetry", list(SYMMETRIES), hint="turns after which it looks the same")
         self._image = gui.add_image(np.full((THUMBNAIL, SHOWN * THUMBNAIL, 3), 255, np.uint8))
         self._pick = gui.add_button_group("Model", [*map(str, range(1, SHOWN + 1)), "more"])
         self._fit = gui.add_markdown("")
@@ -189,9 +187,7 @@ class Page:
         """Handle a click: a point of the scan, or of the model that stands beside it, whichever the ray meets first."""
         origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
         with self._lock:
-            hits = {
-                side: hit(self._drawn[side], origin, direction) for side in ("scan", "model") if side in self._drawn
-            }
+            hits = {of: hit(self._drawn[of], origin, direction) for of in ("scan", "model") if of in self._drawn}
             side = min(hits, key=lambda k: hits[k][0], default="scan")
             if not hits or not np.isfinite(hits[side][0]):
                 return

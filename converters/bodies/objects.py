@@ -65,11 +65,8 @@ def with_feet(hulls: tuple[Hull, ...], vertices: np.ndarray) -> tuple[Hull, ...]
     covered = shapely.union_all([shapely.MultiPoint(p).convex_hull for p in stands if len(p)])
     base = vertices[vertices[:, 2] < FOOT_M, :2]
     lost = base[shapely.distance(shapely.points(base), covered) > FOOT_M] if not covered.is_empty else base[:0]
-    columns = (
-        shapely.get_parts(shapely.union_all(shapely.buffer(shapely.points(lost), 2 * FOOT_M))) if len(lost) else []
-    )
     feet = []
-    for column in columns:
+    for column in shapely.get_parts(shapely.union_all(shapely.buffer(shapely.points(lost), 2 * FOOT_M))):
         inside = vertices[shapely.contains_xy(column, *vertices[:, :2].T) & (vertices[:, 2] < 5 * FOOT_M)]
         level = inside * [1.0, 1.0, 0.0]
         feet.append(convex_hull(np.vstack([inside, level, level + [0.0, 0.0, FOOT_M]])))

@@ -93,9 +93,7 @@ def sample_faces(
     if len(faces) == 0:
         return np.zeros((0, vertices.shape[1])), np.zeros(0, np.int64)
     count = count_samples(vertices, faces, spacing_m, most_steps)
-    check_count(
-        "a surface", count, SAMPLES, f"points at {spacing_m:g} m", "remove long thin faces, or split the source"
-    )
+    check_count("a surface", count, SAMPLES, f"points at {spacing_m:g} m", "remove long thin faces or split the source")
     points, index = zip(*sampled(vertices, faces, spacing_m, most_steps), strict=True)
     return np.concatenate(points), np.concatenate(index)
 
@@ -301,9 +299,7 @@ def simplify_open(vertices: np.ndarray, faces: np.ndarray, most_faces: int) -> t
     normal = unit_normals(vertices, faces[owner])
     tips = (start + end) / 2 + normal * np.linalg.norm(end - start, axis=1, keepdims=True)
     points = np.vstack([vertices, tips])
-    whole = np.vstack([faces, np.column_stack([edges[:, ::-1], len(vertices) + np.arange(len(edges))])]).astype(
-        np.int32
-    )
+    whole = np.vstack([faces, np.c_[edges[:, ::-1], len(vertices) + np.arange(len(edges))]]).astype(np.int32)
     target, left = most_faces, faces
     for _ in range(RIM_ROUNDS):
         # Only the replay returns which corner went where, but its places are in single precision, kilometres off.

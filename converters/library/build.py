@@ -22,15 +22,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from converters.bodies.decompose import DecomposeConfig, cache_folder, decompose_all
+from converters.geometry import faces as geometry
 from converters.geometry.boxes import convex_hull
-from converters.geometry.faces import (
-    compacted,
-    merge_vertices,
-    sample_faces,
-    simplify_to,
-    simplify_within,
-    surface_loss,
-)
 from converters.library.store import Credit, Model, Shape, attribution, write_library
 from converters.read.files import SourceFolder
 from converters.read.meshes import colours_of_faces, read_surface
@@ -170,7 +163,7 @@ def read_selection(pieces: Sequence[CatalogueModel], path: Path = SELECTION) -> 
 
 def as_catalogued(surface: TexturedMesh, piece: CatalogueModel) -> TexturedMesh:
     """Return the surface turned and scaled as its catalogue says, the middle of its base at the origin."""
-    vertices, faces = compacted(surface.vertices, surface.faces)
+    vertices, faces = geometry.compacted(surface.vertices, surface.faces)
     vertices = vertices @ piece.rotation.T
     low, span = vertices.min(axis=0), np.ptp(vertices, axis=0)
     vertices = (vertices - low - span * [0.5, 0.0, 0.5]) * (np.array(piece.size_m) / span)
@@ -187,7 +180,7 @@ def on_top(surface: TexturedMesh, rider: TexturedMesh) -> TexturedMesh:
     """Join both: the rider on what is highest below its footprint, at the middle, its back near the other's."""
     span, rider_span = np.ptp(surface.vertices, axis=0), np.ptp(rider.vertices, axis=0)
     back = min(0.0, rider_span[2] / 2 + 0.03 - span[2] / 2)
-    points, _ = sample_faces(surface.vertices, surface.faces, 0.02)
+    points, _ = geometry.sample_faces(surface.vertices, surface.faces, 0.02)
     below = (np.abs(points[:, [0, 2]] - [0.0, back]) < rider_span[[0, 2]] / 2).all(axis=1)
     top = float(points[below, 1].max()) if below.any() else float(span[1])
     return join_meshes(surface, dataclasses.replace(rider, vertices=rider.vertices + [0.0, top, back]))
@@ -197,17 +190,17 @@ def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]
     """Build one model, ready to be packaged."""
     where = f"{chosen.pieces[0].library}: {chosen.pieces[0].model}"
     surface = functools.reduce(on_top, map(_surface, chosen.pieces))
-    vertices, faces, keep = merge_vertices(surface.vertices, surface.faces)
+    vertices, faces, keep = geometry.merge_vertices(surface.vertices, surface.faces)
     colours = colours_of_faces(surface)[keep]
-    solid = simplify_within(vertices, faces, SOLID_M)
+    solid = geometry.simplify_within(vertices, faces, SOLID_M)
     result = decompose_all({chosen.key: solid}, HULLS, 1, cache or cache_folder(), strict=True)
     size_m = np.ptp(surface.vertices, axis=0)
     foot_m = FOOT_SHARE * size_m[1]
     solids = (hull.vertices for hull in result.hulls[chosen.key])
     hulls = tuple(convex_hull(np.vstack([v, v[v[:, 1] < foot_m] * [1.0, 0.0, 1.0]])) for v in solids)
     for most in (*LEAN_FACES, MOST_FACES):
-        low = simplify_to(vertices, faces, most)
-        kept, off_m = surface_loss(vertices, faces, *low)
+        low = geometry.simplify_to(vertices, faces, most)
+        kept, off_m = geometry.surface_loss(vertices, faces, *low)
         lost = 1 - kept
         if lost <= LEAN_LOST and off_m <= LEAN_OFF_M:
             break
@@ -216,9 +209,7 @@ def make_model(chosen: Chosen, cache: Path | None = None) -> tuple[Model, Shape]
             f"{where}: loses {lost:.2f} of its surface or {off_m:.3f} m at {len(low[1])} faces; leave it out"
         )
     if len(low[1]) > 1.1 * MOST_FACES:
-        raise SceneRejected(
-            f"{where}: has {len(low[1])} faces after simplification, expected {MOST_FACES}; leave it out"
-        )
+        raise SceneRejected(f"{where}: has {len(low[1])} faces when simplified, expected {MOST_FACES}; leave it out")
     spacing_m = max(float(size_m.max()) / TEXELS, 1e-3)
     visual, _ = bake_object(vertices, faces, colours, textured_cloud(surface, spacing_m), low, TEXELS)
     credits = []
@@ -244,9 +235,7 @@ def build(
                 done.append(future.result())
                 report(one.key, len(done) / len(chosen))
         except concurrent.futures.process.BrokenProcessPool:
-            raise StageFailed(
-                f"library: a process died while {jobs} models were made; try again with fewer --jobs"
-            ) from None
+            raise StageFailed(f"library: a process died, one of {jobs}; try again with fewer --jobs") from None
         finally:
             pool.shutdown(cancel_futures=True)
     with whole_file(target / "models.zip") as partial:

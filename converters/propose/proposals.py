@@ -73,14 +73,9 @@ def propose_instances(scan: ScanMesh, voxel_m: float = VOXEL_M) -> tuple[Proposa
         box = upright_box(piece.points)
         inside = (other_voxels >= piece.voxels.min(axis=0)) & (other_voxels <= piece.voxels.max(axis=0))
         purity = min(1.0, len(piece.voxels) / max(int(inside.all(axis=1).sum()), 1))
-        extent = 2 * box.half
-        yaw = math.atan2(box.rotation[1, 0], box.rotation[0, 0])
-        confidence = _confidence(category, extent, purity, len(piece.voxels), voxel_m)
-        proposals.append(
-            Proposal(
-                category, piece.label, piece.points, box.centre, extent, yaw, len(piece.voxels), round(confidence, 4)
-            )
-        )
+        extent, count, yaw = 2 * box.half, len(piece.voxels), math.atan2(box.rotation[1, 0], box.rotation[0, 0])
+        confidence = round(_confidence(category, extent, purity, count, voxel_m), 4)
+        proposals.append(Proposal(category, piece.label, piece.points, box.centre, extent, yaw, count, confidence))
     return tuple(sorted(proposals, key=lambda p: (-p.confidence, p.centre.tolist())))
 
 
@@ -273,9 +268,8 @@ def propose(
             at = max(range(len(proposals)), key=lambda i, box=box: box_iou(box, bounds(proposals[i].points)))
             share = ((proposals[at].points > low) & (proposals[at].points < high)).all(axis=1).mean()
             if share > SAME_OBJECT_SHARE and at in retrieved:
-                comparisons.append(
-                    retrieval.compare_retrieval(annotation, raw.cads, proposals[at], retrieved[at], floor)
-                )
+                pair = proposals[at], retrieved[at]
+                comparisons.append(retrieval.compare_retrieval(annotation, raw.cads, *pair, floor))
     proposed = Proposed(proposals, retrieved, tuple(comparisons))
     report("draw", 0.95)
     text = json.dumps(as_scan2cad(raw.name, proposals, retrieved), indent=1, allow_nan=False) + "\n"

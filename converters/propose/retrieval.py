@@ -132,9 +132,7 @@ def _on_floor(pose: Alignment, p: np.ndarray, q: np.ndarray, w: np.ndarray, base
     height = p[:, 2] - base
     scale_z = max(float(w @ (height * (q[:, 2] - floor_m))) / max(float(w @ height**2), 1e-12), 0.05)
     scale = pose.scale * [1.0, 1.0, 0.0] + [0.0, 0.0, scale_z]
-    return dataclasses.replace(
-        pose, scale=scale, translation=np.array([*pose.translation[:2], floor_m - scale_z * base])
-    )
+    return dataclasses.replace(pose, scale=scale, translation=np.append(pose.translation[:2], floor_m - scale_z * base))
 
 
 def _refine(

@@ -250,9 +250,7 @@ def clean_surface(
     count = np.unique(edges, axis=0, return_counts=True)[1]
     open_edges, busy_edges = int((count == 1).sum()), int((count > 2).sum())
     if busy_edges:
-        source.note(
-            f"{where}: is not manifold ({busy_edges} edges with three faces or more); collision uses closed hulls"
-        )
+        source.note(f"{where}: is not manifold ({busy_edges} edges with 3 faces or more); collision uses closed hulls")
     elif open_edges:
         source.note(f"{where}: is not watertight ({open_edges} open edges); collision uses closed hulls")
     return vertices, faces, colours

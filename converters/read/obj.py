@@ -268,9 +268,8 @@ def texels(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """Return (n, 3) uint8 of an image (h, w, 3) at texture coordinates (n, 2); it repeats outside [0, 1]."""
     height, width = image.shape[:2]
     u, v = (uv % 1.0).T
-    return image[
-        np.clip(((1.0 - v) * height).astype(int), 0, height - 1), np.clip((u * width).astype(int), 0, width - 1)
-    ]
+    row, column = ((1.0 - v) * height).astype(int), (u * width).astype(int)
+    return image[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
 
 
 def join_textures(corner_uv: np.ndarray, number: np.ndarray, images: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

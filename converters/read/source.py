@@ -83,9 +83,7 @@ def read_source(
             )
         return _read(meshes.read_single_mesh, source, strict, up, unit, mirror, within=within)
     if about_mesh:
-        raise SceneRejected(
-            f"{source}: --up, --unit and --mirror are for a single mesh file; a folder's layout says all"
-        )
+        raise SceneRejected(f"{source}: --up, --unit and --mirror are for a single mesh file; leave them out")
     return _read(READERS[layout if layout != "auto" else detect_format(source)][1], source, strict, within=within)
 
 

@@ -7,15 +7,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from converters.geometry.faces import (
-    compacted,
-    face_areas,
-    face_vectors,
-    sample_faces,
-    unit_normals,
-    vertex_vectors,
-    weld,
-)
+from converters.geometry import faces as geometry
 from converters.read.obj import TexturedMesh
 from converters.records.errors import EXTENT_M, SceneRejected
 from converters.records.raw import CEILING, FLOOR, UNLABELLED, WALL, RawScene
@@ -49,7 +41,7 @@ def long_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def welded(mesh: TexturedMesh) -> TexturedMesh:
     """Return the mesh with vertices at equal positions joined, so that normals and neighbours ignore texture seams."""
-    first, group = weld(mesh.vertices)
+    first, group = geometry.weld(mesh.vertices)
     order = np.argsort(first)  # as in the file: labels refer to it
     return dataclasses.replace(mesh, vertices=mesh.vertices[first[order]], faces=np.argsort(order)[group[mesh.faces]])
 
@@ -92,7 +84,7 @@ def check_extent(where: str, vertices: np.ndarray) -> None:
 def floor_level(vertices: np.ndarray, faces: np.ndarray, where: str) -> float:
     """Return the height (m) of the lowest level that has a fifth of the largest one's area, facing up."""
     check_extent(where, vertices)
-    area = face_vectors(vertices, faces) / 2
+    area = geometry.face_vectors(vertices, faces) / 2
     level = area[:, 2] > 0.95 * np.maximum(np.linalg.norm(area, axis=1), 1e-12)
     height, size = vertices[faces[level], 2].mean(axis=1), area[level, 2]
     if not len(height):
@@ -111,7 +103,7 @@ def structure_labels(vertices: np.ndarray, faces: np.ndarray, floor_height_m: fl
     in a column that is steep over most of 0.2 to 1.8 m (furniture is lower). A long face, whose corners must be
     separate (`with_split_corners`), is wall if most of it is.
     """
-    normal, area = vertex_vectors(vertices, faces), face_vectors(vertices, faces)
+    normal, area = geometry.vertex_vectors(vertices, faces), geometry.face_vectors(vertices, faces)
     length = np.linalg.norm(normal, axis=1)
     up = np.divide(normal[:, 2], length, out=np.zeros(len(vertices)), where=length > 0)
     z = vertices[:, 2] - floor_height_m
@@ -121,7 +113,7 @@ def structure_labels(vertices: np.ndarray, faces: np.ndarray, floor_height_m: fl
     steep = (length > 0) & (np.abs(up) < 0.35)
     long = long_faces(vertices, faces)
     long = faces[long & (np.abs(area[:, 2]) < 0.35 * np.linalg.norm(area, axis=1))]
-    points, of = sample_faces(vertices, long, FINE_M)
+    points, of = geometry.sample_faces(vertices, long, FINE_M)
     upright = np.concatenate([steep, np.ones(len(points), bool)])
     wall = _in_wall_columns(np.vstack([vertices, points]), np.concatenate([z, points[:, 2] - floor_height_m]), upright)
     labels[steep & wall[: len(z)]] = WALL
@@ -154,7 +146,7 @@ def check_upright(
 ) -> None:
     """Refuse a mesh that is not z up or has a floor facing down, by NYU40 `labels` or level faces at `height_m`."""
     check_extent(where, vertices)
-    area, axis, shows = face_vectors(vertices, faces) / 2, None, "the floor"
+    area, axis, shows = geometry.face_vectors(vertices, faces) / 2, None, "the floor"
     if labels is not None:
         is_floor = (labels[faces] == FLOOR).all(axis=1)
         across = np.abs(area[is_floor]).sum(axis=0)
@@ -236,6 +228,7 @@ def split_storeys(raw: RawScene) -> tuple[RawScene, ...]:
     for k, storey in enumerate(raw.storeys):
         mine, *drawn = (np.flatnonzero(on[k]) for on in within)
         used, faces = np.unique(scan.faces[mine], return_inverse=True)
+        pairs = zip(raw.picture, drawn, strict=True)
         annotations = tuple(a for a, of in zip(raw.annotations, of_object, strict=True) if of == k)
         scenes.append(
             dataclasses.replace(
@@ -256,7 +249,7 @@ def split_storeys(raw: RawScene) -> tuple[RawScene, ...]:
                 storeys=(),
                 lamps=tuple(p for p in raw.lamps if storey_of(p.at[2], heights, 0.0) == k),
                 windows=tuple(w for w in raw.windows if storey_of(w.middle[2], heights, 0.0) == k),
-                picture=tuple(compacted(v, f[on]) for (v, f), on in zip(raw.picture, drawn, strict=True) if len(on)),
+                picture=tuple(geometry.compacted(v, f[on]) for (v, f), on in pairs if len(on)),
                 warnings=(
                     *raw.warnings,
                     f"floor {k} of {len(heights)}, at {storey.height_m:g} m of the building's frame",
@@ -297,7 +290,7 @@ def find_up(vertices: np.ndarray, faces: np.ndarray, where: str) -> np.ndarray:
     The height is the shortest extent along three orthogonal directions that most area faces. The floor is the end with
     far more area facing inwards, else the one that furniture tops face away from. Up is the floor's mean normal.
     """
-    normal, area = unit_normals(vertices, faces), face_areas(vertices, faces)
+    normal, area = geometry.unit_normals(vertices, faces), geometry.face_areas(vertices, faces)
     if not area.sum() > 0:
         raise SceneRejected(f"{where}: its faces enclose no area; fetch it again")
     middle = vertices[faces].mean(axis=1)
@@ -357,7 +350,7 @@ def faces_away(vertices: np.ndarray, faces: np.ndarray) -> bool:
 
     Outer sides of slabs, which have an opposite side nearby, do not count. `vertices`: m, z up or down.
     """
-    normal, area = unit_normals(vertices, faces), face_areas(vertices, faces)
+    normal, area = geometry.unit_normals(vertices, faces), geometry.face_areas(vertices, faces)
     height = vertices[faces, 2].mean(axis=1)
     middle = np.mean(_extent(height, area))
     level = np.abs(normal[:, 2]) > ALONG
@@ -374,7 +367,7 @@ def faces_away(vertices: np.ndarray, faces: np.ndarray) -> bool:
 
 def find_unit(vertices: np.ndarray, faces: np.ndarray, where: str) -> str:
     """Return the word of `UNITS_M` in which a storey's height (z up) is plausible, of m, cm and mm."""
-    low, high = _extent(vertices[faces, 2].mean(axis=1), face_areas(vertices, faces))
+    low, high = _extent(vertices[faces, 2].mean(axis=1), geometry.face_areas(vertices, faces))
     fits = [word for word in ("m", "cm", "mm") if HEIGHTS_M[0] <= (high - low) * UNITS_M[word] <= HEIGHTS_M[1]]
     if len(fits) == 1:
         return fits[0]

@@ -152,6 +152,5 @@ def read_crops(path: Path) -> list[Crop]:
     """Read what `generate_crops` wrote."""
     with np.load(path) as file:
         ends = np.cumsum(file["lengths"])[:-1]
-        return [
-            Crop(*row) for row in zip(*(np.split(file[f.name], ends) for f in dataclasses.fields(Crop)), strict=True)
-        ]
+        columns = (np.split(file[f.name], ends) for f in dataclasses.fields(Crop))
+        return [Crop(*row) for row in zip(*columns, strict=True)]

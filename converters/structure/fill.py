@@ -12,16 +12,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from converters.bodies.objects import PlacedObject, to_world
-from converters.geometry.faces import (
-    count_samples,
-    face_areas,
-    face_labels,
-    face_vectors,
-    sample_faces,
-    stacked,
-    triangulated,
-    unit_normals,
-)
+from converters.geometry import faces as geometry
 from converters.records.errors import CLOUD
 from converters.records.raw import CEILING, FLOOR, STRUCTURE_LABELS, ColourCloud
 from converters.structure.clean import LIFT_M
@@ -97,7 +88,8 @@ def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> 
     within `WALL_TOLERANCE_M` with normals within 25 degrees. The best of `RANSAC_DRAWS` is refined by least squares
     while its support grows (Chum, Matas and Kittler 2003, Locally optimized RANSAC). Normals point into the room.
     """
-    label, area, normal = face_labels(labels, faces), face_areas(vertices, faces), unit_normals(vertices, faces)
+    label = geometry.face_labels(labels, faces)
+    area, normal = geometry.face_areas(vertices, faces), geometry.unit_normals(vertices, faces)
     left = np.isin(label, [v for v in STRUCTURE_LABELS if v not in (FLOOR, CEILING)]) & (np.abs(normal[:, 2]) < 0.3)
     middle = vertices[faces].mean(axis=1)
     flat = normal[:, :2] / np.maximum(np.linalg.norm(normal[:, :2], axis=1, keepdims=True), 1e-9)
@@ -138,7 +130,7 @@ def wall_planes(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> 
 def faces_in_plane(vertices: np.ndarray, faces: np.ndarray, plane: Plane) -> np.ndarray:
     """Return indices of the faces within `BESIDE_M` of the plane and of like direction, panels and pillars included."""
     candidates = np.flatnonzero(np.abs(plane.distance(vertices))[faces].max(axis=1) < BESIDE_M)
-    normal = face_vectors(vertices, faces[candidates])
+    normal = geometry.face_vectors(vertices, faces[candidates])
     along = normal @ plane.normal
     return candidates[(along > 0.7 * np.linalg.norm(normal, axis=1)) & (along > 1e-9)]
 
@@ -179,11 +171,11 @@ class Shown:
             cells = np.argwhere(pieces == k)[:, ::-1] * self.cell_m + self.low
             outline = shapely.union_all(shapely.box(*cells.T, *(cells + self.cell_m).T), grid_size=1e-6)
             outline = outline.simplify(self.cell_m).segmentize(1.5 * OVERLAP * self.cell_m)
-            flat, index = np.unique(triangulated(outline).reshape(-1, 2), axis=0, return_inverse=True)
+            flat, index = np.unique(geometry.triangulated(outline).reshape(-1, 2), axis=0, return_inverse=True)
             cell = np.clip(np.floor((flat - self.low) / self.cell_m).astype(int), 0, np.array(pieces.shape[::-1]) - 1)
             points = self.plane.lift(flat) + rearmost[cell[:, 1], cell[:, 0], None] * self.plane.normal
             done.append((points, index.reshape(-1, 3)))
-        return stacked(done)
+        return geometry.stacked(done)
 
 
 def _beside(mask: np.ndarray, plan: FloorPlan, shown: Shown, above_m: float) -> np.ndarray:
@@ -254,8 +246,8 @@ def fill_holes(
     for plane in (ground, *planes):
         tolerance_m = FLOOR_TOLERANCE_M if plane is ground else WALL_TOLERANCE_M
         faces = scan[1][faces_in_plane(*scan, plane)]
-        fine = count_samples(scan[0], faces, cell_m / 2, LONG_STEPS) < CLOUD
-        points, _ = sample_faces(scan[0], faces, cell_m / 2 if fine else cell_m, LONG_STEPS)
+        fine = geometry.count_samples(scan[0], faces, cell_m / 2, LONG_STEPS) < CLOUD
+        points, _ = geometry.sample_faces(scan[0], faces, cell_m / 2 if fine else cell_m, LONG_STEPS)
         if plane is ground:
             # The scan's floor is level by now; what is drawn below it is a reflection.
             points = points[plane.distance(points) > -1e-6]
@@ -281,11 +273,11 @@ def fill_holes(
         shows = np.flatnonzero(near & (np.abs(cloud.normals @ plane.normal) > 0.7))
         done.append(patch)
         if len(patch[1]) and len(shows):  # points on it, coloured as what is visible of its plane around them
-            spots, _ = sample_faces(*patch, SPACING_M)
+            spots, _ = geometry.sample_faces(*patch, SPACING_M)
             count = min(48, len(shows))
             distance, index = KDTree(cloud.points[shows]).query(spots, k=count)
             weight = 1.0 / (distance.reshape(-1, count) + 0.05)
             shade = (cloud.colours[shows][index.reshape(-1, count)] * weight[..., None]).sum(axis=1)
             shade /= weight.sum(axis=1, keepdims=True)
             clouds.append(ColourCloud(spots, np.tile(plane.normal, (len(spots), 1)), shade))
-    return stacked(done), clouds
+    return geometry.stacked(done), clouds

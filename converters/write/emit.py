@@ -77,10 +77,8 @@ def _tidy(values: np.ndarray) -> np.ndarray:
 def _add_movable(
     spec: mujoco.MjSpec, placed: PlacedObject, physical: Physical, look: Appearance | None, hulls: tuple[str, ...]
 ) -> None:
-    body = spec.worldbody.add_body(
-        name=placed.name, pos=_tidy(placed.position_w), quat=np.round(placed.quaternion_w, 9)
-    )
-    body.explicitinertial = True
+    body = spec.worldbody.add_body(name=placed.name, pos=_tidy(placed.position_w))
+    body.quat, body.explicitinertial = np.round(placed.quaternion_w, 9), True
     body.mass = round(physical.mass_kg, 4)
     body.ipos = _tidy(physical.com_b)
     # Rounded first: which axes a round thing has is a matter of the last digits.

@@ -149,10 +149,8 @@ class _Export:
                 self._add("point", room, x=x, y=y)
         ElementTree.indent(self.root)
         self.files["Home.xml"] = ElementTree.tostring(self.root, "utf-8", xml_declaration=True)
-        count = (
-            f"{len(self.walls)} walls, {len(rooms)} rooms, {doors} doors, {len(sites)} windows, {pieces} other objects"
-        )
-        return [count, *lines]
+        count = f"{len(self.walls)} walls, {len(rooms)} rooms, {doors} doors, {len(sites)} windows"
+        return [f"{count}, {pieces} other objects", *lines]
 
     def _cloud(self) -> ColourCloud:
         """Return points of what shows the structure."""
@@ -302,9 +300,8 @@ class _Export:
         model = self._model(site.name, lambda points: points, mesh, PANE, np.array([_bar(*s, y) for s in sides]))
         box = np.array([[-x, -y, 0.0], [x, y, high]])
         words = self._words("window", model, box, yaw, at - [0.0, 0.0, up])
-        self._add(
-            "doorOrWindow", movable="false", cutOutShape="M0,0 v1 h1 v-1 z", wallCutOutOnBothSides="true", **words
-        )
+        cut = {"movable": "false", "cutOutShape": "M0,0 v1 h1 v-1 z", "wallCutOutOnBothSides": "true"}
+        self._add("doorOrWindow", **cut, **words)
 
 
 def _lines(vertices: np.ndarray) -> str:

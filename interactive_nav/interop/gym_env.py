@@ -327,9 +327,8 @@ def _checked_slot(env: InteractiveNav, slot: int | None) -> jax.Array:
     """Return the number [1] that a single environment has in a batch."""
     chosen, count = env.config.scene_choice == "slot", len(env.scenes)
     if slot is not None and (not chosen or slot < 0):
-        raise ConfigError(
-            f"slot is {slot} with scene_choice={env.config.scene_choice!r}, expected 0 or more, with 'slot'"
-        )
+        got = f"slot is {slot} with scene_choice={env.config.scene_choice!r}"
+        raise ConfigError(f"{got}, expected 0 or more, with 'slot'")
     if chosen and slot is None and count > 1:
         raise ConfigError(
             f"scene_choice is 'slot' for one environment of {count} scenes, expected its number in a batch: give "

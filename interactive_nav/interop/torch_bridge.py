@@ -33,9 +33,7 @@ def to_jax(tree: Any) -> Any:
         if not isinstance(x, torch.Tensor):
             return x
         if x.requires_grad:
-            raise ConfigError(
-                f"tensor of shape {tuple(x.shape)} requires a gradient, expected a detached one: .detach()"
-            )
+            raise ConfigError(f"tensor of shape {tuple(x.shape)} requires a gradient, expected none; call .detach()")
         return jnp.from_dlpack(x.contiguous())
 
     return jax.tree.map(convert, tree)

@@ -160,9 +160,8 @@ def make_scaling(model: mujoco.MjModel, layout: Layout) -> Callable[[dict, Model
             if scale is not None:
                 value, mine = fields[name], rows[name]
                 # A pair has the larger friction of its two geoms, and the floor's stays.
-                new = xp.maximum(
-                    value * scale ** _MASS.get(name, 1), FLOOR_FRICTION if name == "pair_friction" else 0.0
-                )
+                least = FLOOR_FRICTION if name == "pair_friction" else 0.0
+                new = xp.maximum(value * scale ** _MASS.get(name, 1), least)
                 out[name] = xp.where(mine.reshape(*mine.shape, *[1] * (value.ndim - mine.ndim)), new, value)
         return out
 

@@ -209,9 +209,8 @@ class NativePhysics(Physics):
             if self.hook and hook is not None:
                 place, states = hook[:, 0].astype(int), (pool.state_qpos, pool.state_qvel, pool.applied)
                 pool.applied[:] = self.hook.applied(scene, hook, self._layout, place, *states)
-            record = pool.batch.rollout(
-                self._config.substeps // rounds, record=("sensordata", "solver_niter", "nisland")
-            )
+            steps, names = self._config.substeps // rounds, ("sensordata", "solver_niter", "nisland")
+            record = pool.batch.rollout(steps, record=names)
             sensed.append(record["sensordata"])
             if hook is not None:
                 sensed[-1][:, :1, self._sensors[:-1]] += pool.applied[:, None, self._layout.slot_body, :3]

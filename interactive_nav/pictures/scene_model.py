@@ -162,12 +162,6 @@ def clear_way(model: SceneModel, target_w: np.ndarray, back_w: np.ndarray) -> fl
 def _add_cut_walls(spec: mujoco.MjSpec, walls: np.ndarray) -> None:
     body = spec.worldbody.add_body(name="cut_walls")
     for i, row in enumerate(walls):
-        top = min(row[2] + row[9], CUT_M)
-        body.add_geom(
-            name=f"cut_wall_{i}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=[row[0], row[1], top / 2],
-            quat=row[3:7],
-            size=[row[7], row[8], max(top / 2, 1e-3)],
-            group=CUT_WALLS,
-        )
+        half_m = min(row[2] + row[9], CUT_M) / 2
+        place = {"pos": [row[0], row[1], half_m], "quat": row[3:7], "size": [row[7], row[8], max(half_m, 1e-3)]}
+        body.add_geom(name=f"cut_wall_{i}", type=mujoco.mjtGeom.mjGEOM_BOX, group=CUT_WALLS, **place)

@@ -172,9 +172,8 @@ class RobotSpec(Figures):
 
     def _command_range(self, values, xp):
         """Return `action_low` and `action_high`, each in the shape of actions or commands [..., A]."""
-        return (
-            xp.broadcast_to(xp.asarray(end), xp.asarray(values).shape) for end in (self.action_low, self.action_high)
-        )
+        shape = xp.asarray(values).shape
+        return (xp.broadcast_to(xp.asarray(end), shape) for end in (self.action_low, self.action_high))
 
     def controls(self, command, state: RobotState, xp=np):
         """Return actuator controls [..., nu] for commands [..., A]."""

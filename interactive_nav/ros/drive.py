@@ -86,9 +86,7 @@ class DriveNode(DrivingNode):
 
     def _in_map(self, poses: Any, head: Any) -> np.ndarray:
         points, frame = ros.path_points(poses, head.frame_id), self._pilot.odom_in_map
-        return (
-            points if head.frame_id == ros.MAP else np.array([compose(frame, np.array([*p, 0.0]))[:2] for p in points])
-        )
+        return points if head.frame_id == ros.MAP else np.array([compose(frame, [*p, 0.0])[:2] for p in points])
 
     def _on_frames(self, message: Any) -> None:
         for link in message.transforms:

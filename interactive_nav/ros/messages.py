@@ -123,9 +123,7 @@ def camera_frames(prefix: str) -> tuple[str, str]:
 
 def camera_topics(images: Iterable[str]) -> dict[str, Any]:
     """Return the topics that images are sent on, and their types."""
-    return {
-        camera_topic(*of): kind for name in images for *of, kind in ((name, Image), (name, "camera_info", CameraInfo))
-    }
+    return {camera_topic(*of): kind for one in images for *of, kind in ((one, Image), (one, "camera_info", CameraInfo))}
 
 
 def image_message(image: np.ndarray, head: Header) -> Image:

@@ -150,9 +150,7 @@ def scene_path(about: Mapping[str, Any], scene: Path) -> ScenePath:
     def path(goal: np.ndarray, xy: np.ndarray) -> np.ndarray:
         length, waypoints = at(field(*goal.tolist()), jnp.asarray(xy, jnp.float32))
         if not math.isfinite(length):
-            raise UserError(
-                f"no path from ({xy[0]:.2f}, {xy[1]:.2f}) to goal ({goal[0]:.2f}, {goal[1]:.2f}) in {scene}"
-            )
+            raise UserError(f"no path from ({xy[0]:.2f}, {xy[1]:.2f}) to ({goal[0]:.2f}, {goal[1]:.2f}) in {scene}")
         return np.asarray(waypoints, float)
 
     return path

@@ -199,7 +199,7 @@ class RosSimulator(RosSensors):
         return dataclasses.replace(now, images={**now.images, **drawn})
 
 
-def compose(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
+def compose(outer: np.ndarray, inner: Any) -> np.ndarray:
     """Return a pose (3,), x, y (m), yaw (rad), of a frame at the pose `outer`, in that one's frame."""
     cos, sin = np.cos(outer[2]), np.sin(outer[2])
     return outer + np.array([cos * inner[0] - sin * inner[1], sin * inner[0] + cos * inner[1], inner[2]])

@@ -33,7 +33,7 @@ PARTS = {
 }
 """Part of an observation -> its unit, its frame (base: x forward, y left, z up) and its numbers."""
 COMPARED = ("shape", "dtype", "unit", "scale", "frame", "spacing_m", "avoids")
-"""Properties of an input that must agree with the file, besides the rate."""
+"""Properties of an input that must agree with the file's."""
 
 
 def inputs_of(env: Any, observations: Any) -> dict[str, Any]:
@@ -120,7 +120,7 @@ def _camera(camera: Any, view: Any, robot: RobotSpec) -> dict[str, Any]:
 
 
 def difference(file: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """Return what the file says otherwise than an environment, the first of it; empty: nothing."""
+    """Return the first difference of a file from an environment; empty: none."""
     names = [{"names": list(about["inputs"])} for about in (file, here)]
     groups = [("robot", file["robot"], here["robot"], ("name", "control_mode")), ("inputs", *names, ("names",))]
     shared = [name for name in here["inputs"] if name in file["inputs"]]

@@ -71,7 +71,7 @@ def test_without_a_display_and_mjviser_the_command_says_so_in_one_line(room, mon
     [
         (["--robot", "turtlbot"], "unknown robot 'turtlbot', did you mean 'turtlebot'"),
         (["--objects", "-1"], "--objects is -1, expected 0 or more"),
-        (["--objects", "400"], "no free place for object"),
+        (["--objects", "400"], "no place for object"),
     ],
 )
 def test_bad_arguments_give_one_line(room, capsys, arguments, message):

@@ -68,7 +68,7 @@ def test_without_an_open_heading_a_line_says_what_to_change(tmp_path, capsys):
     cell = write_room(tmp_path / "cell", (1.6, 1.6), ())
     assert main(["explore", str(cell), "--truth", "-o", str(tmp_path), *WORDS]) == 2
     said = capsys.readouterr().err.strip().splitlines()[-1]
-    assert "no heading is open for 1" in said and said.endswith("choose another seed, or less passable")
+    assert "no heading is open for 1" in said and said.endswith("choose another seed or less passable")
     assert main(["explore", str(cell), "--truth", "-o", str(tmp_path), *WORDS, "limit_s=1"]) == 2
     assert "limit_s is 1, expected time to look about; raise it" in capsys.readouterr().err
     assert not (tmp_path / "cell.npz").exists()

@@ -215,14 +215,8 @@ def test_a_file_of_another_robot_or_observation_is_refused_in_one_line(run):
             "names of inputs in the file: ['waypoints', 'goal', 'velocity'], in the environment: ['way",
         ),
         (fewer, "shape of input waypoints in the file: [20], in the environment: [18]"),
-        (
-            ToyEnv(ToyConfig(waypoint_spacing_m=0.4)),
-            "spacing_m of input waypoints in the file: 0.2, in the environment: 0.4",
-        ),
-        (
-            ToyEnv(ToyConfig(potential_round=1.0, waypoints_round=True)),
-            'avoids of input waypoints in the file: None, in the environment: "furniture whose friction exceeds 1 of',
-        ),
+        (ToyEnv(ToyConfig(waypoint_spacing_m=0.4)), "spacing_m of input waypoints in the file: 0.2, in"),
+        (ToyEnv(ToyConfig(potential_round=1.0, waypoints_round=True)), "avoids of input waypoints in the file: None"),
         (other(robot=slow), "high of command in the file: [25.0, 25.0], in the environment: [12.5, 12.5]"),
     ):
         with pytest.raises(OnnxError, match=re.escape(line)) as failure:

@@ -26,20 +26,12 @@ from interactive_nav_common.files import write_arrays
 from interactive_nav_common.jobs.progress import Progress
 from interactive_nav_common.rows import Rows
 from topological_nav.config import PITCHES, DataConfig
-from topological_nav.data.folders import (
-    Folder,
-    draw_missing,
-    load_scenes,
-    numbered,
-    read_arrays,
-    read_shard,
-    read_shards,
-)
+from topological_nav.data import folders
 from topological_nav.data.objects import bodies, clear_of, fewer_at_furniture, strew
 from topological_nav.scenes.rendering import camera_pose
 from topological_nav.scenes.space import FreeSpace, Rooms, agreement, free_space, recorded_rooms, scene_rooms, spread
 
-DATASET = Folder(
+DATASET = folders.Folder(
     file="dataset.json",
     version=2,
     base=DataConfig(),
@@ -155,7 +147,7 @@ def make_dataset(
     scene_folders: Sequence[Path], out: Path, config: DataConfig, progress: Progress = lambda *_: None
 ) -> dict[str, Any]:
     """Make a dataset in the folder `out`, or its missing part; return the content of dataset.json."""
-    scenes = load_scenes(scene_folders, config.engine)
+    scenes = folders.load_scenes(scene_folders, config.engine)
     robot = get_robot(config.robot)
     plans = [plan_scene(scene, free_space(scene, robot.height_m), config) for scene in scenes]
     header = DATASET.describe(config, [about_scene(scene, plan) for scene, plan in zip(scenes, plans, strict=True)])
@@ -166,7 +158,7 @@ def make_dataset(
             files = _shards(out / scene.name, plan, robot, config)
             drawn.append((scene.name, lambda scene=scene: scene, files))
         total = sum(len(p.xy_w) * 3 * config.headings + len(p.passages) for p in plans)
-        draw_missing(drawn, total, config, progress, pick(config.objects))
+        folders.draw_missing(drawn, total, config, progress, pick(config.objects))
         return header
 
 
@@ -186,9 +178,9 @@ def _shards(folder: Path, plan: ScenePlan, robot: RobotSpec, config: DataConfig)
     pitch, heading = (a.ravel() for a in np.meshgrid([up, 0.0, -up], headings(config), indexing="ij"))
     passages, each, level = plan.passages, len(pitch), np.zeros(len(pitch))
     rows = [np.arange(first, min(first + each, len(passages))) for first in range(0, len(passages), each)]
-    for path, places_w in numbered(folder, "rooms", plan.xy_w, config.shard):
+    for path, places_w in folders.numbered(folder, "rooms", plan.xy_w, config.shard):
         yield path, [camera_pose(robot, xy, heading, pitch) for xy in places_w], None
-    for path, sheets in numbered(folder, "passages", rows, config.shard):
+    for path, sheets in folders.numbered(folder, "passages", rows, config.shard):
         poses = [camera_pose(robot, passages.xy_w[r], passages.heading_rad[r], level[: len(r)]) for r in sheets]
         yield path, poses, bodies(passages.small_w[np.concatenate(sheets)])
 
@@ -209,7 +201,7 @@ def load_rooms(folder: Path, pitches: Sequence[str] = PITCHES) -> RoomImages:
 
 def images_at(folder: Path, scene: str, position: int, config: DataConfig) -> np.ndarray:
     """Read the room images [3, K, H, W, 3] u8 of one of a scene's positions, which are a sheet of a file."""
-    images = read_shard(Path(folder) / scene / f"rooms-{position // config.shard:03d}.npz")
+    images = folders.read_shard(Path(folder) / scene / f"rooms-{position // config.shard:03d}.npz")
     images = images.reshape(-1, 3, config.headings, config.height, config.width, 3)
     return images[position % config.shard]
 
@@ -229,7 +221,7 @@ def load_passages(folder: Path) -> PassageImages:
 def load_plan(folder: Path, scene: str) -> ScenePlan:
     """Read the positions of a scene's images."""
     path = Path(folder) / scene / "plan.npz"
-    arrays = read_arrays(path)
+    arrays = folders.read_arrays(path)
     with readable(path, FileError, "run 'data' again"):
         rooms = Rooms(arrays["cluster_xy_w"], arrays["cluster_label"], *(str(w) for w in arrays["how"]))
         arrays.setdefault("passage_small_w", np.zeros((len(arrays["passage_free"]), 0, 3)))
@@ -260,7 +252,7 @@ def _read_all(folder: Path, kind: str, count: int, config: DataConfig, pitches: 
     kept = [PITCHES.index(pitch) for pitch in pitches]
     joined = np.empty((count, *((len(kept), config.headings) if pitches else ()), *one), np.uint8)
     sheets, done = range(count if pitches else math.ceil(count / (3 * config.headings))), 0
-    for images in read_shards([path for path, _ in numbered(folder, kind, sheets, config.shard)]):
+    for images in folders.read_shards([path for path, _ in folders.numbered(folder, kind, sheets, config.shard)]):
         read = len(images) // math.prod(around)
         if images.shape != (read * math.prod(around), *one) or done + read > count:
             raise FileError(f"{folder}: has {kind} of {images.shape}, expected {one}; delete them and make again")

@@ -37,9 +37,7 @@ def read_table(path: Path, needed: str) -> list[dict[str, Any]]:
     with readable(path, FileError, f"write a table with the columns {needed}"):
         columns, *rows = csv.reader(io.StringIO(path.read_text(encoding="utf-8-sig")))
     if not rows or set(needed.split(",")) - set(columns):
-        raise FileError(
-            f"{path}: has {len(rows)} rows of {','.join(columns)}, expected some with {needed}; complete it"
-        )
+        raise FileError(f"{path}: has {len(rows)} rows of {','.join(columns)}, expected some with {needed}; add them")
     return [dict(zip(columns, row, strict=False)) for row in rows if row]
 
 

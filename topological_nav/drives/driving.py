@@ -211,10 +211,8 @@ class Frames:
                 alike["scenes"] = [*alike["scenes"], *header["scenes"]]
             else:
                 folders.append(dict(header))
-        drives = Drives.joined([part.drives for part in parts])
-        return dataclasses.replace(
-            parts[0], drives=drives, header={"folders": folders}, features=np.concatenate(halves)
-        )
+        drives, features = Drives.joined([part.drives for part in parts]), np.concatenate(halves)
+        return dataclasses.replace(parts[0], drives=drives, header={"folders": folders}, features=features)
 
 
 def need_camera(folder: Path, header: Mapping[str, Any], networks: Networks) -> None:

@@ -36,17 +36,8 @@ from topological_nav.config import PASSAGE_POLICY, DataConfig, EvaluationConfig,
 from topological_nav.data.domains import PRESETS, as_seen_from
 from topological_nav.data.folders import lens_of, renderer_of
 from topological_nav.drives.driving import local_policy
-from topological_nav.evaluate.evaluation import (
-    ActionPlayer,
-    Contender,
-    DrivenEpisodes,
-    NavigatorPlayer,
-    Played,
-    columns,
-    count_of,
-    draw_episodes,
-    learned,
-)
+from topological_nav.evaluate import evaluation
+from topological_nav.evaluate.evaluation import DrivenEpisodes, Played
 from topological_nav.gap import GapConfig
 from topological_nav.learn.training import Networks, load_networks
 from topological_nav.maps.build import NetworkSight, Sight, TrueSight, drawn_for, true_map
@@ -131,7 +122,8 @@ class ContestScene:
     @functools.cached_property
     def episodes(self) -> DrivenEpisodes:
         config = self.contest.config
-        return draw_episodes(self.scene.digest, self.space, self.rooms, count_of(self.scene, config), config)
+        count = evaluation.count_of(self.scene, config)
+        return evaluation.draw_episodes(self.scene.digest, self.space, self.rooms, count, config)
 
     @functools.cached_property
     def player(self) -> Player:
@@ -187,7 +179,7 @@ class ContestScene:
             raise ConfigError(f"--policy {name} looks at images, --truth has none; leave one of them out")
         return Navigator(graph, sight, local_policy(name, sight, config, self.networks or ()), config)
 
-    def contender(self, name: str) -> Contender:
+    def contender(self, name: str) -> evaluation.Contender:
         """Return the contender of a name, ready to play."""
         config = self.contest.config
         if name == "expert":
@@ -195,12 +187,12 @@ class ContestScene:
             # episodes are 0.25 m from everything. Where no way is free, it takes the one through the least of objects.
             robot = get_robot(self.contest.robot, CONTROL)
             player = self._player(dataclasses.replace(robot, footprint_radius_m=robot.body_width_m / 2))
-            return ActionPlayer(player, config, lambda: Planner(player.env, EXPERT_WEIGHT).act)
+            return evaluation.ActionPlayer(player, config, lambda: Planner(player.env, EXPERT_WEIGHT).act)
         if name == "ppo":
             assert self.contest.ppo is not None
             player, policy = _learned(self.contest.ppo, self.scene, config)
-            return learned(player, config, policy)
-        return NavigatorPlayer(self.player, config, self.navigator(name), self.camera)
+            return evaluation.learned(player, config, policy)
+        return evaluation.NavigatorPlayer(self.player, config, self.navigator(name), self.camera)
 
     def request(self, contender: str) -> dict[str, Any]:
         """Return everything that determines a contender's rows."""
@@ -342,7 +334,7 @@ def _write(
         "wall_s": wall_s,
     }
     table = {key: [value] * len(episodes) for key, value in constants.items()}
-    table |= {"episode": episodes.number, **columns(episodes, played, config)}
+    table |= {"episode": episodes.number, **evaluation.columns(episodes, played, config)}
     file = f"{_stem(scene, name)}-{episodes.number[0]:04d}"
     tracks = {str(n): np.asarray(t, np.float32) for n, t in zip(episodes.number, played.track_w, strict=True)}
     write_arrays(out / "tracks" / f"{file}.npz", **tracks)

@@ -272,9 +272,7 @@ def drive_episode(venue: ContestScene, contender: str, number: int, filmed: bool
     """Drive one of a scene's episodes."""
     contest = venue.contest
     if not 0 <= number < len(venue.episodes):
-        raise ConfigError(
-            f"episode is {number}, expected 0 to {len(venue.episodes) - 1}; episodes=N makes more of the scene"
-        )
+        raise ConfigError(f"episode is {number}, expected 0 to {len(venue.episodes) - 1}; episodes=N makes more")
     journey = venue.episodes.take(np.array([number]))
     navigator = venue.navigator(contender)
     graph = navigator.map

@@ -68,9 +68,7 @@ class Trained:
     def _rows(self, images: np.ndarray, method: str) -> np.ndarray:
         expected = (self.about["data"]["height"], self.about["data"]["width"], 3)
         if images.shape[-3:] != expected:
-            raise FileError(
-                f"images are {images.shape[-3:]}, expected {expected}, the size that the network learned from"
-            )
+            raise FileError(f"images are {images.shape[-3:]}, expected {expected}, which the network learned from")
         method_of = functools.partial(_applied, self.network, method, self.variables)
         rows = learning.in_batches(method_of, images.reshape(-1, *expected))
         return rows.reshape(*images.shape[:-3], *rows.shape[1:])

@@ -226,9 +226,8 @@ class Navigator:
 
     def _reached(self, s: State, heading: np.ndarray, *phases: int) -> np.ndarray:
         """Return the rows in one of the phases that have reached their heading."""
-        return np.flatnonzero(
-            _any_of(s.phase, phases) & (np.abs(wrap_angle(s.target_rad - heading)) <= self._tolerance)
-        )
+        off = np.abs(wrap_angle(s.target_rad - heading))
+        return np.flatnonzero(_any_of(s.phase, phases) & (off <= self._tolerance))
 
     def _watches(self, s: State, time: np.ndarray) -> np.ndarray:
         """Return which robots check now, within a run, whether the edge's head is passed, [B] bool."""

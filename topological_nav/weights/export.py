@@ -32,14 +32,7 @@ from interactive_nav_common.versions import versions
 from topological_nav.config import PASSAGE_POLICY, RUNS, ExportConfig
 from topological_nav.data.dataset import headings, load_rooms
 from topological_nav.drives.driving import TrainedPolicy, load_policy
-from topological_nav.learn.learning import (
-    DESCRIPTION,
-    PACKED_WEIGHTS,
-    RESULTS,
-    read_description,
-    weights_file,
-    write_network,
-)
+from topological_nav.learn import learning
 from topological_nav.learn.training import Networks, load_networks, load_trained
 from topological_nav.maps.build import Pictures
 from topological_nav.maps.graph import load_map, save_map
@@ -109,7 +102,7 @@ def sizes_of(folder: Path) -> dict[str, int]:
     sizes: Counter[str] = Counter()
     for path in sorted(p for p in Path(folder).rglob("*") if p.is_file()):
         part = path.relative_to(folder).parts[0]
-        sizes[part if path.name == PACKED_WEIGHTS or part == "maps" else "descriptions"] += path.stat().st_size
+        sizes[part if path.name == learning.PACKED_WEIGHTS or part == "maps" else "descriptions"] += path.stat().st_size
     return dict(sizes)
 
 
@@ -157,9 +150,7 @@ def level_images(source: Path, networks: Networks, places: int, progress: Progre
         images = load_rooms(source, ["level"]).images[:, 0]
         return images[np.unique(np.linspace(0, len(images) - 1, places).round().astype(int))]
     if not (source / "scene.json").is_file():
-        raise ConfigError(
-            f"{source}: is neither a dataset nor a scene; name one whose images to compare by: --images PATH"
-        )
+        raise ConfigError(f"{source}: is no dataset or scene whose images to compare by; name one: --images PATH")
     data, scene = networks.camera, load_scene(source)
     robot = get_robot(data.robot)
     xy = free_space(scene, robot.height_m).sample(np.random.default_rng([0, 19]), places, data.clearance_m)
@@ -177,7 +168,7 @@ def _driven(policy: TrainedPolicy, images: np.ndarray) -> np.ndarray:
 
 def _export_run(task: str, run: Path, out: Path, config: ExportConfig) -> dict[str, Any]:
     """Write a run's folder and return its commit, device and command."""
-    for name in (CONFIG, VERSIONS, RESULTS):
+    for name in (CONFIG, VERSIONS, learning.RESULTS):
         if not (run / name).is_file():
             raise FileError(f"{run}: has no {name}; finish the run first")
     reader = Reader(FileError, "finish the run first", finite=False)
@@ -187,14 +178,14 @@ def _export_run(task: str, run: Path, out: Path, config: ExportConfig) -> dict[s
     device = reader.typed(origin.get("device", {}), dict[str, Any], f"{run / VERSIONS}: device").get("kind")
     if not origin["commit"] or not device:
         raise FileError(f"{run}: {VERSIONS} names no {'device' if origin['commit'] else 'commit'}; say commit=HASH")
-    about = {**read_description(run, "network", task), "commit": origin["commit"]}
+    about = {**learning.read_description(run, "network", task), "commit": origin["commit"]}
     if task == "policy":
         for network, other in zip(about["networks"], ("rooms", "passages"), strict=True):
             network["run"] = f"../{other}"
-    tensors, _ = read_weights(weights_file(run), FileError, "train again")
-    write_network(out, half(tensors), about, PRECISION)
+    tensors, _ = read_weights(learning.weights_file(run), FileError, "train again")
+    learning.write_network(out, half(tensors), about, PRECISION)
     write_json(out / VERSIONS, origin)
-    for name in (CONFIG, RESULTS):
+    for name in (CONFIG, learning.RESULTS):
         shutil.copyfile(run / name, out / name)
     kept = {name: about[name] for name in ("digest", "parameters", "commit")}
     return {**kept, "device": device, "command": origin["argv"]}
@@ -249,7 +240,8 @@ def choose(
         runs = localiser or RUNS / "rooms", detector or RUNS / "passages"
         return Choice(*runs, policy or PASSAGE_POLICY, (RUNS / "maps",), False, "")
     packaged = packaged_weights()
-    place = next((p for p in (RUNS, packaged) if all((p / task / DESCRIPTION).is_file() for task in missing)), None)
+    files = [Path(task, learning.DESCRIPTION) for task in missing]
+    place = next((p for p in (RUNS, packaged) if all((p / file).is_file() for file in files)), None)
     if place is None:
         what = " and ".join(missing)
         options = " or ".join({"rooms": "--localiser RUN", "passages": "--detector RUN"}[task] for task in missing)
@@ -260,7 +252,7 @@ def choose(
     chosen = {task: run or place / task for task, run in given.items()}
     if policy is None:
         policy = PASSAGE_POLICY
-        if not any(given.values()) and (place / "policy" / DESCRIPTION).is_file():
+        if not any(given.values()) and (place / "policy" / learning.DESCRIPTION).is_file():
             policy = str(place / "policy")
     if place == RUNS:
         source = f"networks: {' and '.join(str(chosen[task]) for task in missing)}"
@@ -273,7 +265,8 @@ def choose(
 
 def fitting_map(choice: Choice, scene: str, digest: str) -> Path | None:
     """Return the first map of a scene that these networks can use, or None."""
-    networks = [read_description(run, "network", "TASK")["digest"] for run in (choice.localiser, choice.detector)]
+    runs = choice.localiser, choice.detector
+    networks = [learning.read_description(run, "network", "TASK")["digest"] for run in runs]
     for folder in choice.maps:
         path = folder / f"{scene}.npz"
         if path.is_file():

@@ -38,9 +38,8 @@ def onnx_models(networks: Networks, driver: TrainedPolicy | None, images: np.nda
         state, rows = driver.start(len(images)), []
         for image in images.swapaxes(0, 1):
             before, (state, *velocity) = state, driver.act(state, image)
-            rows.append(
-                (np.concatenate([n.embed(image) for n in networks], -1), *before, np.stack(velocity, -1), *state)
-            )
+            embedding = np.concatenate([n.embed(image) for n in networks], -1)
+            rows.append((embedding, *before, np.stack(velocity, -1), *state))
         parts = [(name, np.concatenate(of)) for name, of in zip(_STEP, zip(*rows, strict=True), strict=True)]
         inputs, outputs = dict(parts[:3]), dict(parts[3:])
         limits = {end: [float(of(speed)) for speed in speeds] for end, of in (("low", min), ("high", max))}

@@ -99,9 +99,7 @@ def _board(lines: list[tuple[Any, ...]]) -> str:
 
     header = ("results", "run or policy", "kind", "robot", "scenes", *SCORES.values(), "episodes")
     at = header.index("INS_0.5")
-    words = (
-        "A click on a column sorts by it. Mean over episodes [95 % interval]: Wilson for success, bootstrap elsewhere."
-    )
+    words = "A click on a column sorts by it. Mean over episodes [95 % interval]: Wilson for success, else bootstrap."
     lines = sorted(lines, key=lambda line: -line[at][1])
     if len({line[0] for line in lines}) == 1:
         header, lines, at = header[1:], [line[1:] for line in lines], at - 1

@@ -38,9 +38,7 @@ class Results:
         self.records = [path for path in records if not path.parent.name.startswith("diverged-")]
         self.tables = [path for path in files if path.suffix == ".parquet"]
         if not self.curves and not self.records and not self.tables:
-            raise FileError(
-                f"{root}: nothing to draw (no metrics.jsonl, no rows, no recorded paths); expected a run folder"
-            )
+            raise FileError(f"{root}: nothing to draw: no metrics.jsonl, rows or recorded paths; expected a run folder")
         self.rows = read_rows(self.tables, check_rows) if self.tables else pa.table({})
         runs = run_means(self.rows) if set(self.rows.column_names) >= SWEPT else []
         self.swept = len({(run.cell, run.seed) for run in runs}) > 1

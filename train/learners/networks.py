@@ -228,9 +228,7 @@ def make_split(
         prepare = lambda observation, statistics: {"state": vector(observation, statistics)}  # noqa: E731
     sides = {shape[0] for name, shape in size.items() if name.startswith(PIXELS)}
     if len(sides) > 1:
-        raise ConfigError(
-            f"images have sides of {sorted(sides)} pixels, expected one size of all cameras (env.cameras)"
-        )
+        raise ConfigError(f"images have sides of {sorted(sides)} pixels, expected one of all cameras (env.cameras)")
     for side in sides:
         left = side
         for kernel, stride in zip(config.conv_kernels, config.conv_strides, strict=True):

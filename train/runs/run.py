@@ -357,9 +357,8 @@ def learn(env: Any, config: TrainConfig, callbacks: Any) -> TrainResult:
     devices, privileged = devices_here(config.run.devices), config.network.critic_inputs == "privileged"
     batch = AutoResetEnv(PrivilegedEnv(env) if privileged else env)
     batch.curriculum = config.run.curriculum if config.run.curriculum[0] else None
-    return ALGORITHMS[config.algorithm].train(
-        ShardedEnv(batch, devices) if len(devices) > 1 else batch, config, callbacks
-    )
+    every = ShardedEnv(batch, devices) if len(devices) > 1 else batch
+    return ALGORITHMS[config.algorithm].train(every, config, callbacks)
 
 
 def num_envs(config: TrainConfig) -> int:

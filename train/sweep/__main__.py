@@ -104,9 +104,8 @@ def main(argv: Sequence[str] | None = None, programs: Programs = PROGRAMS) -> in
         console.print(f"{outcome.elsewhere} runs were left to another sweep that works on them")
     if outcome.stopped_by or outcome.timed_out:
         console.print("the same command continues")
-    return outcome.exit_code(
-        "unfinished" if arguments.unfinished else "trained" if arguments.only == "train" else "done"
-    )
+    enough = "unfinished" if arguments.unfinished else "trained" if arguments.only == "train" else "done"
+    return outcome.exit_code(enough)
 
 
 if __name__ == "__main__":

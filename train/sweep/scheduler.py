@@ -161,9 +161,7 @@ class Scheduler:
             self._kill_at = now + self.folder.sweep.config.launch.grace_s
             if busy:
                 why = f"time limit of {limit_s:.0f} s" if timed_out else signal.Signals(stops[0]).name
-                self.display.event(
-                    f"{why}: {len(busy)} run(s) are writing their checkpoints (a second Ctrl-C does not wait)"
-                )
+                self.display.event(f"{why}: {len(busy)} run(s) write their checkpoints (a second Ctrl-C does not wait)")
             self.launcher.send(signal.SIGTERM)
         if busy and self._kill_at > -math.inf and (len(stops) > 1 or now > self._kill_at):
             self._kill_at = -math.inf

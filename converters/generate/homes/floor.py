@@ -131,9 +131,8 @@ class Floor:
 
     def rastered(self, shapes: list[shapely.Geometry], window: tuple[slice, slice]) -> np.ndarray:
         """Return which cells of a window have their middle inside of a shape."""
-        ys, xs = (
-            (np.arange(s.start, s.stop) + 0.5) * CELL_M + low for s, low in zip(window, self.low[::-1], strict=True)
-        )
+        ends = zip(window, self.low[::-1], strict=True)
+        ys, xs = ((np.arange(s.start, s.stop) + 0.5) * CELL_M + low for s, low in ends)
         inside = np.zeros((len(ys), len(xs)), bool)
         for shape in shapes:
             inside |= shapely.contains_xy(shape, *np.meshgrid(xs, ys))

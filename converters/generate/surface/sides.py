@@ -254,9 +254,8 @@ def _leaf(side: Side, middle: float, colour: np.ndarray) -> Colouring:
 
     def paint(p: np.ndarray) -> np.ndarray:
         x, z = np.abs(p[:, 1 - side.axis] - middle), p[:, 2]
-        inside = np.minimum(
-            np.minimum(x - 0.05, 0.36 - x), np.minimum(np.abs(z - 1.05) - 0.12, 0.85 - np.abs(z - 1.05))
-        )
+        off = np.abs(z - 1.05)
+        inside = np.minimum.reduce([x - 0.05, 0.36 - x, off - 0.12, 0.85 - off])
         tone = np.where((inside > 0) & (inside < 0.02), 0.72, np.where((inside > 0.02) & (inside < 0.035), 1.12, 1.0))
         return np.minimum(colour * tone[:, None], 1.0)
 

@@ -368,12 +368,8 @@ class _Reader:
         roots = [root / models for root in (self.root, self.source.root) for models in ("models", "")]
         roots = [root for root in roots if self.source.relative(root) is not None and root.is_dir()]
         names = [name for name in (words, words.rpartition("models/")[2]) if name]
-        candidates = [
-            folder / name for name in names for folder in (path.parent, *roots, path.parent.parent / "models")
-        ]
-        candidates += [
-            folder / rest for root in roots for folder in sorted(root.iterdir()) if _key(folder.name) == _key(head)
-        ]
+        candidates = [at / name for name in names for at in (path.parent, *roots, path.parent.parent / "models")]
+        candidates += [at / rest for root in roots for at in sorted(root.iterdir()) if _key(at.name) == _key(head)]
         for candidate in candidates if head else ():
             if self.source.relative(candidate) is not None and candidate.exists():
                 return candidate

@@ -263,9 +263,8 @@ class _Drawing:
             flat = part_of(door.surface, faces) if len(faces) else _plain_leaf(e, sash, door.surface)
             flat = _beside(flat, _axis(e, sash)[0], [_axis(e, s)[0] for s in sashes if s is not sash])
             pin, hulls = _hinge(e, sash, flat.vertices), door.collision if len(sashes) == 1 else None
-            leaves.append(
-                HomePart(f"{door.name} leaf {k}", door.pose, flat, hulls, False, None, None, False, "door", pin)
-            )
+            about = flat, hulls, False, None, None, False, "door", pin
+            leaves.append(HomePart(f"{door.name} leaf {k}", door.pose, *about))
         if not leaf.any():
             self.source.note(f"{called(e)}: its model has no leaf of its own; flat leaves take its place")
             return leaves

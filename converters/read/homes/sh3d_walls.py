@@ -100,18 +100,16 @@ def read_walls(elements: list[ElementTree.Element], base_m: dict[str | None, flo
         names = [element.get("wallAtStart"), *[name] * (len(points) - 2), element.get("wallAtEnd")]
         for k in range(len(points) - 1):
             some = np.maximum(tall[0] + share[k : k + 2] * (tall[1] - tall[0]), 0.0)
-            wall = Wall(
-                element, points[k : k + 2], thick, some, base_m[element.get("level")], names[k : k + 2], np.zeros(0)
-            )
+            level_m = base_m[element.get("level")]
+            wall = Wall(element, points[k : k + 2], thick, some, level_m, names[k : k + 2], np.zeros(0))
             wall.corners = wall.square()
             pieces[name].append(len(walls))
             walls.append(wall)
     for k, wall in enumerate(walls):
         for end in (0, 1):
             others = [walls[i] for i in pieces.get(wall.joins[end] or "", []) if i != k]
-            near = [
-                (float(np.linalg.norm(o.ends[e] - wall.ends[end])), n, e) for n, o in enumerate(others) for e in (0, 1)
-            ]
+            at = wall.ends[end]
+            near = [(float(np.linalg.norm(o.ends[e] - at)), n, e) for n, o in enumerate(others) for e in (0, 1)]
             if near and min(near)[0] < max(wall.thickness_m, SHORT_M):
                 _mitre(wall, end, others[min(near)[1]], min(near)[2])
     for wall in walls:  # neighbours that are thicker than a wall is long would turn its sides around
@@ -181,9 +179,8 @@ class Opening:
         if self.shape is None:
             run = (shapely.get_coordinates(common) - wall.ends[0]) @ wall.along
             return shapely.box(run.min(), low, run.max(), high)
-        x = (self.middle - wall.ends[0]) @ wall.along + (self.shape[:, 0] - 0.5) * self.width_m * math.copysign(
-            1, cosine
-        )
+        across = (self.shape[:, 0] - 0.5) * self.width_m * math.copysign(1, cosine)
+        x = (self.middle - wall.ends[0]) @ wall.along + across
         cut = shapely.Polygon(np.stack([x, high + self.shape[:, 1] * (low - high)], axis=1))
         return cut if shapely.is_valid(cut) else shapely.make_valid(cut)
 

@@ -40,7 +40,7 @@ def test_trees_keep_their_structure():
 
 
 def test_a_tensor_with_a_gradient_is_refused():
-    with pytest.raises(UserError, match=r"shape \(2,\) requires a gradient, expected a detached one"):
+    with pytest.raises(UserError, match=r"shape \(2,\) requires a gradient, expected none; call .detach"):
         to_jax(torch.ones(2, requires_grad=True))
 
 

@@ -189,8 +189,8 @@ def test_pictures_show_the_episodes_own_models_and_goal(room, played, tmp_path, 
         np.testing.assert_allclose(shown[name].rows[:, 7:], halves)
         body = view.model.body(name)
         np.testing.assert_allclose(view.model.geom_size[body.geomadr[0] : body.geomadr[0] + body.geomnum[0]], halves)
-    painted = []
-    monkeypatch.setattr(record, "FloorPaint", lambda goal, radius, trail: painted.append(radius))
+    painted, made = [], record.drawing.FloorPaint
+    monkeypatch.setattr(record.drawing, "FloorPaint", lambda *of: painted.extend(of[1:2]) or made(*of))
     record.Compositor(told, load_scene(room), height=120).frame(0)
     axis = topdown.panels([told], {str(room): load_scene(room)}).axes[0]
     assert painted.pop() == 0.7

@@ -94,9 +94,7 @@ def test_bad_tables_are_refused_in_one_line(tmp_path, capsys):
         )
 
     assert "photographs.csv: no such file" in line(tmp_path / "none")
-    assert "expected some with file,x_m,y_m,heading_deg; complete it" in line(
-        write(tmp_path / "a", drop=("heading_deg",))
-    )
+    assert "expected some with file,x_m,y_m,heading_deg; add them" in line(write(tmp_path / "a", drop=("heading_deg",)))
     assert "desk0.png has no heading_deg; write a number" in line(write(tmp_path / "b", heading_deg=""))
     assert "write x_m, y_m, heading_deg, free_m" in line(write(tmp_path / "c", heading_deg="north"))
     assert "no place has photographs along all 6 headings" in line(write(tmp_path / "d", heading_deg=90))

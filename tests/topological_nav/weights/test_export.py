@@ -168,7 +168,7 @@ def test_what_does_not_belong_is_refused(made, tmp_path, capsys):
     assert "built with another detector" in told(*words(made, out, "--maps", str(tmp_path / "maps"), "commit=toy"))
     (tmp_path / "none").mkdir()
     assert "holds no map; make some" in told(*words(made, out, "--maps", str(tmp_path / "none"), "commit=toy"))
-    assert "is neither a dataset nor a scene" in told(*words(made, out), "--images", str(tmp_path))
+    assert "is no dataset or scene whose images" in told(*words(made, out), "--images", str(tmp_path))
     assert "expected a run of 'train rooms'" in told(*words(made, out), "--localiser", str(made.passages))
     nameless = tmp_path / "rooms"
     shutil.copytree(made.rooms, nameless)

@@ -126,7 +126,7 @@ def test_impossible_encoders_are_refused(settings, told):
 def test_images_too_small_for_the_kernels_are_refused():
     with pytest.raises(UserError, match=r"12 x 12 pixels are too small for kernels \(8, 4, 3\)"):
         make(NetworkConfig())
-    with pytest.raises(UserError, match=r"images have sides of \[12, 20\] pixels, expected one size of all cameras"):
+    with pytest.raises(UserError, match=r"images have sides of \[12, 20\] pixels, expected one of all cameras"):
         make(SMALL, {**TINY, "pixels/left/depth": (20, 20, 1)})
     images = {name: shape for name, shape in TINY.items() if name != "state"}
     with pytest.raises(UserError, match="images only"):

@@ -245,7 +245,7 @@ def test_time_limit_stops_with_what_was_done_and_the_same_command_goes_on(tmp_pa
     # Time flies once the first two are at work.
     outcome, printed, folder = sweep(path, limit_s=40.0, clock=lambda: 41.0 if all(map(last_line, logs)) else 0.0)
     assert outcome.timed_out and outcome.exit_code("done") == 3
-    assert "time limit of 40 s: 2 run(s) are writing their checkpoints" in printed
+    assert "time limit of 40 s: 2 run(s) write their checkpoints" in printed
     assert sorted(s.state for s in outcome.states) == ["stopped", "stopped", "waiting", "waiting"]
     stopped = {s.name: s.env_steps for s in outcome.states if s.state == "stopped"}
     assert all(0 < steps < 10_000 for steps in stopped.values())
@@ -299,7 +299,7 @@ def test_children_end_with_the_sweep_however_it_ends(tmp_path, number):
     for log in logs:  # each saved before it ended
         assert json.loads((log.parent / "summary.json").read_text())["env_steps"] == last_line(log)["env_steps"]
     if number != signal.SIGKILL:
-        assert f"{number.name}: 2 run(s) are writing" in printed and "the same command continues" in printed
+        assert f"{number.name}: 2 run(s) write" in printed and "the same command continues" in printed
 
 
 def test_a_run_that_somebody_else_works_on_is_left_alone(tmp_path):
