@@ -248,9 +248,9 @@ def clean_surface(
         faces, colours = faces[good], colours[good]
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     count = np.unique(edges, axis=0, return_counts=True)[1]
-    open_edges, busy_edges = int((count == 1).sum()), int((count > 2).sum())
-    if busy_edges:
-        source.note(f"{where}: is not manifold ({busy_edges} edges with 3 faces or more); collision uses closed hulls")
+    open_edges, busy = int((count == 1).sum()), int((count > 2).sum())
+    if busy:
+        source.note(f"{where}: is not manifold ({busy} edges with three faces or more); collision uses closed hulls")
     elif open_edges:
         source.note(f"{where}: is not watertight ({open_edges} open edges); collision uses closed hulls")
     return vertices, faces, colours
