@@ -14,7 +14,7 @@ from scenes_mjcf.categories import MaskClasses
 
 OBSERVATIONS = ("goal", "velocity", "waypoints")
 """Parts of the observation by default."""
-SIGNALS = (*OBSERVATIONS, "localisation", "odometry", "collision", "joints", "lidar", "trail", "hand")
+SIGNALS = (*OBSERVATIONS, "localisation", "odometry", "collision", "joints", "lidar", "hand")
 """Parts of the state vector."""
 IMAGES = ("depth", "segmentation", "rgb", "normals")
 """Parts that are images."""
@@ -221,7 +221,7 @@ class SensorConfig(CameraNoise):
 
     observations: tuple[str, ...] = OBSERVATIONS
     """Parts of the observation. The vector has this order: waypoints, goal, velocity (the original's), localisation,
-    odometry, collision, joints, lidar, trail, hand. With images (depth, segmentation, rgb, normals) it is a dict."""
+    odometry, collision, joints, lidar, hand. With images (depth, segmentation, rgb, normals) it is a dict."""
     renderer: Literal["auto", "warp", "rays"] = "auto"
     """Renderer: warp (MJX-Warp's), rays (plain JAX), or auto: warp with physics on warp, otherwise rays."""
     image_geometry: Literal["boxes", "meshes"] = "boxes"

@@ -21,6 +21,7 @@ def write_room(
     split: str = "train",
     half_m: tuple[float, float, float] = (0.2, 0.2, 0.2),
     door_rad: tuple[float, float] = (-1.5, 1.5),
+    door_y_m: float | None = None,
 ) -> Path:
     """A rectangular room centred on the origin, with cubes of 0.4 m as furniture.
 
@@ -35,6 +36,7 @@ def write_room(
         split: train or test.
         half_m: half sizes of the furniture, where it is no cube.
         door_rad: range of the leaf's hinge; at 0 it lies along the lower wall.
+        door_y_m: puts the leaf into a wall along x at this y, with a gap that it fills; none: at the lower wall.
     """
     folder = Path(folder)
     (folder / "assets").mkdir(parents=True)
@@ -51,6 +53,8 @@ def write_room(
     ]
     if partition:
         walls.append((0.0, -0.5, 0.05, (ly - 1.0) / 2))
+    if door_y_m is not None:
+        walls += [((a + b) / 2, door_y_m, (b - a) / 2, 0.05) for a, b in ((-lx / 2, -1.02), (-0.18, lx / 2))]
     for i, (x, y, hx, hy) in enumerate(walls):
         structure.add_geom(
             name=f"wall_{i}", type=mujoco.mjtGeom.mjGEOM_BOX, pos=[x, y, 0.6], size=[hx, hy, 0.6], group=3
@@ -92,7 +96,7 @@ def write_room(
         movable(category, [x, y, half_m[2]], [((0, 0, 0), half_m)], mass, friction)
     if door:
         leaf = [((0.4, 0, 0.5), (0.4, 0.02, 0.49))]
-        movable("door", [-1.0, -ly / 2 + 0.1, 0.0], leaf, 8.0, 0.4, reach=door_rad)
+        movable("door", [-1.0, -ly / 2 + 0.1 if door_y_m is None else door_y_m, 0.0], leaf, 8.0, 0.4, reach=door_rad)
     if kitchen:
         front = [((0, 0, 0), (0.25, 0.01, 0.1)), ((0, 0.2, 0), (0.22, 0.18, 0.08))]
         movable("drawer", [0.0, ly / 2 - 0.39, 0.3], front, 5.0, 0.4, reach=(0, 0.35), axis=(0, -1, 0))

@@ -31,6 +31,8 @@ NEAR_M = 0.15
 NEAR_COST = 2.0
 START_OFF_M = 0.3
 """The free cell that stands for a start lies this near."""
+SHUT_RAD = 0.5
+"""A door is shut if it has turned less than this since the start."""
 FORCED_COST = 1e3
 """Metres of detour that a metre through an object is worth at weight 1: it is pushed only where no way is free."""
 
@@ -106,6 +108,9 @@ class _SceneGrid:
         self.footprints = Footprints(model, bodies, env.robot.height_m, self.origin_w, self.shape)
         self.price = friction_share(world, index)[self.occupied]
         self.stuck = ~world.slots.held[self.occupied] & (self.price > 1.0)  # its friction exceeds the robot's weight
+        self.doors = np.array(world.slots.categories[index])[self.occupied] == "door"
+        address = world.layout.slot_qpos[self.occupied]
+        self.address, self.rest = address, world.rest_qpos[index][address]
 
     def middles_w(self, cells: np.ndarray) -> np.ndarray:
         """Return [p, 2] m of cells [p, 2] (row, column)."""
@@ -147,10 +152,11 @@ class Ways:
     A weight w of 0 gives the shortest path through everything. Between 0 and 1, a metre through an object of mass m and
     friction mu costs w / (1 - w) * mu m / m_0 metres of detour: its friction's work over the robot's weight. With 1, or
     for an object too heavy to push, paths lead through it only if no other exists. None: nothing is touched.
+    With `barred`, no path leads through doors of rooms that stand as they did at the start.
     """
 
-    def __init__(self, env: Any, weight: float | None):
-        self._env, self._weight = env, weight
+    def __init__(self, env: Any, weight: float | None, barred: bool = False):
+        self._env, self._weight, self._barred = env, weight, barred
         self._grids = [_SceneGrid(env, i) for i in range(len(env.scenes))]
 
     def way(self, scene: int, qpos: np.ndarray, start_xy_w: np.ndarray, goal_xy_w: np.ndarray) -> np.ndarray:
@@ -195,6 +201,8 @@ class Ways:
             if len(cells):
                 forced = grid.stuck[k] or share == 1.0
                 price = FORCED_COST if forced else min(share / (1.0 - share) * grid.price[k], FORCED_COST)
+                shut = grid.doors[k] and abs(qpos[grid.address[k]] - grid.rest[k]) < SHUT_RAD
+                price = np.inf if self._barred and shut else price
                 blocked.flat[cells] = True
                 covered.flat[cells] = np.maximum(covered.flat[cells], price)
         away, index = scipy.ndimage.distance_transform_edt(~blocked, return_indices=True)  # type: ignore[misc]
@@ -204,5 +212,6 @@ class Ways:
             free = free & ~hits
         else:
             cost = cost + np.where(hits, covered[index[0], index[1]], 0.0)
+            free = free & np.isfinite(cost)
         near = np.maximum(near, np.clip(1.0 - (away_m - radius - MARGIN_M) / NEAR_M, 0.0, 1.0) * ~hits)
         return free, cost + NEAR_COST * near

@@ -23,7 +23,6 @@ PARTS = {
     "collision": ("0 or 1", "", "whether a movable object, a wall was touched since the last action"),
     "joints": ("rad or m, rad/s or m/s", "joint", "positions in the robot model's order, then velocities"),
     "lidar": ("m", "scanner", "distances, beams from right to left"),
-    "trail": ("m", "base", "x, y of where the robot was about 1, 2, 4, ..., 64 s ago"),
     "hand": ("m, 1", "base", "grip, opening, gap, touched, class, offset"),
     "hook": ("1, m", "base", "whether the hook holds something, and x, y, z of the coupled point"),
     "depth": ("m", "camera", "distance along the optical axis; 0: nothing is met"),

@@ -2,7 +2,7 @@
 
 By default (reference benchmark, section 1.1) ten waypoints x0, y0, ..., x9, y9, m, and goal minus robot position, m;
 then the base's linear and angular velocity, m/s and rad/s: robot frame, full roll-pitch-yaw inverse, no clipping. Then,
-where requested: localisation, odometry, collision, joints, lidar, trail, hand (`docs/sensors.md`).
+where requested: localisation, odometry, collision, joints, lidar, hand (`docs/sensors.md`).
 """
 
 import jax

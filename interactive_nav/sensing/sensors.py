@@ -76,10 +76,6 @@ def make_mount(model: mujoco.MjModel, base_body: str, camera: RobotCamera, yaw_r
     )
 
 
-TRAIL_STEPS = 10
-"""Control steps between two points of the trail."""
-TRAIL = (1, 2, 4, 8, 16, 32, 64)
-"""Points of it that are observed: 1 to 64 s ago with a control period of 0.1 s, and up to 0.9 s more."""
 LIDAR_NEAR_M = 0.05
 """Distance of the beams' start from the scanner (iGibson)."""
 
@@ -140,7 +136,6 @@ class Sensors:
             "collision": 2,
             "joints": 2 * len(self._joints[0]),
             "lidar": config.lidar_rays,
-            "trail": 2 * len(TRAIL),
             "hand": 10,
         }
         self.sizes = {name: size for name, size in sizes.items() if name in config.observations} | dict(extra or {})
@@ -164,7 +159,7 @@ class Sensors:
     ) -> jax.Array | dict[str, jax.Array]:
         """Return one environment's observation; noise uses the episode's key `rng` without consuming it.
 
-        `remembered` has the observed values among `odometry`, `trail`, `hand` and the `extra` parts.
+        `remembered` has the observed values among `odometry`, `hand` and the `extra` parts.
         """
         vector = self._vector(physics, nav, rng, remembered or {})
         if not self._images:

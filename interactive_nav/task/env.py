@@ -32,7 +32,7 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.slots import parking_spot
 from interactive_nav.scenes.world import build_world
-from interactive_nav.sensing.boxes import CLEAR_M, apply_axes, body_poses, box_gaps_m2, half_sizes_m
+from interactive_nav.sensing.boxes import CLEAR_M, apply_axes, body_poses, box_gaps_m2
 from interactive_nav.sensing.observation import waypoints_in_body
 from interactive_nav.sensing.sensors import Sensors
 from interactive_nav.task.dynamics import Dynamics
@@ -93,7 +93,6 @@ class InteractiveNav(Env):
         self.score_mass_kg = masses_kg[config.robot_mass]  # m_0 as the scores take it
         self._constants = config, self.tables, self.score_mass_kg
         self._small_radius_m = jnp.asarray([o.radius_m for o in self.world.small_objects], jnp.float32)
-        self._half_m = half_sizes_m(self.sensors.boxes)
         self._num_small = len(self.world.small_objects)
         self._parking = jnp.asarray([parking_spot(i) for i in range(self._num_small)], jnp.float32).reshape(-1, 2)
 
@@ -222,7 +221,7 @@ class InteractiveNav(Env):
 
     def privileged(self, state: State) -> jax.Array:
         """Return the true state (`privileged_size`,) f32 of one environment; see `privileged_state`."""
-        return privileged_state(self._moment(state), self.sensors.boxes, self._half_m)
+        return privileged_state(self._moment(state), self.sensors.boxes)
 
     def advance(self, state: State, action: jax.Array) -> State:
         """Do `step` without an observation: `obs` stays what it was until `observe`."""

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from brax.envs.base import State, Wrapper
 
 from interactive_nav.navigation.lookup import free_at
-from interactive_nav.sensing.boxes import BoxTables, body_poses
+from interactive_nav.sensing.boxes import BoxTables, body_poses, half_sizes_m
 from interactive_nav.task.terms import Moment, masses_kg
 
 PRIVILEGED = "privileged_state"
@@ -22,7 +22,7 @@ HOME_M = 10.0
 """Unit of distances across a home."""
 
 
-def privileged_state(at: Moment, boxes: BoxTables, half_m: jax.Array) -> jax.Array:
+def privileged_state(at: Moment, boxes: BoxTables) -> jax.Array:
     """Return (PRIVILEGED_SIZE,) f32 of one environment, zeros where the state is not finite.
 
     The task: goal (2) in the robot's frame, robot (2) and geodesic distance, each in units of `HOME_M`; cosine and sine
@@ -50,7 +50,7 @@ def privileged_state(at: Moment, boxes: BoxTables, half_m: jax.Array) -> jax.Arr
     heading = axis_b / jnp.maximum(jnp.linalg.norm(axis_b, axis=-1, keepdims=True), 1e-6)
     place = jnp.concatenate([turned(offset_w, -sin), offset_w[:, 2:]], -1) / REACH_M
     ones, mass = jnp.ones((len(mass_kg), 1)), jnp.log1p(mass_kg)[:, None] / 5
-    rows = jnp.concatenate([ones, place, heading, half_m[scene], mass], -1)
+    rows = jnp.concatenate([ones, place, heading, half_sizes_m(boxes)[scene], mass], -1)
     rows = jnp.where(distance_m[:, None] < REACH_M, rows, 0.0)[jnp.argsort(distance_m)[:NEAREST]]
     objects = jnp.pad(rows, [(0, NEAREST - len(rows)), (0, 0)]).reshape(-1)
 

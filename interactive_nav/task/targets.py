@@ -5,7 +5,7 @@
 
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +33,18 @@ OPENING_REWARD = 5.0
 CATEGORIES = SEGMENTATIONS["all"].names
 
 
+def opening(world: World, s: int, slot: int, arm_w: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return how far a held body of a scene can move from rest, rad or m, and where its centre then goes.
+
+    This is a vector (2,) in the plane, for a centre that is `arm_w` (3,), m, from the hinge.
+    """
+    slots, tie = world.slots, cast(Any, world.slots.bodies[s][slot]).joint
+    ends = np.array(tie.range or (-math.pi, math.pi)) - world.rest_qpos[s, world.layout.slot_qpos[slot]]
+    most = ends[np.abs(ends).argmax()]
+    axis_w = slots.axes_w[s, slot] @ slots.axis_b[s, slot] * most
+    return abs(most), (axis_w if tie.slides else np.cross(axis_w, arm_w))[:2]
+
+
 def _offers(world: World, config: NavConfig, s: int, places: np.ndarray) -> Iterator[tuple]:
     """Yield a scene's targets: slot, and start and goal places [n, 2] among those where the robot fits, [p, 2] m."""
     scene, radius_m, poses = world.scenes[s], world.robot.footprint_radius_m, rest_poses(world, s)
@@ -54,12 +66,10 @@ def _offers(world: World, config: NavConfig, s: int, places: np.ndarray) -> Iter
             if config.task == "fetch":
                 yield slot, places, places[nearest(com_w[:2], radius_m + 1.0)]
             continue
-        ends = np.array(tie.range or (-math.pi, math.pi)) - world.rest_qpos[s, world.layout.slot_qpos[slot]]
         arm_w = np.zeros(3) if tie.slides else com_w - pos_w - axes_w @ tie.anchor_m
-        opens_w = axes_w @ tie.axis if tie.slides else np.cross(axes_w @ tie.axis, arm_w)
-        opens_w = opens_w[:2] * ends[np.abs(ends).argmax()]
+        most, opens_w = opening(world, s, slot, arm_w)
         length = np.linalg.norm(opens_w)
-        if np.abs(ends).max() < (OPEN_M if tie.slides else OPEN_RAD) or length < 1e-3:
+        if most < (OPEN_M if tie.slides else OPEN_RAD) or length < 1e-3:
             continue
         if config.task == "open":
             at = nearest((com_w + arm_w)[:2] + opens_w / length * (radius_m + 0.1), BESIDE_M)

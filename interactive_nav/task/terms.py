@@ -20,8 +20,8 @@ from interactive_nav.physics.hook import TORN
 from interactive_nav.reward import interactive_navigation_reward
 from interactive_nav.robots.links import make_links, repeated
 from interactive_nav.sensing.boxes import CLEAR_M, box_gaps_m2, box_poses
-from interactive_nav.sensing.observation import advance_odometry, waypoints_in_body
-from interactive_nav.sensing.sensors import TRAIL, TRAIL_STEPS, stream
+from interactive_nav.sensing.observation import advance_odometry
+from interactive_nav.sensing.sensors import stream
 from interactive_nav.types import NavInfo, SceneTables
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.rotations import apply_axes, wrap_angle
@@ -165,11 +165,6 @@ def _odometry(pose: jax.Array, step: Step) -> jax.Array:
     return advance_odometry(pose, moved, last.yaw_rad, wrap_angle(nav.yaw_rad - last.yaw_rad), slip)
 
 
-def _trail(trail_w: jax.Array, step: Step) -> jax.Array:
-    longer = jnp.concatenate([step.nav.robot_pos_w[None, :2], trail_w])[: len(trail_w)]
-    return jnp.where(step.nav.step_count % TRAIL_STEPS == 0, longer, trail_w)
-
-
 def masses_kg(at: Moment) -> jax.Array:
     """Return (M + 1,) kg: the robot's for the scores, then the objects'."""
     tables_kg, dynamics = at.tables.mass_kg[at.nav.scene_index], at.nav.dynamics
@@ -276,10 +271,6 @@ TERMS = (
          lambda _, step: ~step.broken & jnp.stack([jnp.any(step.touches), step.hits_structure])),
     Term("odometry", "(3,) x, y (m) and yaw (rad) reckoned from the start's frame.", "observation",
          lambda pose, at: pose.at[2].set(wrap_angle(pose[2])), lambda nav: jnp.zeros(3), _odometry, 3),
-    Term("trail", f"Where the base was {TRAIL} times {TRAIL_STEPS} control steps ago, robot frame, m.", "observation",
-         lambda trail_w, at: waypoints_in_body(
-             trail_w[jnp.array(TRAIL)], at.nav.robot_pos_w, at.rotation).reshape(-1),
-         lambda nav: jnp.tile(nav.robot_pos_w[:2], (max(TRAIL) + 1, 1)), _trail, 2 * len(TRAIL)),
 )  # fmt: skip
 """The benchmark's terms, metrics in the order of the columns of rows."""
 HOOK_TERMS = (

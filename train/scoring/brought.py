@@ -16,7 +16,7 @@ from interactive_nav.task.rollout import HostPolicy
 from interactive_nav_common.errors import ConfigError, UserError
 from interactive_nav_common.imports import first_line, import_function
 
-TAKEN = ("learned", "random", "follower", "avoider", "namo", "keyboard", "ros")
+TAKEN = ("learned", "random", "follower", "avoider", "namo", "puller", "keyboard", "ros")
 EXPECTED = "expected [name=]module:factory, [name=]path/to/file.py:factory or [name=]policy.onnx"
 
 

@@ -5,12 +5,13 @@ and a key for each, so that episodes are independent.
 
 Planners run on the host, for many episodes at once, and read the state: positions, mass and friction of objects. They
 bound other policies (paper section IV): the avoider goes around every object, the NAMO-style planner weighs pushing
-against detours (`interactive_nav.navigation.ways`).
+against detours (`interactive_nav.navigation.ways`), and the puller opens doors and drawers with a hook.
 """
 
 import dataclasses
 import math
 from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -20,6 +21,7 @@ import numpy as np
 from interactive_nav.navigation.ways import Ways
 from interactive_nav.robots.spec import RobotSpec, TwistMap
 from interactive_nav.task.rollout import HostPolicy, PolicyFn
+from interactive_nav.task.targets import opening
 from interactive_nav_common.config import nearest
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.rotations import wrap_angle
@@ -64,6 +66,8 @@ def make_follower(env: Any) -> PolicyFn:
     return follow
 
 
+_READ = "robot_pos_w", "yaw_rad", "goal_xy_w", "scene_index", "object_pos_w", "step_count", "target"
+"""Fields of `NavInfo` that planners read."""
 REPLAN_STEPS = 10
 """Control steps between two plans of an episode, where something has moved."""
 MOVED_M = 0.02
@@ -102,6 +106,7 @@ class PlannedRoute:
 
     path_w: np.ndarray
     """[p, 2] m; empty where there is none."""
+    goal_xy_w: np.ndarray
     object_pos_w: np.ndarray
     """[M, 3] of the objects when it was planned."""
     step: int
@@ -110,12 +115,12 @@ class PlannedRoute:
 class Planner(HostPolicy):
     """Plan and steer episodes from their states; `weight` of `Ways`: 0 pushes everything, None avoids everything."""
 
-    def __init__(self, env: Any, weight: float | None):
+    def __init__(self, env: Any, weight: float | None, name: str = "namo"):
         if weight is not None and not 0.0 <= weight <= 1.0:
             raise UserError(f"policy namo: weight is {weight}, expected between 0 and 1, as in namo:0.5")
-        need_twist(env.robot, "policy avoider" if weight is None else "policy namo")
+        need_twist(env.robot, f"policy {name}")
         self._env, self._weight = env, weight
-        self._ways = Ways(env, weight)
+        self._ways = Ways(env, weight, barred=name == "puller")
         self._plans: dict[int, PlannedRoute] = {}
         self.no_path = 0
         """Plans without a path."""
@@ -128,28 +133,38 @@ class Planner(HostPolicy):
 
     def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> np.ndarray:
         """Return actions [N, A] of one control step, on plans that are as old as what has moved allows."""
-        nav = state.info["nav"]
-        qpos = np.asarray(state.pipeline_state.qpos)
-        pos, yaw = np.asarray(nav.robot_pos_w)[:, :2], np.asarray(nav.yaw_rad)
-        goal, scene, objects = np.asarray(nav.goal_xy_w), np.asarray(nav.scene_index), np.asarray(nav.object_pos_w)
-        linear, angular = np.zeros(len(pos)), np.zeros(len(pos))
+        nav, physics = state.info["nav"], state.pipeline_state
+        parts = {name: getattr(nav, name) for name in _READ} | {"qpos": physics.qpos}
+        parts |= {"hook": physics.hook} if getattr(physics, "hook", None) is not None else {}
+        parts = {name: np.asarray(part) for name, part in parts.items() if part is not None}
+        commands = np.zeros((3, len(episode)))
         for i in np.flatnonzero(running):
-            plan = self._plans.get(int(episode[i]))
-            started = nav.step_count[i] == 0  # a teacher's environments go through many episodes
-            if plan is None or started or (step - plan.step >= REPLAN_STEPS and self._stale(plan, pos[i], objects[i])):
-                path = self._ways.way(int(scene[i]), qpos[i], pos[i], goal[i])
-                self.plans += 1
-                self.no_path += not len(path)
-                plan = self._plans[int(episode[i])] = PlannedRoute(path, objects[i].copy(), step)
-            if len(plan.path_w):
-                linear[i], angular[i] = self._steer(plan.path_w, pos[i], yaw[i])
-        return np.asarray(self._env.robot.drive(linear, angular, np), np.float32)
+            at = {name: part[i] for name, part in parts.items()}
+            commands[:, i] = self._command(SimpleNamespace(**at, episode=int(episode[i]), step=step))
+        actions = np.array(self._env.robot.drive(*commands[:2], np), np.float32)
+        actions[:, -1] += commands[2]  # the hook's
+        return actions
+
+    def _command(self, at: Any) -> tuple[float, float, float]:
+        """Return one episode's linear (m/s) and angular (rad/s) velocity, and the hook's action."""
+        return *self._drive(at, at.goal_xy_w), 0.0
+
+    def _drive(self, at: Any, goal_xy_w: np.ndarray) -> tuple[float, float]:
+        """Return velocities along a plan to a place (2,), m."""
+        pos, plan = at.robot_pos_w[:2], self._plans.get(at.episode)
+        # A teacher's environments go through many episodes.
+        if plan is None or at.step_count == 0 or (plan.goal_xy_w != goal_xy_w).any() or self._stale(plan, at):
+            path = self._ways.way(int(at.scene_index), at.qpos, pos, goal_xy_w)
+            self.plans += 1
+            self.no_path += not len(path)
+            plan = self._plans[at.episode] = PlannedRoute(path, goal_xy_w.copy(), at.object_pos_w.copy(), at.step)
+        return self._steer(plan.path_w, pos, at.yaw_rad) if len(plan.path_w) else (0.0, 0.0)
 
     @staticmethod
-    def _stale(plan: PlannedRoute, pos: np.ndarray, objects: np.ndarray) -> bool:
-        moved = np.linalg.norm(objects - plan.object_pos_w, axis=-1).max(initial=0.0) > MOVED_M
-        off = len(plan.path_w) > 0 and np.linalg.norm(plan.path_w - pos, axis=-1).min() > 0.15
-        return bool(moved or off)
+    def _stale(plan: PlannedRoute, at: Any) -> bool:
+        moved = np.linalg.norm(at.object_pos_w - plan.object_pos_w, axis=-1).max(initial=0.0) > MOVED_M
+        off = len(plan.path_w) > 0 and np.linalg.norm(plan.path_w - at.robot_pos_w[:2], axis=-1).min() > 0.15
+        return bool(moved or off) and at.step - plan.step >= REPLAN_STEPS
 
     def _steer(self, path: np.ndarray, pos: np.ndarray, yaw: float) -> tuple[float, float]:
         """Return linear (m/s) and angular (rad/s) velocity towards a point a little ahead on the path."""
@@ -157,14 +172,107 @@ class Planner(HostPolicy):
         ahead = path[nearest:]
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ahead, axis=0), axis=-1))])
         target = ahead[min(int(np.searchsorted(along, PLAN_AHEAD_M)), len(ahead) - 1)]
-        offset = target - pos
-        bearing = wrap_angle(math.atan2(offset[1], offset[0]) - yaw)
-        return velocity_towards(self._env.robot.twist, float(bearing), PLAN_CRUISE_M_S, PLAN_ALIGNED_RAD, np)
+        bearing = _bearing(target - pos, yaw)
+        return velocity_towards(self._env.robot.twist, bearing, PLAN_CRUISE_M_S, PLAN_ALIGNED_RAD, np)
+
+
+def _bearing(way_w: np.ndarray, yaw_rad: float) -> float:
+    return float(wrap_angle(math.atan2(way_w[1], way_w[0]) - yaw_rad))
+
+
+PULL_M_S = 0.1
+"""Speed of coupling and of backing off: the wheels of light robots slip if they turn faster."""
+BEFORE_M, EDGE, ENOUGH = 0.3, 0.9, 1.25
+"""Distance from hook to target at which the robot turns to it; share of a leaf's width at which it couples; and share
+of what counts as open at which it lets go."""
+PATIENCE_STEPS, LEAVE_STEPS = 60, 15
+"""Control steps in which nothing happens, after which the puller couples again; and those in which it then backs away
+from what it has opened, so as not to shut it."""
+
+
+class Puller(Planner):
+    """Pull the target open with the hook, as often as it takes, then drive to the goal like `namo:1`.
+
+    The robot couples near a leaf's free edge and backs off on a circle about the hinge, or straight from a drawer.
+    Doors that are shut are obstacles.
+    """
+
+    def __init__(self, env: Any):
+        if env.config.task not in ("open", "clear") or not env.hook:
+            got = f"task is '{env.config.task}' and hook_force_n is {env.config.hook_force_n}"
+            remedy = "set env.task=clear env.hook_force_n=100, or choose another policy"
+            raise UserError(f"policy puller: {got}, expected open or clear, and a hook; {remedy}")
+        super().__init__(env, 1.0, "puller")
+        self._targets, self._starts_w = jax.tree.map(np.asarray, (env.tables.targets, env.tables.start_xy_w))
+        self._front_m = float(env.hook.point_b[0])
+        self._pulls: dict[int, tuple[str, int, float, np.ndarray]] = {}
+        """Episode -> phase (reach the place, couple, pull, leave, pass to the goal); the step in which it began or the
+        target last moved; how far that was open; and the place (2,), m, from which the robot turns to the target."""
+
+    def _command(self, at: Any) -> tuple[float, float, float]:
+        self._look(at)
+        if at.step_count == 0 or at.episode not in self._pulls:
+            self._pulls[at.episode] = "reach", at.step, at.share, self._place(at)
+        last, since, share, place_w = self._pulls[at.episode]
+        late, held, phase = at.step - since > PATIENCE_STEPS, at.hook[0] == at.target, last
+        fell_shut = phase == "pass" and at.share < 0.5 and (at.robot_pos_w[:2] - at.grip_w) @ at.opens_w > 0
+        if phase == "leave":
+            phase = "pass" if at.step - since > LEAVE_STEPS else "leave"
+        elif phase != "pass" and (at.share >= at.enough or (late and at.share >= 1.0)):
+            phase = "leave"
+        elif fell_shut or (phase != "pass" and late) or (phase == "pull" and not held):
+            phase, place_w = "reach", self._place(at)
+        elif phase == "reach" and np.linalg.norm(at.robot_pos_w[:2] - place_w) < 0.1:
+            phase = "couple"
+        elif phase == "couple" and held:
+            phase = "pull"
+        if late or phase != last or (abs(at.share - share) > 0.02 and phase != "leave"):
+            self._pulls[at.episode] = phase, at.step, at.share, place_w
+        if phase == "couple":
+            bearing = _bearing(at.grip_w - at.robot_pos_w[:2], at.yaw_rad)
+            speeds = velocity_towards(self._env.robot.twist, bearing, PULL_M_S, 0.1, np)
+            return *speeds, 1.0 if at.hook[0] < 0 else -1.0
+        if phase in ("pull", "leave"):
+            return (*self._back_off(at), 1.0) if phase == "pull" else (-2 * PULL_M_S, 0.0, -1.0)
+        return *self._drive(at, at.goal_xy_w if phase == "pass" else place_w), -1.0
+
+    def _look(self, at: Any) -> None:
+        """Add to `at` how far the target is open and has to be (1: open), its hinge, where to couple (2,), m, the unit
+        vector (2,) along which that moves, and whether it turns left (1), right (-1) or not (0)."""
+        targets, scene, slot, world = self._targets, int(at.scene_index), int(at.target), self._env.world
+        span, address, hinge_w = targets.span[slot], targets.address[slot], targets.hinge_w[scene, slot]
+        arm_w = at.object_pos_w[slot] - hinge_w
+        most, opens_w = opening(world, scene, slot, arm_w)
+        at.share = abs(at.qpos[address] - world.rest_qpos[scene, address]) / span
+        at.enough = min(ENOUGH, 0.97 * most / span)
+        at.hinge_w, at.opens_w = hinge_w[:2], opens_w / max(np.linalg.norm(opens_w), 1e-9)
+        lever_m = arm_w[0] * at.opens_w[1] - arm_w[1] * at.opens_w[0]
+        at.turns = np.sign(lever_m) * (abs(lever_m) > 0.05)  # a flap, on a level hinge, comes straight out
+        at.grip_w = at.hinge_w + arm_w[:2] * (2 * EDGE if at.turns else 1.0)
+
+    def _place(self, at: Any) -> np.ndarray:
+        """Return where the robot fits, (2,) m, next to a place before the target where the circle begins."""
+        arm_w, scene = at.grip_w - at.hinge_w, at.scene_index
+        inwards = min(abs(at.turns) * self._front_m / max(np.linalg.norm(arm_w), 1e-3), 0.8)
+        away_w = at.opens_w * math.sqrt(1 - inwards**2) - arm_w / max(np.linalg.norm(arm_w), 1e-3) * inwards
+        places = self._starts_w[scene, : self._env.tables.num_starts[scene]]
+        off_w = places - at.grip_w - (self._front_m + BEFORE_M) * away_w
+        return places[np.linalg.norm(off_w, axis=-1).argmin()]
+
+    def _back_off(self, at: Any) -> tuple[float, float]:
+        """Return velocities backwards, on a circle about the hinge that keeps the hook where it holds the leaf."""
+        from_w, held_m = at.robot_pos_w[:2] - at.hinge_w, np.linalg.norm(at.hook[5:7] - at.hinge_w)
+        radius_m = np.linalg.norm(from_w)
+        ahead_w = at.turns * np.array([from_w[1], -from_w[0]]) if at.turns else -at.opens_w
+        off_m = radius_m - math.sqrt(max(held_m**2 - self._front_m**2, 0.01))
+        bearing = _bearing(ahead_w, at.yaw_rad) + at.turns * np.clip(2.0 * off_m, -0.4, 0.4)
+        return -PULL_M_S, at.turns * PULL_M_S / radius_m + 2.0 * bearing
 
 
 def make_baseline(name: str, env: Any) -> PolicyFn | Planner:
-    """Build a policy or planner that never learns, by name: random, follower, avoider or namo:W (W as in `Planner`)."""
-    plain = {"random": make_random, "follower": make_follower, "avoider": lambda env: Planner(env, None)}
+    """Build a policy or planner that never learns, by a name in `train.scoring` (W of namo:W as in `Planner`)."""
+    plain = {"random": make_random, "follower": make_follower, "puller": Puller}
+    plain["avoider"] = lambda env: Planner(env, None, "avoider")
     if name in plain:
         return plain[name](env)
     kind, _, weight = name.partition(":")

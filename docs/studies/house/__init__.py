@@ -14,7 +14,7 @@ from pathlib import PurePosixPath
 
 EXAMPLES = {
     "reward term": r"""["'](reward/)?interaction["']""", "metric with memory": r"\bstructure_steps\b",
-    "observation with memory": r"\b(TRAIL|trail(_w)?)\b", "robot": r"(?i)jackrabbot",
+    "observation with memory": r"\b_?odometry\b", "robot": r"(?i)jackrabbot",
     "scene source": r"\bscan2cad\b", "algorithm": r"\bddpg\b",
 }  # fmt: skip
 """Kind of change -> what code that knows one of its kind matches."""

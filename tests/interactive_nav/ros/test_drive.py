@@ -165,7 +165,7 @@ def test_bytes_are_rounded():
 @pytest.mark.parametrize(
     ("about", "line"),
     [
-        (changed(inputs={"trail": {**VECTOR, "shape": [14]}}), "no topic carries its input trail"),
+        (changed(inputs={"hand": {**VECTOR, "shape": [10]}}), "no topic carries its input hand"),
         (changed(outputs={"action": {}}), "the policy gives no velocity of a base"),
     ],
 )

@@ -29,7 +29,7 @@ from interactive_nav_common.rotations import matrix_from_quat
 
 YAW = 0.3
 SEES = {"observations": ("depth",)}
-ALL = ("goal", "velocity", "waypoints", "localisation", "odometry", "collision", "joints", "lidar", "trail")
+ALL = ("goal", "velocity", "waypoints", "localisation", "odometry", "collision", "joints", "lidar")
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,6 @@ def moment(world):
         "memory": {
             "odometry": jnp.asarray([0.5, -0.1, 4.0]),
             "touching": jnp.asarray([True, False]),
-            "trail": jnp.stack([-1.0 + 0.1 * jnp.arange(65), jnp.full(65, 0.2)], -1),
         },
     }
     fields: dict[str, Any] = zeros | told
@@ -77,17 +76,13 @@ def sense(world, moment, **settings):
 
 def test_signals_stand_behind_the_tasks_29_numbers(world, moment):
     sensors, obs = sense(world, moment, observations=ALL, lidar_rays=4, lidar_fov_deg=360.0, lidar_range_m=4.0)
-    assert sensors.observation_size == obs.shape[0] == 29 + 3 + 3 + 2 + 4 + 4 + 14
-    names = ["waypoints", "goal", "velocity", "localisation", "odometry", "collision", "joints", "lidar", "trail"]
+    assert sensors.observation_size == obs.shape[0] == 29 + 3 + 3 + 2 + 4 + 4
+    names = ["waypoints", "goal", "velocity", "localisation", "odometry", "collision", "joints", "lidar"]
     assert list(sensors.sizes) == names
     part = dict(zip(names, np.split(np.asarray(obs), np.cumsum(list(sensors.sizes.values()))[:-1]), strict=True))
     np.testing.assert_allclose(part["localisation"], [-1.0, 0.2, YAW], atol=1e-6)
     np.testing.assert_allclose(part["odometry"], [0.5, -0.1, 4.0 - 2 * np.pi], atol=1e-6)
     np.testing.assert_array_equal(part["collision"], [1.0, 0.0])
-    ago = 0.1 * np.array([1, 2, 4, 8, 16, 32, 64])  # it came along x, and looks YAW to the left
-    np.testing.assert_allclose(
-        part["trail"].reshape(7, 2), np.stack([ago * np.cos(YAW), -ago * np.sin(YAW)], -1), atol=1e-5
-    )
     # Wheels turn without limit: angles are wrapped.
     np.testing.assert_allclose(part["joints"], [7.0 - 2 * np.pi, -0.5, 3.0, -2.0], atol=1e-5)
     # The room's walls are x = +/- 2, y = +/- 1.5; beams go backwards, to the right, ahead and to the left of yaw 0.3,

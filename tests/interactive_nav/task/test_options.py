@@ -62,13 +62,13 @@ _RESETS: dict[bool, Any] = {}
 
 
 def begin(env, goal=(1.6, 0.0), x=-0.7):
-    """First state, which only options of waypoints, potential and trail change: the others share a compiled reset."""
-    config, trail = env.config, "trail" in env.config.observations
+    """First state, which only options of waypoints and potential change: the others share a compiled reset."""
+    config = env.config
     special = (config.waypoint_style, config.potential, config.potential_round) != (
         "ahead",
         "continuous",
         None,
-    ) or trail
+    )
     if special or False not in _RESETS:
         reset = jax.jit(jax.vmap(env.reset_to))
         _RESETS[special] = reset
@@ -420,17 +420,3 @@ def test_settings_that_say_what_holds_anyway_are_taken():
     assert (either.active_furniture, either.contacts_per_env, either.threads) == (3, 50, 2)
     seen = make_config(observations=("lidar", "depth"), lidar_rays=3, depth_noise=0.1, image_size=32)
     assert (seen.lidar_rays, seen.depth_noise, seen.image_size) == (3, 0.1, 32)
-
-
-def test_the_trail_is_where_the_base_was_a_second_ago_and_longer(pushed):
-    env = make(pushed, observations=("goal", "trail"))
-    states = play(env, [(0.2, -0.1)] * 25)
-    places = value(states, "robot_pos_w")[:, :2]
-    nav = states[25].info["nav"]
-    # Every ten control steps: after 10 and 20; before that the start, which stands for all that is longer ago.
-    np.testing.assert_allclose(nav.memory["trail"][0], [places[20], places[10], *[places[0]] * 63], atol=1e-6)
-    seen = np.asarray(jax.vmap(env.observe)(states[25]).obs)[0, 3:].reshape(7, 2)
-    ago = np.array([places[10], *[places[0]] * 6]) - places[25]
-    cos, sin = math.cos(float(nav.yaw_rad[0])), math.sin(float(nav.yaw_rad[0]))
-    np.testing.assert_allclose(seen, ago @ np.array([[cos, -sin], [sin, cos]]), atol=0.01)  # it pitches a little
-    assert np.linalg.norm(ago[0]) > 0.1

@@ -73,6 +73,51 @@ def test_weight_0_pushes_and_a_large_weight_goes_round(played):
     assert careful.metrics["interaction_steps"][0] > 3 and careful.metrics["success"][0] == 1
 
 
+HOOK = {"backend": "native", "num_objects": 0, "control_mode": "twist", "hook_force_n": 100.0, "episode_steps": 600}
+
+
+def play(env, policy, target, start, goal):
+    """The metrics of one episode."""
+    episode = EpisodeStart(
+        scene_index=jnp.zeros(1, jnp.int32),
+        start_xy_w=jnp.array([start]),
+        start_yaw_rad=jnp.zeros(1),
+        goal_xy_w=jnp.array([goal]),
+        small_xy_w=jnp.zeros((1, 0, 2)),
+        small_yaw_rad=jnp.zeros((1, 0)),
+        small_placed=jnp.zeros((1, 0), bool),
+        target=jnp.array([env.world.slots.names[0].index(target)], jnp.int32),
+    )
+    played = BatchPlayer(env).play(make_baseline(policy, env), episode_keys(0, 1), 1, starts=episode)
+    return {name: float(value[0]) for name, value in played.metrics.items()}
+
+
+@pytest.mark.parametrize("robot", ["fetch", "turtlebot"])
+def test_the_puller_opens_a_door_towards_it_and_drives_through(tmp_path, robot):
+    room = write_room(tmp_path / "room", (4.0, 5.0), door=True, door_rad=(0.0, 1.5), door_y_m=-0.5)
+    env = interactive_nav.make(robot, [room], task="clear", **HOOK)
+    pulled, pushed = (play(env, policy, "door_0", [1.2, 1.2], [-0.6, -1.8]) for policy in ("puller", "namo:1"))
+    assert pulled["success"] == 1 and pulled["opened"] == 1 and pulled["hook_torn"] == 0
+    assert pulled["hook_steps"] > 50 and pulled["nonfinite"] == 0
+    # Past 60 degrees: the leaf's 8 kg have their centre 0.4 m from the hinge.
+    assert pulled["object_displacement_kg_m"] > 8 * 0.4 * np.pi / 3
+    assert pushed["success"] == 0 and pushed["opened"] < 0.05 and pushed["hook_steps"] == 0
+
+
+def test_the_puller_opens_doors_drawers_and_flaps(tmp_path):
+    room = write_room(tmp_path / "room", (4.0, 4.0), (), door=True, kitchen=True, door_rad=(0.0, 1.5))
+    env = interactive_nav.make("freight", [room], task="open", **HOOK)
+    for target in ("door_0", "drawer_0", "cabinet_door_0"):
+        scores = play(env, "puller", target, [-1.0, 0.0], [0.0, 0.5])
+        assert scores["success"] == 1 and scores["opened"] == 1, target
+
+
+def test_the_puller_needs_a_task_and_a_hook(env):
+    got = "task is 'reach' and hook_force_n is 0.0, expected open or clear, and a hook; set env.task=clear"
+    with pytest.raises(UserError, match=f"policy puller: {got}"):
+        make_baseline("puller", env)
+
+
 def test_names_and_weights_are_checked(env):
     with pytest.raises(UserError, match="got 'namo', expected a weight, as in namo:0.5"):
         make_baseline("namo", env)
