@@ -117,8 +117,8 @@ def test_python_of_a_page_runs(page, capsys):
     assert run_page(page, text) > 0
     if page.name in ("results.md", "results-cluttered.md", "results-planners.md"):
         printed = capsys.readouterr().out
-        assert unprinted(text, printed) == [] and "\n| Fetch, `random` |" in text
-        wrong = text.replace("| Fetch, `random` | ", "| Fetch, `random` | 1", 1)
+        assert unprinted(text, printed) == [] and "\n| Fetch, `follower` |" in text
+        wrong = text.replace("| Fetch, `follower` | ", "| Fetch, `follower` | 1", 1)
         assert len(unprinted(wrong, printed)) == 1
 
 
