@@ -98,7 +98,9 @@ def test_a_door_before_a_wall_opens_as_far_as_there_is_room(tmp_path, hull_cache
     (line,) = (w for w in done.manifest.warnings if "hit" in w or "welded" in w)
     words = sorted(words.partition(" (")[0] for words in line.partition(": ")[2].split(", "))
     assert words[:2] == ["hinge_1_of_B_1 not at all", "hinge_1_of_C_1 not at all"]
-    assert words[2::3] == ["hinge_1_of_Cabinet_1 to 0.59 of 1.57 rad", "rail_2_of_Cabinet_1 to 0.32 of 0.42 m"]
+    hinge, rail = words[2::3]  # 6 / 8 of 0.42 m are 0.315 m, which processors round either way
+    assert hinge == "hinge_1_of_Cabinet_1 to 0.59 of 1.57 rad"
+    assert rail in [f"rail_2_of_Cabinet_1 to {most_m} of 0.42 m" for most_m in (0.31, 0.32)]
     assert [w.partition(" to ")[0] for w in words[3:5]] == ["rail_2_of_B_1", "rail_2_of_C_1"]
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "scene.xml"))
     low, high = model.jnt_range.T
