@@ -189,11 +189,12 @@ def simulation(
     nav, physics = state.info["nav"], env.physics
     window = getattr(physics, "window", None)
     rate, clock = statistics.median(rates), env.config
-    seconds = {"make_s": make_s, "reset_s": reset_s, "compile_s": compile_s}
     return {
         "env_steps_per_s": round(rate),
         "physics_steps_per_s": round(rate * round(clock.control_dt_s / clock.sim_dt_s)),
-        **{name: round(took_s, 1) for name, took_s in seconds.items()},
+        "make_s": round(make_s, 1),
+        "reset_s": round(reset_s, 1),
+        "compile_s": round(compile_s, 1),
         "tables_mb": round(sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(env.tables)) / 1e6, 1),
         "host_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
         "steps": CHUNK * len(rates),
@@ -259,21 +260,37 @@ def training(
     """Rate of `python -m train` with a preset and `learner` words laid over it: median over its log lines."""
     algorithm = config_io.load_config(preset).algorithm
     with tempfile.TemporaryDirectory() as folder:
-        overrides = [f"env.scenes=[{','.join(scenes)}]", f"env.backend={backend}", f"{algorithm}.num_envs={num_envs}"]
-        overrides += [f"run.num_timesteps={steps * num_envs}", f"run.checkpoint_every_steps={10 * steps * num_envs}"]
-        overrides += ["run.log_every_steps=1", f"run.out_dir={folder}", "run.name=benchmark", "run.tensorboard=false"]
-        overrides += [*(f"env.{k}={json.dumps(v)}" for k, v in settings.items()), *learner]
+        overrides = [
+            f"env.scenes=[{','.join(scenes)}]",
+            f"env.backend={backend}",
+            f"{algorithm}.num_envs={num_envs}",
+            f"run.num_timesteps={steps * num_envs}",
+            "run.log_every_steps=1",
+            f"run.checkpoint_every_steps={10 * steps * num_envs}",
+            f"run.out_dir={folder}",
+            "run.name=benchmark",
+            "run.tensorboard=false",
+            *(f"env.{k}={json.dumps(v)}" for k, v in settings.items()),
+            *learner,
+        ]
         _, run_folder, _ = train_run(config_io.load_config(preset, overrides), Console(quiet=True))
         if jax.process_index():
             return {}  # process 0 has the run folder
         lines = [json.loads(line) for line in run_folder.metrics.read_text(encoding="utf-8").splitlines()]
     rates = [line["env_steps_per_s"] for line in lines[1:]] or [lines[0]["env_steps_per_s"]]
-    row = {"env_steps_per_s": round(statistics.median(rates)), "compile_s": round(lines[-1]["compile_s"], 1)}
-    row |= {"steps": steps, "mode": algorithm, "preset": preset, "learner": learner}
-    row["episodes"] = sum(line["episodes"] for line in lines)
-    for name in ("nonfinite", "overflow_steps"):
-        row[name] = sum(line.get(f"episode/{name}", 0.0) * line["episodes"] for line in lines)
-    return row | {"peak_memory_mib": _peak_memory_mib()}
+    last = lines[-1]
+    return {
+        "env_steps_per_s": round(statistics.median(rates)),
+        "compile_s": round(last["compile_s"], 1),
+        "steps": steps,
+        "mode": algorithm,
+        "preset": preset,
+        "learner": learner,
+        "episodes": sum(line["episodes"] for line in lines),
+        "nonfinite": sum(line.get("episode/nonfinite", 0.0) * line["episodes"] for line in lines),
+        "overflow_steps": sum(line.get("episode/overflow_steps", 0.0) * line["episodes"] for line in lines),
+        "peak_memory_mib": _peak_memory_mib(),
+    }
 
 
 class Bench(Command):
@@ -323,9 +340,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def measured(args: Bench, mode: str, num_envs: int, settings: dict[str, Any]) -> dict[str, Any]:
     """Return a row."""
-    row: dict[str, Any] = {"mode": mode, "backend": resolve_backend(args.backend), "num_envs": num_envs}
-    row |= {"scenes": list(args.scenes), "settings": settings}
-    row |= ({"processes": jax.process_count()} if jax.process_count() > 1 else {}) | origin(args.commit)
+    row: dict[str, Any] = {
+        "mode": mode,
+        "backend": resolve_backend(args.backend),
+        "num_envs": num_envs,
+        "scenes": list(args.scenes),
+        "settings": settings,
+        **({"processes": jax.process_count()} if jax.process_count() > 1 else {}),
+        **origin(args.commit),
+    }
     measure = (list(args.scenes), args.backend, num_envs, args.steps, settings)
     if mode == "train":
         return row | training(*measure, args.preset, list(args.learner))
