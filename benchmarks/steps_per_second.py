@@ -4,7 +4,6 @@
 
 `simulation` drives random wheel commands through `AutoResetEnv.step`; new episodes are drawn as old ones
 end. `physics`, `task` and `observed` are the same with parts left out, for their shares of a step.
-`windows` counts instead what an environment needs in its window while it drives at random, and proposes settings.
 `train` trains with `python -m train`'s own code and a preset of any algorithm, and reads the rate that it
 logs, compiling and checkpoints apart. Rows carry device, versions and commit, and are appended to
 `benchmarks/results/steps_per_second.jsonl.gz`.
@@ -20,7 +19,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -31,8 +30,6 @@ from rich.console import Console
 
 import interactive_nav
 from interactive_nav.physics import resolve_backend
-from interactive_nav.physics.nearness import widths_at
-from interactive_nav.physics.window import PhysicsWindow
 from interactive_nav.task.wrappers import AutoResetEnv, ShardedEnv
 from interactive_nav.types import FAILURES
 from interactive_nav_common.commands import Command, option, parse
@@ -93,16 +90,8 @@ def random_driving(
     return lambda state, key: jax.lax.scan(one, state, jax.random.split(key, steps))
 
 
-MODES = ("physics", "task", "observed", "simulation", "windows", "train")
 CHUNK = 20
 """Steps in one compiled scan."""
-LEFT_OUT_SHARE = 0.005
-"""Of environment steps: windows are proposed that are too small in fewer."""
-SETTLED_STEPS = 10
-"""Of an episode, after which objects that were laid out lie still."""
-SETTINGS = {"free": "active_furniture", "small": "active_small", "hinge": "active_doors", "walls": "active_walls"}
-SETTINGS |= {"slide": "active_doors"}
-"""What a window holds -> the setting that says how many."""
 
 
 @functools.lru_cache(maxsize=1)
@@ -208,46 +197,6 @@ def simulation(
     }
 
 
-def windows(
-    robot: str, scenes: list[str], backend: str, num_envs: int, steps: int, settings: dict[str, Any]
-) -> dict[str, Any]:
-    """Measure how much each environment needs in its window while it drives at random, at every tenth step.
-
-    Best on `native`, which simulates everything: a window would hide what it left out.
-    """
-    env = _make(robot, tuple(scenes), backend, json.dumps(settings))
-    batch, window = AutoResetEnv(env), PhysicsWindow(env.world, env.config)
-    state = jax.jit(batch.reset)(jax.random.split(jax.random.PRNGKey(0), num_envs))
-    program = jax.jit(random_driving(_counting(batch.step), (num_envs, env.action_size), 10))
-    needs = jax.jit(jax.vmap(lambda *x: window.needs(window.measure(*x))))
-    counted: dict[str, list[np.ndarray]] = {kind: [] for kind in SETTINGS}
-    for i in range(max(1, steps // 10)):
-        state, _ = program(state, jax.random.PRNGKey(1 + i))
-        nav = state.info["nav"]
-        settled = np.asarray(nav.step_count) >= SETTLED_STEPS
-        for kind, count in needs(nav.scene_index, state.pipeline_state).items():
-            counted[kind].append(np.asarray(count)[settled])
-    counts = {kind: np.concatenate(values) for kind, values in counted.items()}
-    shares = (0.5, 0.9, 0.99, 0.995, 0.999, 1.0)
-    proposed = widths_at(counts, 1 - LEFT_OUT_SHARE / len(counts))
-    widths = {kind: width or np.inf for kind, width in window.widths.items()}
-
-    def by_setting(widths: Mapping[str, int]) -> dict[str, int]:
-        return {SETTINGS[k]: max(w for o, w in widths.items() if SETTINGS[o] == SETTINGS[k]) for k in widths}
-
-    def left_out(widths: Mapping[str, float]) -> float:
-        return float(np.mean([counts[kind] > width for kind, width in widths.items()], axis=0).astype(bool).mean())
-
-    return {
-        "env_steps": int(len(counts["walls"])),
-        "needs": {k: {str(q): float(np.quantile(c, q)) for q in shares} for k, c in counts.items()},
-        "set": by_setting(window.widths),
-        "left_out_share": left_out(widths),
-        "proposed": by_setting(proposed),
-        "proposed_left_out_share": left_out(proposed),
-    }
-
-
 def training(
     scenes: list[str],
     backend: str,
@@ -310,7 +259,7 @@ class Bench(Command):
     """Numbers of environments to measure, one row each."""
     steps: AtLeastOne = 200
     """Number of control steps of every environment."""
-    mode: tuple[Literal["physics", "task", "observed", "simulation", "windows", "train"], ...] = ("simulation",)
+    mode: tuple[Literal["physics", "task", "observed", "simulation", "train"], ...] = ("simulation",)
     """What to measure, one row each."""
     preset: str = "turtlebot_ppo"
     """Preset of `python -m train`, for --mode train."""
@@ -353,8 +302,6 @@ def measured(args: Bench, mode: str, num_envs: int, settings: dict[str, Any]) ->
     if mode == "train":
         return row | training(*measure, args.preset, list(args.learner))
     row |= {"robot": args.robot, "devices": args.devices}
-    if mode == "windows":
-        return row | windows(args.robot, *measure)
     return row | simulation(args.robot, *measure, part=mode, devices=args.devices)
 
 

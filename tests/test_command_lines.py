@@ -19,7 +19,7 @@ from docs.program_help import help_of
 HELP, ERRORS = (Path(__file__).parent / "snapshots" / name for name in ("help.txt", "errors.txt"))
 PROGRAMS = (
     "interactive_nav",
-    *(f"interactive_nav.{name}" for name in ("view", "record", "topdown", "episodes", "robots", "ros")),
+    *(f"interactive_nav.{name}" for name in ("view", "record", "episodes", "robots", "ros")),
     *("train", "train.sweep", "train.evaluate", "train.export", "train.figures", "train.figures.report"),
     *("train.record", "train.replay"),
     *("converters", "topological_nav", "topological_nav.ros", "benchmarks.steps_per_second"),

@@ -171,9 +171,9 @@ class Nearness:
         return {kind: np.concatenate(values) for kind, values in counts.items()}
 
 
-def widths_at(counts: Mapping[str, np.ndarray], share: float = SHARE) -> dict[str, int]:
-    """Return, of each kind, what suffices in this share of the counts; at least one, since 0 stands for all."""
-    return {k: max(1, int(np.quantile(c, share, method="higher"))) for k, c in counts.items()}
+def widths_at(counts: Mapping[str, np.ndarray]) -> dict[str, int]:
+    """Return, of each kind, what suffices in `SHARE` of the counts; at least one, since 0 stands for all."""
+    return {k: max(1, int(np.quantile(c, SHARE, method="higher"))) for k, c in counts.items()}
 
 
 def _bounds(slots: SlotTables) -> tuple[np.ndarray, np.ndarray]:

@@ -170,13 +170,6 @@ class PhysicsWindow:
         missed |= (walls < 0).sum() > self.n_walls
         return tuple(chosen), index, missed.astype(jnp.int32)
 
-    def needs(self, measured: Measured) -> dict[str, jax.Array]:
-        """Return how many of each kind can be met, or move, in one environment: [] i32 by kind of slot, and walls."""
-        near, moving, walls = measured
-        needed = (near < 0) | moving
-        counts = {kind: needed[jnp.asarray(slots)].sum() for kind, slots in self._slots.items()}
-        return {**counts, "walls": (walls < 0).sum()}
-
     def awake(self, measured: Measured, chosen: tuple[jax.Array, ...]) -> jax.Array:
         """Return [window slots] bool: what moves, or the robot may already touch; all else rests."""
         near, moving, _ = measured

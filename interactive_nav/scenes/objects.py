@@ -19,7 +19,7 @@ import yaml
 
 from interactive_nav.scenes.scene import Movable, body_task_parts, hull_sources, read_movable
 from interactive_nav_common.config import Positive
-from interactive_nav_common.errors import ConfigError, readable
+from interactive_nav_common.errors import readable
 from interactive_nav_common.files import check_name
 from interactive_nav_common.records import Reader
 from interactive_nav_common.untrusted.reading import check_named
@@ -28,7 +28,6 @@ from scenes_mjcf.schema import CATEGORIES, SceneError
 
 Rgba = tuple[float, float, float, float]
 Size = tuple[float, float, float]
-SPLITS = ("train", "test")
 KINDS = ("basket", "shoe", "pot", "toy", "shoe", "basket", "toy", "pot")
 """Kinds in the order in which `pick` deals them: ten are 3 baskets, 3 shoes, 2 pots, 2 toys."""
 VISUAL_GROUP = 2
@@ -44,11 +43,6 @@ class Box:
     centre_m: tuple[float, float, float]
     half_m: tuple[float, float, float]
     quat: tuple[float, float, float, float] = LEVEL
-
-    def __repr__(self) -> str:
-        # Digests in episode files are of this text: a box that is not turned has the same as ever.
-        turn = "" if self.quat == LEVEL else f", quat={self.quat!r}"
-        return f"Box(centre_m={self.centre_m!r}, half_m={self.half_m!r}{turn})"
 
     @property
     def corners_m(self) -> list[tuple[float, float, float]]:
@@ -229,25 +223,13 @@ MODELS: dict[str, dict[str, tuple[SmallObject, ...]]] = {
 """Split -> kind -> models; no model is in both splits."""
 
 
-def pick(num_objects: int, split: str = "train", variant: int = 0) -> tuple[SmallObject, ...]:
+def pick(num_objects: int, split: str = "train") -> tuple[SmallObject, ...]:
     """Return a set of small objects: two models of each kind, repeated in turn.
 
-    Slot i holds the same kind and number of boxes for every split and variant; these select the two models (variant 0
-    is the default). Ten objects are 3 baskets, 3 shoes, 2 pots, 2 toys.
+    Slot i holds the same kind and number of boxes for every split. Ten objects are 3 baskets, 3 shoes, 2 pots, 2 toys.
     """
-    if num_objects < 0:
-        raise ConfigError(f"num_objects is {num_objects}, expected 0 or more")
-    if variant < 0:
-        raise ConfigError(f"variant is {variant}, expected 0 or more")
-    if split not in MODELS:
-        raise ConfigError(f"split is {split!r}, expected one of {', '.join(SPLITS)}")
-    chosen = []
-    for i in range(num_objects):
-        kind = KINDS[i % len(KINDS)]
-        models = MODELS[split][kind]
-        turn = KINDS[: i % len(KINDS)].count(kind)
-        chosen.append(models[(2 * variant + turn) % len(models)])
-    return tuple(chosen)
+    places = (i % len(KINDS) for i in range(num_objects))
+    return tuple(MODELS[split][KINDS[i]][KINDS[:i].count(KINDS[i])] for i in places)
 
 
 _HALF = math.sqrt(0.5)

@@ -10,7 +10,7 @@ import pytest
 
 import interactive_nav
 import interactive_nav.record
-from interactive_nav import episodes, topdown
+from interactive_nav import episodes
 from interactive_nav.pictures import replay
 from interactive_nav.scenes.objects import body_names
 from tests.train.toy_run import toy_config
@@ -86,11 +86,10 @@ def test_paths_of_an_evaluation_are_no_replay(tmp_path, capsys):
     paths = tmp_path / "evaluation" / "episodes.npz"
     paths.parent.mkdir()
     np.savez(paths, **{"policies": np.array(["learned"]), "learned/goal_xy_w": np.zeros((1, 2))})
-    for drawn in (interactive_nav.record, topdown):
-        assert drawn.main([str(paths), "-o", str(tmp_path / "out.gif")]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        assert "holds paths that an evaluation recorded, expected a replay" in line
-        assert f"python -m train.figures {paths.parent}" in line and "damaged" not in line
+    assert interactive_nav.record.main([str(paths), "-o", str(tmp_path / "out.gif")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "holds paths that an evaluation recorded, expected a replay" in line
+    assert f"python -m train.figures {paths.parent}" in line and "damaged" not in line
 
 
 @pytest.mark.parametrize("words", [[], ["env.backend=warp"]])

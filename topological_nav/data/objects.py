@@ -4,11 +4,10 @@ import numpy as np
 import shapely
 
 from interactive_nav.scenes.objects import body_names, pick
-from interactive_nav.topdown import shadow
 from interactive_nav_common.errors import ConfigError
 from topological_nav.config import DataConfig
 from topological_nav.scenes.rendering import HIDDEN_M, Bodies
-from topological_nav.scenes.space import FreeSpace
+from topological_nav.scenes.space import FreeSpace, shadow
 
 TRIES = 32
 """Places to draw for an object; it takes the first free one."""

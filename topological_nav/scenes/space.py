@@ -5,8 +5,10 @@ by their coordinates alone; the adjusted Rand index compares them with recorded 
 """
 
 import dataclasses
+import itertools
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
@@ -17,13 +19,21 @@ from sklearn.mixture import GaussianMixture
 from threadpoolctl import threadpool_limits
 
 from interactive_nav.scenes.scene import Scene
-from interactive_nav.topdown import shadow
 from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.grids import cell_centres, clearance
+from interactive_nav_common.rotations import matrix_from_quat
 from topological_nav.config import DataConfig
 
 _FREE_M = 1e-6
 """Least clearance of a free cell."""
+
+
+def shadow(boxes: np.ndarray, pos_w: np.ndarray, quat_w: np.ndarray) -> Any:
+    """Return what the boxes [n, 10] of a body at (3,) with quaternion (4,) cover of the floor, in world m."""
+    corners = np.array(list(itertools.product((-1, 1), repeat=3))) * boxes[:, None, 7:10]
+    points_b = boxes[:, None, :3] + corners @ matrix_from_quat(boxes[:, 3:7]).swapaxes(1, 2)
+    points_w = points_b @ matrix_from_quat(quat_w).T + pos_w
+    return shapely.union_all([shapely.MultiPoint(points[:, :2]).convex_hull for points in points_w])
 
 
 @dataclasses.dataclass(frozen=True)

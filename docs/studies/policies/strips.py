@@ -19,9 +19,9 @@ from interactive_nav.pictures.scene_model import ROBOT, SCENE
 from interactive_nav.robots import get_robot
 from interactive_nav.scenes.scene import Scene, load_scene
 from interactive_nav.scenes.slots import bodies_by_name
-from interactive_nav.topdown import shadow
 from interactive_nav_common import figures as style
 from scenes_mjcf.look import CameraPose, Lens, straight_down
+from topological_nav.scenes.space import shadow
 
 LENS = Lens(480, 360, 20.0)
 MARGIN_M = 0.4

@@ -13,11 +13,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-import shapely
 from PIL import Image
 
 import interactive_nav
-from interactive_nav import record, topdown
+from interactive_nav import record
 from interactive_nav.interop import gym_env
 from interactive_nav.pictures import replay
 from interactive_nav.pictures.camera import (
@@ -192,9 +191,7 @@ def test_pictures_show_the_episodes_own_models_and_goal(room, played, tmp_path, 
     painted, made = [], record.drawing.FloorPaint
     monkeypatch.setattr(record.drawing, "FloorPaint", lambda *of: painted.extend(of[1:2]) or made(*of))
     record.Compositor(told, load_scene(room), height=120).frame(0)
-    axis = topdown.panels([told], {str(room): load_scene(room)}).axes[0]
     assert painted.pop() == 0.7
-    assert any(getattr(patch, "radius", 0) == pytest.approx(0.7, abs=1e-3) for patch in axis.patches)
 
 
 def test_the_robots_pictures_have_the_episodes_field_of_view(room, env, played):
@@ -218,7 +215,7 @@ def test_importing_and_drawing_leave_matplotlibs_backend_alone():
 import matplotlib
 matplotlib.use("svg")
 from matplotlib import pyplot
-import interactive_nav.topdown
+import interactive_nav.record
 print(matplotlib.get_backend(), pyplot.get_fignums())
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -341,42 +338,9 @@ def test_a_gif_and_refusals(played, room, two_rooms, tmp_path, capsys):
     assert "height is 125, expected a multiple of 12" in capsys.readouterr().err
     other = dataclasses.replace(played, scene=str(two_rooms))
     replay.save_replay(other, tmp_path / "b.npz")
-    for program in (record, topdown):
-        assert program.main([str(tmp_path / "b.npz"), "-o", str(tmp_path / "b.gif")]) == 2
-        assert "has changed since the replay was recorded" in capsys.readouterr().err
+    assert record.main([str(tmp_path / "b.npz"), "-o", str(tmp_path / "b.gif")]) == 2
+    assert "has changed since the replay was recorded" in capsys.readouterr().err
     assert not (tmp_path / "b.gif").exists()
-
-
-def test_shadows_of_boxes_by_hand():
-    box = np.array([[0.5, 0.0, 1.0, 1, 0, 0, 0, 0.5, 0.25, 1.0]])
-    flat = topdown.shadow(box, np.array([1.0, 2.0, 0.0]), np.array(IDENTITY))
-    assert flat.equals(shapely.box(1.0, 1.75, 2.0, 2.25))
-    quarter = np.array([math.sqrt(0.5), 0, 0, math.sqrt(0.5)])  # x becomes y
-    np.testing.assert_allclose(topdown.shadow(box, np.zeros(3), quarter).bounds, (-0.25, 0, 0.25, 1.0), atol=1e-9)
-    # Fallen over forward, its height of 2 m lies along x.
-    forward = np.array([math.sqrt(0.5), 0, math.sqrt(0.5), 0])
-    np.testing.assert_allclose(topdown.shadow(box, np.zeros(3), forward).bounds, (0, -0.25, 2.0, 0.25), atol=1e-9)
-
-
-def test_a_map_shows_what_was_moved(played, room, tmp_path):
-    """The chair is put 0.5 m further along x at the end: outline before, arrow, filled shape after."""
-    scene, b = load_scene(room), played.bodies.index("chair_0")
-    pos = played.body_pos_w.copy()
-    pos[1:, played.num_robot_bodies :] = pos[:1, played.num_robot_bodies :]  # and nothing else moves
-    pos[:, b], pos[-1, b] = [0.2, 0.0, 0.2], [0.7, 0.0, 0.2]
-    for colour_by in topdown.COLOUR_BY:
-        figure = topdown.panels([dataclasses.replace(played, body_pos_w=pos)], {str(room): scene}, colour_by)
-        axis = figure.axes[0]
-        [arrow] = [text for text in axis.texts if text.arrow_patch is not None]
-        np.testing.assert_allclose([*arrow.xyann, *arrow.xy], [0.2, 0, 0.7, 0], atol=1e-6)
-        [path] = axis.collections
-        assert len(path.get_segments()) == played.num_steps
-    replay.save_replay(played, tmp_path / "replays" / "x-episode4.npz")
-    assert topdown.main([str(tmp_path), "-o", str(tmp_path / "map.png")]) == 0
-    with Image.open(tmp_path / "map.png") as picture:
-        assert picture.size[0] > 500
-    with pytest.raises(UserError, match="colour_by is 'speed', expected one of time, contact"):
-        topdown.draw_topdown(axis, played, scene, "speed")
 
 
 def test_gymnasium_renders_the_view_from_behind(room):

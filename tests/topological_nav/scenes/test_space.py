@@ -1,13 +1,16 @@
 """Clearances and straight ways in rooms whose walls are known."""
 
+import math
+
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.errors import ConfigError
-from topological_nav.scenes.space import FreeSpace, free_space, spread
+from topological_nav.scenes.space import FreeSpace, free_space, shadow, spread
 
 
 @pytest.fixture(scope="module")
@@ -80,3 +83,14 @@ def test_spread_takes_the_farthest_each_time():
         assert second == {0: 2, 1: 2, 2: 0, 3: 2}[first]
         assert third == {0: 3, 1: 3, 2: 3, 3: 0}[first]
     assert len(spread(points, 9, np.random.default_rng(0))) == 4
+
+
+def test_shadows_of_boxes_by_hand():
+    box = np.array([[0.5, 0.0, 1.0, 1, 0, 0, 0, 0.5, 0.25, 1.0]])
+    flat = shadow(box, np.array([1.0, 2.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0]))
+    assert flat.equals(shapely.box(1.0, 1.75, 2.0, 2.25))
+    quarter = np.array([math.sqrt(0.5), 0, 0, math.sqrt(0.5)])  # x becomes y
+    np.testing.assert_allclose(shadow(box, np.zeros(3), quarter).bounds, (-0.25, 0, 0.25, 1.0), atol=1e-9)
+    # Fallen over forward, its height of 2 m lies along x.
+    forward = np.array([math.sqrt(0.5), 0, math.sqrt(0.5), 0])
+    np.testing.assert_allclose(shadow(box, np.zeros(3), forward).bounds, (0, -0.25, 2.0, 0.25), atol=1e-9)
