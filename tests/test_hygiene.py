@@ -20,7 +20,6 @@ import pytest
 import interactive_nav
 from interactive_nav import metrics, reward
 from interactive_nav.navigation.lookup import geodesic_at, goal_field, waypoints_at
-from interactive_nav.sensing.observation import task_observation, waypoints_in_body
 from interactive_nav.task.wrappers import AutoResetEnv
 from tests.train.learners.test_offpolicy import tiny
 from tests.train.learners.test_ppo import make_config
@@ -102,24 +101,20 @@ def test_rewards_and_scores():
         np.testing.assert_allclose(got, want, rtol=1e-6)
 
 
-def test_ways_and_observations(env):
+def test_ways(env):
     """A way across an empty part of the room is straight, at the goal too, where its length is 0."""
-    start, goal, turned = jnp.array([-1.5, -1.0]), jnp.array([1.5, -1.0]), jnp.eye(3)
+    start, goal = jnp.array([-1.5, -1.0]), jnp.array([1.5, -1.0])
 
     def seen(xy):
         scene = jnp.zeros((), jnp.int32)
         field = goal_field(env.tables, scene, goal)
-        pos = jnp.append(xy, 0.1)
-        waypoints = waypoints_in_body(waypoints_at(env.tables, scene, field, xy, 4, 0.2), pos, turned)
-        return geodesic_at(env.tables, scene, field, xy), task_observation(
-            pos, turned, jnp.zeros(3), jnp.zeros(3), goal, waypoints
-        )
+        return geodesic_at(env.tables, scene, field, xy), waypoints_at(env.tables, scene, field, xy, 4, 0.2)
 
     places = jnp.stack([start, goal])
-    (far_m, near_m), parts = checked(jax.vmap(seen))(places)
+    (far_m, near_m), waypoints = checked(jax.vmap(seen))(places)
     np.testing.assert_allclose([far_m, near_m], [3.0, 0.0], atol=0.01)
-    np.testing.assert_allclose(parts["waypoints"][0], [0.2, 0.0, 0.4, 0.0, 0.6, 0.0, 0.8, 0.0], atol=1e-5)
-    np.testing.assert_allclose(parts["goal"], [[3.0, 0.0, -0.1], [0.0, 0.0, -0.1]], atol=1e-6)
+    np.testing.assert_allclose(waypoints[0], [[-1.3, -1.0], [-1.1, -1.0], [-0.9, -1.0], [-0.7, -1.0]], atol=1e-5)
+    np.testing.assert_allclose(waypoints[1], [goal] * 4, atol=1e-5)
 
 
 def test_an_environment_and_its_new_episodes(env):

@@ -36,7 +36,7 @@ def write_recording(
 ) -> int:
     """Write a recording atomically and return its number of image sets: one every few control steps and one at the end.
 
-    `side` is in pixels. Older replays lack waypoints and reward terms, and so do their recordings.
+    `side` is in pixels.
     """
     rr, dt_s = need_rerun(), replay.control_dt_s
     steps = [*range(0, replay.num_steps, every), replay.num_steps]

@@ -10,16 +10,13 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy import ndimage
 
 from interactive_nav.scenes.many import for_each_home
 from interactive_nav_common.errors import readable
-from interactive_nav_common.grids import clearance, largest_component, value_near
 from interactive_nav_common.rotations import rotate
 from scenes_mjcf.agreement import differences
 from scenes_mjcf.categories import MaskClasses, class_id
 from scenes_mjcf.look import geom_mesh
-from scenes_mjcf.robot_facts import SMALLEST
 from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
 from scenes_mjcf.sets import existing, installed
 
@@ -174,24 +171,14 @@ def check_scene(scene: Scene, model: mujoco.MjModel) -> None:
 
 
 def warn_of_reach(scene: Scene) -> None:
-    """Warn where most furniture is out of reach."""
-    path, movables = scene.path, scene.movables
-    apart = objects_apart(scene.maps, movables)
-    if 2 * len(apart) > len(movables):
+    """Warn where most furniture is out of reach, by the gate that the converter wrote."""
+    gate = scene.manifest.gates.get("furniture_apart")
+    if isinstance(gate, dict) and gate.get("passed") is False:
         warnings.warn(
-            f"{path}: {len(apart)} of {len(movables)} movable objects stand on floor that no robot can reach from the "
-            f"largest piece, such as {apart[0]}; look at the map with 'python -m converters preview'",
+            f"{scene.path}: more than half of the movable objects stand on floor that no robot can reach from the "
+            "largest piece; look at the map with 'python -m converters preview'",
             stacklevel=3,
         )
-
-
-def objects_apart(maps: SceneMaps, movables: Sequence[Movable]) -> list[str]:
-    """Return the objects more than `BESIDE_M` away from the largest piece of floor that a small robot fits on."""
-    piece = largest_component(clearance(maps.traversable, maps.resolution_m) >= SMALLEST.radius_m)
-    away_m = np.asarray(ndimage.distance_transform_edt(~piece, sampling=maps.resolution_m))
-    xy_w = np.array([movable.pos_w[:2] for movable in movables]).reshape(-1, 2)
-    apart = value_near(away_m, maps.resolution_m, maps.origin_w, xy_w) > BESIDE_M
-    return [movable.name for movable, is_apart in zip(movables, apart, strict=True) if is_apart]
 
 
 def _wall_faults(maps: SceneMaps, walls: np.ndarray) -> list[str]:

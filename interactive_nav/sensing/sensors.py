@@ -1,7 +1,9 @@
 """Compute what the robot observes from the physics' state and the task's memory: a vector, and images on request.
 
-Without images the observation is the flat f32 vector of `interactive_nav.sensing.observation`. With them it is a dict
-of `state`, that vector if a part of it is requested, and images such as `pixels/depth` (H, W, 1), with several cameras
+Without images the observation is a flat f32 vector. By default it has ten waypoints x0, y0, ..., x9, y9 (m), goal minus
+robot position (m), and the base's linear and angular velocity (m/s, rad/s), all in the robot's frame, in the original
+benchmark's order (reference benchmark, section 1.1); other parts follow on request. With images it is a dict of
+`state`, that vector if a part of it is requested, and images such as `pixels/depth` (H, W, 1), with several cameras
 `pixels/<camera>/depth`. `docs/sensors.md` has their contents, types, ranges and errors. Noise depends on the episode's
 key and the step alone.
 """
@@ -25,7 +27,6 @@ from interactive_nav.robots.spec import RobotCamera
 from interactive_nav.scenes.world import World
 from interactive_nav.sensing import Renderer, build_boxes, make_renderer
 from interactive_nav.sensing.base import draw_look
-from interactive_nav.sensing.observation import task_observation
 from interactive_nav.sensing.rays import cast_fan
 from interactive_nav.types import NavInfo
 from interactive_nav_common.config import nearest
@@ -207,14 +208,13 @@ class Sensors:
     ) -> jax.Array:
         v, q = self._layout.robot_qvel, self._layout.robot_qpos
         rotation = matrix_from_quat(physics.qpos[q + 3 : q + 7])
-        values = task_observation(
-            nav.robot_pos_w,
-            rotation,
-            physics.qvel[v : v + 3],
-            physics.qvel[v + 3 : v + 6],
-            nav.goal_xy_w,
-            nav.waypoints_b,
-        ) | dict(remembered)
+        goal_w = jnp.concatenate([nav.goal_xy_w, jnp.zeros(1)])
+        values = {
+            "waypoints": nav.waypoints_b.reshape(-1),
+            "goal": (goal_w - nav.robot_pos_w) @ rotation,
+            "velocity": jnp.concatenate([physics.qvel[v : v + 3] @ rotation, physics.qvel[v + 3 : v + 6]]),
+            **remembered,
+        }
         if "localisation" in self.sizes:
             values["localisation"] = jnp.append(nav.robot_pos_w[:2], nav.yaw_rad)
         if "collision" in self.sizes:

@@ -33,7 +33,6 @@ from interactive_nav.scenes.scene import Scene
 from interactive_nav.scenes.slots import parking_spot
 from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing.boxes import CLEAR_M, apply_axes, body_poses, box_gaps_m2
-from interactive_nav.sensing.observation import waypoints_in_body
 from interactive_nav.sensing.sensors import Sensors
 from interactive_nav.task.dynamics import Dynamics
 from interactive_nav.task.privileged import PRIVILEGED_SIZE, privileged_state
@@ -355,7 +354,8 @@ class InteractiveNav(Env):
         world = points_at(self.tables, scene, goal, *ahead)
         if self._round and detour and config.waypoints_round:
             world = jnp.where(detour[1], points_at(self._round, scene, detour[0], *ahead), world)
-        return waypoints_in_body(world, pos_w, rotation)
+        offset = jnp.concatenate([world - pos_w[None, :2], jnp.zeros((len(world), 1))], -1)
+        return (offset @ rotation)[:, :2]
 
 
 def _yaw(rotation: jax.Array) -> jax.Array:

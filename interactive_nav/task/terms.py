@@ -20,7 +20,6 @@ from interactive_nav.physics.hook import TORN
 from interactive_nav.reward import interactive_navigation_reward
 from interactive_nav.robots.links import make_links, repeated
 from interactive_nav.sensing.boxes import CLEAR_M, box_gaps_m2, box_poses
-from interactive_nav.sensing.observation import advance_odometry
 from interactive_nav.sensing.sensors import stream
 from interactive_nav.types import NavInfo, SceneTables
 from interactive_nav_common.errors import ConfigError
@@ -154,6 +153,19 @@ def _object_path(path_m: jax.Array, step: Step) -> jax.Array:
     settled = last.step_count >= SETTLE_STEPS
     counts = touched if step.config.kinematic_sum == "touched" else touched | settled
     return path_m + jnp.where(counts, pushed, 0.0)
+
+
+def advance_odometry(
+    pose: jax.Array, moved_w: jax.Array, yaw_rad: jax.Array, turned_rad: jax.Array, noise: jax.Array
+) -> jax.Array:
+    """Advance the dead reckoning `pose` (3,) x, y (m), yaw (rad, not wrapped) by one control step.
+
+    It is relative to the episode's start. `moved_w` (2,) m is the true displacement, `noise` (2,) the relative error of
+    distance and angle.
+    """
+    cos, sin = jnp.cos(pose[2] - yaw_rad), jnp.sin(pose[2] - yaw_rad)
+    x, y = moved_w * (1 + noise[0])
+    return pose + jnp.stack([cos * x - sin * y, sin * x + cos * y, turned_rad * (1 + noise[1])])
 
 
 def _odometry(pose: jax.Array, step: Step) -> jax.Array:

@@ -206,10 +206,6 @@ def test_corner_graph_by_hand():
     side = math.hypot(8.5 - 5.2, 6.2 - 2.05)
     np.testing.assert_allclose(got[0], math.hypot(3.3, 4.15) + 1.4 + side, atol=1e-3)
     np.testing.assert_allclose(got[1], math.hypot(5.2 - 2.5, 0.3) + side, atol=1e-3)  # passes above the first
-    with pytest.raises(ValueError, match="cell_m is 0.12, expected a whole multiple of fine_m"):
-        geodesic.corner_graph(free, 0.05, 0.12, (0.0, 0.0))
-    with pytest.raises(ValueError, match="free has no free cell"):
-        geodesic.corner_graph(~np.ones((4, 4), bool), 0.05, 0.1, (0.0, 0.0))
 
 
 def test_cells_that_touch_only_at_a_corner_are_no_passage():

@@ -10,7 +10,7 @@ import warnings
 import numpy as np
 import pytest
 
-from interactive_nav.scenes.scene import load_scene, objects_apart
+from interactive_nav.scenes.scene import load_scene
 from scenes_mjcf.schema import SceneError, load_maps, save_maps
 from scenes_mjcf.sets import HERE
 from tests.toys import write_room
@@ -87,16 +87,18 @@ def test_a_home_without_walls_is_refused(tmp_path):
 
 
 def test_loading_warns_where_most_furniture_is_out_of_reach(tmp_path):
-    """The partition has no gap: one object stands on the larger part of the floor, two on the other."""
-    blocks = tuple(("chair", x, y, 5.0, 0.5) for x, y in ((-2.2, 0.0), (2.0, -1.0), (2.0, 1.0)))
-    folder = write_room(tmp_path / "room", size_m=(6.0, 3.0), blocks=blocks)
-    maps = load_maps(folder)
-    free = maps.traversable.copy()
-    free[:, 66:70] = False  # 0.3 to 0.5 m right of the middle
-    save_maps(type(maps)(free, maps.resolution_m, maps.origin_w, 0.0), folder)
-    with pytest.warns(UserWarning, match="2 of 3 movable objects stand on floor that no robot can reach"):
-        scene = load_scene(folder)
-    assert objects_apart(scene.maps, scene.movables) == ["chair_1", "chair_2"]
+    """By the gate of the converter: one that passed, or that is not there, warns of nothing."""
+    folder = write_room(tmp_path / "room")
+    for passed, warned in ((False, 1), (True, 0), (None, 0)):
+        text = json.loads((folder / "scene.json").read_text())
+        gate = {"passed": passed, "value": 0.6, "limit": 0.5, "unit": "share"}
+        text["gates"] = {} if passed is None else {"furniture_apart": gate}
+        (folder / "scene.json").write_text(json.dumps(text))
+        with warnings.catch_warnings(record=True) as heard:
+            warnings.simplefilter("always")
+            load_scene(folder)
+        said = [str(each.message) for each in heard if "stand on floor that no robot can reach" in str(each.message)]
+        assert len(said) == warned
 
 
 @pytest.mark.parametrize("name", sorted(p.parent.name for p in HERE.glob("*/scene.json")))
@@ -104,4 +106,4 @@ def test_packaged_scenes_load_without_a_warning(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         scene = load_scene(HERE / name)
-    assert objects_apart(scene.maps, scene.movables) == [] and np.isfinite(scene.walls).all()
+    assert np.isfinite(scene.walls).all()

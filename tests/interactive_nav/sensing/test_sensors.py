@@ -19,9 +19,8 @@ from interactive_nav.scenes.scene import load_scene
 from interactive_nav.scenes.world import build_world
 from interactive_nav.sensing.base import draw_look
 from interactive_nav.sensing.boxes import FLOOR_COLOUR
-from interactive_nav.sensing.observation import advance_odometry
 from interactive_nav.sensing.sensors import Sensors, stream
-from interactive_nav.task.terms import TERMS, Moment
+from interactive_nav.task.terms import TERMS, Moment, advance_odometry
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav.types import NavInfo
 from interactive_nav_common.errors import UserError
