@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 import interactive_nav
-from benchmarks.steps_per_second import MODES, append_row, origin, random_driving, step_of
+from benchmarks.steps_per_second import append_row, origin, random_driving, step_of
 from docs.studies import command_line
 from interactive_nav.task.wrappers import AutoResetEnv
 from interactive_nav_common.errors import ConfigError
@@ -162,7 +162,9 @@ def main(argv: list[str] | None = None) -> int:
     """Measures, prints and appends a row."""
     parser = command_line(__doc__, "kernels", settings=True)
     parser.add_argument("--num-envs", type=int, default=8192)
-    parser.add_argument("--part", choices=(*MODES[:-2], "collect", "update"), default="simulation")
+    parser.add_argument(
+        "--part", choices=("physics", "task", "observed", "simulation", "collect", "update"), default="simulation"
+    )
     parser.add_argument("--steps", type=int, default=4, help="environment steps under the profiler")
     parser.add_argument("--preset", help="of `python -m train`, for `collect` and `update`: its scenes and sizes")
     parser.add_argument("--learner", nargs="*", default=[], metavar="KEY=VALUE", help="laid over the preset")
