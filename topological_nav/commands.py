@@ -21,7 +21,6 @@ from topological_nav.config import ADAPTED, DATASET, DRIVES, PASSAGE_POLICY, RUN
 from topological_nav.data.dataset import load_rooms, make_dataset, read_header
 from topological_nav.data.domains import AdaptConfig
 from topological_nav.data.photographs import import_photographs, unpack_bag
-from topological_nav.drives.dagger import simulate_driven
 from topological_nav.drives.dataset import draw_drives, simulate_drives, summary
 from topological_nav.drives.driving import embed_drives, load_policy
 from topological_nav.drives.imitation import grid_table, train_grid, train_policy
@@ -32,7 +31,7 @@ from topological_nav.figures.maps import dataset_figure, drive_episode, film, jo
 from topological_nav.figures.report import draw_report, transferred
 from topological_nav.learn.networks import in_words
 from topological_nav.learn.training import load_networks, train
-from topological_nav.maps.build import Built, build_map, forget
+from topological_nav.maps.build import Built, build_map
 from topological_nav.maps.graph import save_map
 from topological_nav.presets import configured, preset_of
 from topological_nav.tables import tables
@@ -145,11 +144,9 @@ def build(
     scene: Path, localiser: Path, detector: Path, config: MapConfig, out: Path, ends: Sequence[int] | None = None
 ) -> None:
     """Build a map, draw and describe it."""
-    parts = out.with_name(f"{out.name}.parts")
     with bar() as report:
-        built = build_map(scene, localiser, detector, config, report, parts)
+        built = build_map(scene, localiser, detector, config, report)
     keep_map(built, out, ends)
-    forget(parts)
 
 
 def keep_map(built: Built, out: Path, ends: Sequence[int] | None = None) -> None:
@@ -242,7 +239,7 @@ def _drives(arguments: Any) -> None:
     out, scenes = arguments.out or DRIVES, [Path(s) for s in scene_folders(arguments.scenes)]
     with stop_signals() as stops:
         with bar(stops) as report:
-            drives = (simulate_driven if config.driver else simulate_drives)(scenes, out, config, report)
+            drives = simulate_drives(scenes, out, config, report)
         with bar(stops) as report:
             draw_drives(scenes, out, report)
     save(figures.drives_figure(scenes, out), out / "preview.png")

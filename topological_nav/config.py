@@ -304,10 +304,6 @@ class DriveConfig(ExpertConfig, CameraConfig):
     """Number of drives at once: the most that an interrupted simulation loses."""
     drives: Count = 400
     """Number of drives to start in each scene."""
-    driver: str = ""
-    """Run folder of a local policy that drives, while the expert labels its states (DAgger)."""
-    expert_share: Share = 0.0
-    """With `driver`: probability that a control step executes the expert's command instead."""
     legs: Count = 3
     """Most edges of a drive; each next one is random among those that turn less than `turn_deg`."""
     turn_deg: Annotated[float, Bounds(0.0, 180.0)] = 30.0
@@ -330,7 +326,6 @@ class DriveConfig(ExpertConfig, CameraConfig):
     """Share of the nodes whose drives are for testing only."""
     shard: Count = 10
     """Number of drives per file of images."""
-    IDLE = (("expert_share", "driver=RUN", lambda c: bool(c.driver)),)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,10 +11,8 @@ from docs.studies import rooms as rooms_study
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.jobs import progress
 from topological_nav.__main__ import main
-from topological_nav.maps import build
 from topological_nav.maps.graph import load_map
 from topological_nav.scenes import space as rooms
-from topological_nav.scenes.rendering import SceneRenderer
 
 
 def test_the_map_has_nodes_in_both_rooms_and_images_around_each(made):
@@ -51,34 +49,6 @@ def test_the_nearest_image_of_a_node_may_judge_its_edges(made, tmp_path, capsys)
     # Where an edge runs along one of the 18 headings, both looked at the same image.
     along = np.abs((first.angle_rad / np.deg2rad(20) + 0.5) % 1 - 0.5) < 1e-4
     assert first.p[along] == pytest.approx(second.p[along], abs=1e-4)
-
-
-def test_a_map_that_was_stopped_goes_on(made, tmp_path, monkeypatch):
-    runs = ["--localiser", str(made.rooms), "--detector", str(made.passages)]
-    out, drawn = tmp_path / "map.npz", []
-    draw = SceneRenderer.draw
-    monkeypatch.setattr(build, "CHUNK", 54)
-    monkeypatch.setattr(SceneRenderer, "draw", lambda self, pose: drawn.append(len(pose.pos_w)) or draw(self, pose))
-
-    def interrupted(self, pose):
-        if len(drawn) == 3:
-            signal.raise_signal(signal.SIGINT)
-        drawn.append(len(pose.pos_w))
-        return draw(self, pose)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(SceneRenderer, "draw", interrupted)
-        assert main(["map", str(made.scene), *runs, "-o", str(out)]) == 128 + signal.SIGINT
-    parts = tmp_path / "map.npz.parts"
-    assert not out.exists() and len(list(parts.iterdir())) == 4 and drawn == [54] * 4
-    next(iter(sorted(parts.iterdir()))).write_bytes(b"damaged")
-    drawn.clear()
-    assert main(["map", str(made.scene), *runs, "-o", str(out)]) == 0
-    one, two = load_map(made.map), load_map(out)
-    images = 18 * len(two.xy_w) + len(two.edges)
-    assert sum(drawn) == images - 3 * 54 and not parts.exists()
-    for name in ("xy_w", "embeddings", "edges", "p"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
 
 @pytest.mark.parametrize(

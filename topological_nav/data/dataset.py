@@ -166,7 +166,6 @@ def write_plan(folder: Path, plan: ScenePlan) -> None:
     """Write the positions of a scene's images for `load_plan`."""
     folder.mkdir(parents=True, exist_ok=True)
     passages = {f"passage_{f.name}": getattr(plan.passages, f.name) for f in dataclasses.fields(Passages)}
-    passages = {name: of for name, of in passages.items() if of.shape[1:] != (0, 3)}  # no objects: as ever
     arrays = {name: getattr(plan, name) for name in ("xy_w", "room", "test")} | passages
     arrays |= {"cluster_xy_w": plan.rooms.points_w, "cluster_label": plan.rooms.labels}
     write_arrays(folder / "plan.npz", **arrays, how=np.asarray([plan.rooms.method, plan.rooms.chosen_by]))
@@ -224,7 +223,6 @@ def load_plan(folder: Path, scene: str) -> ScenePlan:
     arrays = folders.read_arrays(path)
     with readable(path, FileError, "run 'data' again"):
         rooms = Rooms(arrays["cluster_xy_w"], arrays["cluster_label"], *(str(w) for w in arrays["how"]))
-        arrays.setdefault("passage_small_w", np.zeros((len(arrays["passage_free"]), 0, 3)))
         passages = Passages(*(arrays[f"passage_{f.name}"] for f in dataclasses.fields(Passages)))
         return ScenePlan(rooms, arrays["xy_w"], arrays["room"], arrays["test"], passages)
 

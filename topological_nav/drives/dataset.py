@@ -7,13 +7,13 @@
            embedded-<digest>.npy   embeddings of all images by two networks, which `train policy` keeps
            preview.png             the drives on the floor plans, and images of some
 
-A drive is kept if it reached its last node without contact, so that furniture is at rest as rendered. A policy's drive
-ends at its first contact and is kept. Plans depend on scenes and settings alone. Existing files are skipped.
+A drive is kept if it reached its last node without contact, so that furniture is at rest as rendered. Plans depend on
+scenes and settings alone. Existing files are skipped.
 """
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ import numpy as np
 
 from interactive_nav import get_robot, load_scene
 from interactive_nav.scenes.scene import Scene
-from interactive_nav.task.rollout import HostPolicy, Player
+from interactive_nav.task.rollout import Player
 from interactive_nav_common.errors import ConfigError, FileError
 from interactive_nav_common.files import alone_in, write_arrays
 from interactive_nav_common.jobs.progress import Progress
@@ -75,8 +75,6 @@ class Drives:
     """[n] bool: physics failed."""
     goal_w: np.ndarray
     """[n, 2] m, the last node."""
-    labelled: np.ndarray
-    """[n] bool: a policy drove until contact; commands are the expert's labels."""
 
     def __len__(self) -> int:
         return len(self.scene)
@@ -98,8 +96,8 @@ class Drives:
 
     @property
     def kept(self) -> np.ndarray:
-        """Return which drives are rendered and used, [n] bool; the expert's must reach the goal without contact."""
-        return ~self.broken & (self.labelled | (self.reached & ~self.touched))
+        """Return which drives are rendered and used, [n] bool: they reached the goal without contact."""
+        return ~self.broken & self.reached & ~self.touched
 
     @classmethod
     def joined(cls, parts: Sequence["Drives"]) -> "Drives":
@@ -231,9 +229,8 @@ def simulate_drives(
     out: Path,
     config: DriveConfig,
     progress: Progress = lambda *_: None,
-    pupil: Callable[[Expert, np.ndarray], HostPolicy] | None = None,
 ) -> Drives:
-    """Simulate drives that are missing; `pupil` maps the expert and drive numbers to the policy that drives."""
+    """Simulate drives that are missing."""
     scenes = load_scenes(scene_folders, config.engine)
     header = DRIVES.describe(config, [{"name": s.name, "digest": s.digest, "split": s.split} for s in scenes])
     with DRIVES.claimed(out, header):
@@ -253,10 +250,9 @@ def simulate_drives(
                     progress("drives", int(mine[0]) + min(ended, len(mine) - 1), total)  # the padding's are no news
 
                 # Padded by its last drive: one size, one program.
-                rows = np.minimum(mine[0] + np.arange(config.batch), total - 1)
-                part = tasks.take(rows)
+                part = tasks.take(np.minimum(mine[0] + np.arange(config.batch), total - 1))
                 expert = Expert(terrain, jax.tree.map(jnp.asarray, part), player.env, config)
-                driven = drive(player, part, pupil(expert, rows) if pupil else expert, report)
+                driven = drive(player, part, expert, report)
                 driven = {name: values[: len(mine)] for name, values in driven.items()}
                 on = np.arange(driven["pose_w"].shape[1]) < driven["steps"][:, None]  # not after its end
                 write_arrays(path, **{n: row[on] if row.shape[:2] == on.shape else row for n, row in driven.items()})
@@ -321,7 +317,7 @@ def load_drives(folder: Path) -> Drives:
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     first = np.concatenate([[0], np.cumsum(joined.pop("steps"))])
     joined |= {name: plan[name] for name in ("scene", "test", "goal_w")}
-    return Drives(first=first, labelled=np.full(len(plan["scene"]), bool(config.driver)), **joined)
+    return Drives(first=first, **joined)
 
 
 def summary(drives: Drives) -> dict[str, float]:

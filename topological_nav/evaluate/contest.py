@@ -38,7 +38,6 @@ from topological_nav.data.folders import lens_of, renderer_of
 from topological_nav.drives.driving import local_policy
 from topological_nav.evaluate import evaluation
 from topological_nav.evaluate.evaluation import DrivenEpisodes, Played
-from topological_nav.gap import GapConfig
 from topological_nav.learn.training import Networks, load_networks
 from topological_nav.maps.build import NetworkSight, Sight, TrueSight, drawn_for, true_map
 from topological_nav.maps.graph import TopologicalMap, load_map
@@ -55,8 +54,6 @@ EXPERT_WEIGHT = 1.0
 """Weight of path against effort: objects are pushed only where no path is free."""
 UNDECIDING = ("batch", "episodes", "supersample")
 """Settings that do not affect rows, or enter the digest in another form."""
-LATER = ("goal_images", "blocked", "asked_m", *(f.name for f in dataclasses.fields(GapConfig)))
-"""Settings that older rows lack; those rows count where the setting has its default."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,9 +193,7 @@ class ContestScene:
 
     def request(self, contender: str) -> dict[str, Any]:
         """Return everything that determines a contender's rows."""
-        default, config = to_dict(EvaluationConfig()), to_dict(self.contest.config)
-        left_out = {*UNDECIDING, *(name for name in LATER if config[name] == default[name])}
-        config = {k: v for k, v in config.items() if k not in left_out}
+        config = {k: v for k, v in to_dict(self.contest.config).items() if k not in UNDECIDING}
         request = {"scene": self.scene.digest, "robot": self.contest.robot, "contender": contender, "settings": config}
         if contender == "ppo":
             assert self.contest.ppo is not None
@@ -211,16 +206,9 @@ class ContestScene:
         parts = [graph.xy_w, graph.embeddings, graph.edges, graph.p, graph.angle_rad]
         request["map"] = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()
         if self.networks is not None:
-            request["detector"] = self.networks.detector.stored
-            if "export" in self.networks.localiser.about:
-                request["localiser"] = self.networks.localiser.stored
-            if self.contest.domain != "clean":
-                request["domain"] = to_dict(PRESETS[self.contest.domain])
-            drawn, learned_from = self.drawn, self.networks.camera
-            if drawn != learned_from:
-                # The size only where it differs, so that older rows still count.
-                size = [drawn.supersample] if drawn.supersample != learned_from.supersample else []
-                request["drawn"] = [drawn.engine, drawn.fov_deg, *size]
+            request["networks"] = [network.stored for network in self.networks]
+            request["domain"] = to_dict(PRESETS[self.contest.domain])
+            request["drawn"] = [self.drawn.engine, self.drawn.fov_deg, self.drawn.supersample]
         return {**request, "policy": self.contest.policy, "weights": _digest_of(self.contest.policy)}
 
 

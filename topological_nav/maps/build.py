@@ -5,11 +5,7 @@ image, and how far the path ahead is free: `NetworkSight` by networks, `TrueSigh
 for tests and measurements.
 """
 
-import contextlib
 import dataclasses
-import functools
-import hashlib
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
@@ -23,7 +19,6 @@ from interactive_nav.robots import RobotSpec
 from interactive_nav.scenes.scene import Scene
 from interactive_nav_common.config import overlay, to_dict
 from interactive_nav_common.errors import ConfigError, FileError
-from interactive_nav_common.files import whole_file
 from interactive_nav_common.jobs.progress import Progress
 from topological_nav.config import DataConfig, MapConfig
 from topological_nav.data.dataset import headings
@@ -32,7 +27,7 @@ from topological_nav.learn.learning import DESCRIPTION
 from topological_nav.learn.networks import nearest_turn
 from topological_nav.learn.training import Networks, Trained, load_networks
 from topological_nav.maps.graph import TopologicalMap, assemble, lengths, place_nodes
-from topological_nav.scenes.rendering import SceneRenderer, camera_pose, need_engine
+from topological_nav.scenes.rendering import camera_pose, need_engine
 from topological_nav.scenes.space import FreeSpace, Rooms, free_space, scene_rooms
 
 OUT_OF_SIGHT_M = 100.0
@@ -179,9 +174,8 @@ def build_map(
     detector_run: Path,
     config: MapConfig,
     progress: Progress = lambda *_: None,
-    parts: Path | None = None,
 ) -> Built:
-    """Build a scene's map by the runs of an embedding and a passage detector; `parts` keeps images, to resume."""
+    """Build a scene's map by the runs of an embedding and a passage detector."""
     networks = load_networks(localiser_run, detector_run).asking(config.asked_m)
     data = drawn_for(networks.camera, config.supersample)
     scene, robot = load_scene(scene_folder), get_robot(data.robot)
@@ -191,7 +185,7 @@ def build_map(
     if not len(xy):
         raise ConfigError(f"{scene.path}: no place is {config.clearance_m} m from obstacles; lower clearance_m")
     around = headings(data)
-    pictures = Pictures(scene, data, robot, progress, parts)
+    pictures = Pictures(scene, data, robot, progress)
     images = pictures.draw_around(xy, around, "nodes")
 
     def along(edges: np.ndarray, angle: np.ndarray) -> np.ndarray:
@@ -284,16 +278,11 @@ def drawn_for(data: DataConfig, supersample: int | None) -> DataConfig:
 
 
 class Pictures:
-    """Render level images of a scene in chunks, each kept in a file until it is no longer needed."""
+    """Render level images of a scene in chunks."""
 
-    def __init__(self, scene: Scene, data: DataConfig, robot: RobotSpec, progress: Progress, parts: Path | None = None):
-        self._scene, self._data, self._robot, self._progress, self._parts = scene, data, robot, progress, parts
+    def __init__(self, scene: Scene, data: DataConfig, robot: RobotSpec, progress: Progress):
+        self._renderer, self._robot, self._progress = renderer_of(scene, data), robot, progress
         self._done, self.total = 0, 0
-        self._of = json.dumps([scene.digest, to_dict(data)], sort_keys=True).encode()
-
-    @functools.cached_property
-    def _renderer(self) -> SceneRenderer:
-        return renderer_of(self._scene, self._data)
 
     def draw_around(self, xy: np.ndarray, around: np.ndarray, what: str) -> np.ndarray:
         """Render images [N, K, H, W, 3] of places [N, 2] along each of K headings, and add them to the total."""
@@ -306,32 +295,11 @@ class Pictures:
         drawn = []
         for first in range(0, len(xy), CHUNK):
             rows = slice(first, first + CHUNK)
-            drawn.append(self._chunk(xy[rows], heading[rows]))
+            level = np.zeros(len(xy[rows]))
+            drawn.append(self._renderer.draw(camera_pose(self._robot, xy[rows], heading[rows], level)))
             self._done += len(drawn[-1])
             self._progress(what, self._done, self.total)
         return np.concatenate(drawn)
-
-    def _chunk(self, xy: np.ndarray, heading: np.ndarray) -> np.ndarray:
-        kept = None
-        if self._parts is not None:
-            poses = np.concatenate([xy, heading[:, None]], 1).astype(float)
-            kept = self._parts / f"{hashlib.sha256(self._of + poses.tobytes()).hexdigest()[:16]}.npy"
-            if kept.is_file():
-                with contextlib.suppress(ValueError, EOFError, OSError):  # a damaged or vanished one is drawn again
-                    return np.load(kept)
-        images = self._renderer.draw(camera_pose(self._robot, xy, heading, np.zeros(len(xy))))
-        if kept is not None:
-            with whole_file(kept) as partial, open(partial, "wb") as file:
-                np.save(file, images)
-        return images
-
-
-def forget(parts: Path) -> None:
-    """Delete the images that `build_map` kept, once the map is written."""
-    for path in parts.glob("*.npy"):
-        path.unlink(missing_ok=True)  # by another process that built the same map
-    with contextlib.suppress(OSError):
-        parts.rmdir()
 
 
 def edge_scores(graph: TopologicalMap, free: np.ndarray, passable: float) -> dict[str, Any]:

@@ -92,8 +92,6 @@ class State(Events):
     """[B, E] added to the edges' weights."""
     driven: np.ndarray = column(-1, np.int32)
     """i32 edge driven since the robot last localised; -1 if none."""
-    times_lost: np.ndarray = column(0, np.int32)
-    """i32 times that the map had no path."""
     integral: np.ndarray = column(0.0)
     """PID: integral term, rad/s."""
     error_rad: np.ndarray = column(np.nan)
@@ -267,7 +265,6 @@ class Navigator:
             if edge >= 0:
                 s.base_rad[i] = self.map.angle_rad[edge]
             else:
-                s.times_lost[i] += 1
                 s.lost[i] = True
                 s.base_rad[i] = wrap_angle(heading[i] + GOLDEN_RAD)
         s.phase[rows] = FACE

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,15 +19,6 @@ from topological_nav.navigate.navigator import Navigator, State
 from topological_nav.weights.export import Choice
 
 
-class VelocityCommand(NamedTuple):
-    """Hold the velocity to command until a driver's next step."""
-
-    linear_mps: float
-    angular_radps: float
-    done: bool = False
-    """The episode is over, and the robot stands still."""
-
-
 class PilotDriver:
     """Drive one robot by the navigator until it reaches the goal or runs out of time."""
 
@@ -36,13 +26,15 @@ class PilotDriver:
         """Begin an episode from its first state; `lens` is the one that pictures must have, None: any."""
         self._navigator, self._state, self.lens = navigator, state, lens
 
-    def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> VelocityCommand:
-        """Return the next command, by a level image [H, W, 3] u8 straight ahead and the yaw in the map's frame."""
+    def step(self, image: np.ndarray, heading_rad: float, time_s: float) -> tuple[tuple[float, float], bool]:
+        """Return the next command, m/s and rad/s, and whether the episode is over and the robot stands still.
+
+        It follows from a level image [H, W, 3] u8 straight ahead and the yaw in the map's frame.
+        """
         now = image[None], np.array([heading_rad]), np.array([time_s])
         self._state = state = self._navigator.step(self._state, *now)
         done = bool(state.arrived[0]) or bool(state.timed_out[0])
-        velocity = (0.0, 0.0) if done else (float(state.linear[0]), float(state.angular[0]))
-        return VelocityCommand(*velocity, done)
+        return (0.0, 0.0) if done else (float(state.linear[0]), float(state.angular[0])), done
 
 
 def topological_driver(

@@ -63,16 +63,16 @@ class NavigatorNode(DrivingNode):
         heading = math.remainder(heading_at(self._headings, time_s) + self._offset, math.tau)
         lens = self._driver.lens
         image = self._image if lens is None else self._seen("rgb", self._image, lens)
-        command = self._driver.step(image, heading, time_s)
+        (linear, angular), done = self._driver.step(image, heading, time_s)
         if time_s - self._said_s >= 10.0:
             self._said_s = time_s
             self._say(
                 f"navigator: {time_s:.1f} s, heading {math.degrees(heading):.0f} degrees, "
-                f"{command.linear_mps:.2f} m/s, {command.angular_radps:.2f} rad/s"
+                f"{linear:.2f} m/s, {angular:.2f} rad/s"
             )
-        if command.done:  # before the command, with which the simulator goes on in lockstep
+        if done:  # before the command, with which the simulator goes on in lockstep
             self._done.publish(Bool(data=True))
-        return (command.linear_mps, command.angular_radps), command.done
+        return (linear, angular), done
 
     def _forget(self) -> str:
         self._used_s = self._said_s = -math.inf

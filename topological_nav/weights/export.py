@@ -11,7 +11,6 @@ The package contains such a folder, `weights/exported`; its policy and maps are 
 
 import dataclasses
 import importlib.resources
-import json
 import os
 import shutil
 from collections import Counter
@@ -258,7 +257,7 @@ def choose(
         source = f"networks: {' and '.join(str(chosen[task]) for task in missing)}"
         maps, renewed = (RUNS / "maps",), False
     else:
-        source = f"networks: {' and '.join(missing)} of the package, {packaged}{_origin(packaged)}"
+        source = f"networks: {' and '.join(missing)} of the package, {packaged}"
         maps, renewed = (RUNS / "maps-packaged", packaged / "maps"), True
     return Choice(chosen["rooms"], chosen["passages"], policy, maps, renewed, source)
 
@@ -277,11 +276,3 @@ def fitting_map(choice: Choice, scene: str, digest: str) -> Path | None:
             if [about.get(name) for name in ("localiser", "detector")] == networks:
                 return path
     return None
-
-
-def _origin(folder: Path) -> str:
-    try:
-        about = json.loads((folder / ABOUT).read_text())["networks"]["rooms"]
-        return f" (commit {about['commit'][:12]}, {about['device']})"
-    except (OSError, ValueError, KeyError):
-        return ""

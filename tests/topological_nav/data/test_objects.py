@@ -1,10 +1,7 @@
 """Small objects in passage images: labels by hand and as of furniture, layouts, balance, pictures; none by default."""
 
-import dataclasses
 import hashlib
-import json
 import math
-import shutil
 
 import numpy as np
 import pytest
@@ -15,7 +12,7 @@ from interactive_nav.robots import get_robot
 from interactive_nav.scenes.objects import pick
 from interactive_nav.scenes.scene import load_scene
 from interactive_nav_common.config import overridden
-from interactive_nav_common.errors import ConfigError, FileError
+from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.grids import cell_centres, clearance
 from scenes_mjcf.look import Lens
 from tests.topological_nav.conftest import WORDS
@@ -163,22 +160,6 @@ def test_impossible_numbers_are_refused_in_one_line(word, painted, capsys):
     assert main(["data", str(painted), word]) != 0
     error = capsys.readouterr().err.strip()
     assert f"objects is {word[8:]}, expected between 0 and 100" in error and "\n" not in error
-
-
-def test_a_dataset_from_before_there_were_objects_goes_on_but_not_with_some(made, tmp_path):
-    copy = tmp_path / "data"
-    shutil.copytree(made.data, copy)
-    with np.load(copy / "painted" / "plan.npz") as plan:
-        assert "passage_small_w" not in plan.files
-    header = json.loads((copy / "dataset.json").read_text())
-    assert header["settings"].pop("objects") == 0
-    (copy / "dataset.json").write_text(json.dumps(header))
-    before = {path: path.stat().st_mtime_ns for path in copy.rglob("*-*.npz")}
-    config = overridden(DataConfig(), WORDS)
-    dataset.make_dataset([made.scene], copy, config)
-    assert before == {path: path.stat().st_mtime_ns for path in copy.rglob("*-*.npz")}
-    with pytest.raises(FileError, match="the dataset there has objects = 0, this one 2; choose another folder"):
-        dataset.make_dataset([made.scene], copy, dataclasses.replace(config, objects=2))
 
 
 @pytest.fixture(scope="module")

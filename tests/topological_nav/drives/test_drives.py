@@ -149,11 +149,8 @@ def test_contacts_and_failures_are_counted_and_left_out():
         np.array([True, True, False]),
         np.zeros(3, bool),
         np.zeros((3, 2)),
-        np.zeros(3, bool),
     )
     assert made.touched.tolist() == [False, True, False] and made.kept.tolist() == [True, False, False]
-    labelled = dataclasses.replace(made, labelled=np.ones(3, bool), broken=np.array([False, False, True]))
-    assert labelled.kept.tolist() == [True, True, False]
     assert made.rows(1).tolist() == [3, 4, 5] and made.rows(np.array([2, 0])).tolist() == [6, 7, 8, 0, 1, 2]
     row = driving.summary(made)
     assert row["reached"] == pytest.approx(2 / 3) and row["touched"] == row["kept"] == pytest.approx(1 / 3)

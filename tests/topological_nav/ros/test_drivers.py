@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scenes_mjcf.look import Lens
-from topological_nav.ros.drivers import PilotDriver, VelocityCommand
+from topological_nav.ros.drivers import PilotDriver
 
 
 class Three:
@@ -28,7 +28,7 @@ def test_the_navigator_is_asked_as_a_batch_of_one_and_ends_the_episode(how):
     navigator, lens = Three(how), Lens(4, 3, 90.0)
     driver = PilotDriver(navigator, SimpleNamespace(number=0), lens)  # type: ignore[arg-type]
     commands = [driver.step(np.zeros((3, 4, 3), np.uint8), 0.5, 1.0 + 0.1 * k) for k in range(3)]
-    assert commands == [VelocityCommand(0.3, -0.2), VelocityCommand(0.3, -0.2), VelocityCommand(0.0, 0.0, done=True)]
+    assert commands == [((0.3, -0.2), False), ((0.3, -0.2), False), ((0.0, 0.0), True)]
     assert (
         driver._state.number == 3
         and navigator.asked == [((1, 3, 4, 3), [0.5], [1.0 + 0.1 * k]) for k in range(3)]

@@ -16,7 +16,6 @@ from interactive_nav.ros.simulator import Pace, Sensed
 from scenes_mjcf.look import Lens
 from tests.topological_nav.ros.turning import Turning
 from topological_nav.ros import nodes as navigator_nodes
-from topological_nav.ros.drivers import VelocityCommand
 from topological_nav.ros.nodes import NavigatorNode, heading_at
 
 
@@ -191,7 +190,7 @@ class Watcher:
 
     def step(self, image, heading_rad, time_s):
         self.shown.append((image, heading_rad, time_s))
-        return VelocityCommand(0.2, 0.0, done=len(self.shown) == self.steps)
+        return (0.2, 0.0), len(self.shown) == self.steps
 
 
 def test_pictures_have_the_drivers_lens_and_headings_are_in_the_maps_frame(bus):

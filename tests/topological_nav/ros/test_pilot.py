@@ -37,15 +37,15 @@ def test_the_goal_is_the_node_that_looks_like_its_picture(made, goal):
     assert driver._state.goal.tolist() == [int(away.argmin())]  # type: ignore[attr-defined]
     assert driver.lens is not None and (driver.lens.width, driver.lens.height) == goal[1].shape[1::-1]
     # It begins with a look about: on the spot, to the nearest of the map's headings, and then 20 degrees on.
-    first = driver.step(goal[1], math.radians(5), 0.0)
-    assert (first.linear_mps, first.done) == (0.0, False) and first.angular_radps < 0
-    assert driver.step(goal[1], 0.0, 0.1).angular_radps > 0
+    (linear, angular), done = driver.step(goal[1], math.radians(5), 0.0)
+    assert (linear, done) == (0.0, False) and angular < 0
+    assert driver.step(goal[1], 0.0, 0.1)[0][1] > 0
 
 
 def test_out_of_time_it_is_done(made, goal):
     driver = topological_driver(made.map, seeing(made), (goal[0],), 0.0, NavigatorConfig(limit_s=1.0))
-    assert not driver.step(goal[1], 0.5, 10.0).done
-    assert driver.step(goal[1], 0.5, 11.0).done
+    assert not driver.step(goal[1], 0.5, 10.0)[1]
+    assert driver.step(goal[1], 0.5, 11.0)[1]
 
 
 def test_what_is_missing_is_told(made, tmp_path, capsys):

@@ -4,7 +4,6 @@ import math
 import sys
 
 from interactive_nav.ros.nodes import ros_node
-from topological_nav.ros.drivers import VelocityCommand
 from topological_nav.ros.nodes import NavigatorNode
 
 
@@ -20,11 +19,11 @@ class Turning:
         error = math.remainder(self._heading_rad - heading_rad, math.tau)
         turn = min(max(2.0 * error, -1.0), 1.0)
         if self._since is None and abs(error) > 0.1:
-            return VelocityCommand(0.0, turn)
+            return (0.0, turn), False
         self._since = time_s if self._since is None else self._since
         if time_s - self._since >= 2.0 - 1e-6:
-            return VelocityCommand(0.0, 0.0, done=True)
-        return VelocityCommand(0.5, turn)
+            return (0.0, 0.0), True
+        return (0.5, turn), False
 
 
 if __name__ == "__main__":
