@@ -152,10 +152,10 @@ def build(
 def keep_map(built: Built, out: Path, ends: Sequence[int] | None = None) -> None:
     """Write, draw and describe a map, with the path between two nodes if requested."""
     save_map(built.map, out)
-    route = None
+    route = []
     if ends:
-        route = built.map.plan(*ends)
-        print(f"{ends[0]} to {ends[1]}: {' '.join(map(str, route.nodes))}, cost {route.cost:.2f}")
+        route, cost = built.map.plan(*ends)
+        print(f"{ends[0]} to {ends[1]}: {' '.join(map(str, route))}, cost {cost:.2f}")
     picture = out.with_suffix(".png")
     save(map_figure(built.space, [built.map], route), picture)
     for name, value in built.scores.items():

@@ -45,8 +45,6 @@ class HostPolicy:
     """A remark to print beside its scores."""
     observes = True
     """Whether it reads `state.obs`; without it environments are stepped faster."""
-    remembers: MemoryPolicy | None = None
-    """Whose memory travels in `state.info["policy"]`: `act` then returns the new one as the third part of a tuple."""
 
     def act(self, state: Any, episode: np.ndarray, running: np.ndarray, step: int) -> Any:
         """Return the actions [N, A] of one control step, or a tuple of them and [N] bool of episodes that are over.
@@ -179,9 +177,8 @@ class Player:
         episode_of = np.arange(size)  # episode played by each place in the batch
         finished = episode_of >= count
         act: Any = policy  # a pytree argument of the program, so that its numbers are none of its constants
-        remembers: Any = policy.remembers if isinstance(policy, HostPolicy) else policy
-        if hasattr(remembers, "start"):
-            memory = self._remember(remembers, state, jnp.asarray(done + episode_of))
+        if hasattr(policy, "start"):
+            memory = self._remember(policy, state, jnp.asarray(done + episode_of))
             state = state.replace(info=state.info | {"policy": memory})
         elif not isinstance(policy, (jax.tree_util.Partial, HostPolicy)):
             act = jax.tree_util.Partial(policy)
@@ -262,9 +259,7 @@ class Player:
             if not running.any():
                 break
             acted = policy.act(carry[0], episode_of, running, step + t)
-            actions, over, *memory = acted if isinstance(acted, tuple) else (acted, None)
-            if memory:
-                carry = (carry[0].replace(info=carry[0].info | {"policy": memory[0]}), *carry[1:])
+            actions, over = acted if isinstance(acted, tuple) else (acted, None)
             with signals_wait():
                 carry, track = jax.block_until_ready(self._step(carry, actions, over, observe=policy.observes))
             tracks.append(jax.tree.map(np.asarray, track))

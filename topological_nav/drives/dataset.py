@@ -31,9 +31,9 @@ from interactive_nav_common.rotations import wrap_angle
 from scenes_mjcf.look import CameraPose
 from topological_nav.config import DataConfig, DriveConfig, MapConfig
 from topological_nav.data.folders import Folder, draw_missing, load_scenes, numbered, read_arrays, read_shards
-from topological_nav.drives.expert import CONTROL_S, RECORDERS, Expert, Tasks, Terrain, drive, drive_env, way_field
+from topological_nav.drives.expert import CONTROL_S, RECORDERS, Expert, Tasks, Terrain, drive_env, way_field
 from topological_nav.maps.graph import angles, near_pairs, place_nodes
-from topological_nav.scenes.rendering import camera_pose
+from topological_nav.scenes.rendering import camera_pose, episode_starts
 from topological_nav.scenes.space import FreeSpace, free_space, scene_rooms
 
 DRIVES = Folder(
@@ -246,13 +246,16 @@ def simulate_drives(
             if not path.is_file():
                 player = player or Player(drive_env(scene_folders, config), RECORDERS)
 
-                def report(ended: int, mine: np.ndarray = mine) -> None:
+                def report(ended: int, _: int, mine: np.ndarray = mine) -> None:
                     progress("drives", int(mine[0]) + min(ended, len(mine) - 1), total)  # the padding's are no news
 
                 # Padded by its last drive: one size, one program.
                 part = tasks.take(np.minimum(mine[0] + np.arange(config.batch), total - 1))
                 expert = Expert(terrain, jax.tree.map(jnp.asarray, part), player.env, config)
-                driven = drive(player, part, expert, report)
+                starts = episode_starts(part.start_xy_w, part.start_yaw_rad, part.goals_w[:, 0], 0, part.scene)
+                keys = jnp.zeros((len(part), 2), jnp.uint32)
+                result = player.rollout(expert, keys, starts, on_progress=report)
+                driven = {"steps": result.num_steps, **result.values}  # by control step [B, T, ...], or [B]
                 driven = {name: values[: len(mine)] for name, values in driven.items()}
                 on = np.arange(driven["pose_w"].shape[1]) < driven["steps"][:, None]  # not after its end
                 write_arrays(path, **{n: row[on] if row.shape[:2] == on.shape else row for n, row in driven.items()})

@@ -20,7 +20,7 @@ import scipy.ndimage
 from scipy.sparse.csgraph import dijkstra
 
 from interactive_nav import InteractiveNav
-from interactive_nav.task.rollout import Player, Recorder
+from interactive_nav.task.rollout import Recorder
 from interactive_nav.types import LOST
 from interactive_nav_common.errors import UserError
 from interactive_nav_common.grids import MOVES_32, cell_centres, grid_graph, nearest_cell
@@ -28,7 +28,7 @@ from interactive_nav_common.rotations import wrap_angle
 from interactive_nav_common.rows import Rows
 from scenes_mjcf.robot_facts import ROBOTS
 from topological_nav.config import DriveConfig, ExpertConfig
-from topological_nav.scenes.rendering import episode_starts, make_env
+from topological_nav.scenes.rendering import make_env
 from topological_nav.scenes.space import FreeSpace
 
 CONTROL_S = 0.1
@@ -278,15 +278,3 @@ class Expert:
 _REMEMBERED: Any = {"pose_w": "step", "command": "step", "gap_m": "step", "reached": "end", "broken": "end"}
 RECORDERS = {n: Recorder(lambda state, _, n=n: state.info["policy"][n], at) for n, at in _REMEMBERED.items()}
 RECORDERS |= {"touching": Recorder(lambda state, action: state.info["nav"].memory["touching"], "step")}
-
-
-def drive(player: Player, tasks: Tasks, expert: Expert, on_progress: Callable[[int], None]) -> dict[str, np.ndarray]:
-    """Drive tasks to their ends with a player that has `RECORDERS`.
-
-    Return fields of `dataset.Drives` by control step [B, T, ...], invalid after a drive's `steps` [B], and `reached`
-    and `broken` [B].
-    """
-    starts = episode_starts(tasks.start_xy_w, tasks.start_yaw_rad, tasks.goals_w[:, 0], 0, tasks.scene)
-    keys = jnp.zeros((len(tasks), 2), jnp.uint32)
-    result = player.rollout(expert, keys, starts, on_progress=lambda ended, step: on_progress(ended))
-    return {"steps": result.num_steps, **result.values}

@@ -24,7 +24,7 @@ from interactive_nav_common.jobs.progress import Progress
 from topological_nav.data.dataset import images_at, load_plan, read_header
 from topological_nav.evaluate.contest import ContestScene
 from topological_nav.evaluate.evaluation import DrivenEpisodes, NavigatorPlayer, Played
-from topological_nav.maps.graph import Route, TopologicalMap
+from topological_nav.maps.graph import TopologicalMap
 from topological_nav.navigate.navigator import FACE, PHASES, State
 from topological_nav.scenes.rendering import Snapshot
 from topological_nav.scenes.space import FreeSpace
@@ -147,7 +147,7 @@ def dataset_figure(folder: Path) -> Figure:
     return figure
 
 
-def map_figure(space: FreeSpace, graphs: Sequence[TopologicalMap], route: Route | None = None) -> Figure:
+def map_figure(space: FreeSpace, graphs: Sequence[TopologicalMap], route: Sequence[int] = ()) -> Figure:
     """Draw maps of a scene side by side, a route on top: edges from blocked to free, each direction on half of it."""
     extent = np.ptp(space.centres(0.0), axis=0)
     width = 7.2 if len(graphs) == 1 else 5.5
@@ -167,8 +167,8 @@ def map_figure(space: FreeSpace, graphs: Sequence[TopologicalMap], route: Route 
         for node, xy in enumerate(graph.xy_w):
             if np.linalg.norm(graph.xy_w[:node] - xy, axis=-1).min(initial=1.0) > 0.25:  # else one over the other
                 axis.text(xy[0], xy[1], str(node), ha="center", va="center", fontsize=6, zorder=5)
-        if route is not None:
-            axis.plot(*graph.xy_w[list(route.nodes)].T, color="k", linewidth=2.6, zorder=3)
+        if route:
+            axis.plot(*graph.xy_w[list(route)].T, color="k", linewidth=2.6, zorder=3)
         axis.set_title(f"{graph.scene}: {len(graph.xy_w)} nodes, {len(graph.edges)} directed edges", fontsize=9)
     look: Any = {"label": "probability that the way is free", "orientation": "horizontal", "aspect": 20 * len(graphs)}
     figure.colorbar(ScalarMappable(cmap=FREE), ax=axes, shrink=0.6, pad=0.01, **look)

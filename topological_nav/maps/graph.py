@@ -31,15 +31,6 @@ LEAST_P = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
-class Route:
-    """Describe a path through a map."""
-
-    nodes: tuple[int, ...]
-    cost: float
-    """Sum of the legs' weights."""
-
-
-@dataclasses.dataclass(frozen=True)
 class TopologicalMap:
     """Hold N nodes, K images each, and E directed edges."""
 
@@ -68,15 +59,15 @@ class TopologicalMap:
         """Return the lengths of the edges, [E] m."""
         return lengths(self.xy_w, self.edges)
 
-    def plan(self, start: int, goal: int) -> Route:
-        """Return the cheapest path between two nodes, by Dijkstra's algorithm; raise `FileError` if there is none."""
+    def plan(self, start: int, goal: int) -> tuple[list[int], float]:
+        """Return the nodes and the cost of the cheapest path between two; raise `FileError` if there is none."""
         for node in (start, goal):
             if not 0 <= node < len(self.xy_w):
                 raise FileError(f"node {node} is not in the map of '{self.scene}', expected 0 to {len(self.xy_w) - 1}")
         cost, before = dijkstra(self._matrix(self.weight), indices=start, return_predecessors=True)
         if not np.isfinite(cost[goal]):
             raise FileError(f"no way from node {start} to {goal} in the map of '{self.scene}'; make it denser")
-        return Route(tuple(reversed(follow(before, goal, start))), float(cost[goal]))
+        return follow(before, goal, start)[::-1], float(cost[goal])
 
     @functools.cached_property
     def weight(self) -> np.ndarray:

@@ -35,21 +35,10 @@ class Sweep(OnCluster):
     """Only continue: refuse a sweep that was never started."""
     only: Annotated[Literal["train", "evaluate"] | None, option(metavar="train|evaluate")] = None
     """Only train runs, or only evaluate trained runs."""
-    redo: Flag = False
-    """Evaluate runs again that are already evaluated."""
-    unfinished: Flag = False
-    """Also evaluate unfinished runs, with --only evaluate."""
     time_limit: Annotated[Positive | None, option(metavar="SECONDS")] = None
     """Stop all runs after this time in seconds; their checkpoints are kept."""
     where: Annotated[Repeated, option(metavar="KEY=VALUE[,VALUE]")] = ()
     """Only process runs with these settings, for example env.robot=fetch."""
-    shard: Annotated[str | None, option(metavar="I/N")] = None
-    """Only process every N-th run, starting with run I: the share of one machine."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.unfinished and self.only != "evaluate":
-            raise ConfigError("--unfinished evaluates without training on; expected --only evaluate with it")
 
     @classmethod
     def epilog(cls) -> str:
@@ -66,7 +55,7 @@ def main(argv: Sequence[str] | None = None, programs: Programs = PROGRAMS) -> in
     """Run a sweep; see `Outcome.exit_code`."""
     arguments = parse(Sweep, "python -m train.sweep", argv)
     console = SafeConsole()
-    sweep = spec.select(spec.load_sweep(arguments.sweep), arguments.where, arguments.shard)
+    sweep = spec.select(spec.load_sweep(arguments.sweep), arguments.where)
     folder = SweepFolder(sweep)
     if arguments.status:
         states = [folder.state(run) for run in sweep.runs]
@@ -96,7 +85,7 @@ def main(argv: Sequence[str] | None = None, programs: Programs = PROGRAMS) -> in
     stages = (arguments.only,) if arguments.only else STAGES
     with stop_signals(second_ends=False) as stops, SweepDisplay(console) as display:
         display.event(f"{folder.root}: {len(sweep.runs)} runs")
-        scheduler = Scheduler(folder, launcher, display, stages, arguments.redo, arguments.unfinished, programs)
+        scheduler = Scheduler(folder, launcher, display, stages, programs)
         outcome = scheduler.run(stops, arguments.time_limit)
     console.print(status_table(outcome.states))
     console.print(totals(outcome.states))
@@ -104,8 +93,7 @@ def main(argv: Sequence[str] | None = None, programs: Programs = PROGRAMS) -> in
         console.print(f"{outcome.elsewhere} runs were left to another sweep that works on them")
     if outcome.stopped_by or outcome.timed_out:
         console.print("the same command continues")
-    enough = "unfinished" if arguments.unfinished else "trained" if arguments.only == "train" else "done"
-    return outcome.exit_code(enough)
+    return outcome.exit_code("trained" if arguments.only == "train" else "done")
 
 
 if __name__ == "__main__":

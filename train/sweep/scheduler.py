@@ -99,8 +99,7 @@ class Outcome:
         """Return 0: every run is `done` or worked on elsewhere; 1: not; 3: stopped by the time limit; 128 + signal."""
         if self.stopped_by:
             return 128 + self.stopped_by
-        enough = {"done": (), "trained": ("trained",), "unfinished": ("trained", "stopped", "waiting")}[done]
-        left = [s for s in self.states if s.state not in ("done", *enough)]
+        left = [s for s in self.states if s.state not in ("done", done)]
         if any(s.reason for s in left):
             return 1
         if self.timed_out:
@@ -116,10 +115,6 @@ class Scheduler:
     launcher: Launcher
     display: SweepDisplay
     stages: Sequence[str] = STAGES
-    redo: bool = False
-    """Evaluate again what is evaluated."""
-    unfinished: bool = False
-    """Evaluate unfinished runs too."""
     programs: Programs = dataclasses.field(default_factory=lambda: PROGRAMS)
     clock: Callable[[], float] = time.monotonic
 
@@ -130,7 +125,6 @@ class Scheduler:
         self._given_up: set[tuple[str, str]] = set()
         self._alone: set[str] = set()
         self._not_before: dict[str, float] = {}
-        self._redo = set(self._runs) if self.redo else set()
         self._outcome = Outcome((), None, False, 0)
         self._kill_at = math.inf
         """Finite once what runs was requested to end; -inf once it was killed."""
@@ -185,8 +179,7 @@ class Scheduler:
             return False
         if stage == "train":
             return not state.over
-        far = state.over or (self.unfinished and state.env_steps > 0)
-        return far and (state.name in self._redo or not self.folder.evaluated(self._runs[state.name]))
+        return state.over and not self.folder.evaluated(self._runs[state.name])
 
     def _jobs(self, states: list[RunState]) -> Iterator[RunJob]:
         """Yield jobs for runs that nobody else works on, as far as is visible: training, first of runs that have begun,
@@ -245,10 +238,8 @@ class Scheduler:
             return
         if job.kind == "evaluate":
             left = [name for name in job.runs if not self.folder.evaluated(self._runs[name])]
-            for name in set(job.runs) - set(left) if code == 0 or not self._redo else set():
-                self._redo.discard(name)
+            for name in set(job.runs) - set(left):
                 self.folder.drop_old_rows(self._runs[name])
-            left = left or ([name for name in job.runs if name in self._redo] if code else [])
         else:
             left = [name for name in job.runs if not self.folder.state(self._runs[name]).over]
         if not left:

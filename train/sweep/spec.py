@@ -193,8 +193,8 @@ def expand(plain: Any, where: str, default_name: str) -> Sweep:
     return Sweep(config, root, tuple(runs.values()))
 
 
-def select(sweep: Sweep, where: Sequence[str], shard: str | None) -> Sweep:
-    """Return one machine's part of a sweep: runs that match all `setting=value[,value]` of `where`, in shard `I/N`."""
+def select(sweep: Sweep, where: Sequence[str]) -> Sweep:
+    """Return one machine's part of a sweep: the runs that match all `setting=value[,value]` of `where`."""
     runs = list(sweep.runs)
     for word in where:
         axis, equals, text = word.partition("=")
@@ -203,14 +203,8 @@ def select(sweep: Sweep, where: Sequence[str], shard: str | None) -> Sweep:
         chosen = [config_io.parsed(item, f"--where {word!r}") for item in text.split(",")]
         wanted = _where({axis: chosen}, sweep.config, f"--where {word}")
         runs = [run for run in runs if _matches(wanted, run.values)]
-    if shard is not None:
-        match = re.fullmatch(r"(\d+)/(\d+)", shard)
-        index, count = (int(match[1]), int(match[2])) if match else (0, 0)
-        if index >= count:
-            raise ConfigError(f"--shard {shard!r}: expected I/N with I from 0 to N - 1, for example 0/2 and 1/2")
-        runs = runs[index::count]
     if not runs:
-        raise ConfigError("no run of the sweep is left; expected --where and --shard to leave some")
+        raise ConfigError("no run of the sweep is left; expected --where to leave some")
     return dataclasses.replace(sweep, runs=tuple(runs))
 
 

@@ -30,7 +30,6 @@ def drives_of(*commands) -> Drives:
         flags,
         ~flags,
         np.zeros((len(steps), 2)),
-        ~flags,
     )
 
 

@@ -22,8 +22,8 @@ def built() -> Any:
 
 
 def test_a_map_has_a_bar_numbers_apart_and_its_route():
-    there, route = built(), SimpleNamespace(nodes=(0, 1, 3), cost=1.0)
-    axis, scale = map_figure(there.space, [there.map], route).axes  # type: ignore[arg-type]
+    there = built()
+    axis, scale = map_figure(there.space, [there.map], [0, 1, 3]).axes  # type: ignore[arg-type]
     assert [text.get_text() for text in axis.texts] == ["2 m", "0", "1", "3"]
     bar, route = axis.lines
     ends = np.asarray(bar.get_xdata(), float)

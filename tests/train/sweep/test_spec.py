@@ -70,19 +70,16 @@ def test_every_combination_but_the_skipped_has_its_own_settings():
 def test_machines_can_share_a_sweep():
     sweep = sweep_of(FILE)
     names = [run.name for run in sweep.runs]
-    shards = [[run.name for run in spec.select(sweep, [], f"{i}/2").runs] for i in range(2)]
-    assert shards == [names[::2], names[1::2]]
-    only = spec.select(sweep, ["env.k_int=1.0", "run.seed=1,0"], None)
+    only = spec.select(sweep, ["env.k_int=1.0", "run.seed=1,0"])
     assert [run.name for run in only.runs] == names[1:]
-    for where, shard, message in (
-        (["env.k_int=2"], None, "env.k_int is 2, expected one of [0.0, 1.0]"),
-        (["k_int=1"], None, "'k_int' is no axis of the grid, did you mean 'env.k_int'?"),
-        (["env.k_int"], None, "expected setting=value"),
-        ([], "2/2", "expected I/N with I from 0 to N - 1"),
-        (["env.k_int=0.0"], "1/2", "no run of the sweep is left"),
+    for where, message in (
+        (["env.k_int=2"], "env.k_int is 2, expected one of [0.0, 1.0]"),
+        (["k_int=1"], "'k_int' is no axis of the grid, did you mean 'env.k_int'?"),
+        (["env.k_int"], "expected setting=value"),
+        (["env.k_int=0.0", "env.k_int=1.0"], "no run of the sweep is left"),
     ):
         with pytest.raises(ConfigError) as error:
-            spec.select(sweep, where, shard)
+            spec.select(sweep, where)
         assert message in str(error.value)
 
 
@@ -173,7 +170,6 @@ def test_a_wrong_file_is_one_line_and_exit_2(tmp_path, capsys):
         (["kitn"], "no sweep 'kitn', did you mean 'kint'?"),
         ([str(tmp_path / "no.yaml")], "no.yaml: no such file; expected a YAML file"),
         ([], "missing NAME|PATH"),
-        (["kint", "--unfinished"], "expected --only evaluate with it"),
         (["kint", "--time-limit", "0"], "--time-limit is 0.0, expected a positive number"),
     ):
         assert main(words) == 2

@@ -111,8 +111,10 @@ def test_stages_can_be_run_and_repeated_alone(tmp_path):
     assert len(written) == 4
     sweep(path, stages=("evaluate",))
     assert {p: p.stat().st_mtime_ns for p in folder.rows.iterdir()} == written
-    sweep(path, stages=("evaluate",), redo=True)
-    assert all(p.stat().st_mtime_ns > written[p] for p in folder.rows.iterdir())
+    (again,) = list(folder.rows.glob("k_int0-seed1-*.parquet"))
+    again.unlink()
+    sweep(path, stages=("evaluate",))
+    assert [p for p in written if p.stat().st_mtime_ns > written[p]] == [again]
 
 
 def test_how_far_a_run_is_is_told_while_another_sweep_tries_it_again(tmp_path):
@@ -149,10 +151,9 @@ def test_a_truncated_reason_is_told_with_the_status(tmp_path, capsys):
     assert state.state == "failed" and "not readable as JSON" in state.reason
 
 
-@pytest.mark.parametrize("words", [[], ["--unfinished"]])
-def test_there_is_nothing_to_evaluate_of_a_sweep_that_was_never_trained(tmp_path, capsys, words):
+def test_there_is_nothing_to_evaluate_of_a_sweep_that_was_never_trained(tmp_path, capsys):
     path = write_sweep(tmp_path)
-    assert main([str(path), "--only", "evaluate", *words], FAKE) == 2
+    assert main([str(path), "--only", "evaluate"], FAKE) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("train.sweep: --only evaluate: no run of ") and "has trained a step; train first" in line
     assert not (tmp_path / "small").exists()
@@ -363,9 +364,8 @@ def test_what_is_neither_done_nor_worked_on_is_no_success(tmp_path):
     assert Outcome((done, running), None, False, 1).exit_code("done") == 0
     stopped = RunState("c", "stopped", 3, 9, {})
     assert Outcome((done, stopped), None, False, 0).exit_code("done") == 1
-    assert Outcome((done, stopped), None, False, 0).exit_code("unfinished") == 0
-    failed = RunState("d", "failed", 3, 9, {}, "evaluate: x")
-    assert Outcome((done, failed), None, False, 0).exit_code("unfinished") == 1
+    trained = RunState("d", "trained", 9, 9, {})
+    assert [Outcome((done, trained), None, False, 0).exit_code(far) for far in ("trained", "done")] == [0, 1]
 
 
 @pytest.mark.heavy
@@ -472,26 +472,6 @@ def test_impossible_words_are_one_line(tmp_path, capsys):
         assert main([path, *words], FAKE) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert message in line
-
-
-def test_unfinished_runs_can_be_evaluated_as_far_as_they_are(tmp_path):
-    slow = {f"k_int{k}-seed{s}": ["slow"] for k in (0, 1) for s in (0, 1)}
-    set_fates(tmp_path, slow)
-    path = write_sweep(tmp_path, steps=10_000)
-    logs = [tmp_path / "small" / "runs" / f"k_int0-seed{s}" / "metrics.jsonl" for s in (0, 1)]
-    sweep(path, limit_s=40.0, clock=lambda: 41.0 if all(map(last_line, logs)) else 0.0)
-    outcome, _, folder = sweep(path, stages=("evaluate",))
-    assert not list(folder.rows.glob("*.parquet"))
-    outcome, _, folder = sweep(path, stages=("evaluate",), unfinished=True)
-    assert {p.name.rsplit("-", 1)[0] for p in folder.rows.glob("*.parquet")} == {"k_int0-seed0", "k_int0-seed1"}
-    assert sorted(s.state for s in outcome.states) == ["stopped", "stopped", "waiting", "waiting"]
-    before = {p: p.stat().st_mtime_ns for p in folder.rows.iterdir()}
-    sweep(path, stages=("evaluate",), unfinished=True)
-    assert {p: p.stat().st_mtime_ns for p in folder.rows.iterdir()} == before
-    # Trained further, they are evaluated anew.
-    set_fates(tmp_path, {})
-    outcome, _, folder = sweep(path)
-    assert {s.state for s in outcome.states} == {"done"} and all(p.stat().st_mtime_ns > t for p, t in before.items())
 
 
 def test_a_fifo_in_place_of_metrics_does_not_block(tmp_path):
