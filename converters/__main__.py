@@ -45,25 +45,6 @@ def gate_table(gates: "tuple[Gate, ...]") -> Table:
     return table
 
 
-def alignment_table(rows: tuple[dict[str, Any], ...]) -> Table:
-    """Return a table of alignments; `settled` is how far the simulation moved the object from its annotation."""
-    heads = ("object", "pairs", "rms cm", "shift cm", "yaw °", "scale x y z", "tilt °", "settled cm")
-    table = Table(*heads, title="Pose re-solved from keypoints, against the annotated pose")
-    for row in rows:
-        if row["solved"]:
-            solved = (
-                f"{100 * row['rms_m']:.1f}",
-                f"{100 * row['translation_difference_m']:.1f}",
-                f"{row['yaw_difference_deg']:.1f}",
-                " ".join(f"{v:.2f}" for v in row["scale_ratio"]),
-            )
-        else:
-            solved = ("-", "-", "-", row["reason"])
-        moved = f"{row['tilt_removed_deg']:.1f}", f"{100 * row['settle_shift_m']:.1f}"
-        table.add_row(row["name"], str(row["n_keypoints"]), *solved, *moved)
-    return table
-
-
 class Convert(OnCluster, segmenting.MeshFile, segmenting.WithLibrary, generating.Decomposing):
     """Convert a scan, drawing or home into a scene folder (SRC OUT), or several into one folder (SRC... --into DIR)."""
 
@@ -135,8 +116,6 @@ class Convert(OnCluster, segmenting.MeshFile, segmenting.WithLibrary, generating
         with stage_progress(console) as report:
             results = convert_building(self.source, self.out, config, report, warn=warn, annotations=self.annotations)
         for result in results:
-            if any(row.get("n_keypoints") for row in result.manifest.alignment):
-                console.print(alignment_table(result.manifest.alignment))
             console.print(gate_table(result.gates))
             for warning in result.manifest.warnings:
                 warn(warning)
@@ -208,20 +187,18 @@ class Check(generating.Command):
 
 
 class Preview(generating.Command):
-    """Draw the stages of a conversion from above."""
+    """Draw a scene: two views of the home, and its objects and collision shapes from above."""
 
-    scene: Annotated[Path, *word("SCENE_OR_OBJECT_DIR")]
-    """Folder of a scene or of an object."""
+    scene: Annotated[Path, *word("SCENE_DIR")]
+    """Scene folder to draw."""
     output: Annotated[Path, option("-o", metavar="PNG")]
     """PNG file to write."""
-    source: Annotated[Path | None, option(metavar="SRC")] = None
-    """Raw folder or file that the scene was converted from, to draw the scan and its cuts as well."""
 
     def run(self, console: Console) -> None:
         """Run the command."""
         from converters.check.preview import preview
 
-        preview(existing(self.scene), self.output, self.source)
+        preview(existing(self.scene), self.output)
         console.print(f"{self.output}: picture of {self.scene}")
 
 
@@ -261,8 +238,7 @@ COMMANDS: dict[str, Any] = {
     "generate": generating.Generate,
     "generate-scenes": generating.GenerateScenes,
     "scenes": {"list": generating.ListScenes, "make": generating.MakeScenes},
-    "models": generating.Models,
-    "library": {"get": generating.Get, "build": generating.Build, "list": generating.ListModels},
+    "library": {"build": generating.Build, "list": generating.ListModels},
     "preview": Preview,
     "export": Export,
 }

@@ -160,62 +160,22 @@ class ListScenes(Command):
             print(f"{'-':<10} {'-':<6} {scene.relative_to(sets.HERE).as_posix():<15} {scene}")
 
 
-class Models(Command):
-    """Draw the CAD models that furnish generated homes."""
-
-    names: Annotated[tuple[str, ...], *word("NAME")] = ()
-    """Models or categories to draw (default: all models)."""
-    output: Annotated[Path, option("-o", metavar="PNG")]
-    """PNG file to write."""
-
-    def run(self, console: Console) -> None:
-        """Run the command."""
-        from converters.check.pictures import model_sheet
-
-        count = model_sheet(self.output, self.names)
-        console.print(f"{self.output}: picture of {count} models")
-
-
-class Get(Command):
-    """Fetch the furniture libraries of Sweet Home 3D."""
-
-    name: Annotated[Literal["sweethome3d"], *word("NAME")]
-    """Libraries to fetch."""
-    given: Annotated[Path | None, option(name="from", metavar="FILE.deb|DIR")] = None
-    """Debian package, or folder of .sh3f files, to read (default: apt-get downloads the package)."""
-    out: Annotated[Path | None, option("-o", metavar="DIR")] = None
-    """Folder to write the libraries to (default: the cache folder)."""
-    overwrite: Flag = False
-    """Replace libraries that were fetched before."""
-
-    def run(self, console: Console) -> None:
-        """Run the command."""
-        from converters.library.build import fetch, library_folder
-
-        target = self.out or library_folder()
-        files = fetch(self.given, target, self.overwrite)
-        console.print(f"{target}: {len(files)} furniture libraries, checked by digest")
-
-
 class Build(Command):
     """Rebuild the packaged selection of furniture: models.zip and ATTRIBUTION.md."""
 
     WRITES = ("{}/*",)
     out: Annotated[Path, *word("OUT")]
     """Folder to write both files to."""
-    given: Annotated[Path | None, option(name="from", metavar="DIR")] = None
-    """Folder that contains the .sh3f files (default: the folder that `library get` writes)."""
+    given: Annotated[Path, option(name="from", metavar="DIR")]
+    """Folder that contains the .sh3f files of Debian's package sweethome3d-furniture 1.8, unpacked."""
     jobs: Annotated[AtLeastOne, option(metavar="N")] = CORES
     """Number of models to process in parallel."""
 
     def run(self, console: Console) -> None:
         """Run the command."""
-        from converters.library.build import FILES, build, checked, library_folder
+        from converters.library.build import build, libraries_in
 
-        given = self.given or library_folder()
-        files = [given / f"{name}.sh3f" for name in FILES]
-        for path in files:
-            checked(given, path.stem, path.read_bytes() if path.is_file() else None)
+        files = libraries_in(self.given)
         with stage_progress(console) as report:
             count = build(files, self.out, self.jobs, report)
         console.print(f"{self.out}: {count} models with their hulls, and ATTRIBUTION.md")

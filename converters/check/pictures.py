@@ -1,28 +1,20 @@
-"""Draw compiled scenes and CAD models with their textures in NumPy, without a display or a GPU."""
+"""Draw compiled scenes and models with their textures in NumPy, without a display or a GPU."""
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from pathlib import Path
 
 import mujoco
 import numpy as np
 import shapely
-from PIL import Image, ImageDraw
+from PIL import Image
 from scipy.ndimage import map_coordinates
 from scipy.spatial import ConvexHull
 from trimesh.intersections import slice_faces_plane
 from trimesh.triangles import nondegenerate
 
-from converters.generate.models.cad import LIBRARY, cad_model, tints
-from converters.generate.models.parts import MATERIALS
 from converters.geometry.faces import corner_normals, face_vectors, unit_normals
-from converters.read.obj import in_colour, join_meshes
 from converters.records.raw import TexturedMesh
 from converters.write.texture import box_pixels
-from interactive_nav_common.config import nearest
-from interactive_nav_common.errors import UserError
-from interactive_nav_common.files import whole_file
 from interactive_nav_common.grids import cell_centres, clearance
 from scenes_mjcf.look import GLASS, GLASS_ALPHA, CameraPose, Lens, geom_image, geom_mesh, look_along, mesh_of, over
 from scenes_mjcf.schema import SceneMaps
@@ -47,10 +39,6 @@ FREE_M, NEAR_M, FAR_M = 0.5, 1.2, 7.0
 HEADINGS, PLACES = 24, 200
 SHARP = 2
 """Pixels a side that become one, at eye height: from farther off that is noise, which makes files large."""
-PIXELS = 200
-"""Side of a model's picture."""
-LABEL_PIXELS = 30
-COLUMNS = 8
 AZIMUTH_RAD, ABOVE_RAD = 0.6, 0.42
 """Where the reader stands: to the right of the front, and above."""
 Surfaces = dict[str, TexturedMesh]
@@ -149,13 +137,13 @@ def geom_surface(model: mujoco.MjModel, geom: int) -> TexturedMesh:
     return TexturedMesh(*geom_mesh(model, geom), uv * [1.0, -1.0] + [0.0, 1.0], image[..., :3])
 
 
-def geom_outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int, axes_w: np.ndarray) -> np.ndarray:
-    """Return (k, 2) m: outline of a mesh or box geom, viewed along the third of the axes."""
+def geom_outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
+    """Return (k, 2) m: outline of a mesh or box geom from above."""
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
         corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T * model.geom_size[geom]
     else:
         corners = mesh_of(model, model.geom_dataid[geom])[0]
-    points = (corners @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]) @ axes_w[:2].T
+    points = (corners @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])[:, :2]
     return points[ConvexHull(points).vertices]
 
 
@@ -228,7 +216,7 @@ def _vantage(
     distance = np.linalg.norm(way, axis=2)
     weight = np.linalg.norm(high - low, axis=1) / np.maximum(distance, NEAR_M)
     walls = [g for g in range(model.ngeom) if model.geom(g).name.startswith("wall_")]
-    stand = shapely.union_all([shapely.Polygon(geom_outline(model, data, g, np.eye(3))) for g in walls])
+    stand = shapely.union_all([shapely.Polygon(geom_outline(model, data, g)) for g in walls])
     start = np.broadcast_to(places[:, None], way.shape)
     hidden = np.asarray(shapely.intersects(shapely.linestrings(np.stack([start, start + way], axis=2)), stand))
     visible = (distance > NEAR_M) & (distance < FAR_M) & ~hidden
@@ -248,45 +236,10 @@ def camera_axes() -> np.ndarray:
     return np.stack([right, np.cross(toward, right), toward])
 
 
-def model_picture(name: str, pixels: int = PIXELS) -> np.ndarray:
-    """Draw a (pixels, pixels, 3) uint8 picture of a model, in the colours of its materials or texture, on white."""
-    model = cad_model(name)
-    if (surface := model.surface) is not None:
-        mesh = TexturedMesh(surface.vertices, surface.faces, surface.uv[surface.uv_faces], surface.image)
-    else:
-        parts = ((TexturedMesh(p.vertices, p.faces, None, None), np.array(MATERIALS[p.material])) for p in model.parts)
-        mesh = join_meshes(*(in_colour(*part) for part in parts))
-    return mesh_picture(mesh, camera_axes(), pixels, one_sided=True)
-
-
-def mesh_picture(mesh: TexturedMesh, axes: np.ndarray, pixels: int, one_sided: bool = False) -> np.ndarray:
+def mesh_picture(mesh: TexturedMesh, axes: np.ndarray, pixels: int) -> np.ndarray:
     """Draw a (pixels, pixels, 3) uint8 picture of a whole mesh on white, along axes such as `camera_axes`'."""
     turned = mesh.vertices @ axes.T
     half, middle = np.ptp(turned, axis=0)[:2].max() / 2 / 0.94, (turned.min(axis=0) + turned.max(axis=0)) / 2
     picture = Picture(*over(axes, middle - half, middle + half, 2 * half / pixels))
-    picture.draw(mesh, one_sided)
+    picture.draw(mesh)
     return picture.image
-
-
-def model_sheet(target: Path, names: Sequence[str] = ()) -> int:
-    """Draw models into a PNG, whole or not at all; return how many."""
-    unknown = [n for n in names if n not in LIBRARY and n not in {d.category for d in LIBRARY.values()}]
-    if unknown:
-        words = sorted({d.category for d in LIBRARY.values()})
-        near = nearest(unknown[0], [*words, *LIBRARY])
-        raise UserError(f"no model or category named {', '.join(unknown)}{near}; categories: {', '.join(words)}")
-    wanted = [n for n, d in LIBRARY.items() if not names or n in names or d.category in names]
-    wanted = [tint for n in sorted(wanted, key=lambda name: LIBRARY[name].category) for tint in tints(n)]
-    rows = -(-len(wanted) // COLUMNS)
-    columns = min(COLUMNS, len(wanted))
-    sheet = Image.new("RGB", (columns * PIXELS, rows * (PIXELS + LABEL_PIXELS)), "white")
-    draw = ImageDraw.Draw(sheet)
-    for k, name in enumerate(wanted):
-        x, y = k % COLUMNS * PIXELS, k // COLUMNS * (PIXELS + LABEL_PIXELS)
-        sheet.paste(Image.fromarray(model_picture(name)), (x, y))
-        size = " x ".join(f"{v:.2f}" for v in 2 * cad_model(name).half_extents * cad_model(name).unit_m)
-        draw.text((x + 4, y + PIXELS + 2), name, fill="black", font_size=12)
-        draw.text((x + 4, y + PIXELS + 15), f"{size} m", fill="grey", font_size=11)
-    with whole_file(target) as partial:
-        sheet.save(partial, format="PNG", optimize=True)
-    return len(wanted)

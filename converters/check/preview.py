@@ -1,4 +1,4 @@
-"""Draw the stages of a conversion from above into one PNG, from a scene folder and its raw folder."""
+"""Draw a scene folder into one PNG: two views, and panels of its objects and collision shapes from above."""
 
 import dataclasses
 import math
@@ -17,17 +17,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from PIL import Image
 
-from converters.bodies.objects import PlacedObject
 from converters.check import pictures
 from converters.check.pictures import geom_outline
-from converters.geometry.boxes import convex_hull
-from converters.read.obj import in_colour, textured_by_face
-from converters.records.raw import RawScene, TexturedMesh
-from converters.structure.clean import cut_furniture
-from interactive_nav_common.files import check_name, whole_file
+from converters.read.obj import in_colour
+from converters.records.raw import TexturedMesh
+from interactive_nav_common.files import whole_file
 from scenes_mjcf.categories import CATEGORIES
-from scenes_mjcf.look import geom_mesh, over, spec_for_people
-from scenes_mjcf.schema import SCENES, SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
+from scenes_mjcf.look import over, spec_for_people
+from scenes_mjcf.schema import SceneError, SceneManifest, SceneMaps, load_manifest, load_maps
 
 LEGEND_ENTRY_IN, LEGEND_LINE_IN = 1.25, 0.19
 """Inches that an entry of the legend takes across and down."""
@@ -35,12 +32,6 @@ LETTER_IN = 0.05
 """Width of a letter of an object's label, 6 points high."""
 MARGIN_M = 0.3
 """Empty border around the map."""
-VIEWS = {
-    "from above": np.eye(3),
-    "from the front": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
-    "from the side": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
-}
-"""Rows: what runs to the right, what runs up, and what looks at the reader."""
 SURFACE_PIXELS = 480
 """Longer side of a surface's picture; a panel is about as large on the page."""
 COLUMNS, PANEL_IN, LEAST_WIDTH_IN = 3, 3.3, 9.0
@@ -55,15 +46,6 @@ WALL = (0.75, 0.75, 0.75)
 def _geoms(model: mujoco.MjModel) -> list[tuple[str, str, int]]:
     """Return (geom name, body name, geom id) of every geom."""
     return [(model.geom(g).name, model.body(model.geom_bodyid[g]).name, g) for g in range(model.ngeom)]
-
-
-@dataclasses.dataclass(frozen=True)
-class _About:
-    """What is read of object.json."""
-
-    name: str
-    category: str
-    mass_kg: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,25 +69,17 @@ def _frame(axes: Axes, scene: _Scene, title: str) -> None:
     axes.text(left + 0.5, bottom - 0.27, "1 m", ha="center", va="bottom", fontsize=8)
 
 
-def _draw_along(
-    axes: Axes, axes_w: np.ndarray, low: np.ndarray, high: np.ndarray, meshes: Iterable[TexturedMesh], sided: bool
-) -> tuple[float, float, float, float]:
-    """Draw meshes between corners (2,) m along `axes_w`, `sided` without backs; return the picture's extent."""
+def _draw_from_above(axes: Axes, scene: _Scene, meshes: Iterable[TexturedMesh], title: str) -> None:
+    left, right, bottom, top = scene.maps.extent_w
+    low, high = np.array([left, bottom]) - MARGIN_M, np.array([right, top]) + MARGIN_M
     pixel_m = float((high - low).max()) / SURFACE_PIXELS
-    picture = pictures.Picture(*over(axes_w, low, high, pixel_m))
+    picture = pictures.Picture(*over(np.eye(3), low, high, pixel_m))
     for mesh in meshes:
-        picture.draw(mesh, one_sided=sided)
+        picture.draw(mesh)
     rows, columns = picture.image.shape[:2]
     extent = (low[0], low[0] + columns * pixel_m, low[1], low[1] + rows * pixel_m)
     clear = 255 * (picture.image < 255).any(axis=2, keepdims=True).astype(np.uint8)
     axes.imshow(np.dstack([picture.image, clear]), extent=extent, interpolation="nearest")
-    return extent
-
-
-def _draw_from_above(axes: Axes, scene: _Scene, meshes: Iterable[TexturedMesh], title: str, sided: bool = True) -> None:
-    left, right, bottom, top = scene.maps.extent_w
-    low, high = np.array([left, bottom]) - MARGIN_M, np.array([right, top]) + MARGIN_M
-    _draw_along(axes, np.eye(3), low, high, meshes, sided)
     _frame(axes, scene, title)
 
 
@@ -132,7 +106,7 @@ def _draw_ground(axes: Axes, scene: _Scene) -> None:
     axes.imshow(shade, origin="lower", extent=scene.maps.extent_w, interpolation="nearest")
     for name, _, geom in _geoms(scene.model):
         if name.startswith("wall_"):
-            outline = geom_outline(scene.model, scene.data, geom, np.eye(3))
+            outline = geom_outline(scene.model, scene.data, geom)
             axes.fill(*outline.T, facecolor=WALL, edgecolor="0.45", linewidth=0.4)
 
 
@@ -154,7 +128,7 @@ def _draw_objects(axes: Axes, scene: _Scene) -> None:
     colours = {o.name: np.array(CATEGORIES[o.category].preview_colour) for o in scene.manifest.objects}
     meshes = [in_colour(scene.surfaces[name], colour) for name, colour in colours.items()]
     area = f"{scene.manifest.floor_area_m2:.1f} m² traversable"
-    _draw_from_above(axes, scene, meshes, f"{len(meshes)} objects, {area}", sided=False)
+    _draw_from_above(axes, scene, meshes, f"{len(meshes)} objects, {area}")
     names = list(colours)
     metre_in = PANEL_IN / (scene.maps.extent_w[3] - scene.maps.extent_w[2] + 0.5 + MARGIN_M)
     sizes = np.array([(LETTER_IN * len(name) + 0.03, 2.2 * LETTER_IN) for name in names]).reshape(-1, 2) / metre_in
@@ -172,7 +146,7 @@ def _draw_collision(axes: Axes, scene: _Scene, kind: str) -> None:
     for name, body, geom in _geoms(scene.model):
         if body in category and name.startswith(f"{body}_{kind}_"):
             colours.append(CATEGORIES[category[body]].preview_colour)
-            outlines.append(geom_outline(scene.model, scene.data, geom, np.eye(3)))
+            outlines.append(geom_outline(scene.model, scene.data, geom))
     inner = [(*colour, 0.30) for colour in colours]
     axes.add_collection(PolyCollection(outlines, facecolors=inner, edgecolors=colours, linewidths=0.6))
     count = len(outlines)
@@ -181,67 +155,20 @@ def _draw_collision(axes: Axes, scene: _Scene, kind: str) -> None:
     _frame(axes, scene, title)
 
 
-def _placed(scene: _Scene) -> tuple[PlacedObject, ...]:
-    """Return the scene's objects as the cut takes them."""
-    placed = []
-    for item in scene.manifest.objects:
-        vertices, faces = geom_mesh(scene.model, scene.model.geom(f"{item.name}_visual").id)
-        names = [f"{item.name}_hull_{i}" for i in range(item.n_hulls)]
-        hulls = [geom_mesh(scene.model, scene.model.geom(name).id)[0] for name in names]
-        body = scene.model.body(item.name).id
-        mesh, pose = (vertices, faces, np.zeros_like(faces, np.uint8)), (scene.data.xpos[body], scene.data.xquat[body])
-        solids = tuple(convex_hull(h) for h in hulls)
-        placed.append(PlacedObject(item.name, item.category, item.cad_id, *mesh, solids, (), *pose))
-    return tuple(placed)
-
-
-def read_source(source: Path, manifest: SceneManifest, floor_height_m: float) -> RawScene:
-    """Read a scene's raw folder; `floor_height_m`, in the scan's frame, chooses the storey."""
-    from converters.read import source as sources
-    from converters.read.surfaces import split_storeys
-
-    raw = sources.read_source(source)
-    expected = manifest.source.get("sha256", {})
-    strange = sorted(k for k in raw.sources if k in expected and raw.sources[k] != expected[k])
-    if strange or not set(raw.sources) & set(expected):
-        what = f"{strange[0]} differs" if strange else "no file is the same"
-        raise SceneError(f"{source}: is not what {manifest.name} was converted from ({what}); give its --source")
-    floors = split_storeys(raw)
-    return min(floors, key=lambda f: abs((f.floor_height_m or floor_height_m) - floor_height_m))
-
-
-def draw(scene: _Scene, raw: RawScene | None) -> Figure:
-    """Draw two views, and panels: scan, cut and filled where the raw scene is given; objects, hulls and boxes."""
+def draw(scene: _Scene) -> Figure:
+    """Draw two views, and panels of the objects, their hulls and their boxes."""
     left, right, bottom, top = scene.maps.extent_w
     ratio = (right - left + 2 * MARGIN_M) / (top - bottom + 0.5 + MARGIN_M)
-    rows = 2 if raw is not None else 1
     width = max(COLUMNS * PANEL_IN * ratio, LEAST_WIDTH_IN)
     tall = width * SLANTWISE * (0.8 / ratio + 0.12) + 0.3  # of the view from the south
     panel = width / COLUMNS / ratio + 0.3
-    figure = plt.figure(figsize=(width, tall + rows * panel + 0.7), dpi=DPI)
-    places = figure.add_gridspec(1 + rows, COLUMNS, height_ratios=(tall, *[panel] * rows))
+    figure = plt.figure(figsize=(width, tall + panel + 0.7), dpi=DPI)
+    places = figure.add_gridspec(2, COLUMNS, height_ratios=(tall, panel))
     top_row = places[0, :].subgridspec(1, 2, width_ratios=(SLANTWISE, 1 - SLANTWISE))
     slantwise, standing = figure.add_subplot(top_row[0]), figure.add_subplot(top_row[1])
-    panels = [figure.add_subplot(places[row, column]) for row in range(1, 1 + rows) for column in range(COLUMNS)]
     _draw_views(slantwise, standing, scene, width)
 
-    if raw is not None:
-        vertices_w = raw.scan.vertices - [0.0, 0.0, scene.maps.floor_height_m]
-        scan = raw.scan
-        keep = cut_furniture(vertices_w, scan.faces, scan.labels, _placed(scene), scan.furnished).keep
-        for axes, chosen, title in (
-            (panels.pop(0), np.arange(len(keep)), f"scan, {len(keep):,} triangles"),
-            (panels.pop(0), np.flatnonzero(keep), f"cut, {int(keep.sum()):,} triangles left"),
-        ):
-            faces = scan.faces[chosen]
-            if scan.texture is not None and scan.corner_uv is not None:
-                surface = TexturedMesh(vertices_w, faces, scan.corner_uv[chosen], scan.texture)
-            else:
-                assert scan.vertex_colours is not None
-                surface = textured_by_face(vertices_w, faces, scan.vertex_colours[faces].mean(axis=1))
-            _draw_from_above(axes, scene, [surface], title)
-        _draw_from_above(panels.pop(0), scene, [scene.surfaces["structure"]], "filled: the static structure")
-    objects, hulls, boxes = panels
+    objects, hulls, boxes = (figure.add_subplot(places[1, column]) for column in range(COLUMNS))
     _draw_objects(objects, scene)
     _draw_collision(hulls, scene, "hull")
     _draw_collision(boxes, scene, "box")
@@ -257,56 +184,8 @@ def draw(scene: _Scene, raw: RawScene | None) -> Figure:
     return figure
 
 
-def draw_object(folder: Path) -> Figure:
-    """Draw the textured surface, and the hulls and boxes that collide, as the object stands at rest."""
-    described = folder / "object.json"
-    about = SCENES.record(SCENES.json(described), _About, str(described), others=True)
-    name = check_name(about.name, f"{described}: name", SceneError)
-    try:
-        model = mujoco.MjModel.from_xml_path(str(folder / "object.xml"))
-        body = model.body(name).id
-    except (OSError, KeyError, ValueError) as error:
-        raise SceneError(f"{folder}: is no readable object ({error}); convert it again") from error
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    mesh = pictures.world_surfaces(model, data)[name]
-    size_m = float(np.ptp(mesh.vertices, axis=0).max())
-    figure, grid = plt.subplots(2, 3, figsize=(10.5, 7.4), dpi=100)
-    for (title, axes_w), (surface, solid) in zip(VIEWS.items(), grid.T, strict=True):
-        points = mesh.vertices @ axes_w[:2].T
-        low, high = points.min(axis=0) - 0.1 * size_m, points.max(axis=0) + 0.1 * size_m
-        extent = _draw_along(surface, axes_w, low, high, [mesh], sided=False)
-        for geom in np.flatnonzero(model.geom_bodyid == body):
-            box = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX
-            if box or model.geom_contype[geom]:  # else the surface
-                fill, line = ("none", "#b03020") if box else ("#3070c040", "none")
-                outline = geom_outline(model, data, int(geom), axes_w)
-                solid.fill(*outline.T, facecolor=fill, edgecolor=line, linewidth=0.8)
-        for axes in (surface, solid):
-            axes.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
-            axes.axis("off")
-            if title != "from above":
-                axes.axhline(0.0, color="0.6", linewidth=0.8)  # the floor
-        surface.set_title(title, fontsize=10)
-    bar_m = 10.0 ** np.floor(np.log10(size_m))
-    left, bottom = grid[0, 0].get_xlim()[0], grid[0, 0].get_ylim()[0]
-    grid[0, 0].plot([left, left + bar_m], [bottom] * 2, color="black", linewidth=4, solid_capstyle="butt")
-    grid[0, 0].text(left, bottom, f" {100 * bar_m:g} cm", va="bottom", fontsize=8)
-    hulls = sum(model.geom_type[g] == mujoco.mjtGeom.mjGEOM_BOX for g in range(model.ngeom))
-    figure.suptitle(
-        f"{name}: {about.category}, {about.mass_kg:.3g} kg; below: {hulls} hulls (filled) and their boxes (lines)"
-    )
-    figure.tight_layout()
-    return figure
-
-
-def preview(folder: Path, target: Path, source: Path | None = None) -> None:
-    """Draw a scene folder, or an object folder of `python -m converters object`, into a PNG, atomically."""
-    if (folder / "object.json").is_file():
-        if source is not None:
-            raise SceneError(f"{folder}: is a single object, which has no scan to draw; leave --source out")
-        _save(draw_object(folder), target)
-        return
+def preview(folder: Path, target: Path) -> None:
+    """Draw a scene folder into a PNG, atomically."""
     manifest, maps = load_manifest(folder), load_maps(folder)
     try:
         model = spec_for_people(folder).compile()
@@ -317,19 +196,14 @@ def preview(folder: Path, target: Path, source: Path | None = None) -> None:
             raise SceneError(
                 f"{folder / 'scene.xml'}: no body named '{item.name}', which scene.json lists; convert the scene again"
             )
-    raw = read_source(source, manifest, maps.floor_height_m) if source is not None else None
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    _save(draw(_Scene(model, data, manifest, maps, pictures.world_surfaces(model, data)), raw), target, few=True)
-
-
-def _save(figure: Figure, target: Path, few: bool = False) -> None:
+    figure = draw(_Scene(model, data, manifest, maps, pictures.world_surfaces(model, data)))
     with whole_file(target) as picture:
         figure.savefig(picture, format="png", metadata={"Software": None})
-        if few:
-            with Image.open(picture) as image:
-                small = image.convert("RGB").quantize(
-                    COLOURS, method=Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE
-                )
-                small.save(picture, "PNG", compress_level=7)
+        with Image.open(picture) as image:
+            small = image.convert("RGB").quantize(
+                COLOURS, method=Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE
+            )
+            small.save(picture, "PNG", compress_level=7)
     plt.close(figure)

@@ -1,4 +1,4 @@
-"""Download furniture libraries and build the packaged furniture: scaled, simplified, textured, decomposed.
+"""Build the packaged furniture from furniture libraries: scaled, simplified, textured, decomposed.
 
 `selection.yaml` names the models of each category and split; no creator is in both splits.
 """
@@ -8,12 +8,8 @@ import concurrent.futures.process
 import dataclasses
 import functools
 import hashlib
-import io
 import multiprocessing
 import re
-import shutil
-import subprocess
-import tarfile
 import tempfile
 import zipfile
 from collections.abc import Callable, Sequence
@@ -32,7 +28,7 @@ from converters.records.errors import SceneRejected, StageFailed
 from converters.records.raw import TexturedMesh
 from converters.write.texture import bake_object, textured_cloud
 from interactive_nav_common.errors import ConfigError, FileError, readable
-from interactive_nav_common.files import whole_file, whole_folder, write_text
+from interactive_nav_common.files import whole_file, write_text
 from interactive_nav_common.records import Reader
 from scenes_mjcf.categories import CATEGORIES
 
@@ -46,7 +42,9 @@ FILES = {
     "Scopia": "b4505451b1e8ab339c101c0afddfef4e1a07b95aa8c821c61ec41487afd43850",
 }
 """Library -> sha256 of its `.sh3f` in version 1.8; the package's fifth holds people."""
-REMEDY = f"give the package with --from (on Debian: apt-get download {PACKAGE}), or a folder of its .sh3f files"
+REMEDY = (
+    f"give the folder of its .sh3f files (on Debian: apt-get download {PACKAGE}, then dpkg-deb -x {PACKAGE}_*.deb .)"
+)
 _ESCAPE = re.compile(r"\\(?:u([0-9a-fA-F]{4})|(.))")
 
 
@@ -93,7 +91,7 @@ def _piece(library: Path, licence: str, of: dict[str, str]) -> CatalogueModel:
 
 
 def read_catalogue(path: Path) -> tuple[CatalogueModel, ...]:
-    """Read the pieces of a `.sh3f` file, one of those whose digests `checked` knows."""
+    """Read the pieces of a `.sh3f` file, one that `libraries_in` has checked."""
     with readable(path, SceneRejected, "fetch it again", " as a furniture library"), zipfile.ZipFile(path) as archive:
         whole = parse_properties(archive.read(PROPERTIES))
     of: dict[int, dict[str, str]] = {}
@@ -244,50 +242,12 @@ def build(
     return len(done)
 
 
-def library_folder() -> Path:
-    """Return where fetched libraries lie."""
-    return cache_folder().parent / "library" / f"sweethome3d-{VERSION}"
-
-
-def checked(place: Path, name: str, data: bytes | None) -> bytes:
-    """Return the content of a library if it is that of version `VERSION`; `place` is named in errors."""
-    if data is None:
-        raise FileError(f"{place}: holds no {name}.sh3f; {REMEDY}")
-    if hashlib.sha256(data).hexdigest() != FILES[name]:
-        raise FileError(f"{place}: {name}.sh3f is not that of version {VERSION} (sha256 differs); {REMEDY}")
-    return data
-
-
-def fetch(given: Path | None, target: Path, overwrite: bool = False) -> tuple[Path, ...]:
-    """Put all libraries into a folder, atomically; `given` is the Debian package or a folder (None: download it)."""
-    with whole_folder(target, overwrite) as folder, tempfile.TemporaryDirectory(prefix="library-") as scratch:
-        if (place := given) is None:
-            if shutil.which("apt-get") is None:
-                raise FileError(f"{PACKAGE}: apt-get is not here to download it; {REMEDY}")
-            words = ["apt-get", "-qq", "download", PACKAGE]
-            done = subprocess.run(words, cwd=scratch, capture_output=True, text=True)
-            packages = sorted(Path(scratch).glob("*.deb"))
-            if done.returncode or not packages:
-                last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-                raise FileError(f"{PACKAGE}: apt-get cannot download it ({last}); run apt-get update, or {REMEDY}")
-            place = packages[0]
-        files = {path.stem: path for path in sorted(place.rglob("*.sh3f")) if path.stem in FILES}
-        libraries = {k: p.read_bytes() for k, p in files.items()} if place.is_dir() else _of_package(place)
-        for name in FILES:
-            (folder / f"{name}.sh3f").write_bytes(checked(place, name, libraries.get(name)))
-    return tuple(target / f"{name}.sh3f" for name in FILES)
-
-
-def _of_package(path: Path) -> dict[str, bytes]:
-    """Return the libraries in a Debian package: an `ar` archive with a tar in it."""
-    with readable(path, FileError, REMEDY, " as a Debian package"):
-        data = path.read_bytes()
-        at, tar = 8, b""
-        while data.startswith(b"!<arch>\n") and at + 60 <= len(data):
-            size = int(data[at + 48 : at + 58])
-            if data[at : at + 16].startswith(b"data.tar"):
-                tar = data[at + 60 : at + 60 + size]
-            at += 60 + size + size % 2
-        with tarfile.open(fileobj=io.BytesIO(tar)) as archive:
-            inside = [m for m in archive.getmembers() if m.isfile() and m.name.endswith(".sh3f")]
-            return {Path(m.name).stem: file.read() for m in inside if (file := archive.extractfile(m)) is not None}
+def libraries_in(folder: Path) -> tuple[Path, ...]:
+    """Return the `.sh3f` files in or below a folder, all of version `VERSION`."""
+    paths = {path.stem: path for path in sorted(folder.rglob("*.sh3f"))}
+    for name, digest in FILES.items():
+        if name not in paths:
+            raise FileError(f"{folder}: holds no {name}.sh3f; {REMEDY}")
+        if hashlib.sha256(paths[name].read_bytes()).hexdigest() != digest:
+            raise FileError(f"{paths[name]}: is not that of version {VERSION} (sha256 differs); {REMEDY}")
+    return tuple(paths[name] for name in FILES)

@@ -212,19 +212,6 @@ def test_an_object_joins_a_scene_and_rests_there(tmp_path, hull_cache, room):
     assert model.body("new_out").mass == pytest.approx(2.5)
 
 
-def test_the_preview_of_an_object_shows_surface_and_solids(tmp_path, hull_cache):
-    convert_object(write(tmp_path), tmp_path / "out", ObjectConfig(), hull_cache)
-    assert main(["preview", str(tmp_path / "out"), "-o", str(tmp_path / "x.png")]) == 0
-    picture = np.asarray(Image.open(tmp_path / "x.png").convert("RGB")).astype(int)
-    grey = (np.abs(picture - 170).max(axis=2) < 12).mean()
-    blue = (np.abs(picture - [203, 219, 239]).max(axis=2) < 12).mean()
-    assert 0.05 < grey < 0.5 and 0.05 < blue < 0.5
-    assert main(["preview", str(tmp_path / "out"), "-o", str(tmp_path / "y.png"), "--source", str(tmp_path)]) == 2
-    (tmp_path / "out" / "object.json").write_text("{}")
-    assert main(["preview", str(tmp_path / "out"), "-o", str(tmp_path / "y.png")]) == 2
-    assert not (tmp_path / "y.png").exists()
-
-
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("name", "category", "mass_kg", "friction"),

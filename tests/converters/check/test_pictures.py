@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 from trimesh.intersections import slice_faces_plane
 
-from converters.check.pictures import Picture, _taken, at_eye_height, from_the_south, world_surfaces
+from converters.check.pictures import (
+    Picture,
+    _taken,
+    at_eye_height,
+    camera_axes,
+    from_the_south,
+    mesh_picture,
+    world_surfaces,
+)
+from converters.generate.models.cad import cad_model
 from converters.records.raw import TexturedMesh
 from scenes_mjcf.look import GLASS, CameraPose, Lens, look_along, over
 from scenes_mjcf.schema import load_maps
@@ -130,3 +139,20 @@ def test_both_views_of_a_scene_show_an_object(tiny_scene):
     ):
         shown = (picture[..., 0] > 150) & (picture[..., 2] > 150) & (picture[..., 1] < 60)
         assert picture.shape[1] == 120 and 0.01 < shown.mean() < 0.6
+
+
+def test_the_reader_of_a_models_picture_stands_before_right_of_and_above_it():
+    axes = camera_axes()
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert (axes[2] > 0).all() and axes[2, 2] > axes[2, 0] and axes[1, 1] > 0.9 and axes[0, 1] == 0
+
+
+def test_a_model_is_drawn_in_its_colours_and_fills_the_picture():
+    surface = cad_model("Scopia/chair").surface
+    assert surface is not None
+    mesh = TexturedMesh(surface.vertices, surface.faces, surface.uv[surface.uv_faces], surface.image)
+    picture = mesh_picture(mesh, camera_axes(), 120)
+    used = np.argwhere((picture < 255).any(axis=2))
+    assert (used.min(axis=0).min(), used.max(axis=0).max()) == (4, 115)  # it fills 94 % of the longer side
+    shade = picture[tuple(used.T)].max(axis=0)
+    assert (shade <= surface.image.reshape(-1, 3).max(axis=0)).all() and len(used) > 2000

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from converters.library.build import PROPERTIES, fetch, parse_properties, read_catalogue, unpack_model
+from converters.library import build
+from converters.library.build import PROPERTIES, libraries_in, parse_properties, read_catalogue, unpack_model
 from converters.records.errors import SceneRejected
 from interactive_nav_common.errors import FileError
 
@@ -58,18 +60,13 @@ def test_a_broken_archive_is_one_line(tmp_path):
             read_catalogue(tmp_path / "broken.sh3f")
 
 
-def test_libraries_are_fetched_whole_and_checked(tmp_path, monkeypatch):
-    (tmp_path / "given").mkdir()
-    target = tmp_path / "there"
-    with pytest.raises(FileError, match="holds no BlendSwap-CC-0.sh3f; give the package with --from"):
-        fetch(tmp_path / "given", target)
-    write_library(tmp_path / "given" / "BlendSwap-CC-0.sh3f")
-    with pytest.raises(FileError, match=r"BlendSwap-CC-0.sh3f is not that of version 1.8 \(sha256 differs\)"):
-        fetch(tmp_path / "given", target)
-    (tmp_path / "package.deb").write_bytes(b"!<arch>\n" + b"data.tar.xz".ljust(48) + b"4".ljust(10) + b"`\nxxxx")
-    with pytest.raises(FileError, match="not readable as a Debian package"):
-        fetch(tmp_path / "package.deb", target)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(FileError, match="apt-get is not here to download it"):
-        fetch(None, target)
-    assert not target.exists()
+def test_every_library_must_be_there_in_the_version_of_the_digests(tmp_path, monkeypatch):
+    (tmp_path / "usr").mkdir()
+    with pytest.raises(FileError, match="holds no BlendSwap-CC-0.sh3f; give the folder of its .sh3f files"):
+        libraries_in(tmp_path)
+    path = write_library(tmp_path / "usr" / "BlendSwap-CC-0.sh3f")
+    with pytest.raises(FileError, match=r"BlendSwap-CC-0.sh3f: is not that of version 1.8 \(sha256 differs\)"):
+        libraries_in(tmp_path)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    monkeypatch.setattr(build, "FILES", {"BlendSwap-CC-0": digest})
+    assert libraries_in(tmp_path) == (path,)
