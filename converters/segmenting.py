@@ -239,13 +239,13 @@ def proposal_tables(proposed: Any) -> Iterator[Table]:
 
 
 class Propose(WithLibrary):
-    """Find furniture in a labelled scan; write proposals.json, in the format of Scan2CAD, and a picture."""
+    """Find furniture in a labelled scan; write proposals.json in the format of Scan2CAD."""
 
-    WRITES = ("{}/proposals.*",)
+    WRITES = ("{}/proposals.json",)
     source: Annotated[Path, *word("SRC")]
     """Folder of the raw scan, or mesh file."""
     output: Annotated[Path, option("-o", metavar="DIR")]
-    """Folder to write proposals.json and proposals.png to."""
+    """Folder to write proposals.json to."""
     auto_align: Flag = False
     """Also select a CAD model and its pose for each proposal, and compare them with annotations."""
 
@@ -262,7 +262,7 @@ class Propose(WithLibrary):
             proposed = propose(raw, self.output, library, report)
         for table in proposal_tables(proposed):
             console.print(table)
-        console.print(f"{self.output}: proposals.json and proposals.png")
+        console.print(f"{self.output}: proposals.json")
 
 
 class Annotate(MeshFile, WithLibrary):

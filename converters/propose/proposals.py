@@ -14,19 +14,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from shapely import MultiPoint
 
-from converters.bodies.alignment import apply_alignment
 from converters.geometry.boxes import upright_box
 from converters.geometry.faces import face_labels, sample_faces
 from converters.propose import pieces, retrieval
 from converters.propose.pieces import Proposal, bounds, box_iou
 from converters.records.errors import SceneRejected
-from converters.records.raw import CEILING, FLOOR, SYNSETS, UNLABELLED, WALL, Annotation, CadModel, RawScene, ScanMesh
+from converters.records.raw import FLOOR, SYNSETS, UNLABELLED, WALL, Annotation, CadModel, RawScene, ScanMesh
 from converters.structure.clean import fit_floor
-from interactive_nav_common.files import whole_file
+from interactive_nav_common.files import write_text
 from interactive_nav_common.rotations import Y_UP_TO_Z_UP, transform, yaw_matrix
-from scenes_mjcf.categories import CATEGORIES
 
 VOXEL_M = 0.03
 """Chairs that touch at 0.05 m stay apart at 0.03 m in the sample scan."""
@@ -201,59 +198,13 @@ def with_retrieved(raw: RawScene, library_root: Path | None, progress: Callable[
     )
 
 
-def _draw(raw: RawScene, proposed: Proposed, target: Path) -> None:
-    """Draw the scan from above, proposals as boxes with class and confidence, retrieved models as outlines."""
-    import matplotlib  # 0.3 s that no conversion needs
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    from matplotlib.patches import Patch, Polygon
-
-    figure, axes = plt.subplots(figsize=(9, 9), dpi=110)
-    keep = raw.scan.labels != CEILING
-    vertices = raw.scan.vertices[keep]
-    low = vertices[:, 2] < np.percentile(vertices[:, 2], 85)
-    shade = "0.75"
-    if raw.scan.vertex_colours is not None:
-        shade = raw.scan.vertex_colours[keep][low] / 255.0
-    axes.scatter(*vertices[low][:, :2].T, s=0.6, c=shade, alpha=0.5, linewidths=0)
-    for k, proposal in enumerate(proposed.proposals):
-        colour = CATEGORIES[proposal.category].preview_colour
-        square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * proposal.extent_m[:2] / 2
-        corners = square @ yaw_matrix(proposal.yaw)[:2, :2].T + proposal.centre[:2]
-        axes.add_patch(Polygon(corners, fill=False, edgecolor=colour, linewidth=2))
-        text = f"{proposal.category} {proposal.confidence:.2f}"
-        model = proposed.retrieved.get(k)
-        if model is not None:
-            outline = MultiPoint(apply_alignment(model.pose, model.cad.vertices)[:, :2]).convex_hull
-            axes.add_patch(
-                Polygon(np.asarray(outline.exterior.coords), fill=True, alpha=0.25, facecolor=colour, edgecolor=colour)
-            )
-            text += f"\nmodel {model.cad.cad_id[:6]} {model.confidence:.2f}"
-        box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1}
-        x, y = proposal.centre[:2].tolist()
-        axes.text(x, y, text, ha="center", va="center", fontsize=8, bbox=box)
-    for annotation in raw.annotations:
-        hull = MultiPoint(retrieval.annotated_vertices(annotation, raw.cads)[:, :2]).convex_hull
-        axes.plot(*np.asarray(hull.exterior.coords).T, "k:", linewidth=1)
-    shown = sorted({p.category for p in proposed.proposals})
-    handles = [Patch(facecolor="none", edgecolor=CATEGORIES[c].preview_colour, label=c) for c in shown]
-    handles.append(Patch(facecolor="none", edgecolor="black", linestyle=":", label="annotated model"))
-    axes.legend(handles=handles, fontsize=8, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.06), frameon=False)
-    axes.set(aspect="equal", xlabel="x, m (scan frame)", ylabel="y, m (scan frame)")
-    axes.set_title(f"{raw.name}: {len(proposed.proposals)} proposals, class and confidence")
-    figure.tight_layout()
-    figure.savefig(target, metadata={"Software": None})
-    plt.close(figure)
-
-
 def propose(
     raw: RawScene,
     target: Path,
     library: Mapping[str, CadModel] | None = None,
     report: Callable[[str, float], None] = lambda stage, share: None,
 ) -> Proposed:
-    """Propose instances, and models if there is a library, and write both files; older files survive a failure."""
+    """Propose instances, and models if there is a library, and write `proposals.json`, whole or not at all."""
     report("propose", 0.0)
     proposals = propose_instances(raw.scan)
     if not proposals:
@@ -271,10 +222,7 @@ def propose(
                 pair = proposals[at], retrieved[at]
                 comparisons.append(retrieval.compare_retrieval(annotation, raw.cads, *pair, floor))
     proposed = Proposed(proposals, retrieved, tuple(comparisons))
-    report("draw", 0.95)
     text = json.dumps(as_scan2cad(raw.name, proposals, retrieved), indent=1, allow_nan=False) + "\n"
-    with whole_file(target / "proposals.json") as written, whole_file(target / "proposals.png") as picture:
-        written.write_text(text, encoding="utf-8")
-        _draw(raw, proposed, picture)
-    report("draw", 1.0)
+    write_text(target / "proposals.json", text)
+    report("write", 1.0)
     return proposed

@@ -299,16 +299,6 @@ def solid(kind: str, size: np.ndarray) -> TexturedMesh:
     return TexturedMesh(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64), None, None)
 
 
-def height_field(height_m: np.ndarray, half_m: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices and faces of a surface of `height_m` [rows along y, columns along x], centred on the origin."""
-    rows, columns = height_m.shape
-    x, y = np.meshgrid(np.linspace(-half_m[0], half_m[0], columns), np.linspace(-half_m[1], half_m[1], rows))
-    number = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
-    faces = np.vstack([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
-    return np.column_stack([x.ravel(), y.ravel(), height_m.ravel()]), faces
-
-
 def rectangle(x_m: float, y_m: float) -> TexturedMesh:
     """Return an uncoloured rectangle around the origin that looks up, from its half sides."""
     corners = np.array([(-x_m, -y_m, 0), (x_m, -y_m, 0), (x_m, y_m, 0), (-x_m, y_m, 0)], float)

@@ -18,7 +18,7 @@ import numpy as np
 from converters.read.files import SourceFolder, only_file
 from converters.read.homes.parts import LEVEL, HomePart, category_of, home
 from converters.read.obj import TexturedMesh, in_colour
-from converters.read.urdf import SHAPES, height_field, joined, parse_xml, placed, rectangle, solid, trouble
+from converters.read.urdf import SHAPES, joined, parse_xml, placed, rectangle, solid, trouble
 from converters.records.errors import FILES, GEOMS, PIXELS, SceneRejected, check_count, check_image
 from converters.records.raw import RawScene, ScannedHinge
 from interactive_nav_common.rotations import matrix_from_quat, transform
@@ -293,11 +293,6 @@ def _mesh(model: mujoco.MjModel, geom: int, span_m: float) -> TexturedMesh | Non
         # MuJoCo keeps images with their first row at the top and texture coordinates from there.
         image = np.clip(image[..., :3] * rgba[:3], 0, 255).astype(np.uint8)
         return TexturedMesh(vertices, faces, uv.astype(float) * [1.0, -1.0] + [0.0, 1.0], image)
-    if kind == _GEOM.mjGEOM_HFIELD:
-        rows, columns, first = (int(v[data]) for v in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
-        x, y, high, _ = model.hfield_size[data]
-        height_m = high * model.hfield_data[first : first + rows * columns].reshape(rows, columns).astype(float)
-        return in_colour(TexturedMesh(*height_field(height_m, (x, y)), None, None), rgba)
     if kind == _GEOM.mjGEOM_PLANE:
         x, y = (v if v > 0 else span_m for v in size[:2])
         return in_colour(rectangle(x, y), rgba)

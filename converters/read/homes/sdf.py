@@ -19,7 +19,7 @@ import trimesh
 
 from converters.geometry.faces import unit_normals
 from converters.read import urdf
-from converters.read.files import SourceFolder, only_file, read_image
+from converters.read.files import SourceFolder, only_file
 from converters.read.homes.parts import LEVEL, HomePart, home
 from converters.read.meshes import UP_AXES, collada_frame, read_surface
 from converters.read.obj import GREY, TexturedMesh, find_file, in_colour
@@ -116,8 +116,6 @@ def _frame(pose: ElementTree.Element | None) -> str:
 
 DEEPEST = 8
 """Models within models."""
-HEIGHTS = 256
-"""Most columns and rows of a height field that are read."""
 TABLES = read_packaged(Path(__file__).with_suffix(".yaml"), dict[str, dict[str, str]])
 FUEL = re.compile(r"https?://.*/models/([^/]+)(?:/(?:\d+|tip))?(?:/files)?(/.*)?")
 """The address of a model, or of a file of one, on Gazebo's server."""
@@ -313,7 +311,9 @@ class _Reader:
             shape = next((s for g in element.findall("geometry") for s in g), None)
             if shape is None:
                 self.unread[f"<{kind}> without a shape"] += 1
-            elif shape.tag != "empty" and urdf.numbers(element.findtext("transparency"), (0.0,))[0] < 1.0:
+                continue
+            transparency = urdf.numbers(element.findtext("transparency"), (0.0,))[0]
+            if shape.tag not in ("empty", "heightmap") and transparency < 1.0:
                 mesh = self._shape(shape, model.path)
                 if not np.isfinite(mesh.vertices).all() or not len(mesh.faces):
                     raise ValueError(f"a <{shape.tag}> of link '{link.get('name')}' has no usable size")
@@ -322,23 +322,15 @@ class _Reader:
     def _shape(self, shape: ElementTree.Element, path: Path) -> TexturedMesh:
         if shape.findtext("submesh/name"):
             raise ValueError("shows a <submesh>, which is not read; export it to a mesh file of its own")
-        size = shape.findtext("size")
-        if shape.tag in ("mesh", "heightmap"):
+        if shape.tag == "mesh":
             file = self.source.inside(self._find((shape.findtext("uri") or "").strip(), path))
-            if shape.tag == "mesh":
-                matrix = np.diag([*urdf.numbers(shape.findtext("scale"), (1.0, 1.0, 1.0)), 1.0])
-                mesh = read_surface(self.source, file, "")
-                if file.lower().endswith(".dae"):  # Gazebo does not read the axis that points up
-                    matrix[:3, :3] @= UP_AXES[collada_frame(self.source.root / file)[0]].T
-                return urdf.placed(mesh, matrix)
-            at, size_m = urdf.numbers(shape.findtext("pos"), (0.0, 0.0, 0.0)), urdf.numbers(size, (1.0, 1.0, 1.0))
-            grey = read_image(self.source.use(file, ""), "L")[::-1].astype(float)
-            step = max(1, max(grey.shape) // HEIGHTS)
-            height_m = grey[::step, ::step] / max(grey.max(), 1.0) * size_m[2]  # the brightest pixel is that high
-            vertices, faces = urdf.height_field(height_m, (size_m[0] / 2, size_m[1] / 2))
-            return TexturedMesh(vertices + at, faces, None, None)
+            matrix = np.diag([*urdf.numbers(shape.findtext("scale"), (1.0, 1.0, 1.0)), 1.0])
+            mesh = read_surface(self.source, file, "")
+            if file.lower().endswith(".dae"):  # Gazebo does not read the axis that points up
+                matrix[:3, :3] @= UP_AXES[collada_frame(self.source.root / file)[0]].T
+            return urdf.placed(mesh, matrix)
         if shape.tag == "plane":
-            x, y = np.maximum(urdf.numbers(size, (1.0, 1.0)), 1e-3) / 2
+            x, y = np.maximum(urdf.numbers(shape.findtext("size"), (1.0, 1.0)), 1e-3) / 2
             a, b, c = urdf.numbers(shape.findtext("normal"), (0.0, 0.0, 1.0))
             axis, angle = (-b, a, 0.0) if a or b else (1.0, 0.0, 0.0), math.atan2(math.hypot(a, b), c)
             turn = np.asarray(trimesh.transformations.rotation_matrix(angle, axis))

@@ -138,13 +138,7 @@ class _Drawing:
             e = wall.element
             looks = {side: self.models.look(e, f"{side}SideColor", f"{side}SideTexture") for side in ("left", "right")}
             looks["top"] = self.models.look(e, "topColor", "", mean_colour(looks["right"][0]))
-            boards = {}
-            for board in e.findall("baseboard"):
-                side = (board.get("attribute") or "").removesuffix("SideBaseboard")
-                if side in looks and (size := metres(board, "thickness", "height", default=1.0)).min() > 0:
-                    paint = self.models.look(board, "color", "texture", looks[side][0][:1, :1])
-                    boards[side] = (float(size[0]), float(size[1]), paint)
-            part = sh3d_walls.wall_part(wall, openings, looks, boards)
+            part = sh3d_walls.wall_part(wall, openings, looks)
             low = wall.height_m.max() < sh3d_walls.LOW_M
             parts += [] if part is None else [dataclasses.replace(part, low=low)]
         rooms, floors_m, bases = [], set(), sorted(set(self.base_m.values()))

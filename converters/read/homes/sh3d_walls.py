@@ -185,32 +185,21 @@ class Opening:
         return cut if shapely.is_valid(cut) else shapely.make_valid(cut)
 
 
-def wall_part(
-    wall: Wall, openings: list[Opening], looks: dict[str, Look], boards: dict[str, tuple[float, float, Look]]
-) -> HomePart | None:
-    """Return a wall without its openings, with its `boards`: side -> thickness and height, m, and look."""
+def wall_part(wall: Wall, openings: list[Opening], looks: dict[str, Look]) -> HomePart | None:
+    """Return a wall without its openings."""
     sheet = Sheet()
-    ends = np.array([0.0, wall.length_m])
-    outer = shapely.Polygon([(0, 0), (ends[1], 0), (ends[1], wall.height_m[1]), (0, wall.height_m[0])])
+    length = wall.length_m
+    outer = shapely.Polygon([(0, 0), (length, 0), (length, wall.height_m[1]), (0, wall.height_m[0])])
     cuts = [cut for o in openings if (cut := o.within(wall)) is not None]
     region = outer if not cuts else shapely.difference(outer, shapely.union_all(cuts))
-    sides = _side(wall, 0, 0.0), _side(wall, 1, 0.0)
-    _solid(sheet, region, sides, looks, float(wall.height_m.min()))
-    for k, name in enumerate(("left", "right")):
-        if name in boards:
-            thick, high, look = boards[name]
-            low = shapely.intersection(region, shapely.box(-1.0, 0.0, ends[1] + 1.0, high))
-            out = _side(wall, k, thick)
-            pair = (out, sides[0]) if k == 0 else (sides[1], out)
-            _solid(sheet, low, pair, {"left": look, "right": look, "top": look}, high)
+    _solid(sheet, region, (_side(wall, 0), _side(wall, 1)), looks, float(wall.height_m.min()))
     return sheet.part(f"wall {wall.element.get('id') or ''}")
 
 
-def _side(wall: Wall, k: int, out_m: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Return (n, 2) along and above a wall -> (n, 3) on its left (0) or right (1) side, or so far out of it."""
-    sign = 1 if k == 0 else -1
-    ends = wall.corners[k] + sign * out_m * wall.left
-    off = sign * (wall.thickness_m / 2 + out_m) * wall.left
+def _side(wall: Wall, k: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Return (n, 2) along and above a wall -> (n, 3) on its left (0) or right (1) side."""
+    ends = wall.corners[k]
+    off = (1 if k == 0 else -1) * wall.thickness_m / 2 * wall.left
 
     def place(flat: np.ndarray) -> np.ndarray:
         at = wall.ends[0] + flat[:, :1] * wall.along + off
