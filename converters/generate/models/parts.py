@@ -181,6 +181,17 @@ def leaf(base, tip, width, material, thick=0.008) -> Part:
     return hull([p + s * thick / 2 * up for p in rim for s in (-1, 1)], material)
 
 
+def four_legs(width, depth, height, thick, material, square=True) -> list[Part]:
+    """Build legs under the corners of a `width` x `depth` top whose underside is at `height`."""
+    legs = []
+    for sx in (-1, 1):
+        for sz in (-1, 1):
+            x, z = sx * (width / 2 - thick), sz * (depth / 2 - thick)
+            sides, radius = (4, thick * 0.7) if square else (10, (thick * 0.4, thick * 0.6))
+            legs.append(bar((x, 0.0, z), (x, height, z), radius, material, sides))
+    return legs
+
+
 def on_floor(parts) -> list[Part]:
     """Return the same parts, with what leaning bars reach below the floor cut off."""
     low = [part.vertices[:, 1].min() for part in parts]
