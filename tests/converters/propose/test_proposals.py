@@ -233,15 +233,17 @@ def test_propose_writes_json_and_prints_the_comparison(scan2cad_raw, tmp_path, c
 
 @pytest.mark.parametrize("failure", [KeyboardInterrupt(), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))])
 def test_what_fails_leaves_the_older_file(scan2cad_raw, tmp_path, monkeypatch, capsys, failure):
-    (tmp_path / "proposals.json").write_text("older")
+    out = tmp_path / "p"
+    out.mkdir()
+    (out / "proposals.json").write_text("older")
 
     def fail(*_):
         raise failure
 
     monkeypatch.setattr("converters.propose.proposals.as_scan2cad", fail)
-    assert main(["propose", str(scan2cad_raw), "-o", str(tmp_path)]) == (130 if failure.args == () else 2)
+    assert main(["propose", str(scan2cad_raw), "-o", str(out)]) == (130 if failure.args == () else 2)
     assert capsys.readouterr().err.count("\n") == 1
-    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("proposals.json", "older")]
+    assert [(p.name, p.read_text()) for p in out.iterdir()] == [("proposals.json", "older")]
 
 
 def test_propose_refuses_a_scan_without_furniture_labels(gibson_raw, tmp_path, capsys):
