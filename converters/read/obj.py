@@ -29,7 +29,7 @@ UNUSED = ("ke", "map_ke", "map_ka", "map_d", "map_tr", "d", "tr")
 """Statements of an MTL that change what viewers show, unless their numbers are 0 (of `d`: 1)."""
 NUMBERED = {"-o": 0.0, "-s": 1.0, "-t": 0.0, "-mm": 1.0}
 """Options of a texture that take one to three numbers (-mm: two), and the value of absent ones; others take a word."""
-UNUSED_OPTIONS = ("-cc", "-imfchan", "-t")
+UNUSED_OPTIONS = ("-cc", "-clamp", "-imfchan", "-mm", "-t")
 """Options of a texture that change what viewers show."""
 BORDER = 2
 """Texels around each joined image that repeat its edge: smoothed and smaller versions show no neighbour."""
@@ -106,8 +106,7 @@ def read_materials(
                 image_name, placing = texture_options(named, unused)
                 image = read_texture(source, path, image_name)
                 if image is not None and (placing != PLAIN).any():
-                    (base, gain), placings[name] = placing[3], placing
-                    image = np.clip(np.round(255 * base + gain * image.astype(float)), 0, 255).astype(np.uint8)
+                    placings[name] = placing
                 result[name] = result[name] if image is None else image
         source.note_counts(f"{source.relative(path)}: not used:", +unused, " ")
     return result, placings
@@ -151,15 +150,14 @@ def parse_mtl(text: str) -> dict[str, tuple[tuple[int, int, int], str]]:
     return result
 
 
-PLAIN = np.array([[1.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 1.0]])
+PLAIN = np.array([[1.0, 1.0], [0.0, 0.0]])
 """`texture_options` of a texture without options."""
 
 
 def texture_options(text: str, unused: collections.Counter[str]) -> tuple[str, np.ndarray]:
     """Split a `map_Kd` into file name and options, and count the options that are not supported.
 
-    The options (4, 2) are the scale and the offset of texture coordinates, clamp or repeat (1 or 0), and the base and
-    gain of the image.
+    The options (2, 2) are the scale and the offset of texture coordinates.
     """
     placing = PLAIN.copy()
     while len(words := text.split(None, 1)) > 1 and words[0].startswith("-"):
@@ -173,10 +171,9 @@ def texture_options(text: str, unused: collections.Counter[str]) -> tuple[str, n
             if not text:
                 return "", placing
         if option not in NUMBERED:
-            word, text = [*text.split(None, 1), "", ""][:2]
-            placing[2] = word.lower() == "on" if option == "-clamp" else placing[2]
-        elif option != "-t":
-            placing[("-s", "-o", "", "-mm").index(option)] = [*values, NUMBERED[option], NUMBERED[option]][:2]
+            text = " ".join(text.split(None, 1)[1:])
+        elif option in ("-s", "-o"):
+            placing[("-s", "-o").index(option)] = [*values, NUMBERED[option], NUMBERED[option]][:2]
     return text, placing
 
 
@@ -233,11 +230,8 @@ def read_painted_obj(
     for k, name in enumerate(mesh.materials):
         of = mesh.material == k
         if name in placings and of.any():
-            scale, offset, clamped, _ = placings[name]
-            modes = ("clamp", "clamp") if clamped.any() else ("repeat", "repeat")
-            uv[of], _, across = wrapped(uv[of] * scale + offset, [chosen[k]], modes)
-            if across:
-                source.note(f"{relative}: faces of '{name}' lie across a texture's edge: stretched there")
+            scale, offset = placings[name]
+            uv[of] = uv[of] * scale + offset
     plain = np.array([image.shape[:2] == (1, 1) for image in chosen])[number]
     if mesh.colours is not None and plain.any():
         # Viewers differ in what colours of vertices do to a texture: there they are left out.
