@@ -32,6 +32,13 @@ COLLADA_UNUSED = (
     "colours of vertices beside a material",
     "textures that do not repeat",
 )
+PLY_USED = {"element vertex", "element face"} | {
+    f"property {name}"
+    for name in (
+        *("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", "s", "t", "u", "v", "texture_u"),
+        *("texture_v", "vertex_index", "vertex_indices", "texcoord"),
+    )
+}
 UP_AXES = {
     "X_UP": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
     "Y_UP": Y_UP_TO_Z_UP,
@@ -107,24 +114,39 @@ def _read_surface(source: SourceFolder, relative: str, remedy: str) -> obj.Textu
             raise
     if resolver.refusal is not None:
         raise resolver.refusal from None
-    if path.suffix.lower() == ".dae":
-        source.note_counts(f"{relative}: not used:", _unused(path), " ")
+    source.note_counts(f"{relative}: not used:", _unused(path), " ")
     if not parts:
         raise SceneRejected(f"{path}: holds no triangle mesh; export it as OBJ, PLY, STL or GLB")
     return obj.join_meshes(*parts)
 
 
 def _unused(path: Path) -> dict[str, int]:
-    """Count what trimesh's reader of COLLADA passes over."""
-    root = ElementTree.parse(path).getroot()
-    elements = collections.Counter(e.tag.rpartition("}")[2] for e in root.iter())
-    glow = ((e.findtext("{*}color") or "1").split()[:3] for e in root.iterfind(".//{*}emission"))
-    elements["emission"] = sum(any(as_number(value) > 0 for value in colour) for colour in glow)
-    modes = (e.text or "" for tag in ("wrap_s", "wrap_t") for e in root.iterfind(f".//{{*}}{tag}"))
-    elements["textures that do not repeat"] = sum(mode.strip() not in ("", "WRAP") for mode in modes)
-    painted = (e for e in root.iter() if e.get("material") and e.find("{*}input[@semantic='COLOR']") is not None)
-    elements["colours of vertices beside a material"] = sum(1 for _ in painted)
-    return {what: count for what, count in elements.items() if count and what in COLLADA_UNUSED}
+    """Count what trimesh's readers pass over."""
+    if path.suffix.lower() == ".dae":
+        root = ElementTree.parse(path).getroot()
+        elements = collections.Counter(e.tag.rpartition("}")[2] for e in root.iter())
+        glow = ((e.findtext("{*}color") or "1").split()[:3] for e in root.iterfind(".//{*}emission"))
+        elements["emission"] = sum(any(as_number(value) > 0 for value in colour) for colour in glow)
+        modes = (e.text or "" for tag in ("wrap_s", "wrap_t") for e in root.iterfind(f".//{{*}}{tag}"))
+        elements["textures that do not repeat"] = sum(mode.strip() not in ("", "WRAP") for mode in modes)
+        painted = (e for e in root.iter() if e.get("material") and e.find("{*}input[@semantic='COLOR']") is not None)
+        elements["colours of vertices beside a material"] = sum(1 for _ in painted)
+        return {what: count for what, count in elements.items() if count and what in COLLADA_UNUSED}
+    content = path.read_bytes()
+    if path.suffix.lower() == ".ply":
+        lines = [line.split() for line in content.partition(b"end_header")[0].decode("latin-1").splitlines()]
+        words = [f"{line[0]} {line[-1] if line[0] == 'property' else line[1]}" for line in lines if len(line) > 2]
+        return collections.Counter(w for w in words if w.startswith(("property", "element")) and w not in PLY_USED)
+    if path.suffix.lower() == ".stl" and len(content) == 84 + 50 * int.from_bytes(content[80:84], "little"):
+        colours = np.frombuffer(content, np.uint8, offset=84).reshape(-1, 50)[:, 48:]
+        return {"colours of faces": count} if (count := int(colours.any(axis=1).sum())) else {}
+    if path.suffix.lower() == ".off":
+        rows = [line.partition("#")[0].split() for line in content.decode("latin-1").splitlines()]
+        body = [row for row in rows if row][1:]
+        coloured = [row for row in body if row[0].isdigit() and len(row) > int(row[0]) + 1 > 3]
+        counts = {"colours of faces": len(coloured), "colours of vertices": int(content.lstrip()[:1] == b"C")}
+        return {what: count for what, count in counts.items() if count}
+    return {}
 
 
 def read_single_mesh(

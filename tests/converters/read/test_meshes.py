@@ -204,7 +204,7 @@ PLACES = np.array([(448262.0001, 5411932.0003, 520.00001), (448263, 5411932.0003
 
 
 @pytest.mark.parametrize(("kind", "order"), [("ascii", "<"), ("binary_little_endian", "<"), ("binary_big_endian", ">")])
-def test_doubles_of_a_ply_keep_all_digits(tmp_path, kind, order):
+def test_doubles_of_a_ply_keep_all_digits_and_other_properties_are_said(tmp_path, kind, order):
     fields = [("x", "double"), ("y", "double"), ("z", "double"), ("quality", "float"), ("red", "uchar"),
               ("green", "uchar"), ("blue", "uchar")]  # fmt: skip
     head = f"ply\nformat {kind} 1.0\nelement vertex 3\n" + "".join(f"property {t} {name}\n" for name, t in fields)
@@ -217,6 +217,30 @@ def test_doubles_of_a_ply_keep_all_digits(tmp_path, kind, order):
     mesh = read_surface(source, "m.ply", "")
     np.testing.assert_array_equal(mesh.vertices, PLACES)
     assert tuple(colours_of_faces(mesh)[0]) == (60, 90, 160)
+    assert source.warnings == ["m.ply: not used: 1 property quality"]
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", []),
+        ("COFF\n3 1 0\n0 0 0 9 9 9 9\n1 0 0 9 9 9 9\n0 1 0 9 9 9 9\n3 0 1 2\n", ["1 colours of vertices"]),
+        ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2 200 0 0\n", ["1 colours of faces"]),
+    ],
+)
+def test_colours_of_an_off_file_are_said(tmp_path, text, what):
+    (tmp_path / "m.off").write_text(text)
+    source = SourceFolder(tmp_path)
+    assert len(read_surface(source, "m.off", "").faces) == 1
+    assert source.warnings == [f"m.off: not used: {each}" for each in what]
+
+
+def test_colours_of_an_stl_file_are_reported(tmp_path):
+    triangle = np.array([(0, 0, 1), (0, 0, 0), (1, 0, 0), (0, 1, 0)], "<f4").tobytes()
+    (tmp_path / "m.stl").write_bytes(b" " * 80 + struct.pack("<I", 2) + (triangle + b"\0\0") + (triangle + b"\x1f\x80"))
+    source = SourceFolder(tmp_path)
+    assert len(read_surface(source, "m.stl", "").faces) == 2
+    assert source.warnings == ["m.stl: not used: 1 colours of faces"]
 
 
 def test_textures_of_a_collada_file_that_do_not_repeat_are_reported(tmp_path):
