@@ -38,6 +38,8 @@ CAMERA_PIXELS = 68
 """Depth and mask are rendered at the resolution of the paper's policies (section V)."""
 _CAMERA_LAG_S = 1.0
 """The camera behind the robot turns smoothly: a Gaussian of this width over its heading."""
+_BESIDE_M, _BESIDE_RAD = (2.0, 2.0), 1.8
+"""How far from the robot and how high the camera of the view `beside` is, and how far from straight behind."""
 _HOLD_S = 1.5
 """The last picture stays so long."""
 
@@ -52,58 +54,62 @@ class Compositor:
         the robot's camera.
         """
         check_height(height)
-        check_replay_scene(replay, scene)
+        if scene.digest != replay.scene_digest:
+            raise ReplayError(
+                f"{scene.path}: scene.xml or maps.npz has changed since the replay was recorded; "
+                "record the episode again"
+            )
         self.replay, self.height, self.views = replay, height, tuple(views)
         self._columns, self._strip = height * 4 // 3, height // 6
         self.size = len(views) * self._columns or self._columns + height // 3, height + self._strip
         """Columns and rows of a frame."""
-        robot = get_robot(replay.robot)
-        self._middle_m = 0.6 * robot.height_m
-        self._view = drawing.SceneView(robot, scene, replay.small, replay.segmentation_classes)
+        self._view = drawing.SceneView(get_robot(replay.robot), scene, replay.small, replay.segmentation_classes)
+        self._middle_m = 0.6 * self._view.robot.height_m
         yaw = np.unwrap(yaw_from_quat(replay.body_quat_w[:, 0]))
         self._yaw = gaussian_filter1d(yaw, _CAMERA_LAG_S / replay.control_dt_s, mode="nearest")
         self._target = gaussian_filter1d(replay.body_pos_w[:, 0], 0.2 / replay.control_dt_s, axis=0, mode="nearest")
-        self._cameras = {view: self._positions(view) for view in self.views if view in drawing.BEHIND_M}
+        self._cameras = {view: self._positions(view) for view in self.views if view != "above"}
         # Pillow's font has spaces of 0.2 em, which round to nothing between some letters of small sizes.
         self._font = ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf"), height / 28)
 
     def frame(self, step: int) -> np.ndarray:
         """Draw [rows, columns, 3] u8: the state after `step` control steps."""
-        replay, height = self.replay, self.height
-        self._place(step)
+        view, replay, height = self._placed(step), self.replay, self.height
         paint = drawing.FloorPaint(replay.goal_xy_w, replay.success_distance_m, _dense(replay.robot_xy_w[: step + 1]))
         if self.views:
-            panes = [self._view.textured(*self._camera(v, step), (*SCENE, ROBOT), paint) for v in self.views]
+            panes = [view.textured(*self._camera(v, step), (*SCENE, ROBOT), paint) for v in self.views]
             return np.concatenate([np.concatenate(panes, 1), self._caption(step)], 0)
         camera = drawing.chase_camera(self._target[step], float(self._yaw[step]), height, self._columns)
-        behind = self._view.render(*camera, drawing.OUTSIDE, paint)["rgb"]
+        behind = view.render(*camera, drawing.OUTSIDE, paint)["rgb"]
         side = height // 3
-        cameras = [drawing.robot_camera(self._view, n, n, replay.image_fov_deg) for n in (side, CAMERA_PIXELS)]
-        colour, image = self._view.render(*cameras[0], SCENE)["rgb"], self._view.render(*cameras[1], SCENE)
+        cameras = [drawing.robot_camera(view, n, n, replay.image_fov_deg) for n in (side, CAMERA_PIXELS)]
+        colour, image = view.render(*cameras[0], SCENE)["rgb"], view.render(*cameras[1], SCENE)
         depth_m, mask = image["depth"], image["segmentation"]
         small = [drawing.depth_picture(depth_m), drawing.mask_picture(mask, depth_m, replay.segmentation_classes)]
         large = (Image.fromarray(x).resize((side, side), Image.Resampling.NEAREST) for x in small)
         picture = np.concatenate([behind, np.concatenate([colour, *map(np.asarray, large)], 0)], 1)
         return np.concatenate([picture, self._caption(step)], 0)
 
-    def _place(self, step: int) -> None:
+    def _placed(self, step: int) -> drawing.SceneView:
         self._view.place(self.replay.bodies, self.replay.body_pos_w[step], self.replay.body_quat_w[step])
+        return self._view
 
     def _positions(self, view: str) -> np.ndarray:
-        """Return [T + 1, 3] m: behind the robot and in front of walls and furniture, without jerks."""
-        back_m, up_m = drawing.BEHIND_M[view]
-        steps = _CAMERA_LAG_S / self.replay.control_dt_s
-        # Behind where it goes, not where it looks: a robot turns on the spot.
-        ahead = gaussian_filter1d(np.gradient(self._target[:, :2], axis=0), 2 * steps, axis=0, mode="nearest")
+        """Return [T + 1, 3] m: behind or beside the robot and in front of walls and furniture, without jerks."""
+        back_m, up_m = drawing.BEHIND_M.get(view, _BESIDE_M)
+        steps, up_m, best = _CAMERA_LAG_S / self.replay.control_dt_s, up_m - self._middle_m, (-1.0, np.zeros(3))
+        # Behind where it goes, not where it looks: a robot turns on the spot. It backs off from what it pulls, however.
+        moved = np.gradient(self._target[:, :2], axis=0)
+        forward = np.cos(self._yaw) * moved[:, 0] + np.sin(self._yaw) * moved[:, 1] >= 0
+        ahead = gaussian_filter1d(np.where(forward[:, None], moved, -moved), 2 * steps, axis=0, mode="nearest")
         yaw = gaussian_filter1d(np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])), steps, mode="nearest")
-        back = np.stack([-back_m * np.cos(yaw), -back_m * np.sin(yaw), 0 * yaw + up_m - self._middle_m], -1)
         target = self._target * [1, 1, 0] + [0, 0, self._middle_m]
-        share = []
-        for step, way in enumerate(zip(target, back, strict=True)):
-            self._place(step)
-            share.append(clear_way(self._view, *way))
-        share = gaussian_filter1d(minimum_filter1d(share, max(1, round(2 * steps))), steps / 2, mode="nearest")
-        return target + share[:, None] * back
+        for turn in (-_BESIDE_RAD, _BESIDE_RAD) if view == "beside" else (0.0,):  # the side with more room
+            back = np.stack([-back_m * np.cos(yaw + turn), -back_m * np.sin(yaw + turn), 0 * yaw + up_m], -1)
+            share = [clear_way(self._placed(i), *way) for i, way in enumerate(zip(target, back, strict=True))]
+            share = gaussian_filter1d(minimum_filter1d(share, max(1, round(2 * steps))), steps / 2, mode="nearest")
+            best = max(best, (share.sum(), target + share[:, None] * back), key=lambda side: side[0])
+        return best[1]
 
     def _camera(self, view: str, step: int) -> tuple[CameraPose, Lens]:
         if view != "above":
@@ -122,7 +128,7 @@ class Compositor:
         about = f"reward {replay.reward[:step].sum():6.2f}   force {replay.force_n[at] if step else 0.0:5.1f} N   "
         about += f"touches {touched}" * bool(step)
         if step == replay.num_steps:
-            about = "reached the goal" if scores["success"] else "did not reach the goal"
+            about = "succeeded" if scores["success"] else "failed"
             for name, key in (("P_eff", "path_efficiency"), ("E_eff", "effort_efficiency"), ("INS_0.5", "ins_0.5")):
                 about += f"   {name} {scores[key]:.2f}"
         where = f"{replay.policy}  episode {replay.episode}  {Path(replay.scene).name}  {replay.label}"
@@ -142,14 +148,6 @@ def check_format(path: Path) -> None:
     """Raise `ReplayError` unless a video can be written to a file of that ending."""
     if path.suffix not in FORMATS:
         raise ReplayError(f"{path}: ends in '{path.suffix}', expected one of {', '.join(FORMATS)}")
-
-
-def check_replay_scene(replay: Replay, scene: Scene) -> None:
-    """Raise `ReplayError` unless the scene's files are those that the replay was recorded in."""
-    if scene.digest != replay.scene_digest:
-        raise ReplayError(
-            f"{scene.path}: scene.xml or maps.npz has changed since the replay was recorded; record the episode again"
-        )
 
 
 def _dense(path: np.ndarray, step_m: float = 0.03) -> np.ndarray:
@@ -225,7 +223,7 @@ class Picture(Command):
     """Write a Rerun recording to this file instead of a video."""
     height: int = 360
     """Height of the view from behind in pixels, a multiple of 12 from 120 on."""
-    views: Annotated[tuple[Literal["eye", "follow", "above"], ...], option()] = ()
+    views: Annotated[tuple[Literal["eye", "follow", "beside", "above"], ...], option()] = ()
     """Textured views to show side by side, instead of the default layout."""
     every: AtLeastOne = 1
     """Number of control steps between two frames."""

@@ -279,7 +279,7 @@ def test_words_of_a_caption_stand_apart_within_the_frame(played, room, height):
         ]
         # Spaces are 0.32 em, the letters at most 0.15 em from each other.
         words = {0: "0.0 s reward 0.00 force 0.0 N", 20: "2.0 s reward 0.0 force 0.0 N touches nothing"}
-        end = "6.0 s did not reach the goal P_eff 0.0 E_eff 0.0 INS_0.5 0.0"
+        end = "6.0 s failed P_eff 0.0 E_eff 0.0 INS_0.5 0.0"
         count = len(words.get(step, end).split())
         assert sum(gap >= 0.2 * height / 28 + 0.9 for gap in gaps) in (count - 1, count), (step, gaps)
 
@@ -318,6 +318,17 @@ def test_a_film_from_eye_height_and_from_above(played, tmp_path, engine):
     red, green, blue = frame[int(row), int(column)].astype(int)
     assert green > red + 15 and green > blue + 15
     assert np.abs(frame[:120, :160].astype(int) - frame[0, 0]).max() > 50
+
+
+def test_a_camera_stays_behind_or_beside_a_robot_that_backs_off(played, room):
+    pos_w, quat = played.body_pos_w.copy(), played.body_quat_w.copy()
+    pos_w[:, 0, :2] = np.stack([np.linspace(1.0, 0.0, len(pos_w)), np.zeros(len(pos_w))], -1)
+    quat[:, 0] = IDENTITY
+    backs = dataclasses.replace(played, body_pos_w=pos_w, body_quat_w=quat)  # along -x, looking along +x
+    film = record.Compositor(backs, load_scene(room), height=120, views=("eye", "beside"))
+    for view, turn_rad in (("eye", 0.0), ("beside", record._BESIDE_RAD)):
+        away = film._cameras[view][:, :2] - film._target[:, :2]
+        np.testing.assert_allclose(np.abs(np.arctan2(away[:, 1], -away[:, 0])), turn_rad, atol=1e-3)
 
 
 def test_a_gif_and_refusals(played, room, two_rooms, tmp_path, capsys):
