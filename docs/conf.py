@@ -1,10 +1,12 @@
 """Sphinx's settings: `make docs` builds this folder into docs/_build/html."""
 
+import re
 import sys
 from pathlib import Path
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
+from sphinx.ext.napoleon.docstring import GoogleDocstring
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -29,6 +31,7 @@ html_theme_options = {
 }
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
+toc_object_entries_show_parents = "hide"
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_mock_imports = ["rsl_rl", "skrl", "stable_baselines3", "tensordict", "torch"]
@@ -44,6 +47,28 @@ def formula(page, node):
     raise nodes.SkipNode
 
 
+def break_tables(app, doctree, docname):
+    """Let long code in tables break between its words, and keep each interval `[low, high]` on one line."""
+    for cell in doctree.findall(nodes.entry):
+        for text in list(cell.findall(nodes.Text)):
+            if not isinstance(text.parent, nodes.literal):
+                together = re.sub(r"\[-?\d[^\]]*\]", lambda found: found[0].replace(" ", "\N{NO-BREAK SPACE}"), text)
+                text.parent.replace(text, nodes.Text(together))
+            elif len(text) > 16:
+                first, *others = re.split(r"(?<=[_/,=])(?=[A-Za-z])|(?<=\.)(?=[A-Za-z]\w{3})", text)
+                parts = [part for word in others for part in (nodes.raw("", "<wbr>", format="html"), nodes.Text(word))]
+                text.parent.replace(text, [nodes.Text(first), *parts])
+
+
+def shorten_signature(app, what, name, obj, options, signature, returns):
+    """Leave out the signature of a class of settings, which would repeat all the fields below it."""
+    return ("", returns) if what == "class" and len(signature or "") > 500 else None
+
+
 def setup(app):
-    """Register the renderer that `html_math_renderer` names."""
+    """Register the renderer that `html_math_renderer` names, and what makes tables and the API readable."""
+    # Napoleon takes an attribute's words before the first colon for its type.
+    GoogleDocstring._parse_attribute_docstring = lambda docstring: list(docstring._lines)
+    app.connect("doctree-resolved", break_tables)
+    app.connect("autodoc-process-signature", shorten_signature)
     app.add_html_math_renderer("mathml", (formula, None), (formula, None))

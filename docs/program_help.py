@@ -11,6 +11,8 @@ import importlib
 import importlib.util
 import io
 import os
+import re
+import textwrap
 from collections.abc import Iterator, Mapping
 from typing import Any
 from unittest import mock
@@ -38,8 +40,14 @@ def help_of(module: str) -> dict[str, str]:
             program.main([*words, "--help"])
         if not printed.getvalue():
             raise ValueError(f"{module}: no help; expected a program that prints it with --help")
-        texts[" ".join(["python -m", module, *words])] = printed.getvalue()
+        texts[" ".join(["python -m", module, *words])] = "\n".join(map(_wrapped, printed.getvalue().splitlines()))
     return texts
+
+
+def _wrapped(line: str) -> str:
+    """Return a line that is too long on several lines, indented as its description."""
+    name = re.match(r" *(?:\S+ +(?=\S))?", line) if line.startswith("  ") else None
+    return textwrap.fill(line, COLUMNS, subsequent_indent=" " * len(name[0] if name else "")) if line else line
 
 
 def _commands(commands: Mapping[str, Any]) -> Iterator[list[str]]:

@@ -7,6 +7,8 @@ block is left out only where an HTML comment right before it says why: `<!-- not
 from __future__ import annotations
 
 import contextlib
+import functools
+import http.server
 import importlib
 import importlib.util
 import inspect
@@ -15,7 +17,9 @@ import itertools
 import re
 import shlex
 import sys
+import threading
 import traceback
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 from unittest.mock import patch
@@ -27,6 +31,7 @@ from sphinx.application import Sphinx
 
 from interactive_nav.__main__ import PROGRAMS
 from interactive_nav.config import make_config
+from tests.converters.annotate.chromium import tab, until
 
 ROOT = Path(__file__).parents[1]
 README_WORDS = 700
@@ -307,11 +312,17 @@ def formulas(text: str) -> list[str]:
     return [t.content for token in top for t in (token, *(token.children or ())) if t.type.startswith("math_")]
 
 
-@pytest.mark.filterwarnings("ignore:.*Check CHANGES for Sphinx API")  # of MyST's use of Sphinx
-def test_the_site_works_without_network(tmp_path):
-    docs, site = ROOT / "docs", tmp_path / "site"
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The folder of the documentation as HTML."""
+    docs, made = ROOT / "docs", tmp_path_factory.mktemp("site")
     left_out = {"exclude_patterns": ["_build", "api.md", "commands.md"]}  # these import or run every program
-    Sphinx(docs, docs, site, tmp_path / "trees", "html", left_out, status=None, warning=None).build()
+    with warnings.catch_warnings(action="ignore"):  # of MyST's use of Sphinx
+        Sphinx(docs, docs, made, made / "trees", "html", left_out, status=None, warning=None).build()
+    return made
+
+
+def test_the_site_works_without_network(site):
     pages = {page.name: page.read_text(encoding="utf-8") for page in site.glob("*.html")}
     assert {name: found for name, html in pages.items() if (found := from_the_network(html))} == {}
     sources = {f"{p.stem}.html": len(formulas(p.read_text(encoding="utf-8"))) for p in PAGES[1:]}
@@ -326,3 +337,55 @@ def test_a_page_that_loads_from_the_network_is_found():
     html = f'<script defer="defer" src="{cdn}"></script><script src="_static/site.js"></script><a href="{cdn}">a</a>'
     assert from_the_network(html) == [cdn]
     assert formulas("$a_1$ for `$S`\n\n```sh\necho $HOME $S\n```\n\n$$\nb\n$$\n") == ["a_1", "\nb\n"]
+
+
+FAULTS = """
+(async () => {
+  const frame = document.createElement("iframe");
+  frame.style = "position: fixed; inset: 0; width: 1400px; height: 900px";
+  frame.src = "PAGE";
+  document.body.append(frame);
+  await new Promise(done => frame.onload = done);
+  const page = frame.contentDocument, faults = [];
+  const scrolls = [...page.querySelectorAll(".table-wrapper")].filter(table => table.scrollWidth > table.clientWidth);
+  faults.push(...scrolls.map(table => "scrolls at 1400 px: " + table.textContent.trim().slice(0, 40)));
+  const menu = page.querySelector(".sidebar-scroll");
+  if (menu && menu.scrollHeight > menu.clientHeight) faults.push("the sidebar is higher than 900 px");
+  faults.push(...[...page.images].filter(i => !i.naturalWidth).map(i => "no picture: " + i.getAttribute("src")));
+  frame.style.width = "400px";
+  if (page.documentElement.scrollWidth > 400) faults.push("wider than 400 px");
+  frame.remove();
+  return faults;
+})()
+"""
+
+
+def test_pages_fit_wide_and_narrow_windows(site, tmp_path):
+    wide = '<div class="table-wrapper" style="overflow: auto"><p style="width: 1500px">A row</p></div>'
+    page = f'<!doctype html>{wide}<img src="gone.png"><p style="width: 500px">A line'
+    (site / "wrong.html").write_text(page, encoding="utf-8")
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(site))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            with tab(f"http://127.0.0.1:{server.server_address[1]}/index.html", tmp_path / "profile") as browser:
+                until(lambda: browser.evaluate("document.readyState === 'complete'"), what="the page")
+                found = {}
+                for page in site.glob("*.html"):
+                    script = FAULTS.replace("PAGE", page.name)
+                    result = browser.send("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
+                    found[page.name] = result["result"]["value"]
+        finally:
+            server.shutdown()
+    wrong = ["scrolls at 1400 px: A row", "no picture: gone.png", "wider than 400 px"]
+    assert len(found) > 50
+    assert {page: faults for page, faults in found.items() if faults} == {"wrong.html": wrong}
+
+
+def test_tables_keep_intervals_together_and_let_code_break(site):
+    cells = re.findall(r"<td>.*?</td>", (site / "design.html").read_text("utf-8"), re.DOTALL)
+    assert any(">jax_</span><wbr><span" in cell for cell in cells)
+    cells = re.findall(r"<td>.*?</td>", (site / "tables-cluttered.html").read_text("utf-8"), re.DOTALL)
+    intervals = [found for cell in cells for found in re.findall(r"\[-?\d[^]]*\]", cell)]
+    assert len(intervals) > 100
+    assert [interval for interval in intervals if ",\N{NO-BREAK SPACE}" not in interval] == []

@@ -58,6 +58,13 @@ def test_help_is_that_of_the_parser_and_of_its_commands():
     assert list(told) == ["python -m interactive_nav.episodes", "python -m interactive_nav.episodes make"]
     assert "--num-objects" in told["python -m interactive_nav.episodes make"]
     assert max(len(line) for text in told.values() for line in text.splitlines()) <= 100
+
+
+def test_long_descriptions_keep_their_column():
+    lines = help_of("converters")["python -m converters"].splitlines()
+    (first,) = (k for k, line in enumerate(lines) if line.startswith("  convert "))
+    assert max(map(len, lines)) <= 100
+    assert lines[first + 1].index("folder") == lines[first].index("Convert")
     assert "generate-scenes" in help_of("interactive_nav")["python -m interactive_nav"]
     with pytest.raises(AttributeError):
         help_of("train.config")
