@@ -14,6 +14,7 @@ from scenes_mjcf.categories import MaskClasses
 
 OBSERVATIONS = ("goal", "velocity", "waypoints")
 """Parts of the observation by default."""
+Task = Literal["reach", "open", "clear", "fetch"]
 SIGNALS = (*OBSERVATIONS, "localisation", "odometry", "collision", "joints", "lidar", "hand")
 """Parts of the state vector."""
 IMAGES = ("depth", "segmentation", "rgb", "normals")
@@ -27,7 +28,7 @@ ORIGINAL_CODE: dict[str, Any] = VARIANTS["code"]
 class TaskRules(Settings):
     """What the task is: goals, rewards, objects, what an action commands, and how episodes are scored."""
 
-    task: Literal["reach", "open", "clear", "fetch"] = "reach"
+    task: Task = "reach"
     """Task: reach a place, open (a door by 60 degrees or a drawer by 0.2 m), clear (reach a place behind a door that
     must be pulled) or fetch (touch furniture of a given category). Open and clear start with all doors shut."""
     control_mode: str = "native"

@@ -13,13 +13,14 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import interactive_nav
+from interactive_nav.config import Task
 from interactive_nav.navigation.lookup import geodesic_at, goal_field
 from interactive_nav.navigation.ways import Ways
 from interactive_nav.scenes.scene import TASK_DIGEST
@@ -274,7 +275,7 @@ class Make(Command):
     """Random seed of the episodes."""
     num_objects: Natural = 10
     """Number of small objects in each episode."""
-    task: Literal["reach", "open", "clear", "fetch"] = "reach"
+    task: Task = "reach"
     """Task of the episodes (the setting `env.task`)."""
     objects: Annotated[tuple[str, ...], option(metavar="OBJECT_DIR")] = ()
     """Folders of small objects to use (default: the built-in ones)."""

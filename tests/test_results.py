@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import dataclasses
 import importlib.util
 import itertools
 import json
@@ -22,6 +23,7 @@ from interactive_nav_common.rows import read_rows, where
 from interactive_nav_common.statistics import estimate
 from topological_nav.evaluate.scores import differences, markdown, summary, text
 from topological_nav.tables import tables as topological_tables
+from train.config_io import load_config
 from train.figures import tables
 from train.runs.run import config_to_play
 from train.runs.run_folder import RunFolder
@@ -68,7 +70,8 @@ def test_every_run_is_whole_and_says_where_it_comes_from():
 
 def test_runs_above_the_planners_played_the_same_episodes_as_these():
     kept = ROOT / "results" / "above"
-    rows, planned = (pandas.read_parquet(kept / f"{name}.parquet") for name in ("episodes", "planners"))
+    full, rest, planned = (pandas.read_parquet(kept / f"{x}.parquet") for x in ("episodes", "ablations", "planners"))
+    rows = pandas.concat([full, rest])
     assert {path.name for path in (kept / "runs").iterdir()} == set(rows.run)
     played = pandas.concat([rows, planned.assign(run=planned.policy)]).groupby(["robot", "run"])
     assert set(played.episode.nunique()) == set(played.size()) == {1000}
@@ -83,13 +86,36 @@ def test_runs_above_the_planners_played_the_same_episodes_as_these():
         config = RunFolder(run).read_config()
         assert config.network.memory == "gru" and config.env.k_int == 0
         assert len(read_metrics(run / PACKED_METRICS)) >= 10
-    policies = sorted(path.parts[-4] for path in kept.rglob("policy.safetensors"))
-    assert policies == ["fetch-seed0", "turtlebot-seed0"]
-    # By hand, from the rows of one cell: the TurtleBot's five seeds.
-    of_seeds = rows[rows.robot == "turtlebot"].groupby("run").agg(mean=("ins_0.5", "mean"))
-    means = of_seeds["mean"].to_numpy()
+    for robot in ("turtlebot", "fetch"):  # the packaged policies are those of seed 0
+        packaged = ROOT / "train" / "policies" / f"{robot}_above"
+        assert RunFolder(packaged).read_config() == RunFolder(kept / "runs" / f"{robot}-seed0").read_config()
+        (meta,) = packaged.glob("checkpoints/000013107200/meta.json")
+        assert json.loads(meta.read_text())["robot"] == robot
+    # By hand, from the rows of one cell: the TurtleBot's success without masks.
+    (without_masks,) = (x for _, x in rest.groupby("run") if "nomasks" in x.run.iloc[0])
+    mean = without_masks.success.sum() / len(without_masks)
     page = (ROOT / "docs" / "results-planners.md").read_text()
-    assert f"| {sum(means) / len(means):.3f} [{min(means):.3f}, {max(means):.3f}] |" in page
+    assert f"| the same without masks | {mean:.3f} |" in page
+
+
+def test_policies_that_open_doors_played_the_same_episodes_and_were_trained_by_the_preset():
+    kept, preset = ROOT / "results" / "tasks", load_config("fetch_hook")
+    rows = pandas.read_parquet(kept / "episodes.parquet")
+    unseen = rows[~rows.scene.str.startswith("cluttered")].fillna({"seed": -1})
+    for _, played in unseen.groupby(["task", "robot"]):
+        of_each = played.groupby(["policy", "seed"]).shortest_path_m
+        assert set(of_each.size()) == {100} and len(of_each) >= 3
+        np.testing.assert_allclose(of_each.sum(), played.shortest_path_m.sum() / len(of_each), rtol=1e-6)
+    assert {path.name for path in (kept / "runs").iterdir()} == set(unseen[unseen.policy == "learned"].run)
+    for run in (kept / "runs").iterdir():
+        config, task = RunFolder(run).read_config(), run.name.partition("-")[0]
+        assert config.env.task == task
+        assert dataclasses.replace(config.env, task="clear", backend="auto") == preset.env
+        assert (config.ppo, config.network) == (preset.ppo, preset.network)
+    # By hand, from the rows of one cell.
+    opened = unseen.query("task == 'clear' and policy == 'learned'").groupby("seed").success.sum()
+    page = (ROOT / "docs" / "results.md").read_text()
+    assert f"| `clear` | fetch, `learned` | {opened.sum() / 300:.3f} [" in page and len(opened) == 3
 
 
 def test_runs_in_cluttered_homes_played_the_same_episodes_and_say_where_they_come_from():
