@@ -124,7 +124,7 @@ def homes() -> dict[str, Target]:
     return {
         "sdf": _layout("sdf", fresh(test_sdf.write_world, test_sdf.ROOM + test_sdf.THINGS + test_sdf.MORE)),
         "habitat": _layout("habitat", fresh(test_habitat.write_home, test_habitat.SCENE_OBJECTS)),
-        "mjcf": _layout("mjcf", fresh(test_mjcf.write_room, test_mjcf.HFIELD), start="home.xml"),
+        "mjcf": _layout("mjcf", fresh(test_mjcf.write_room), start="home.xml"),
         "sh3d": _layout("sh3d", test_sh3d.write_home, "flat.sh3d", start="flat.sh3d"),
     }
 

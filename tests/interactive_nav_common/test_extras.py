@@ -47,6 +47,7 @@ USES: list[tuple[str, str, Callable[[], Any]]] = [
 ]
 """Extra, the module that it brings, and a use of it."""
 GUARDED = {
+    "docs/conf.py": {"sphinx"},
     "docs/program_help.py": {"sphinx"},  # which imports it
     "interactive_nav/interop/gym_env.py": {"gymnasium"},  # says the line
     "interactive_nav/physics/warp_callbacks.py": {"warp"},  # after `resolve_backend`, as the next
