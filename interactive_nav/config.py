@@ -15,6 +15,7 @@ from scenes_mjcf.categories import MaskClasses
 OBSERVATIONS = ("goal", "velocity", "waypoints")
 """Parts of the observation by default."""
 Task = Literal["reach", "open", "clear", "fetch"]
+"""Names of the tasks; `TaskRules.task` describes them."""
 SIGNALS = (*OBSERVATIONS, "localisation", "odometry", "collision", "joints", "lidar", "hand")
 """Parts of the state vector."""
 IMAGES = ("depth", "segmentation", "rgb", "normals")

@@ -1,6 +1,6 @@
 """Run `python -m topological_nav COMMAND`.
 
-Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when stopped: the same command resumes.
+Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when stopped.
 """
 
 import importlib
@@ -202,7 +202,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         run = f"run_{type(arguments).__name__.lower()}"
         getattr(importlib.import_module(f"topological_nav.{module}"), run)(arguments)
     except (Stopped, KeyboardInterrupt) as stopped:  # the latter: outside of loops that stop between two steps
-        print("topological_nav: stopped; the same command goes on", file=sys.stderr)
+        print("topological_nav: stopped; give the same command again", file=sys.stderr)
         return 128 + number_of(stopped)
     return 0
 

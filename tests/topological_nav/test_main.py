@@ -111,7 +111,7 @@ def test_a_stop_before_the_work_begins_is_one_line(monkeypatch, capsys):
 
     monkeypatch.setattr("topological_nav.commands.run_data", stopped)
     assert main(["data", "nowhere"]) == 128 + signal.SIGINT
-    assert capsys.readouterr().err == "topological_nav: stopped; the same command goes on\n"
+    assert capsys.readouterr().err == "topological_nav: stopped; give the same command again\n"
 
 
 def test_a_room_classifier_judges_no_passages(made, capsys, tmp_path):

@@ -117,7 +117,7 @@ def test_a_stop_while_scoring_is_one_line_and_the_same_command_scores(
     with monkeypatch.context() as patch:
         patch.setattr(training, "_scores", lambda *_: signal.raise_signal(number))
         assert main(command) == 128 + number
-    assert capsys.readouterr().err == "topological_nav: stopped; the same command goes on\n"
+    assert capsys.readouterr().err == "topological_nav: stopped; give the same command again\n"
     assert not (tmp_path / "run" / "results.json").exists()
     assert main(command) == 0 and "epoch" not in capsys.readouterr().out
     results = [json.loads((run / "results.json").read_text()) for run in (tmp_path / "run", whole[0])]
