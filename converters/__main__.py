@@ -238,7 +238,7 @@ COMMANDS: dict[str, Any] = {
     "generate": generating.Generate,
     "generate-scenes": generating.GenerateScenes,
     "scenes": {"list": generating.ListScenes, "make": generating.MakeScenes},
-    "library": {"build": generating.Build, "list": generating.ListModels},
+    "library": {"list": generating.ListModels},
     "preview": Preview,
     "export": Export,
 }

@@ -160,27 +160,6 @@ class ListScenes(Command):
             print(f"{'-':<10} {'-':<6} {scene.relative_to(sets.HERE).as_posix():<15} {scene}")
 
 
-class Build(Command):
-    """Rebuild the packaged selection of furniture: models.zip and ATTRIBUTION.md."""
-
-    WRITES = ("{}/*",)
-    out: Annotated[Path, *word("OUT")]
-    """Folder to write both files to."""
-    given: Annotated[Path, option(name="from", metavar="DIR")]
-    """Folder that contains the .sh3f files of Debian's package sweethome3d-furniture 1.8, unpacked."""
-    jobs: Annotated[AtLeastOne, option(metavar="N")] = CORES
-    """Number of models to process in parallel."""
-
-    def run(self, console: Console) -> None:
-        """Run the command."""
-        from converters.library.build import build, libraries_in
-
-        files = libraries_in(self.given)
-        with stage_progress(console) as report:
-            count = build(files, self.out, self.jobs, report)
-        console.print(f"{self.out}: {count} models with their hulls, and ATTRIBUTION.md")
-
-
 class ListModels(Command):
     """List the packaged models with their category, size and credits."""
 

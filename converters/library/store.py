@@ -6,7 +6,6 @@ Frame of a model: metres, y up, front along +z, the middle of its base at the or
 import dataclasses
 import functools
 import io
-import json
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,10 +25,7 @@ STEPS = 65535
 """Coordinates are kept in so many steps of the model's bounding box: 0.05 mm of 3 m."""
 COLOURS = 96
 """Of a model's image, as it is given out: so that scenes keep it in a palette."""
-QUALITY = 80
-"""Of an image as it is packaged, in WebP's scale: off by about two levels of 256."""
 REINSTALL = "install the package again"
-_DAY = (1980, 1, 1, 0, 0, 0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,64 +65,15 @@ class Shape:
     hulls: tuple[Hull, ...]
 
 
-def _packed(values: np.ndarray, low: np.ndarray | float, span: np.ndarray | float) -> np.ndarray:
-    return np.rint((values - low) / span * STEPS).astype(np.uint16)
-
-
-def _planes(table: np.ndarray) -> np.ndarray:
-    """Return (2, columns, rows) bytes of the steps from row to row of a table (rows, columns): they pack to less."""
-    steps = np.diff(table.T, axis=1, prepend=np.uint16(0))
-    return np.stack([steps & 255, steps >> 8]).astype(np.uint8)
-
-
 def _table(planes: np.ndarray) -> np.ndarray:
     steps = planes[0].astype(np.uint16) | planes[1].astype(np.uint16) << 8
     return np.cumsum(steps, axis=1, dtype=np.uint16).T
-
-
-def _by_use(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return points in the order in which faces name them, and how far each corner lies behind the next new point."""
-    flat = faces.ravel()
-    first = np.unique(flat, return_index=True)[1]
-    order = flat[np.sort(first)]
-    place = np.zeros(len(points), np.int64)
-    place[order] = np.arange(len(order))
-    new = np.isin(np.arange(len(flat)), first)
-    behind = (np.cumsum(new) - new) - place[flat]
-    return points[order], behind.astype(np.uint16).reshape(-1, 1)
 
 
 def _faces(behind: np.ndarray) -> np.ndarray:
     flat = behind.ravel().astype(np.int64)
     new = flat == 0
     return ((np.cumsum(new) - new) - flat).reshape(-1, 3)
-
-
-def write_library(path: Path, models: Sequence[tuple[Model, Shape]]) -> None:
-    """Write the archive: the same models, the same bytes."""
-    with zipfile.ZipFile(path, "w") as archive:
-
-        def put(name: str, data: bytes) -> None:
-            archive.writestr(zipfile.ZipInfo(name, _DAY), data, zipfile.ZIP_LZMA)
-
-        index = [dataclasses.asdict(model) for model, _ in models]
-        put("index.json", json.dumps(index, indent=1, sort_keys=True).encode())
-        for model, shape in models:
-            visual, hulls, buffer, image = shape.visual, shape.hulls, io.BytesIO(), io.BytesIO()
-            points = np.vstack([visual.vertices, *(hull.vertices for hull in hulls)])
-            low, span = points.min(axis=0), np.maximum(np.ptp(points, axis=0), 1e-6)
-            tables = (
-                *_by_use(_packed(visual.vertices, low, span), visual.faces),
-                *_by_use(_packed(np.clip(visual.uv, 0, 1), 0.0, 1.0), visual.uv_faces),
-                _packed(np.vstack([h.vertices for h in hulls]), low, span),
-                np.vstack([h.faces for h in hulls]).astype(np.uint16),
-                np.array([(len(h.vertices), len(h.faces)) for h in hulls], np.uint16),
-            )
-            for array in (np.stack([low, span]), *map(_planes, tables)):
-                np.lib.format.write_array(buffer, array, allow_pickle=False)
-            put(f"{model.name}.arrays", buffer.getvalue())
-            Image.fromarray(visual.image).save(image, "WEBP", quality=QUALITY, method=6)
-            put(f"{model.name}.webp", image.getvalue())
 
 
 def attribution(models: Sequence[Model]) -> str:
