@@ -27,10 +27,10 @@ MAX_TEXTURE_PX = 8192
 """Textures of several materials are joined in an image of at most this width; wider ones are shrunk."""
 UNUSED = ("ke", "map_ke", "map_ka", "map_d", "map_tr", "d", "tr")
 """Statements of an MTL that change what viewers show, unless their numbers are 0 (of `d`: 1)."""
-NUMBERED = {"-o": 0.0, "-s": 1.0, "-t": 0.0, "-mm": 1.0}
-"""Options of a texture that take one to three numbers (-mm: two), and the value of absent ones; others take a word."""
-UNUSED_OPTIONS = ("-cc", "-clamp", "-imfchan", "-mm", "-t")
+UNUSED_OPTIONS = ("-cc", "-clamp", "-imfchan", "-mm", "-o", "-s", "-t")
 """Options of a texture that change what viewers show."""
+NUMBERED = {"-mm": (2, None), "-o": (3, 0.0), "-s": (3, 1.0), "-t": (3, 0.0)}
+"""Options that take so many numbers or fewer, and the number that changes nothing; others take a word."""
 BORDER = 2
 """Texels around each joined image that repeat its edge: smoothed and smaller versions show no neighbour."""
 SMALL_IMAGE = 10_000
@@ -76,10 +76,8 @@ def use_named(source: SourceFolder, folder: Path, name: str, by: str) -> Path | 
     return source.use(relative, "")
 
 
-def read_materials(
-    source: SourceFolder, obj: Path, libraries: tuple[str, ...]
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return the image (h, w, 3) uint8 of every material of an OBJ's MTL files, and the known `texture_options`.
+def read_materials(source: SourceFolder, obj: Path, libraries: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Return the image (h, w, 3) uint8 of every material of an OBJ's MTL files.
 
     A material without a usable texture has one pixel of its colour (Kd).
     """
@@ -94,7 +92,6 @@ def read_materials(
             f"{where}: its material file {', '.join(libraries) or '(none named)'} is missing; it stays grey"
         )
     result: dict[str, np.ndarray] = {}
-    placings: dict[str, np.ndarray] = {}
     for path in paths:
         text = read_text(path)
         unused: collections.Counter[str] = collections.Counter()
@@ -103,13 +100,10 @@ def read_materials(
         for name, (colour, named) in parse_mtl(text).items():
             result[name] = np.array(colour, np.uint8).reshape(1, 1, 3)
             if named:
-                image_name, placing = texture_options(named, unused)
-                image = read_texture(source, path, image_name)
-                if image is not None and (placing != PLAIN).any():
-                    placings[name] = placing
+                image = read_texture(source, path, texture_name(named, unused))
                 result[name] = result[name] if image is None else image
         source.note_counts(f"{source.relative(path)}: not used:", +unused, " ")
-    return result, placings
+    return result
 
 
 def read_texture(source: SourceFolder, by: Path, name: str) -> np.ndarray | None:
@@ -150,55 +144,16 @@ def parse_mtl(text: str) -> dict[str, tuple[tuple[int, int, int], str]]:
     return result
 
 
-PLAIN = np.array([[1.0, 1.0], [0.0, 0.0]])
-"""`texture_options` of a texture without options."""
-
-
-def texture_options(text: str, unused: collections.Counter[str]) -> tuple[str, np.ndarray]:
-    """Split a `map_Kd` into file name and options, and count the options that are not supported.
-
-    The options (2, 2) are the scale and the offset of texture coordinates.
-    """
-    placing = PLAIN.copy()
-    while len(words := text.split(None, 1)) > 1 and words[0].startswith("-"):
-        option, text = words[0].lower(), words[1]
-        unused[option] += option in UNUSED_OPTIONS
-        values: list[float] = []
-        most = 2 if option == "-mm" else 3
-        while option in NUMBERED and len(values) < most and math.isfinite(as_number(text.split(None, 1)[0])):
-            first, *rest = text.split(None, 1)
-            values, text = [*values, float(first)], "".join(rest)
-            if not text:
-                return "", placing
-        if option not in NUMBERED:
-            text = " ".join(text.split(None, 1)[1:])
-        elif option in ("-s", "-o"):
-            placing[("-s", "-o").index(option)] = [*values, NUMBERED[option], NUMBERED[option]][:2]
-    return text, placing
-
-
-def wrapped(
-    uv: np.ndarray, images: list[np.ndarray], modes: tuple[str, str]
-) -> tuple[np.ndarray, list[np.ndarray], bool]:
-    """Return texture coordinates and images that repeat, equivalent to those of other wrapping modes.
-
-    `uv` (m, 3, 2) has its origin at the lower left, `images` are of one size, `modes` (`repeat`, `mirror` or `clamp`)
-    are along u and v. Return also whether each face crosses an edge at which its texture is clamped.
-    """
-    across = False
-    for k, mode in enumerate(modes):
-        beyond = (uv[..., k] < -1e-3) | (uv[..., k] > 1 + 1e-3)
-        if mode == "repeat" or not beyond.any():
-            continue
-        uv, axis = uv.copy(), 1 - k
-        if mode == "mirror":
-            images = [np.concatenate([i, np.flip(i, axis)][:: 1 - 2 * k], axis) for i in images]
-            uv[..., k] /= 2
-        else:
-            half = 0.5 / images[0].shape[axis]
-            uv[..., k] = np.clip(uv[..., k], half, 1 - half)
-            across = across or bool((beyond.any(axis=1) & ~beyond.all(axis=1)).any())
-    return uv, images, across
+def texture_name(text: str, unused: collections.Counter[str]) -> str:
+    """Return the file name in a `map_Kd` without the options before it; count those that viewers would show."""
+    while text.startswith("-") and len(words := text.split()) > 1:
+        option = words[0].lower()
+        most, plain = NUMBERED.get(option, (1, None))
+        values = [as_number(word) for word in words[1 : 1 + most]]
+        taken = next((k for k, v in enumerate(values) if math.isnan(v)), most) if option in NUMBERED else 1
+        unused[option] += option in UNUSED_OPTIONS and any(value != plain for value in values[:taken])
+        text = "".join(text.split(None, 1 + taken)[1 + taken :])
+    return text
 
 
 def read_painted_obj(
@@ -215,7 +170,7 @@ def read_painted_obj(
         source.note(f"{relative}: has no texture; it stays grey")
         return mesh, np.zeros(len(mesh.faces), np.int64), []
     no_file = not mesh.libraries and (builtin is not None or mesh.colours is not None)
-    images, placings = ({}, {}) if no_file else read_materials(source, path, mesh.libraries)
+    images = {} if no_file else read_materials(source, path, mesh.libraries)
     default = builtin or (lambda _: GREYS)
     chosen = [images[name] if name in images else default(name) for name in mesh.materials]
     absent = sorted({n for n in mesh.materials if n not in images})
@@ -227,11 +182,6 @@ def read_painted_obj(
         number[number < 0] = len(chosen)
         chosen.append(next(iter(images.values())) if len(images) == 1 else default(""))
     uv = np.zeros((len(mesh.faces), 3, 2)) if mesh.corner_uv is None else mesh.corner_uv.copy()
-    for k, name in enumerate(mesh.materials):
-        of = mesh.material == k
-        if name in placings and of.any():
-            scale, offset = placings[name]
-            uv[of] = uv[of] * scale + offset
     plain = np.array([image.shape[:2] == (1, 1) for image in chosen])[number]
     if mesh.colours is not None and plain.any():
         # Viewers differ in what colours of vertices do to a texture: there they are left out.

@@ -19,40 +19,38 @@ from PIL import Image
 from trimesh.visual.color import linear_to_srgb, srgb_to_linear
 
 from converters.read.files import SourceFolder, check_mesh
-from converters.read.obj import join_textures, read_texture, textured_by_face, use_named, wrapped
+from converters.read.obj import join_textures, read_texture, textured_by_face, use_named
 from converters.records.errors import NUMBERS, PIXELS, SceneRejected, check_count
 from converters.records.raw import TexturedMesh
 from interactive_nav_common.errors import typed
 from interactive_nav_common.records import Reader
 from interactive_nav_common.rotations import transformed
 
-READ = {f"KHR_materials_{name}" for name in ("pbrSpecularGlossiness", "unlit", "emissive_strength")}
-READ |= {"KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp", "EXT_mesh_gpu_instancing"}
+READ = {"KHR_materials_pbrSpecularGlossiness", "KHR_materials_unlit", "KHR_materials_emissive_strength"}
+READ |= {"KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"}
 """Extensions; others are refused where a file requires them, and reported where it only uses them."""
 COMPRESSED = {f"{by}_meshopt_compression": "meshopt" for by in ("EXT", "KHR")} | {"KHR_draco_mesh_compression": "Draco"}
 USED = ("POSITION", "NORMAL", "TANGENT", "COLOR_0", "TEXCOORD_0")
 """Attributes, besides the texture coordinates that a material names."""
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-TRIANGLES, STRIP, FAN = 4, 5, 6
+TRIANGLES, REPEAT = 4, 10497
 TRIMESH_GREY = 0.4
-WRAPPING = {33071: "clamp", 33648: "mirror"}
 TINTS = 16
 """Copies of a texture, in different colours of vertices, that a primitive may need."""
 
 
 @dataclasses.dataclass(frozen=True)
-class _Layer:
-    """A linear colour (3,), times a texture."""
+class _Paint:
+    """What a material shows: a linear colour (3,), times a texture, and the linear light (3,) that it emits."""
 
     colour: np.ndarray
+    emitted: np.ndarray
     image: np.ndarray | None = None
     coordinates: str = ""
     """Attribute."""
     matrix: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(3))
     """(3, 3) of the texture's coordinates, their origin at the upper left."""
-    modes: tuple[str, str] = ("repeat", "repeat")
-    """How the texture wraps along its two coordinates."""
 
 
 def read_gltf(source: SourceFolder, path: Path) -> list[TexturedMesh]:
@@ -86,7 +84,6 @@ class _File:
         self._check()
         self.buffers: dict[int, bytes] = {}
         self.images: dict[int, np.ndarray | None] = {}
-        self.painted: dict[tuple[Any, ...], np.ndarray] = {}
         self.unused: collections.Counter[str] = collections.Counter()
         for key in ("animations", "cameras", "skins"):
             self.unused[key] += len(self.tree.get(key, []))
@@ -137,18 +134,11 @@ class _File:
                     f"{self.path}: bones move its node '{nodes[k].get('name', k)}'; apply the armature and export again"
                 )
             mesh = self.tree["meshes"][nodes[k]["mesh"]]
-            weights = nodes[k].get("weights", mesh.get("weights", []))
-            copies = [np.eye(4)]  # in the node's frame
-            given = nodes[k].get("extensions", {}).get("EXT_mesh_gpu_instancing", {}).get("attributes")
-            if given is not None:
-                keys = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}
-                values = {keys[name]: self._accessor(i) for name, i in given.items() if name in keys}
-                copies = [_pose(dict(zip(values, row, strict=True))) for row in zip(*values.values(), strict=True)]
+            self.unused["shape keys (morph targets)"] += any("targets" in part for part in mesh["primitives"])
             for part in mesh["primitives"]:
-                for copy in copies:
-                    meshes += self._primitive(part, pose @ copy, weights)
-                    faces += len(meshes[-1].faces) if meshes else 0
-                    check_count(self.path, faces, NUMBERS, "faces in its nodes", "simplify it")
+                meshes += self._primitive(part, pose)
+                faces += len(meshes[-1].faces) if meshes else 0
+                check_count(self.path, faces, NUMBERS, "faces in its nodes", "simplify it")
         return meshes
 
     def _bytes(self, item: Any, what: str) -> bytes:
@@ -171,13 +161,6 @@ class _File:
             self.buffers[number] = self._bytes(buffer, "buffer") if "uri" in buffer else self.binary
         return memoryview(self.buffers[number])[start : start + view["byteLength"]]  # type: ignore[return-value]
 
-    def _array(self, at: Any, kind: str, count: int, width: int, stride: int = 0) -> np.ndarray:
-        row = np.dtype(kind).itemsize * width
-        if stride and stride < row:
-            raise ValueError(f"a byteStride of {stride}")
-        strides = (stride or row, np.dtype(kind).itemsize)
-        return np.ndarray((count, width), kind, self._view(at["bufferView"]), at.get("byteOffset", 0), strides)
-
     def _accessor(self, k: int, width: int = 0, normalized: bool = False) -> np.ndarray:
         """Return (count, width) numbers, normalised ones as floats; with `width`, of no other width."""
         a = self.tree["accessors"][k]
@@ -187,82 +170,76 @@ class _File:
                 f"{self.path}: accessor {k} is of type {a['type']!s:.20}, expected "
                 f"{next((w for w, n in WIDTHS.items() if n == width), 'a scalar or vector')}; export it again"
             )
-        values = np.zeros((count, columns), kind)
-        if "bufferView" in a:
-            stride = self.tree["bufferViews"][a["bufferView"]].get("byteStride", 0)
-            values = self._array(a, kind, count, columns, stride)
         if "sparse" in a:
-            sparse, values = a["sparse"], values.copy()
-            at = self._array(sparse["indices"], COMPONENTS[sparse["indices"]["componentType"]], sparse["count"], 1)
-            values[at[:, 0]] = self._array(sparse["values"], kind, sparse["count"], columns)
+            raise SceneRejected(f"{self.path}: accessor {k} is sparse, which is not read; export it without shape keys")
+        values, row = np.zeros((count, columns), kind), np.dtype(kind).itemsize * columns
+        if "bufferView" in a:
+            stride = self.tree["bufferViews"][a["bufferView"]].get("byteStride", 0) or row
+            if stride < row:
+                raise ValueError(f"a byteStride of {stride}")
+            strides = (stride, row // columns)
+            values = np.ndarray(values.shape, kind, self._view(a["bufferView"]), a.get("byteOffset", 0), strides)
         if (normalized or a.get("normalized")) and values.dtype.kind in "iu":
             return np.maximum(values / np.iinfo(values.dtype).max, -1.0)
         return values.astype(float if values.dtype.kind == "f" else np.int64)
 
-    def _primitive(self, part: Any, pose: np.ndarray, weights: Any) -> list[TexturedMesh]:
-        """Return a primitive as one mesh; nothing of points and lines."""
-        mode, attributes = part.get("mode", TRIANGLES), part["attributes"]
-        if mode not in (TRIANGLES, STRIP, FAN):
-            self.unused["primitives of points or lines"] += 1
+    def _primitive(self, part: Any, pose: np.ndarray) -> list[TexturedMesh]:
+        """Return a primitive's triangles as one mesh; nothing of other kinds."""
+        attributes = part["attributes"]
+        if part.get("mode", TRIANGLES) != TRIANGLES:
+            self.unused["primitives other than triangles (points, lines, strips or fans)"] += 1
             return []
         vertices = self._accessor(attributes["POSITION"], 3).astype(float)
-        for weight, target in zip(weights, part.get("targets", []), strict=False):
-            vertices += weight * self._accessor(target["POSITION"], 3) if weight and "POSITION" in target else 0.0
         index = self._accessor(part["indices"], 1)[:, 0] if "indices" in part else np.arange(len(vertices))
-        k = np.arange(max(len(index) - 2, 0))
-        if mode == TRIANGLES:
-            faces = index[: len(index) // 3 * 3].reshape(-1, 3)
-        else:
-            corners = [k, k + 1 + k % 2, k + 2 - k % 2] if mode == STRIP else [k + 1, k + 2, 0 * k]
-            faces = index[np.stack(corners, axis=1)]
+        faces = index[: len(index) // 3 * 3].reshape(-1, 3)
         if not len(faces):
             return []
         check_mesh(self.path, vertices, faces)
         vertices = transformed(vertices, pose)
         faces = faces[:, ::-1] if np.linalg.det(pose[:3, :3]) < 0 else faces
         check_mesh(self.path, vertices, faces)
-        layers = self._layers(self.tree["materials"][part["material"]]) if "material" in part else None
-        named = {layer.coordinates for layer in layers or []}
-        for name in attributes.keys() - named - set(USED):
+        paint = self._material(self.tree["materials"][part["material"]]) if "material" in part else None
+        for name in attributes.keys() - {paint and paint.coordinates} - set(USED):
             self.unused[f"attributes {name:.40}"] += 1
-        if layers is None and "COLOR_0" not in attributes:
+        if paint is None and "COLOR_0" not in attributes:
             return [TexturedMesh(vertices, faces, None, None)]
         light = np.ones((len(faces), 3))
         if "COLOR_0" in attributes:
             light = self._light(self._accessor(attributes["COLOR_0"], normalized=True)[:, :3])[faces].mean(axis=1)
-        return [self._paint(vertices, faces, layers or [_Layer(np.ones(3))], light, attributes)]
+        return [self._painted(vertices, faces, paint or _Paint(np.ones(3), np.zeros(3)), light, attributes)]
 
     def _light(self, colours: np.ndarray) -> np.ndarray:
         return srgb_to_linear(np.clip(colours, 0.0, 1.0)) if self.srgb else colours
 
-    def _layers(self, material: Any) -> list[_Layer]:
+    def _material(self, material: Any) -> _Paint:
         """Return what a material reflects of white light, and what it emits."""
         more = material.get("extensions", {})
         pbr, gloss = material.get("pbrMetallicRoughness", {}), more.get("KHR_materials_pbrSpecularGlossiness")
-        base = ("baseColorFactor", "baseColorTexture") if gloss is None else ("diffuseFactor", "diffuseTexture")
+        at, factor, texture = pbr, "baseColorFactor", "baseColorTexture"
+        if gloss is not None:
+            at, factor, texture = gloss, "diffuseFactor", "diffuseTexture"
         alpha = pbr.get("baseColorFactor", (1.0,))[-1] < 1 or "baseColorTexture" in pbr
         self.unused["transparency of materials"] += alpha and material.get("alphaMode", "OPAQUE") != "OPAQUE"
         strength = more.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
-        layers = [self._layer(pbr if gloss is None else gloss, *base, np.ones(3))]
-        emitted = self._layer(material, "emissiveFactor", "emissiveTexture", np.zeros(3))
-        return [*layers, dataclasses.replace(emitted, colour=emitted.colour * strength)]
-
-    def _layer(self, at: Any, factor: str, texture: str, default: np.ndarray) -> _Layer:
-        colour = np.array(at.get(factor, default), float)[:3] + np.zeros(3)
+        emitted = strength * self._light(np.array(material.get("emissiveFactor", np.zeros(3)), float))
+        if "emissiveTexture" in material and emitted.any():
+            self.unused["emissive textures"] += 1
+            emitted = np.zeros(3)
+        colour = np.array(at.get(factor, np.ones(3)), float)[:3]
         if self.srgb:
-            colour = default if texture in at and np.allclose(colour, TRIMESH_GREY) else self._light(colour)
+            colour = np.ones(3) if texture in at and np.allclose(colour, TRIMESH_GREY) else self._light(colour)
         if texture not in at or not colour.any():
-            return _Layer(colour)
+            return _Paint(colour, emitted)
         info = at[texture]
         of = self.tree["textures"][info["index"]]
-        image, sampler = self._image(of), self.tree["samplers"][of["sampler"]] if "sampler" in of else {}
-        modes = [WRAPPING.get(sampler.get(key, 0), "repeat") for key in ("wrapS", "wrapT")]
+        sampler = self.tree["samplers"][of["sampler"]] if "sampler" in of else {}
+        modes = [sampler.get(key, REPEAT) for key in ("wrapS", "wrapT")]
+        self.unused["clamped or mirrored textures (they repeat)"] += modes != [REPEAT] * 2
         moved = info.get("extensions", {}).get("KHR_texture_transform", {})
         turned = trimesh.transformations.planar_matrix(moved.get("offset"), moved.get("rotation"))
         matrix = turned @ np.diag([*moved.get("scale", (1.0, 1.0)), 1.0])
-        return _Layer(
-            colour, image, f"TEXCOORD_{moved.get('texCoord', info.get('texCoord', 0))}", matrix, (modes[0], modes[1])
-        )
+        coordinates = f"TEXCOORD_{moved.get('texCoord', info.get('texCoord', 0))}"
+        return _Paint(colour, emitted, self._image(of), coordinates, matrix)
 
     def _image(self, texture: Any) -> np.ndarray | None:
         """Return a texture's image (h, w, 3) uint8; None and a warning where it cannot be read."""
@@ -282,50 +259,25 @@ class _File:
                     self.images[k] = None
         return self.images[k]
 
-    def _paint(
-        self, vertices: np.ndarray, faces: np.ndarray, layers: list[_Layer], light: np.ndarray, attributes: Any
+    def _painted(
+        self, vertices: np.ndarray, faces: np.ndarray, paint: _Paint, light: np.ndarray, attributes: Any
     ) -> TexturedMesh:
-        """Return a mesh in the colours of its layers, the first of them times the faces' own `light` (m, 3)."""
-        layers = [x if x.image is not None and x.coordinates in attributes else _Layer(x.colour) for x in layers]
-        first = next((x for x in layers if x.image is not None), None)
-        if first is None:
-            emitted = sum((x.colour for x in layers[1:]), np.zeros(3))
-            return textured_by_face(vertices, faces, to_srgb(layers[0].colour * light + emitted))
-        for k, x in enumerate(layers):
-            if x.image is not None and (x.coordinates, x.matrix.tolist()) != (first.coordinates, first.matrix.tolist()):
-                self.unused["emissive textures in places of their own (their mean colour is added)"] += 1
-                layers[k] = _Layer(x.colour * BYTES[x.image].mean(axis=(0, 1)))
-        uv = np.nan_to_num(self._accessor(attributes[first.coordinates], 2).astype(float), posinf=0.0, neginf=0.0)
-        uv = uv @ first.matrix[:2, :2].T + first.matrix[:2, 2]
+        """Return a mesh in a material's colours times the faces' own `light` (m, 3)."""
+        image = paint.image
+        if image is None or paint.coordinates not in attributes:
+            return textured_by_face(vertices, faces, to_srgb(paint.colour * light + paint.emitted))
+        uv = np.nan_to_num(self._accessor(attributes[paint.coordinates], 2).astype(float), posinf=0.0, neginf=0.0)
+        uv = uv @ paint.matrix[:2, :2].T + paint.matrix[:2, 2]
         uv = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)[faces]
-        assert first.image is not None
         colours, number = np.unique(np.round(255 * light), axis=0, return_inverse=True)
-        most = max(1, min(TINTS, PIXELS // 4 // first.image[..., 0].size))
+        most = max(1, min(TINTS, PIXELS // 4 // image[..., 0].size))
         if len(colours) > most:
             row = Image.fromarray(np.clip(np.round(255 * light), 0, 255).astype(np.uint8)[None]).quantize(most)
-            palette = row.getpalette() or []
-            colours, number = np.reshape(palette, (-1, 3)), np.asarray(row)
-        images = [self._mixed(layers, colour / 255) for colour in colours]
-        uv, images, across = wrapped(uv, images, first.modes)
-        self.unused["faces across the edge of a clamped texture (it is stretched there)"] += across
+            colours, number = np.reshape(row.getpalette() or [], (-1, 3)), np.asarray(row)
+        # A table of each channel's bytes, so that large images are looked up and not computed.
+        tables = [to_srgb(BYTES[:, None] * (paint.colour * tint / 255) + paint.emitted) for tint in colours]
+        images = [np.stack([table[image[..., c], c] for c in range(3)], axis=-1) for table in tables]
         return TexturedMesh(vertices, faces, *join_textures(uv, number.reshape(-1), images))
-
-    def _mixed(self, layers: list[_Layer], light: np.ndarray) -> np.ndarray:
-        """Return the image of layers in one place, the first of them times `light` (3,); the same object each time."""
-        layers = [dataclasses.replace(layers[0], colour=layers[0].colour * light), *layers[1:]]
-        key = tuple((id(x.image), *x.colour) for x in layers)
-        if key not in self.painted:
-            size = max((x.image.shape[:2] for x in layers if x.image is not None), key=lambda s: s[0] * s[1])
-            channels = []
-            for c in range(3):
-                total = np.zeros(size, np.float32)
-                for x in layers:
-                    table = (x.colour[c] * BYTES).astype(np.float32)
-                    plane = None if x.image is None else np.asarray(Image.fromarray(x.image[..., c]).resize(size[::-1]))
-                    total += np.float32(x.colour[c]) if plane is None else table[plane]
-                channels.append(to_srgb(total))
-            self.painted[key] = np.stack(channels, axis=-1)
-        return self.painted[key]
 
 
 def _pose(node: Any) -> np.ndarray:

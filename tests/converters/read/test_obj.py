@@ -17,7 +17,7 @@ from converters.read.obj import (
     parse_mtl,
     read_scan_obj,
     texels,
-    texture_options,
+    texture_name,
 )
 from converters.records.errors import SceneRejected
 
@@ -127,34 +127,35 @@ def test_mtl_options_and_colours():
 
 
 @pytest.mark.parametrize(
-    ("text", "name", "placing"),
+    ("text", "name", "unused"),
     [
-        ("wood.png", "wood.png", [[1, 1], [0, 0]]),
-        ("my wood 2.png", "my wood 2.png", [[1, 1], [0, 0]]),
-        ("-blendu on -s 2 3 1 my wood.png", "my wood.png", [[2, 3], [0, 0]]),
-        ("-blendv off -s 2 -o 0.5 -0.25 wood.png", "wood.png", [[2, 1], [0.5, -0.25]]),
-        ("-blendu on", "", [[1, 1], [0, 0]]),
-        ("-s 2", "", [[1, 1], [0, 0]]),
-        ("-mm 0.1 0.5 -bm 0.5 -imfchan r -clamp on -texres 512 -t 1 1 1 a.png", "a.png", [[1, 1], [0, 0]]),
+        ("wood.png", "wood.png", {}),
+        ("my wood 2.png", "my wood 2.png", {}),
+        ("-blendu on -s 2 3 1 my wood.png", "my wood.png", {"-s": 1}),
+        ("-blendv off -s 2 -o 0.5 -0.25 wood.png", "wood.png", {"-s": 1, "-o": 1}),
+        ("-blendu on", "", {}),
+        ("-s 2", "", {"-s": 1}),
+        (
+            "-mm 0.1 0.5 -bm 0.5 -imfchan r -clamp on -texres 512 -t 1 1 1 a.png",
+            "a.png",
+            {"-clamp": 1, "-imfchan": 1, "-mm": 1, "-t": 1},
+        ),
     ],
 )
-def test_options_of_a_texture(text, name, placing):
-    unused = collections.Counter()
-    found, where = texture_options(text, unused)
-    assert found == name
-    np.testing.assert_array_equal(where, placing)
-    assert +unused == ({"-clamp": 1, "-imfchan": 1, "-mm": 1, "-t": 1} if "-imfchan" in text else {})
+def test_options_of_a_texture(text, name, unused):
+    counted = collections.Counter()
+    assert texture_name(text, counted) == name and +counted == unused
 
 
 @pytest.mark.parametrize(
-    ("options", "expected", "notes"),
+    ("options", "notes"),
     [
-        # The left half of the image is red, the right half green; u is 1.2 at two corners and 1.3 at the third.
-        ("", (200, 0, 0), []), ("-o 0.5 ", (0, 200, 0), []), ("-clamp on ", (200, 0, 0), ["m.mtl: not used: 1 -clamp"]),
-        ("-cc on ", (200, 0, 0), ["m.mtl: not used: 1 -cc"]),
+        ("", []), ("-o 0.5 ", ["m.mtl: not used: 1 -o"]), ("-clamp on ", ["m.mtl: not used: 1 -clamp"]),
+        ("-s 1 1 1 ", []), ("-cc on ", ["m.mtl: not used: 1 -cc"]),
     ],
 )  # fmt: skip
-def test_a_moved_texture_is_shown_so(tmp_path, options, expected, notes):
+def test_options_of_a_texture_are_reported(tmp_path, options, notes):
+    """The left half of the image is red, the right half green; u is 1.2 at two corners and 1.3 at the third."""
     Image.fromarray(np.array([[(200, 0, 0), (0, 200, 0)]], np.uint8)).save(tmp_path / "a.png")
     (tmp_path / "m.mtl").write_text(f"newmtl a\nd 1\nTr 0\nmap_Kd {options}a.png\n")
     text = "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 1.2 0.5\nvt 1.2 0.5\nvt 1.3 0.5\nusemtl a\nf 1/1 2/2 3/3\n"
@@ -162,7 +163,7 @@ def test_a_moved_texture_is_shown_so(tmp_path, options, expected, notes):
     source = SourceFolder(tmp_path)
     mesh = read_scan_obj(source, "m.obj", "")
     assert mesh.texture is not None and mesh.corner_uv is not None
-    assert texels(mesh.texture, mesh.corner_uv[0]).tolist() == [list(expected)] * 3
+    assert texels(mesh.texture, mesh.corner_uv[0]).tolist() == [[200, 0, 0]] * 3
     assert source.warnings == notes
 
 
@@ -209,20 +210,6 @@ def test_colours_of_vertices_are_kept_where_no_texture_is(tmp_path, of):
     assert [tuple(map(int, sampled(mesh, k))) for k in range(3)] == [(255, 0, 0), (255, 128, 0), (255, 128, 0)]
     path.write_text("v 0 0 0 1 0 0\nv 1 0 0 0 1 0\nv 1 1 0 0 0 1\nf 1 2 3\n")
     assert tuple(sampled(read_scan_obj(SourceFolder(tmp_path), "mesh.obj", ""), 0)) == (85, 85, 85)
-
-
-def test_scale_and_offset_move_a_texture(tmp_path):
-    pixels = np.array([[(1, 1, 1), (2, 2, 2)], [(3, 3, 3), (4, 4, 4)]], np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "Boden Textur.png")
-    (tmp_path / "m.mtl").write_text(
-        "newmtl a\nmap_Kd Boden Textur.png\nnewmtl b\nmap_Kd -o 0.5 0 0 Boden Textur.png\n"
-        "newmtl c\nmap_Kd -s 1 3 1 Boden Textur.png\n"
-    )
-    faces = "".join(f"usemtl {name}\nf 1/1 2/1 3/1\n" for name in "abc")
-    obj(tmp_path, f"mtllib m.mtl\n{SQUARE}vt 0.25 0.25\n{faces}")
-    source = SourceFolder(tmp_path)
-    mesh = read_scan_obj(source, "mesh.obj", "")
-    assert [int(sampled(mesh, k)[0]) for k in range(3)] == [3, 4, 1] and source.warnings == []
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1"])
