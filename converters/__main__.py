@@ -229,7 +229,6 @@ def _lines(place: str) -> list[str]:
 COMMANDS: dict[str, Any] = {
     "convert": Convert,
     "segment": segmenting.Segment,
-    "segment-train": segmenting.SegmentTrain,
     "segment-score": segmenting.SegmentScore,
     "propose": segmenting.Propose,
     "annotate": segmenting.Annotate,

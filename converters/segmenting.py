@@ -14,9 +14,8 @@ from tyro.conf import Suppress
 
 from converters.generating import Command
 from converters.records.errors import SceneRejected
-from interactive_nav_common.commands import Flag, Words, option, word
-from interactive_nav_common.config import AtLeastOne
-from interactive_nav_common.errors import ConfigError, typed
+from interactive_nav_common.commands import Flag, option, word
+from interactive_nav_common.errors import typed
 from interactive_nav_common.files import write_arrays, write_text
 from interactive_nav_common.jobs.progress import stage_progress
 from interactive_nav_common.signals import number_of
@@ -75,8 +74,6 @@ class Segment(MeshFile):
 
     source: Annotated[Path, *word("SRC")]
     """Mesh file, or folder in the Gibson layout."""
-    weights: Annotated[Path | None, option(metavar="FILE")] = None
-    """Weights file of a training run, weights.safetensors (default: the packaged weights)."""
     overwrite: Flag = False
     """Replace labels that exist."""
     output: Annotated[Path | None, Suppress] = None
@@ -87,14 +84,14 @@ class Segment(MeshFile):
         self.output = target = _beside(self.source, "labels.npz")
         if target.exists() and not self.overwrite:
             raise SceneRejected(f"{target}: the scan has labels; give --overwrite to replace them")
-        _label(self, target, self.weights, console)
+        _label(self, target, console)
 
 
 def label_unlabelled(arguments: Any, console: Console) -> None:
     """Label the source of `convert --segment` beside it, unless it has labels, perhaps edited ones."""
     target = _beside(arguments.source, "labels.npz")
     if not target.exists():
-        return _label(arguments, target, None, console)
+        return _label(arguments, target, console)
     console.print(f"{target}: is there, kept")
 
 
@@ -145,72 +142,38 @@ def next_step(arguments: Any, layout: str) -> str:
     return f"no movable object: {first}place models by hand with: {_annotate(arguments.source)}"
 
 
-def _label(arguments: Any, target: Path, weights: Path | None, console: Console) -> None:
+def _label(arguments: Any, target: Path, console: Console) -> None:
     from converters.segment.labelling import label_scan, load_scores
 
-    scores = load_scores(weights)
+    scores = load_scores()
     with stage_progress(console) as report:
         labels = label_scan(_read(arguments), scores, report)
     write_arrays(target, label=labels.astype("uint8"))
     console.print(f"{target}: labels of {len(labels)} vertices")
 
 
-class SegmentTrain(Command):
-    """Train the segmentation network on generated buildings."""
-
-    out: Annotated[Path, *word("OUT")]
-    """Folder of the training run. A run that exists is continued."""
-    settings: Words = ()
-    """Override settings of the training, for example steps=1000. `SegmentConfig` documents them."""
-
-    def run(self, console: Console) -> None:
-        """Run the command."""
-        from converters.segment.train import SegmentConfig, train
-        from interactive_nav_common.config import overridden
-
-        config = overridden(SegmentConfig(), self.settings)
-        with stage_progress(console) as report:
-            scores = train(self.out, config, report, lambda line: console.print(line))
-        _table(console, "held-out crops", scores)
-
-
 class SegmentScore(Command):
-    """Score the segmentation network on labelled scans and on generated buildings."""
+    """Score the segmentation network on labelled scans."""
 
-    sources: Annotated[tuple[Path, ...], *word("SRC")] = ()
+    sources: Annotated[tuple[Path, ...], *word("SRC")]
     """Labelled scans to score."""
-    homes: Annotated[AtLeastOne | None, option(metavar="N")] = None
-    """Number of generated buildings to score in addition."""
-    weights: Annotated[Path | None, option(metavar="FILE")] = None
-    """Weights file of a training run, weights.safetensors (default: the packaged weights)."""
 
     def run(self, console: Console) -> None:
         """Run the command."""
         from converters.read.source import read_source
-        from converters.segment.labelling import load_scores, score_homes, score_source
-        from converters.segment.train import HELD_OUT_SEED
+        from converters.segment.labelling import load_scores, score_source
 
-        if not (self.sources or self.homes):
-            raise ConfigError("nothing to score; expected SRC, a labelled scan, or --homes N")
-        scores = load_scores(self.weights)
+        scores = load_scores()
         with stage_progress(console) as report:
             for source in self.sources:
                 score = score_source(read_source(source), scores, report)
-                _table(console, str(source), score["iou"])
+                mean = sum(score["iou"].values()) / max(len(score["iou"]), 1)
+                row = ", ".join(f"{name} {value:.3f}" for name, value in score["iou"].items())
+                console.print(f"{source}: mIoU {mean:.3f}; {row}")
                 console.print(
                     f"{source}: {score['matched']} of {score['objects']} annotated objects are recognised, "
                     f"{score['matched_true']} with the scan's labels"
                 )
-            if self.homes:
-                # Whole buildings of other seeds than those whose crops the training was watched by.
-                iou = score_homes(HELD_OUT_SEED + 50_000, self.homes, scores, report)
-                _table(console, f"{self.homes} held-out buildings", iou)
-
-
-def _table(console: Console, what: str, iou: dict[str, float]) -> None:
-    mean = iou.get("mean", sum(iou.values()) / max(len(iou), 1))
-    row = ", ".join(f"{name} {value:.3f}" for name, value in iou.items() if name != "mean")
-    console.print(f"{what}: mIoU {mean:.3f}; {row}")
 
 
 def proposal_tables(proposed: Any) -> Iterator[Table]:

@@ -17,7 +17,6 @@ import numpy as np
 from flax.traverse_util import unflatten_dict
 
 from converters.clock import Report
-from converters.generate import GenerationError
 from converters.propose.pieces import bounds, box_iou
 from converters.propose.proposals import propose_instances
 from converters.propose.retrieval import annotated_vertices
@@ -25,13 +24,10 @@ from converters.read.surfaces import floor_level, storey_of
 from converters.records.errors import SceneRejected
 from converters.records.raw import UNLABELLED, RawScene
 from converters.segment import voxels
-from converters.segment.samples import TIERS, building_surface
-from interactive_nav_common.errors import readable
 from interactive_nav_common.runs import weights
 from interactive_nav_common.signals import signals_wait
 
 WEIGHTS = Path(__file__).with_name("weights.safetensors")
-"""The packaged ones."""
 TILE, MARGIN = 160, 16
 """Voxels of a tile's side, and of its border, which is left to the next tile."""
 
@@ -39,27 +35,26 @@ TILE, MARGIN = 160, 16
 class VoxelNet(nn.Module):
     """Compute scores [N, X, Y, Z, classes] of tiles [N, X, Y, Z, FEATURES + 2]."""
 
-    widths: Sequence[int] = (40, 64, 96)
-    dtype: Any = jnp.float32
+    widths: Sequence[int]
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """Return the scores of every voxel; sides are multiples of 8."""
-        x, skips = _fold(x.astype(self.dtype)), []
+        x, skips = _fold(x), []
         for level, width in enumerate(self.widths):
             if level:
                 skips.append(x)
-                x = nn.Dense(width, dtype=self.dtype)(_fold(x))
+                x = nn.Dense(width)(_fold(x))
             x = self._block(x, width)
         for skip in reversed(skips):
             width = skip.shape[-1]
-            x = jnp.concatenate([_unfold(nn.Dense(8 * width, dtype=self.dtype)(x)), skip], axis=-1)
+            x = jnp.concatenate([_unfold(nn.Dense(8 * width)(x)), skip], axis=-1)
             x = self._block(x, width)
-        return _unfold(nn.Dense(8 * len(voxels.NAMES), dtype=self.dtype)(x)).astype(jnp.float32)
+        return _unfold(nn.Dense(8 * len(voxels.NAMES))(x)).astype(jnp.float32)
 
     def _block(self, x: jax.Array, width: int) -> jax.Array:
-        x = nn.relu(nn.LayerNorm(dtype=self.dtype)(nn.Conv(width, (3, 3, 3), dtype=self.dtype)(x)))
-        return nn.relu(x + nn.LayerNorm(dtype=self.dtype)(nn.Conv(width, (3, 3, 3), dtype=self.dtype)(x)))
+        x = nn.relu(nn.LayerNorm()(nn.Conv(width, (3, 3, 3))(x)))
+        return nn.relu(x + nn.LayerNorm()(nn.Conv(width, (3, 3, 3))(x)))
 
 
 def _fold(x: jax.Array) -> jax.Array:
@@ -120,31 +115,20 @@ def score_voxels(
     return out
 
 
-def save_network(path: Path, net: VoxelNet, variables: Any) -> None:
-    """Write weights of a byte each, with a factor for each output of a layer; vectors in half precision."""
-    params = {name: np.asarray(value, np.float32) for name, value in weights.flat(variables["params"]).items()}
-    tensors = {name: value if value.ndim > 1 else value.astype(np.float16) for name, value in params.items()}
-    about = {"task": "segment", "widths": list(net.widths), "names": list(voxels.NAMES), "voxel_m": voxels.VOXEL_M}
-    weights.write_weights(path, weights.rounded(tensors, step=0.0, least=0), about)
-
-
-def load_network(path: Path = WEIGHTS) -> tuple[VoxelNet, dict[str, Any]]:
-    """Return what `save_network` was given; weights of a byte each are restored."""
-    remedy = f"give {WEIGHTS.name} of 'python -m converters segment-train'"
-    tensors, about = weights.read_weights(path, SceneRejected, remedy)
-    with readable(path, SceneRejected, remedy):
-        net = VoxelNet(tuple(int(w) for w in about["widths"]))
-        params = {name: jnp.asarray(tensor, jnp.float32) for name, tensor in tensors.items()}
-        return net, {"params": unflatten_dict(params, sep="/")}
+def load_network() -> tuple[VoxelNet, dict[str, Any]]:
+    """Read the packaged network, which commit b97304ed trained; its weights of a byte each are restored."""
+    tensors, about = weights.read_weights(WEIGHTS, SceneRejected, "install the package again")
+    params = {name: jnp.asarray(tensor, jnp.float32) for name, tensor in tensors.items()}
+    return VoxelNet(tuple(about["widths"])), {"params": unflatten_dict(params, sep="/")}
 
 
 MATCH_IOU = 0.5
 """Of boxes, from which on a proposal is an annotated object."""
 
 
-def load_scores(weights: Path | None = None) -> Scores:
-    """Load the network for `label_scan`, compiled once a shape; None: with the packaged weights."""
-    net, variables = load_network(weights or WEIGHTS)
+def load_scores() -> Scores:
+    """Load the network for `label_scan`, compiled once a shape."""
+    net, variables = load_network()
 
     @signals_wait()  # a compilation that is left crashes the interpreter at its end
     @functools.partial(jax.jit, static_argnums=2)
@@ -190,20 +174,3 @@ def score_source(raw: RawScene, scores: Scores, report: Report) -> dict[str, Any
         hits = [any(c == of and box_iou(box, at) >= MATCH_IOU for c, at in proposed) for of, box in boxes]
         matched.append(sum(hits))
     return {"iou": iou, "objects": len(raw.annotations), "matched": matched[0], "matched_true": matched[1]}
-
-
-def score_homes(seed: int, count: int, scores: Scores, report: Report) -> dict[str, float]:
-    """Return IoU by class over the surfaces of generated buildings of all tiers, their furniture held out."""
-    truth, predicted = [], []
-    while len(truth) < count:
-        seed += 1
-        try:
-            surface, classes = building_surface(seed - 1, TIERS[len(truth) % len(TIERS)], "test")
-        except GenerationError:
-            continue
-        guess = score_points(surface, (0.0,), scores, lambda stage, share: None)
-        inside = guess.any(axis=1)
-        truth.append(classes[inside])
-        predicted.append(guess[inside].argmax(axis=1))
-        report("score", len(truth) / count)
-    return voxels.intersection_over_union(np.concatenate(truth), np.concatenate(predicted))

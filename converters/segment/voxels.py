@@ -5,7 +5,6 @@ Voxels count from `Voxels.origin`, `BELOW_M` under the floor, in the scan's fram
 
 import dataclasses
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -127,15 +126,3 @@ def intersection_over_union(truth: np.ndarray, predicted: np.ndarray) -> dict[st
     confusion = np.bincount(truth[labelled].astype(int) * 256 + predicted[labelled], minlength=65536).reshape(256, 256)
     union = confusion.sum(axis=0) + confusion.sum(axis=1) - confusion.diagonal()
     return {name: float(confusion[k, k] / union[k]) for k, name in enumerate(NAMES) if confusion[k].any()}
-
-
-def joined(surfaces: Sequence[Surface]) -> Surface:
-    """Join surfaces; `face` counts on, and what has no colour is grey where others have some."""
-    start = np.cumsum([0, *(int(s.face.max(initial=-1)) + 1 for s in surfaces)])
-    grey = [np.full((len(s.points), 3), 127.5) if s.colours is None else s.colours for s in surfaces]
-    return Surface(
-        np.concatenate([s.points for s in surfaces]),
-        np.concatenate([s.normals for s in surfaces]),
-        None if all(s.colours is None for s in surfaces) else np.concatenate(grey),
-        np.concatenate([s.face + k for s, k in zip(surfaces, start, strict=False)]),
-    )
