@@ -3,7 +3,6 @@
 import json
 import signal
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -176,31 +175,6 @@ class SegmentScore(Command):
                 )
 
 
-def proposal_tables(proposed: Any) -> Iterator[Table]:
-    """Yield a table of the proposals; and with a library and annotations, how well."""
-    table = Table("class", "confidence", "x y z, m", "size, m", "model", "sure", title="Proposals")
-    for k, proposal in enumerate(proposed.proposals):
-        model = proposed.retrieved.get(k)
-        table.add_row(
-            proposal.category,
-            f"{proposal.confidence:.2f}",
-            " ".join(f"{v:.2f}" for v in proposal.centre),
-            " ".join(f"{v:.2f}" for v in proposal.extent_m),
-            model.cad.cad_id[:8] if model else "-",
-            f"{model.confidence:.2f}" if model else "-",
-        )
-    yield table
-    if not proposed.comparisons:
-        return
-    from converters.propose.retrieval import COMPARED
-
-    caption = "cm, yaw and scale: the annotated model's best fit against its annotated pose"
-    table = Table(*COMPARED, title="Retrieved models against the annotation", caption=caption)
-    for row in proposed.comparisons:
-        table.add_row(*row)
-    yield table
-
-
 class Propose(WithLibrary):
     """Find furniture in a labelled scan; write proposals.json in the format of Scan2CAD."""
 
@@ -210,7 +184,7 @@ class Propose(WithLibrary):
     output: Annotated[Path, option("-o", metavar="DIR")]
     """Folder to write proposals.json to."""
     auto_align: Flag = False
-    """Also select a CAD model and its pose for each proposal, and compare them with annotations."""
+    """Also select a CAD model and its pose for each proposal."""
 
     def run(self, console: Console) -> None:
         """Run the command."""
@@ -222,9 +196,19 @@ class Propose(WithLibrary):
             raw, library = read_source(self.source, self.format), None
             if self.auto_align or self.library:
                 library = read_library(self.library, self.source)
-            proposed = propose(raw, self.output, library, report)
-        for table in proposal_tables(proposed):
-            console.print(table)
+            proposals, retrieved = propose(raw, self.output, library, report)
+        table = Table("class", "confidence", "x y z, m", "size, m", "model", "sure", title="Proposals")
+        for k, proposal in enumerate(proposals):
+            model = retrieved.get(k)
+            table.add_row(
+                proposal.category,
+                f"{proposal.confidence:.2f}",
+                " ".join(f"{v:.2f}" for v in proposal.centre),
+                " ".join(f"{v:.2f}" for v in proposal.extent_m),
+                model.cad.cad_id[:8] if model else "-",
+                f"{model.confidence:.2f}" if model else "-",
+            )
+        console.print(table)
         console.print(f"{self.output}: proposals.json")
 
 

@@ -96,15 +96,6 @@ class Map(UsesNetworks):
     """Numbers of two nodes to draw the route between."""
 
 
-class Explore(_Driving):
-    """Build a scene's map while the robot explores it, and draw it."""
-
-    scene: Annotated[str, *word("SCENE")]
-    """Scene folder."""
-    out: Annotated[Path, option("-o", metavar="DIR")] = RUNS / "maps-explored"
-    """Folder to write the map to. With --truth the map has no images, so navigation cannot use it."""
-
-
 class Navigate(_Driving):
     """Drive one episode of a scene and draw it."""
 
@@ -187,7 +178,7 @@ class Figures(_Driving):
     """Folder to write the pictures to (default: RUNS/figures)."""
 
 
-KINDS = (Data, Train, Map, Explore, Navigate, Evaluate, Adapt, Export, Tables, Figures)
+KINDS = (Data, Train, Map, Navigate, Evaluate, Adapt, Export, Tables, Figures)
 COMMANDS = {kind.__name__.lower(): kind for kind in KINDS}
 
 
@@ -198,9 +189,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parse(COMMANDS, "python -m topological_nav", argv)
     try:
         # Imported once the command is clear: it is heavy.
-        module = "exploration" if isinstance(arguments, Explore) else "commands"
-        run = f"run_{type(arguments).__name__.lower()}"
-        getattr(importlib.import_module(f"topological_nav.{module}"), run)(arguments)
+        commands = importlib.import_module("topological_nav.commands")
+        getattr(commands, f"run_{type(arguments).__name__.lower()}")(arguments)
     except (Stopped, KeyboardInterrupt) as stopped:  # the latter: outside of loops that stop between two steps
         print("topological_nav: stopped; give the same command again", file=sys.stderr)
         return 128 + number_of(stopped)

@@ -18,7 +18,7 @@ import numpy as np
 from converters.geometry.boxes import upright_box
 from converters.geometry.faces import face_labels, sample_faces
 from converters.propose import pieces, retrieval
-from converters.propose.pieces import Proposal, bounds, box_iou
+from converters.propose.pieces import Proposal, bounds
 from converters.records.errors import SceneRejected
 from converters.records.raw import FLOOR, SYNSETS, UNLABELLED, WALL, Annotation, CadModel, RawScene, ScanMesh
 from converters.structure.clean import fit_floor
@@ -146,20 +146,6 @@ def scan2cad_list(scan_id: str, models: list[dict[str, Any]]) -> list[dict[str, 
     ]
 
 
-SAME_OBJECT_SHARE = 0.3
-"""Share of a proposal's points in an annotated model's box from which they are compared."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Proposed:
-    """Hold the result of `propose`."""
-
-    proposals: tuple[Proposal, ...]
-    retrieved: dict[int, retrieval.Retrieval]
-    comparisons: tuple[tuple[str, ...], ...]
-    """Where the source has annotations and models were retrieved, `retrieval.COMPARED` for each that was proposed."""
-
-
 def floor_of(raw: RawScene) -> float:
     """Return the height of the floor in the scan frame, m."""
     given = raw.floor_height_m
@@ -203,26 +189,18 @@ def propose(
     target: Path,
     library: Mapping[str, CadModel] | None = None,
     report: Callable[[str, float], None] = lambda stage, share: None,
-) -> Proposed:
-    """Propose instances, and models if there is a library, and write `proposals.json`, whole or not at all."""
+) -> tuple[tuple[Proposal, ...], dict[int, retrieval.Retrieval]]:
+    """Propose instances, and by their index models of a library; write `proposals.json`, whole or not at all."""
     report("propose", 0.0)
     proposals = propose_instances(raw.scan)
     if not proposals:
         raise SceneRejected(f"{raw.name}: no furniture label in the scan, expected NYU40 ids 5, 6, 7, 8, 14 or 39")
     retrieved: dict[int, retrieval.Retrieval] = {}
-    comparisons = []
     if library is not None:
-        floor = floor_of(raw)
-        retrieved = retrieval.auto_align(proposals, library, floor, lambda share: report("retrieve", 0.1 + 0.8 * share))
-        for annotation in raw.annotations:
-            low, high = box = bounds(retrieval.annotated_vertices(annotation, raw.cads))
-            at = max(range(len(proposals)), key=lambda i, box=box: box_iou(box, bounds(proposals[i].points)))
-            share = ((proposals[at].points > low) & (proposals[at].points < high)).all(axis=1).mean()
-            if share > SAME_OBJECT_SHARE and at in retrieved:
-                pair = proposals[at], retrieved[at]
-                comparisons.append(retrieval.compare_retrieval(annotation, raw.cads, *pair, floor))
-    proposed = Proposed(proposals, retrieved, tuple(comparisons))
+        retrieved = retrieval.auto_align(
+            proposals, library, floor_of(raw), lambda share: report("retrieve", 0.1 + 0.8 * share)
+        )
     text = json.dumps(as_scan2cad(raw.name, proposals, retrieved), indent=1, allow_nan=False) + "\n"
     write_text(target / "proposals.json", text)
     report("write", 1.0)
-    return proposed
+    return proposals, retrieved

@@ -16,9 +16,8 @@ import trimesh
 from scipy.spatial import KDTree
 
 from converters.bodies.alignment import Alignment, AlignmentError, apply_alignment, least_squares
-from converters.bodies.objects import pose_difference, upright
 from converters.library.store import read_index, read_shape
-from converters.propose.pieces import SIZES_M, Proposal, bounds, box_iou
+from converters.propose.pieces import SIZES_M, Proposal, bounds
 from converters.read.annotations import read_cad
 from converters.read.files import SourceFolder
 from converters.read.obj import texels
@@ -259,31 +258,3 @@ def auto_align(
             retrieved[k] = one
         progress((k + 1) / len(proposals))
     return retrieved
-
-
-COMPARED = ("class", "annotated", "chosen", "rank", "cm", "yaw °", "scale x y z", "IoU", "sure")
-"""What `compare_retrieval` returns. Ranks count from 1, 0: not tried; the IoU is of axis-aligned boxes."""
-
-
-def compare_retrieval(
-    annotation: Annotation, cads: Mapping[str, CadModel], proposal: Proposal, best: Retrieval, floor_m: float | None
-) -> tuple[str, ...]:
-    """Compare a retrieval with a person's annotation of the same object; return `COMPARED` in words.
-
-    Yaw and scale are compared for the same model: if another was chosen, by the annotated model's best fit.
-    """
-    cad = cads[annotation.cad_id]
-    pivot = (cad.vertices.min(axis=0) + cad.vertices.max(axis=0)) / 2
-    reference, _ = upright(annotation.pose, pivot)
-    pose = best.pose
-    if best.cad.cad_id != annotation.cad_id:
-        pose = fit_model(proposal, cad, None if proposal.category == "door" else floor_m).pose
-    ids = [cad_id for cad_id, _ in best.ranking]
-    chosen = apply_alignment(best.pose, best.cad.vertices)
-    rank = ids.index(annotation.cad_id) + 1 if annotation.cad_id in ids else 0
-    translation_m, yaw_rad, scale_ratio = pose_difference(pose, reference, pivot, annotation.symmetry)
-    iou = box_iou(bounds(chosen), bounds(annotated_vertices(annotation, cads)))
-    names, numbers = (annotation.cad_id[:6], best.cad.cad_id[:6]), (f"{iou:.2f}", f"{best.confidence:.2f}")
-    scales = " ".join(f"{v:.2f}" for v in scale_ratio)
-    pose_words = f"{100 * translation_m:.1f}", f"{math.degrees(yaw_rad):.1f}", scales
-    return (annotation.category, *names, f"{rank}/{len(ids)}", *pose_words, *numbers)

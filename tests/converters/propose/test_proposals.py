@@ -222,10 +222,10 @@ def test_nothing_of_the_class_in_the_library(scan2cad_raw):
     assert retrieve(table, library, 0.3) is None
 
 
-def test_propose_writes_json_and_prints_the_comparison(scan2cad_raw, tmp_path, capsys):
+def test_propose_writes_json_and_prints_a_table(scan2cad_raw, tmp_path, capsys):
     assert main(["propose", str(scan2cad_raw), "-o", str(tmp_path / "p"), "--auto-align"]) == 0
     printed = capsys.readouterr().out
-    assert "Retrieved models against the annotation" in printed and "1/1" in printed
+    assert "Proposals" in printed and "basket" in printed and "table" in printed
     data = json.loads((tmp_path / "p" / "proposals.json").read_text())
     assert data[0]["n_aligned_models"] == len(data[0]["aligned_models"]) == 2
     assert all(0 < m["proposal"]["confidence"] <= 1 and m["id_cad"] for m in data[0]["aligned_models"])
