@@ -14,7 +14,7 @@ from scenes_mjcf.categories import MaskClasses
 
 OBSERVATIONS = ("goal", "velocity", "waypoints")
 """Parts of the observation by default."""
-Task = Literal["reach", "open", "clear", "fetch"]
+Task = Literal["reach", "open", "clear", "fetch", "lift"]
 """Names of the tasks; `TaskRules.task` describes them."""
 SIGNALS = (*OBSERVATIONS, "localisation", "odometry", "collision", "joints", "lidar", "hand")
 """Parts of the state vector."""
@@ -31,14 +31,16 @@ class TaskRules(Settings):
 
     task: Task = "reach"
     """Task: reach a place, open (a door by 60 degrees or a drawer by 0.2 m), clear (reach a place behind a door that
-    must be pulled) or fetch (touch furniture of a given category). Open and clear start with all doors shut."""
+    must be pulled), fetch (touch furniture of a given category) or lift (raise an object of at most 6 kg by 0.1 m and
+    carry it 0.5 m). Open and clear start with all doors shut."""
     control_mode: str = "native"
     """Control mode of the robot, which decides what an action commands; `native` is the original benchmark's."""
     symmetric_actions: bool = False
     """Let action 0 command nothing; the original's ranges are lopsided (TurtleBot's wheels: -12.5 to 25 rad/s)."""
     hook_force_n: NotNegative = 0.0
-    """Largest force in N of a hook at a wheeled robot's front (100 pulls doors and chairs); 0: no hook. It adds one
-    action: above 0 couples it to an object within 0.1 m, below 0 lets go."""
+    """Largest force in N of a hook at a wheeled robot's front, or at its hand if the control mode moves that (100 pulls
+    doors and lifts chairs); 0: no hook. It adds one action: above 0 couples it to an object within 0.1 m, below 0 lets
+    go."""
     num_objects: Natural = 10
     """Number of small objects that lie on the floor, at random places in each episode."""
     small_objects: Literal["train", "test"] = "train"
@@ -108,7 +110,7 @@ class TaskRules(Settings):
 
     IDLE = (
         ("small_objects objects", "num_objects above 0", lambda c: c.num_objects > 0),
-        ("doors_shut", "task reach or fetch", lambda c: c.task in ("reach", "fetch")),
+        ("doors_shut", "task reach, fetch or lift", lambda c: c.task in ("reach", "fetch", "lift")),
         ("waypoints_round", "potential_round", lambda c: c.potential_round is not None),
     )
 

@@ -1,7 +1,8 @@
-"""Pull what stands before a wheeled robot by a hook: a spring and a damper of limited force, on any backend.
+"""Pull or lift what a wheeled robot reaches by a hook: a spring and a damper of limited force, on any backend.
 
-The hook is a point at the robot's front. It couples to a point that is fixed in a body's frame, and in every physics
-substep pulls the two together. Functions take NumPy or JAX arrays with any leading axes.
+The hook is a point at the robot's front, or the grip of a hand that the control mode moves. It couples to a point that
+is fixed in a body's frame, and in every physics substep pulls the two together. A hand also bears the weight of what it
+holds. Functions take NumPy or JAX arrays with any leading axes.
 """
 
 import jax.numpy as jnp
@@ -9,6 +10,8 @@ import numpy as np
 
 from interactive_nav.config import NavConfig
 from interactive_nav.physics.base import PhysicsState
+from interactive_nav.robots.links import make_links
+from interactive_nav.robots.spec import RobotState
 from interactive_nav.scenes.slots import Layout
 from interactive_nav.scenes.world import World
 from interactive_nav_common.errors import ConfigError
@@ -32,14 +35,16 @@ _Motion = tuple[Array, Array, Array, Array]
 """A body's position [..., 3], axes [..., 3, 3] and velocity [..., 3], world frame, and angular velocity, body frame."""
 
 
-def spring_force(stretch_m: Array, speed_m_s: Array, mobility: Array, step_s: float, most_n: float) -> Array:
+def spring_force(
+    stretch_m: Array, speed_m_s: Array, mobility: Array, step_s: float, most_n: float, borne_n: Array | float = 0.0
+) -> Array:
     """Return the force [..., 3], N, along `stretch_m` [..., 3], of norm at most `most_n`, and 0 beyond `TORN_M`.
 
     `speed_m_s` [..., 3] is the rate at which the stretch grows. With `mobility` [...], 1/kg, the inverse of the reduced
-    mass, light and heavy bodies follow in the same time.
+    mass, light and heavy bodies follow in the same time. `borne_n` [..., 3] is added to what the spring wants.
     """
     xp = namespace(stretch_m, mobility)
-    wanted = (_STIFFNESS * stretch_m / step_s**2 + _DAMPING * speed_m_s / step_s) / mobility[..., None]
+    wanted = (_STIFFNESS * stretch_m / step_s**2 + _DAMPING * speed_m_s / step_s) / mobility[..., None] + borne_n
     share = most_n / xp.maximum(xp.sqrt((wanted**2).sum(-1)), most_n)
     near = (stretch_m**2).sum(-1) <= TORN_M**2
     return xp.where(near[..., None], wanted * share[..., None], 0.0)
@@ -63,7 +68,17 @@ class Hook:
         length_m = robot.size_m[0] if robot.size_m else 2 * robot.footprint_radius_m
         self.point_b = np.array([length_m / 2, 0.0, HEIGHT_M - robot.spawn_height_m], np.float32)
         # A disc that is pulled sideways at its rim.
-        self._mobility = 3.0 / world.robot_mass_kg
+        self._mobility, self._link = 3.0 / world.robot_mass_kg, 0
+        self.at_hand = bool(robot.hand) and robot.control_mode in ("hand", "whole_body")
+        if self.at_hand:
+            model, bodies = world.models[0], self.layout.robot_bodies.tolist()
+            self._links = make_links(model, bodies, self.layout.robot_qpos)
+            self._link, parents = bodies.index(model.body(robot.hand).id), (0, *(x.parent for x in self._links.rest))
+            self.point_b = model.site_pos[model.site_bodyid == bodies[self._link]].sum(0).astype(np.float32)
+            self._mobility, link, self._arm = 3.0 * float(model.body_invweight0[bodies[self._link], 0]), self._link, []
+            while link:
+                self._arm = [*(joint[1] for joint in self._links.rest[link - 1].joints), *self._arm]
+                link = parents[link]
         com, axis, anchor = slots.com_b_m, slots.axis_b, slots.anchor_b_m
         inverse = np.stack([model.body_invweight0[self.layout.slot_body] for model in world.models])
         # Means of three directions, of which a hinge or a slide has one. Twice the mean is at least 2/3 of the largest.
@@ -73,12 +88,15 @@ class Hook:
         tables = slots.pos_w_m, slots.axes_w, axis, anchor, com, pivot
         tables += shift * inverse[..., 0], np.where(hinge, 3.0, 2.0)[:, 0] * inverse[..., 1]
         self._tables = tuple(table.astype(np.float32) for table in tables)
-        self._com_b = np.float32(world.models[0].body_ipos[self.layout.robot_bodies[0]])
+        self._com_b = np.float32(world.models[0].body_ipos[self.layout.robot_bodies[self._link]])
+        masses_kg = np.stack([model.body_mass[self.layout.slot_body] for model in world.models])
+        weights_n = np.where(self._held[:, 0] | (self._link == 0), 0.0, -world.models[0].opt.gravity[2] * masses_kg)
+        self._borne_n = (weights_n[..., None] * [0.0, 0.0, 1.0]).astype(np.float32)
 
     def _motions(
         self, scene: Array, slot: Array, layout: Layout, place: Array, qpos: Array, qvel: Array
     ) -> tuple[_Motion, _Motion]:
-        """Return the motions of a slot's body, which `layout` has at `place` [...] in the states, and of the base."""
+        """Return the motions of a slot's body, which `layout` has at `place` [...] in the states, and of the hook's."""
         xp, robot = namespace(qpos), layout.robot_state(qpos, qvel, 0.0)
         numbers = (qpos, layout.slot_qpos, 7), (qvel, layout.slot_qvel, 6)
         at = [(x, xp.asarray(first)[place][..., None] + xp.arange(n)) for x, first, n in numbers]
@@ -92,13 +110,23 @@ class Hook:
         free = q[..., :3], matrix_from_quat(q[..., 3:]), v[..., :3], v[..., 3:]
         tied = hung, swung, drift, xp.where(slides, 0.0, rate)
         body = zip((held, held[..., None], held, held), tied, free, strict=True)
-        base = robot.qpos[..., :3], matrix_from_quat(robot.qpos[..., 3:7]), robot.qvel[..., :3], robot.qvel[..., 3:6]
-        return tuple(xp.where(*parts) for parts in body), base
+        return tuple(xp.where(*parts) for parts in body), self._mine(robot)
+
+    def _mine(self, robot: RobotState) -> _Motion:
+        """Return the motion of the hook's body; a hand's is without its spin, but with the velocity of its grip."""
+        place, axes, xp = robot.qpos[..., :3], matrix_from_quat(robot.qpos[..., 3:7]), namespace(robot.qpos)
+        velocity, spin = robot.qvel[..., :3], robot.qvel[..., 3:6]
+        if not self._link:
+            return place, axes, velocity, spin
+        (hand, hand_axes), joints = self._links.frames(robot.qpos)[self._link], np.array(self._arm)
+        lever = self._links.jacobian(robot.qpos, self._link, self._arm, self.point_b)
+        grip_b = apply_axes(axes.swapaxes(-1, -2), _point((hand, hand_axes, velocity, spin), self.point_b)[0] - place)
+        moves = xp.cross(spin, grip_b) + apply_axes(lever, robot.qvel[..., joints - 1])
+        return hand, hand_axes, velocity + apply_axes(axes, moves), xp.zeros_like(spin)
 
     def point_w(self, state: PhysicsState) -> Array:
         """Return where the hook is, [3], m."""
-        pose = self.layout.robot_state(state.qpos, state.qvel, 0.0).qpos[:7]
-        return pose[:3] + apply_axes(matrix_from_quat(pose[3:]), self.point_b)
+        return _point(self._mine(self.layout.robot_state(state.qpos, state.qvel, 0.0)), self.point_b)[0]
 
     def grip(
         self, scene: Array, state: PhysicsState, wish: Array, slot: Array, gap_m2: Array, mass_scale: Array | float
@@ -133,9 +161,11 @@ class Hook:
         motions = self._motions(scene, slot, layout, place, qpos, qvel)
         coms = xp.asarray(self._tables[4])[scene, slot], xp.asarray(self._com_b)
         (there_w, theirs), (here_w, mine) = map(_point, motions, (hook[..., 1:4], xp.asarray(self.point_b)))
-        force = spring_force(here_w - there_w, mine - theirs, hook[..., 4], self._step_s, self._most_n)
+        borne_n = xp.asarray(self._borne_n)[scene, slot]
+        force = spring_force(here_w - there_w, mine - theirs, hook[..., 4], self._step_s, self._most_n, borne_n)
         force = xp.where((place >= 0)[..., None], force, 0.0)
-        out, bodies = xp.zeros_like(old), (xp.asarray(layout.slot_body)[place][..., None], layout.robot_bodies[:1])
+        hand = layout.robot_bodies[self._link : self._link + 1]
+        out, bodies = xp.zeros_like(old), (xp.asarray(layout.slot_body)[place][..., None], hand)
         for point, motion, com, body in zip((there_w, here_w), motions, coms, bodies, strict=True):
             wrench = xp.concatenate([force, xp.cross(point - _point(motion, com)[0], force)], -1)
             mine = xp.arange(old.shape[-2]) == body

@@ -9,6 +9,8 @@ import numpy as np
 
 from interactive_nav_common.rotations import Array, apply_axes, compose, matrix_from_quat, namespace, swing
 
+_ORIGIN = np.zeros(3)
+
 
 @dataclasses.dataclass(frozen=True)
 class Link:
@@ -51,13 +53,13 @@ class Links:
             frames.append((pos, axes))
         return frames
 
-    def jacobian(self, qpos: Array, link: int, joints: Sequence[int]) -> Array:
-        """Return [..., 3, J]: how fast a link's origin moves in the base's frame, m/rad or m/m, with each joint.
+    def jacobian(self, qpos: Array, link: int, joints: Sequence[int], point_b: np.ndarray = _ORIGIN) -> Array:
+        """Return [..., 3, J]: how fast a link's point moves in the base's frame, m/rad or m/m, with each joint.
 
         `joints` are addresses in `qpos` [..., nq], of joints that carry the link; 0 is the base among the links.
         """
         xp, frames, columns = namespace(qpos), self.frames(qpos), {}
-        base, place = frames[0][1], frames[link][0]
+        base, place = frames[0][1], frames[link][0] + apply_axes(frames[link][1], repeated(qpos, point_b))
         for (pos, axes), carried in zip(frames[1:], self.rest, strict=True):
             for slides, address, _, axis, anchor in carried.joints:  # neither moves its own axis
                 axis_w, anchor_w = (apply_axes(axes, repeated(qpos, each)) for each in (axis, anchor))
@@ -71,15 +73,19 @@ def repeated(qpos: Array, value: np.ndarray) -> Array:
     return xp.broadcast_to(xp.asarray(value, qpos.dtype), (*qpos.shape[:-1], *value.shape))
 
 
-def make_links(model: mujoco.MjModel, bodies: Sequence[int]) -> Links:
-    """Return the links of a model's bodies: the one with the free joint first, parents before children."""
+def make_links(model: mujoco.MjModel, bodies: Sequence[int], first_qpos: int = 0) -> Links:
+    """Return the links of a model's bodies: the one with the free joint first, parents before children.
+
+    Addresses count from `first_qpos`.
+    """
     rest = []
     for body in bodies[1:]:
         joints = []
         for j in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
             slides = model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE
             address = int(model.jnt_qposadr[j])
-            joints.append((bool(slides), address, float(model.qpos0[address]), model.jnt_axis[j], model.jnt_pos[j]))
+            zero, axis, anchor = float(model.qpos0[address]), model.jnt_axis[j], model.jnt_pos[j]
+            joints.append((bool(slides), address - first_qpos, zero, axis, anchor))
         parent = list(bodies).index(model.body_parentid[body])
         rest.append(Link(parent, model.body_pos[body], matrix_from_quat(model.body_quat[body]), tuple(joints)))
-    return Links(int(model.jnt_qposadr[model.body_jntadr[bodies[0]]]), tuple(rest))
+    return Links(int(model.jnt_qposadr[model.body_jntadr[bodies[0]]]) - first_qpos, tuple(rest))

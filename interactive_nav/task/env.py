@@ -36,7 +36,7 @@ from interactive_nav.sensing.boxes import CLEAR_M, apply_axes, body_poses, box_g
 from interactive_nav.sensing.sensors import Sensors
 from interactive_nav.task.dynamics import Dynamics
 from interactive_nav.task.privileged import PRIVILEGED_SIZE, privileged_state
-from interactive_nav.task.targets import TERMS_OF_TASKS, achieved, build_targets
+from interactive_nav.task.targets import TERMS_OF_TASKS, achieved, build_targets, reaching_terms
 from interactive_nav.task.terms import HOOK_TERMS, TERMS, Moment, Step, Term, hand_term
 from interactive_nav.types import Detour, EpisodeStart, GoalField, NavInfo
 from interactive_nav_common.errors import ConfigError
@@ -73,7 +73,7 @@ class InteractiveNav(Env):
         self.physics = make_physics(self.world, config)
         self.dynamics = Dynamics(config, robot)
         self.hook: Hook | None = self.physics.hook
-        terms = (*terms, *(HOOK_TERMS if self.hook else ()), *TERMS_OF_TASKS[config.task])
+        terms = (*terms, *(HOOK_TERMS if self.hook else ()), *TERMS_OF_TASKS[config.task], *reaching_terms(self))
         observed = config.observations
         self.terms = (*(t for t in TERMS if t.kind != "observation" or t.name in observed), *terms)
         keys = [t.key for t in self.terms]
@@ -288,7 +288,7 @@ class InteractiveNav(Env):
         away = (goal_w - pos_w)[: 3 if self.config.success_in_3d or flies else 2]
         at_goal = jnp.linalg.norm(away) < self.success_distance_m
         touches = (self.tables.mass_kg[scene, 1:] > 0) & (signals.slot_force_n > TOUCH_FORCE_N)
-        if self.config.task in ("open", "fetch"):
+        if self.config.task in ("open", "fetch", "lift"):
             at_goal = achieved(self.config.task, self.tables, nav, physics.qpos, touches)
         success = at_goal & ~broken & (signals.overflow == 0)
         hits_structure = signals.structure_force_n > TOUCH_FORCE_N

@@ -1,4 +1,4 @@
-"""Define the tasks with a target: open a door or drawer, pull a door open and go through, touch an object.
+"""Define the tasks with a target: open a door or drawer, pull a door open and go through, touch or lift an object.
 
 `build_targets` lists what each scene offers, on the host; the rest works on one environment inside jit.
 """
@@ -17,6 +17,7 @@ from interactive_nav.navigation.tables import FINE_CELLS, furniture_map, rest_po
 from interactive_nav.scenes.world import World
 from interactive_nav.task.terms import Moment, Step, Term
 from interactive_nav.types import NavInfo, SceneTables, Targets
+from interactive_nav_common.errors import ConfigError
 from interactive_nav_common.grids import label, sampled_clearance, value_near
 from interactive_nav_common.rotations import matrix_from_quat
 from scenes_mjcf.categories import SEGMENTATIONS
@@ -24,12 +25,17 @@ from scenes_mjcf.schema import SceneError
 
 OPEN_RAD, OPEN_M = math.pi / 3, 0.2
 """A door is open when it has turned, a drawer when it has slid, this far from where it stood at the start."""
+LIFT_M, CARRY_M, LIFT_KG = 0.1, 0.5, 6.0
+"""An object is lifted when its centre of mass is this far above, and this far aside of, its place at the start. Tipping
+it over raises it less. Targets have at most this mass, the payload of Fetch's arm."""
 BESIDE_M = 0.5
 """The robot fits before a handle if it fits within this distance of the place straight before it."""
 PAIRS = 1024
 """Pairs of start and goal of each scene, from which episodes are drawn."""
 OPENING_REWARD = 5.0
-"""Sum of the rewards of opening a target."""
+"""Sum of the rewards of opening or lifting a target."""
+NEAR_M = 1.0
+"""The way of a hook at a hand to the target pays from this distance on."""
 CATEGORIES = SEGMENTATIONS["all"].names
 
 
@@ -63,7 +69,7 @@ def _offers(world: World, config: NavConfig, s: int, places: np.ndarray) -> Iter
         axes_w = matrix_from_quat(quat)
         com_w = pos_w + axes_w @ body.com_m
         if tie is None:
-            if config.task == "fetch":
+            if config.task == "fetch" or (config.task == "lift" and body.mass_kg <= LIFT_KG):
                 yield slot, places, places[nearest(com_w[:2], radius_m + 1.0)]
             continue
         arm_w = np.zeros(3) if tie.slides else com_w - pos_w - axes_w @ tie.anchor_m
@@ -115,16 +121,21 @@ def build_targets(world: World, config: NavConfig, tables: SceneTables) -> Targe
 
 
 def opened(tables: SceneTables, at: NavInfo, qpos: jax.Array) -> jax.Array:
-    """Return [] in [0, 1]: how far an episode's target is open, as a share of what counts; 0 without a joint."""
+    """Return [] in [0, 1]: how far an episode's target is open, as a share of what counts.
+
+    Of an object without a joint, it is how far it is lifted, and a half of it how far it is carried.
+    """
     targets: Any = tables.targets
     address = targets.address[at.target]
     moved = jnp.abs(qpos[address] - tables.rest_qpos[at.scene_index, address]) / targets.span[at.target]
-    return jnp.where(address >= 0, jnp.clip(moved, 0.0, 1.0), 0.0)
+    away_m = at.object_pos_w[at.target] - targets.hinge_w[at.scene_index, at.target]
+    lifted, carried = jnp.clip(away_m[2] / LIFT_M, 0.0, 1.0), jnp.clip(jnp.linalg.norm(away_m[:2]) / CARRY_M, 0.0, 1.0)
+    return jnp.where(address >= 0, jnp.clip(moved, 0.0, 1.0), 0.5 * lifted * (1.0 + carried))
 
 
 def achieved(task: str, tables: SceneTables, at: NavInfo, qpos: jax.Array, touches: jax.Array) -> jax.Array:
-    """Return [] bool: the target is open (`open`), or an object of its category is among the touched (M,) (`fetch`)."""
-    if task == "open":
+    """Return [] bool: the target is open or lifted, or in `fetch` an object of its category is touched (M,)."""
+    if task in ("open", "lift"):
         return opened(tables, at, qpos) >= 1.0
     kinds = tables.targets.category[at.scene_index]  # pyright: ignore[reportOptionalMemberAccess]
     return (touches & (kinds[:-1] == kinds[at.target])).any()
@@ -147,11 +158,34 @@ def _opening(shares: jax.Array, step: Step) -> jax.Array:
     return jnp.stack([jnp.where(step.broken, shares[0], share), shares[0]])
 
 
+def reaching_terms(env: Any) -> tuple[Term, ...]:
+    """Return what pays for the way of a hook at a hand to the target, and for its hold, in `open` and `lift`."""
+    at_hand = env.hook is not None and env.hook.at_hand
+    if env.config.task == "lift" and not at_hand:
+        got = f"hook_force_n is {env.config.hook_force_n} and control_mode '{env.robot.control_mode}' with task 'lift'"
+        raise ConfigError(f"{got}, expected a hook at a hand; set hook_force_n=100 and control_mode=hand")
+    if env.config.task not in ("open", "lift") or not at_hand:
+        return ()
+
+    def near(nav: NavInfo, physics: Any) -> jax.Array:
+        away_m = jnp.linalg.norm(env.hook.point_w(physics) - nav.object_pos_w[nav.target])
+        holds = physics.hook[0] == nav.target
+        return jnp.where(holds, 1.0, jnp.clip(1.0 - away_m / NEAR_M, 0.0, 1.0) / 2.0)
+
+    def update(shares: jax.Array, step: Step) -> jax.Array:
+        return jnp.stack([jnp.where(step.broken, shares[0], near(step.nav, step.physics)), shares[0]])
+
+    doc = "The change of the hook's nearness to the target; 1 where it holds it."
+    return (Term("reaching", doc, "reward", lambda near, _: near[0] - near[1], lambda nav: jnp.zeros(2), update),)
+
+
 _CATEGORY = Term("category", "Of what to touch, one-hot.", "observation", _category, size=len(CATEGORIES))
 _OPENING = (
-    Term("target", "Its centre (3) and hinge (2), robot frame, m; share open.", "observation", _place, size=6),
-    Term("opening", "`OPENING_REWARD` times the change of the share that is open.", "reward",
+    Term("target", "Its centre (3), hinge (2), robot frame, m; share open or lifted.", "observation", _place, size=6),
+    Term("opening", "`OPENING_REWARD` times the change of the share that is open or lifted.", "reward",
          lambda shares, _: OPENING_REWARD * (shares[0] - shares[1]), lambda nav: jnp.zeros(2), _opening),
-    Term("opened", "Share of what counts as open.", "metric", lambda _, step: step.nav.memory["reward/opening"][0]),
+    Term("opened", "Share of what counts as open or lifted.", "metric",
+         lambda _, step: step.nav.memory["reward/opening"][0]),
 )  # fmt: skip
-TERMS_OF_TASKS: dict[str, tuple[Term, ...]] = {"reach": (), "fetch": (_CATEGORY,), "open": _OPENING, "clear": _OPENING}
+TERMS_OF_TASKS: dict[str, tuple[Term, ...]] = {"reach": (), "fetch": (_CATEGORY,)}
+TERMS_OF_TASKS |= dict.fromkeys(("open", "clear", "lift"), _OPENING)

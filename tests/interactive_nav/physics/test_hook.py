@@ -74,13 +74,18 @@ def test_the_force_by_hand(xp):
     # 0.1 m would be 125 N: the cap keeps its direction.
     want = [[12.5, 0, 0], [22.5, 0, 0], [60, 80, 0], [0, 0, 0], [0, -10, 0]]
     np.testing.assert_allclose(force, want, atol=1e-4)
+    borne = spring_force(stretch, speed, xp.full(5, 0.5), 0.02, MOST_N, xp.asarray([[0, 0, 30.0]]))
+    # Of the third, 75, 100 and 30 N, the cap leaves 100 in 128.55.
+    want = [[12.5, 0, 30], [22.5, 0, 30], [58.34, 77.79, 23.34], [0, 0, 0], [0, -10, 30]]
+    np.testing.assert_allclose(borne, want, atol=0.01)
 
 
-def test_places_velocities_and_torques_are_those_of_c_mujoco(tmp_path):
+@pytest.mark.parametrize(("name", "mode"), [("freight", "twist"), ("fetch", "hand"), ("jackrabbot2", "whole_body")])
+def test_places_velocities_and_torques_are_those_of_c_mujoco(tmp_path, name, mode):
     """For a free body, a door, a drawer and a flap: the power of the forces is that of MuJoCo's generalised force."""
     folder = write_room(tmp_path / "room", (5.0, 4.0), (("chair", 0.7, 0.0, 5.0, 0.5),), door=True, kitchen=True)
-    config = NavConfig.of(num_objects=0, hook_force_n=MOST_N, control_mode="twist")
-    world = build_world(get_robot("freight", "twist").hooked(), (load_scene(folder),), config)
+    config = NavConfig.of(num_objects=0, hook_force_n=MOST_N, control_mode=mode)
+    world = build_world(get_robot(name, mode).hooked(), (load_scene(folder),), config)
     hook, model, layout, rng = Hook(world, config), world.models[0], world.layout, np.random.default_rng(0)
     assert len(layout.slot_body) == 4
     for slot, body in enumerate(layout.slot_body):
@@ -89,7 +94,7 @@ def test_places_velocities_and_torques_are_those_of_c_mujoco(tmp_path):
         mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 0.3)
         mujoco.mj_forward(model, data)
         moves, base = hook._motions(np.int32(0), np.int32(slot), layout, np.int32(slot), data.qpos, data.qvel)
-        base_body = layout.robot_bodies[0]
+        base_body = model.body(world.robot.hand).id if mode != "twist" else layout.robot_bodies[0]
         for motion, at, point in ((moves, body, point_b), (base, base_body, hook.point_b)):
             place, velocity = _point(motion, point)
             jacobian = np.zeros((3, model.nv))

@@ -13,9 +13,11 @@ from scipy import ndimage
 import interactive_nav
 from interactive_nav import episodes
 from interactive_nav.episodes import EpisodeFileError
-from interactive_nav.task.targets import CATEGORIES, OPENING_REWARD, achieved, opened
+from interactive_nav.task.targets import CARRY_M, CATEGORIES, LIFT_M, OPENING_REWARD, achieved, opened
 from interactive_nav.types import EpisodeStart
+from interactive_nav_common.errors import ConfigError
 from scenes_mjcf.schema import SceneError
+from tests.interactive_nav.robots.test_wheeled_doors import READY
 from tests.toys import write_room
 
 HOOK = {"backend": "native", "num_objects": 0, "control_mode": "twist", "hook_force_n": 100.0}
@@ -174,6 +176,56 @@ def test_fetch_counts_any_object_of_the_category(room):
         if state.done:
             break
     assert state.done and float(state.metrics["success"]) == 1.0 and int(state.metrics["interaction_steps"]) == 1
+
+
+def test_fetch_lifts_a_chair_and_carries_it_aside(tmp_path):
+    """The arm is in a pose whose grip is 0.05 m before the chair's back; 5 kg are lifted, 7 kg are no target."""
+    blocks = ("chair", 1.13, 0.0, 5.0, 0.5), ("chair", -1.5, 1.0, 7.0, 0.5)
+    folder = write_room(tmp_path / "lift", (6.0, 4.0), blocks, half_m=(0.15, 0.2, 0.4))
+    hand = {**HOOK, "control_mode": "hand", "task": "lift", "k_int": 0.0}
+    env = interactive_nav.make("fetch", [folder], **hand)
+    assert slots_of(env) == {"chair_0"}
+    state: Any = env.reset_to(start_at(env, 0.0, 0.0, 0.0, [-2.5, 1.5], "chair_0"), jax.random.PRNGKey(0))
+    at = jnp.array([int(env.world.models[0].joint(f"fetch_{name}").qposadr[0]) for name in READY])
+    qpos = state.pipeline_state.qpos.at[at].set(jnp.array([*READY.values()], jnp.float32))
+    state, paid = state.replace(pipeline_state=state.pipeline_state.replace(qpos=qpos)), []
+    step = jax.jit(env.step)
+    for steps, turn, up in ((5, 0.0, 0.0), (25, 0.0, 0.2), (60, 0.4, 0.15)):
+        for _ in range(steps):
+            command = np.array([0.0, turn, 0.0, 0.0, up, 0.04, 1.0])
+            state = step(state, jnp.asarray(env.robot.action(command), jnp.float32))
+            paid.append([float(state.metrics[f"reward/{name}"]) for name in ("opening", "reaching", "success")])
+            if state.done:
+                break
+    chair_m = np.asarray(state.info["nav"].object_pos_w[0])
+    assert state.done and float(state.metrics["success"]) == 1.0 and int(state.pipeline_state.hook[0]) == 0
+    assert chair_m[2] >= 0.4 + LIFT_M and np.linalg.norm(chair_m[:2] - [1.13, 0.0]) >= CARRY_M
+    np.testing.assert_allclose(np.sum(paid, 0), [OPENING_REWARD, 1.0, 10.0], atol=1e-3)
+    # The arm bears the chair's weight for most of the time.
+    assert 0.5 * 5.0 * 9.81 < float(state.metrics["force_sum_n"]) / len(paid) < 100.0
+
+
+def test_lifted_is_half_of_a_share_and_carried_is_the_rest(tmp_path):
+    folder = write_room(tmp_path / "lift", (6.0, 4.0), (("chair", 1.0, 0.0, 5.0, 0.5),))
+    env = interactive_nav.make("fetch", [folder], **{**HOOK, "control_mode": "hand", "task": "lift"})
+    state: Any = env.reset_to(start_at(env, 0.0, 0.0, 0.0, [-2.5, 1.5], "chair_0"), jax.random.PRNGKey(0))
+    nav, qpos = state.info["nav"], state.pipeline_state.qpos
+    for up_m, aside_m, share in (
+        (0, 0, 0),
+        (0, 0.6, 0),
+        (0.05, 0, 0.25),
+        (0.2, 0, 0.5),
+        (0.1, 0.25, 0.75),
+        (0.2, 0.6, 1),
+    ):
+        moved = nav.replace(object_pos_w=nav.object_pos_w.at[0].add(jnp.array([aside_m, 0.0, up_m])))
+        assert float(opened(env.tables, moved, qpos)) == pytest.approx(share, abs=1e-3)
+    for settings, got in (
+        ({"control_mode": "twist"}, "100.0 and control_mode 'twist'"),
+        ({"hook_force_n": 0}, "0 and"),
+    ):
+        with pytest.raises(ConfigError, match=f"{got}.* with task 'lift', expected a hook at a hand"):
+            interactive_nav.make("fetch", [folder], **{**HOOK, "control_mode": "hand", "task": "lift", **settings})
 
 
 def test_draws_keep_the_largest_distance(opening):
