@@ -237,7 +237,6 @@ COMMANDS: dict[str, Any] = {
     "generate": generating.Generate,
     "generate-scenes": generating.GenerateScenes,
     "scenes": {"list": generating.ListScenes, "make": generating.MakeScenes},
-    "library": {"list": generating.ListModels},
     "preview": Preview,
     "export": Export,
 }

@@ -158,19 +158,3 @@ class ListScenes(Command):
             print(f"{name:<10} {member.split:<6} {scene.name:<15} {what}")
         for scene in sorted({path.parent for path in sets.HERE.rglob("scene.json")} - set(listed)):
             print(f"{'-':<10} {'-':<6} {scene.relative_to(sets.HERE).as_posix():<15} {scene}")
-
-
-class ListModels(Command):
-    """List the packaged models with their category, size and credits."""
-
-    def run(self, console: Console) -> None:
-        """Run the command."""
-        from converters.library.store import read_index
-
-        for model in read_index().values():
-            width, height, depth = model.size_m
-            print(
-                f"{model.name:<40} {model.category:<15} {model.split:<6} {width:.2f} x {depth:.2f} x {height:.2f} m "
-                f"{model.faces:>5} faces {model.hulls:>3} hulls  "
-                + "; ".join(f"{c.creator}, {c.licence}" for c in model.credits)
-            )

@@ -199,15 +199,10 @@ class Propose(WithLibrary):
             proposals, retrieved = propose(raw, self.output, library, report)
         table = Table("class", "confidence", "x y z, m", "size, m", "model", "sure", title="Proposals")
         for k, proposal in enumerate(proposals):
-            model = retrieved.get(k)
-            table.add_row(
-                proposal.category,
-                f"{proposal.confidence:.2f}",
-                " ".join(f"{v:.2f}" for v in proposal.centre),
-                " ".join(f"{v:.2f}" for v in proposal.extent_m),
-                model.cad.cad_id[:8] if model else "-",
-                f"{model.confidence:.2f}" if model else "-",
-            )
+            model, sizes = retrieved.get(k), (proposal.centre, proposal.extent_m)
+            fitted = (model.cad.cad_id[:8], f"{model.confidence:.2f}") if model else ("-", "-")
+            metres = (" ".join(f"{v:.2f}" for v in values) for values in sizes)
+            table.add_row(proposal.category, f"{proposal.confidence:.2f}", *metres, *fitted)
         console.print(table)
         console.print(f"{self.output}: proposals.json")
 

@@ -3,7 +3,6 @@
 Exit codes: 0 done, 2 on a user's error (one line on stderr), 128 + signal when stopped.
 """
 
-import importlib
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -189,7 +188,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parse(COMMANDS, "python -m topological_nav", argv)
     try:
         # Imported once the command is clear: it is heavy.
-        commands = importlib.import_module("topological_nav.commands")
+        from topological_nav import commands
+
         getattr(commands, f"run_{type(arguments).__name__.lower()}")(arguments)
     except (Stopped, KeyboardInterrupt) as stopped:  # the latter: outside of loops that stop between two steps
         print("topological_nav: stopped; give the same command again", file=sys.stderr)

@@ -35,7 +35,7 @@ from topological_nav.maps.build import Built, build_map
 from topological_nav.maps.graph import save_map
 from topological_nav.presets import configured, preset_of
 from topological_nav.tables import tables
-from topological_nav.weights.export import choose, export, fitting_map, level_images, size_lines
+from topological_nav.weights.export import choose, export, fitting_map, level_images
 from topological_nav.weights.onnx_files import onnx_models
 
 
@@ -169,7 +169,7 @@ def keep_map(built: Built, out: Path, ends: Sequence[int] | None = None) -> None
 def run_export(arguments: Any) -> None:
     config = overridden(configs.ExportConfig(), arguments.settings)
     if arguments.onnx:
-        refuse_unused(arguments, "--maps limit_mib tolerance commit", "with --onnx")
+        refuse_unused(arguments, "--maps tolerance commit", "with --onnx")
         networks = load_networks(arguments.localiser, arguments.detector)
         driver = arguments.policy and load_policy(arguments.policy, arguments.localiser, arguments.detector)
         with bar() as report, whole_folder(arguments.out) as part:
@@ -179,10 +179,11 @@ def run_export(arguments: Any) -> None:
         return print(f"{arguments.out}: as JAX over {len(images) * images.shape[1]:,} images")
     with bar() as report:
         runs = (arguments.localiser, arguments.detector, arguments.policy, arguments.maps)
-        sizes, compared = export(*runs, arguments.images, arguments.out, config, report)
+        compared = export(*runs, arguments.images, arguments.out, config, report)
     for name, value in compared.items():
         print(f"{name.replace('_', ' ')}: {value:.3g}")
-    print(f"{arguments.out}: {size_lines(sizes, config.limit_mib)}")
+    size = sum(path.stat().st_size for path in arguments.out.rglob("*") if path.is_file())
+    print(f"{arguments.out}: {size / 2**20:.2f} MiB")
 
 
 def run_tables(arguments: Any) -> None:

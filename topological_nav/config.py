@@ -378,8 +378,6 @@ class PolicyConfig(Settings):
 class ExportConfig(Settings):
     """Set the limits of an export."""
 
-    limit_mib: Annotated[float, Bounds(0.001, 1e6)] = 8.0
-    """Largest size of the folder in MiB."""
     places: Count = 24
     """Number of places whose images compare exported networks with the runs'."""
     tolerance: Annotated[float, Bounds(0.0, 10.0)] = 0.02

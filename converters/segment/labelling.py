@@ -115,20 +115,15 @@ def score_voxels(
     return out
 
 
-def load_network() -> tuple[VoxelNet, dict[str, Any]]:
-    """Read the packaged network, which commit b97304ed trained; its weights of a byte each are restored."""
-    tensors, about = weights.read_weights(WEIGHTS, SceneRejected, "install the package again")
-    params = {name: jnp.asarray(tensor, jnp.float32) for name, tensor in tensors.items()}
-    return VoxelNet(tuple(about["widths"])), {"params": unflatten_dict(params, sep="/")}
-
-
 MATCH_IOU = 0.5
 """Of boxes, from which on a proposal is an annotated object."""
 
 
 def load_scores() -> Scores:
-    """Load the network for `label_scan`, compiled once a shape."""
-    net, variables = load_network()
+    """Load the packaged network, which commit b97304ed trained, for `label_scan`; compiled once a shape."""
+    tensors, about = weights.read_weights(WEIGHTS, SceneRejected, "install the package again")
+    net = VoxelNet(tuple(about["widths"]))
+    variables = {"params": unflatten_dict({k: jnp.asarray(v, jnp.float32) for k, v in tensors.items()}, sep="/")}
 
     @signals_wait()  # a compilation that is left crashes the interpreter at its end
     @functools.partial(jax.jit, static_argnums=2)

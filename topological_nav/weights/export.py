@@ -2,7 +2,7 @@
 
 OUT/rooms/ passages/ policy/   weights.safetensors.xz, network.json, config.yaml, versions.json, results.json
     maps/SCENE.npz             embeddings in half precision
-    export.json                commit, device and digest of each run, sizes, agreement of the networks with the runs
+    export.json                commit, device and digest of each run, agreement of the networks with the runs
 
 Kernels and matrices are fp16; biases, scales and statistics stay f32, because a variance may overflow fp16. `digest` in
 network.json is that of the run, so that maps and policies fit both. Exports whose predictions differ are refused.
@@ -13,7 +13,6 @@ import dataclasses
 import importlib.resources
 import os
 import shutil
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 from typing import Any
@@ -49,8 +48,8 @@ def export(
     out: Path,
     config: ExportConfig,
     progress: Progress = lambda *_: None,
-) -> tuple[dict[str, int], dict[str, float]]:
-    """Write an export atomically, replacing one at `out`; return `sizes_of` it and the comparison."""
+) -> dict[str, float]:
+    """Write an export atomically, replacing one at `out`; return the comparison."""
     out = Path(os.path.abspath(out))
     if out.exists() and not (out / ABOUT).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise FileError(f"{out}: is something else than an export; choose another folder (-o)")
@@ -89,29 +88,8 @@ def export(
                 )
         about |= {"compared": compared, "exported_by": {"commit": versions()["commit"]}}
         write_json(part / ABOUT, about)
-        sizes = sizes_of(part)
-        if sum(sizes.values()) > config.limit_mib * 2**20:
-            raise FileError(f"{out}: {size_lines(sizes, config.limit_mib)}")
     progress("comparing", total, total)
-    return sizes, compared
-
-
-def sizes_of(folder: Path) -> dict[str, int]:
-    """Return the bytes of an export by their use: weights of each network, maps, descriptions."""
-    sizes: Counter[str] = Counter()
-    for path in sorted(p for p in Path(folder).rglob("*") if p.is_file()):
-        part = path.relative_to(folder).parts[0]
-        sizes[part if path.name == learning.PACKED_WEIGHTS or part == "maps" else "descriptions"] += path.stat().st_size
-    return dict(sizes)
-
-
-def size_lines(sizes: dict[str, int], limit_mib: float) -> str:
-    """Format the sizes, the largest first."""
-    total = sum(sizes.values()) / 2**20
-    parts = (f"{name} {size / 2**20:.2f}" for name, size in sorted(sizes.items(), key=lambda item: -item[1]))
-    remedy = "leave maps out, or train with a smaller width, hidden or projection"
-    excess = f"; expected at most {limit_mib:g} MiB (limit_mib): {remedy}" if total > limit_mib else ""
-    return f"{total:.2f} MiB: {', '.join(parts)}{excess}"
+    return compared
 
 
 def compare(

@@ -4,14 +4,12 @@ Factors and vertex colours are linear and images are sRGB, by the standard; resu
 exception: it writes all colours as sRGB, and its default grey as the factor of every texture.
 """
 
-import base64
 import collections
 import dataclasses
 import io
-import re
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote_to_bytes
+from urllib.request import urlopen
 
 import numpy as np
 import trimesh
@@ -143,10 +141,9 @@ class _File:
 
     def _bytes(self, item: Any, what: str) -> bytes:
         """Content of a buffer or image: a data URI, or a file beside the model."""
-        match = re.match(r"data:[^,]*?(;base64)?,", item["uri"])
-        if match:
-            data = unquote_to_bytes(item["uri"][match.end() :])
-            return base64.b64decode(data) if match[1] else data
+        if item["uri"].startswith("data:"):
+            with urlopen(item["uri"]) as content:
+                return content.read()
         path = use_named(self.source, self.path.parent, item["uri"], self.where)
         if path is None:
             raise SceneRejected(f"{self.path}: names the {what} '{item['uri']}', which is not there; put it there")

@@ -18,7 +18,7 @@ from topological_nav.learn.learning import weights_file
 from topological_nav.learn.training import load_networks, load_trained, save_trained
 from topological_nav.maps.build import NetworkSight
 from topological_nav.maps.graph import load_map, save_map
-from topological_nav.weights.export import level_images, size_lines, sizes_of
+from topological_nav.weights.export import level_images
 
 pytestmark = pytest.mark.heavy
 
@@ -114,28 +114,6 @@ def test_it_says_where_everything_comes_from(made, exported):
         "nodes": len(made_map.xy_w),
         "edges": len(made_map.edges),
     }
-
-
-def test_what_is_too_large_is_refused_and_nothing_is_left(made, tmp_path, capsys):
-    out = tmp_path / "small"
-    assert main(words(made, out, "limit_mib=0.05", "commit=toy")) == 2
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert "passages 0." in error and "rooms 0." in error and "expected at most 0.05 MiB (limit_mib)" in error
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_sizes_are_told_by_part(tmp_path):
-    for name, size in (
-        ("rooms/weights.safetensors.xz", 3 << 20),
-        ("rooms/config.yaml", 1 << 19),
-        ("maps/a.npz", 1 << 20),
-    ):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_bytes(bytes(size))
-    sizes = sizes_of(tmp_path)
-    assert sizes == {"rooms": 3 << 20, "descriptions": 1 << 19, "maps": 1 << 20}
-    assert size_lines(sizes, 5.0) == "4.50 MiB: rooms 3.00, maps 1.00, descriptions 0.50"
-    assert "expected at most 4 MiB" in size_lines(sizes, 4.0)
 
 
 def test_an_export_is_replaced_and_another_folder_is_not(made, tmp_path, capsys):
