@@ -47,6 +47,15 @@ def formula(page, node):
     raise nodes.SkipNode
 
 
+def keep_percentages(app, doctree, docname):
+    """Keep each percent sign on the line of its number."""
+    for text in list(doctree.findall(nodes.Text)):
+        if not isinstance(text.parent, nodes.literal | nodes.literal_block | nodes.raw):
+            together = re.sub(r"(?<=\d) (?=%)", "\N{NO-BREAK SPACE}", text)
+            if together != text:
+                text.parent.replace(text, nodes.Text(together))
+
+
 def break_tables(app, doctree, docname):
     """Let long code in tables break between its words, and keep each interval `[low, high]` on one line."""
     for cell in doctree.findall(nodes.entry):
@@ -69,6 +78,7 @@ def setup(app):
     """Register the renderer that `html_math_renderer` names, and what makes tables and the API readable."""
     # Napoleon takes an attribute's words before the first colon for its type.
     GoogleDocstring._parse_attribute_docstring = lambda docstring: list(docstring._lines)
+    app.connect("doctree-resolved", keep_percentages)
     app.connect("doctree-resolved", break_tables)
     app.connect("autodoc-process-signature", shorten_signature)
     app.add_html_math_renderer("mathml", (formula, None), (formula, None))

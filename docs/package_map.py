@@ -115,13 +115,12 @@ def svg(graph: Graph) -> str:
             if any(room.partition(".")[0] == package for room in graph):
                 y = _draw_package(shapes, graph, package, WIDE * k + 8, y)
         heights.append(y)
-    size = f"{WIDE * len(COLUMNS)} {max(heights) + 8}"
-    wide, high = size.split()
+    size = f'width="{WIDE * len(COLUMNS)}" height="{max(heights) + 8}"'
     return "\n".join(
         [
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {size}" font-family="sans-serif" font-size="13">',
-            f'<rect width="{wide}" height="{high}" fill="#fff"/>',
-            "<style>.room { fill: #e6f1f8; stroke: #0072b2 }</style>",
+            f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="sans-serif" font-size="13">',
+            f'<rect {size} fill="#fff"/>',
+            "<style>.room { fill: #e6f1f8; stroke: #0072b2 } .name { text-anchor: middle }</style>",
             *shapes,
             "</svg>",
             "",
@@ -148,7 +147,7 @@ def _draw_package(shapes: list[str], graph: Graph, package: str, x: int, y: int)
             if right + wide > x + WIDE - 16:
                 right, y = x + 16, y + HIGH + 2
             shapes.append(f'<rect x="{right}" y="{y}" width="{wide}" height="{HIGH}" rx="4" class="room"/>')
-            shapes.append(f'<text x="{right + wide // 2}" y="{y + 15}" text-anchor="middle">{name}</text>')
+            shapes.append(f'<text x="{right + wide // 2}" y="{y + 15}" class="name">{name}</text>')
             right += wide + 6
         y += HIGH + 6
     return y + 6

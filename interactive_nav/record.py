@@ -206,7 +206,7 @@ def _write_frames(frames: Iterator[np.ndarray], path: Path, rate: float, hold_s:
     if path.suffix == ".gif":
         pictures = [picture.quantize(128, dither=Image.Dither.NONE) for picture in pictures]
     shown_ms = [round(1000 / rate)] * (len(pictures) - 1) + [round(1000 * hold_s)]
-    words: dict[str, Any] = {"quality": 40, "method": 4} if path.suffix == ".webp" else {}
+    words: dict[str, Any] = {"quality": 40, "method": 4, "minimize_size": True} if path.suffix == ".webp" else {}
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=shown_ms, loop=0, **words)
 
 

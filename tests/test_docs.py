@@ -354,6 +354,8 @@ FAULTS = """
   faults.push(...[...page.images].filter(i => !i.naturalWidth).map(i => "no picture: " + i.getAttribute("src")));
   frame.style.width = "400px";
   if (page.documentElement.scrollWidth > 400) faults.push("wider than 400 px");
+  const drawings = [...page.images].filter(i => i.src.endsWith(".svg") && i.clientWidth < i.naturalWidth);
+  faults.push(...drawings.map(i => "shrunk at 400 px: " + i.getAttribute("src")));
   frame.remove();
   return faults;
 })()
@@ -362,7 +364,10 @@ FAULTS = """
 
 def test_pages_fit_wide_and_narrow_windows(site, tmp_path):
     wide = '<div class="table-wrapper" style="overflow: auto"><p style="width: 1500px">A row</p></div>'
-    page = f'<!doctype html>{wide}<img src="gone.png"><p style="width: 500px">A line'
+    drawing = '<svg xmlns="http://www.w3.org/2000/svg" width="720" height="9"></svg>'
+    (site / "small.svg").write_text(drawing, encoding="utf-8")
+    shrunk = '<img src="small.svg" style="max-width: 100%">'
+    page = f'<!doctype html>{wide}<img src="gone.png">{shrunk}<p style="width: 500px">A line'
     (site / "wrong.html").write_text(page, encoding="utf-8")
     handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(site))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
@@ -377,7 +382,7 @@ def test_pages_fit_wide_and_narrow_windows(site, tmp_path):
                     found[page.name] = result["result"]["value"]
         finally:
             server.shutdown()
-    wrong = ["scrolls at 1400 px: A row", "no picture: gone.png", "wider than 400 px"]
+    wrong = ["scrolls at 1400 px: A row", "no picture: gone.png", "wider than 400 px", "shrunk at 400 px: small.svg"]
     assert len(found) > 50
     assert {page: faults for page, faults in found.items() if faults} == {"wrong.html": wrong}
 
@@ -389,3 +394,8 @@ def test_tables_keep_intervals_together_and_let_code_break(site):
     intervals = [found for cell in cells for found in re.findall(r"\[-?\d[^]]*\]", cell)]
     assert len(intervals) > 100
     assert [interval for interval in intervals if ",\N{NO-BREAK SPACE}" not in interval] == []
+
+
+def test_percent_signs_stay_with_their_numbers(site):
+    text = re.sub(r"<pre>.*?</pre>", "", (site / "results.html").read_text("utf-8"), flags=re.DOTALL)
+    assert "97\N{NO-BREAK SPACE}%" in text and re.findall(r"\d %", text) == []

@@ -98,7 +98,8 @@ def run_navigate(arguments: Any) -> None:
     out = arguments.out or RUNS / "navigate" / f"{name}-{arguments.episode}.png"
     (venue,) = contest_scenes(contest)
     with bar() as report:
-        driven = drive_episode(venue, contest.contenders[0], arguments.episode, bool(arguments.video), report)
+        camera = venue.film_camera if arguments.video else None
+        driven = drive_episode(venue, contest.contenders[0], arguments.episode, camera, report)
     for line in driven.log:
         print(line)
     save(driven.figure(), out)

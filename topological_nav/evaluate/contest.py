@@ -12,6 +12,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -52,6 +53,8 @@ CONTENDERS = ("dense", "sparse", "expert", "ppo")
 """The navigator on its map and on a thinned one; an expert with the plan; a policy that observes the goal."""
 EXPERT_WEIGHT = 1.0
 """Weight of path against effort: objects are pushed only where no path is free."""
+FILM_HEIGHT = 480
+"""Height of a film in pixels."""
 UNDECIDING = ("batch", "episodes", "supersample")
 """Settings that do not affect rows, or enter the digest in another form."""
 
@@ -143,8 +146,23 @@ class ContestScene:
         """Return the camera for the navigator's sight."""
         if self.networks is None:
             return lambda xy_w, yaw_rad, _=None: np.column_stack([xy_w, yaw_rad])  # what `TrueSight` looks at
+        return self._camera(self.drawn)
+
+    @functools.cached_property
+    def film_camera(self) -> Camera | None:
+        """Return the camera for films, with as many pixels; with a domain the navigator's, as its blur is in pixels."""
+        if self.networks is None:
+            return None
+        if self.contest.domain != "clean":
+            return self.camera
+        drawn = self.drawn
+        by = math.ceil(FILM_HEIGHT / drawn.height)
+        larger = {"width": by * drawn.width, "height": by * drawn.height, "supersample": 2}
+        return self._camera(dataclasses.replace(drawn, **larger))
+
+    def _camera(self, drawn: DataConfig) -> Camera:
         world = self.player.env.world
-        plain = scene_camera(renderer_of(self.scene, self.drawn, world.small_objects), self.robot, world)
+        plain = scene_camera(renderer_of(self.scene, drawn, world.small_objects), self.robot, world)
         domain = PRESETS[self.contest.domain]
         return lambda xy, yaw, qpos=None: as_seen_from(plain(xy, yaw, qpos), domain, xy, yaw)
 

@@ -22,11 +22,11 @@ from interactive_nav_common.figures import BLUE, GREEN, ORANGE, PINK, SKY, VERMI
 from interactive_nav_common.files import whole_file
 from interactive_nav_common.jobs.progress import Progress
 from topological_nav.data.dataset import images_at, load_plan, read_header
-from topological_nav.evaluate.contest import ContestScene
+from topological_nav.evaluate.contest import FILM_HEIGHT, ContestScene
 from topological_nav.evaluate.evaluation import DrivenEpisodes, NavigatorPlayer, Played
 from topological_nav.maps.graph import TopologicalMap
 from topological_nav.navigate.navigator import FACE, PHASES, State
-from topological_nav.scenes.rendering import Snapshot
+from topological_nav.scenes.rendering import Camera, Snapshot
 from topological_nav.scenes.space import FreeSpace
 
 WON, LOST = BLUE, VERMILION
@@ -178,7 +178,6 @@ def map_figure(space: FreeSpace, graphs: Sequence[TopologicalMap], route: Sequen
 FILM_EVERY_S = 0.5
 FILM_RATE = 20.0
 """Frames per second of film, ten times as fast as real time."""
-FILM_HEIGHT = 480
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,14 +261,16 @@ class Driven:
             frame = np.array(canvas.buffer_rgba())[..., :3]  # type: ignore[attr-defined]
             if (view := self.views.get(step)) is not None:
                 side = int(round(FILM_HEIGHT * view.shape[1] / view.shape[0] / 2)) * 2
-                beside = Image.fromarray(view).resize((side, FILM_HEIGHT), Image.Resampling.NEAREST)
+                beside = Image.fromarray(view).resize((side, FILM_HEIGHT), Image.Resampling.BOX)
                 frame = np.concatenate([frame, np.asarray(beside)], 1)
             yield frame
         plt.close(figure)
 
 
-def drive_episode(venue: ContestScene, contender: str, number: int, filmed: bool, progress: Progress) -> Driven:
-    """Drive one of a scene's episodes."""
+def drive_episode(
+    venue: ContestScene, contender: str, number: int, camera: Camera | None, progress: Progress
+) -> Driven:
+    """Drive one of a scene's episodes; keep views of the camera, if any."""
     contest = venue.contest
     if not 0 <= number < len(venue.episodes):
         raise ConfigError(f"episode is {number}, expected 0 to {len(venue.episodes) - 1}; episodes=N makes more")
@@ -282,8 +283,8 @@ def drive_episode(venue: ContestScene, contender: str, number: int, filmed: bool
     every = _film_every(venue)
 
     def watch(time_s: float, now: Snapshot, state: State) -> None:
-        if filmed and not contest.truth and len(steps) % every == 0:
-            views[len(steps)] = venue.camera(now.xy_w[:1], now.yaw_rad[:1], now.qpos[:1])[0]
+        if camera and len(steps) % every == 0:
+            views[len(steps)] = camera(now.xy_w[:1], now.yaw_rad[:1], now.qpos[:1])[0]
         steps.append((time_s, now.xy_w[0], now.yaw_rad[0], int(state.phase[0])))
         log.extend(f"{time_s:7.1f} s  {line}" for line in _log_lines(graph, state))
 

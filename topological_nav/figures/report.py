@@ -132,7 +132,7 @@ def episodes(venue: ContestScene, progress: Progress) -> Iterator[tuple[str, Fig
     """Yield the first episode that is won (13 to 15), and the first that is lost (16, 17), on either map."""
     count, names = min(venue.contest.config.episodes or TRIED, len(venue.episodes)), {True: "13-15", False: "16-17"}
     for contender, number in ((of, k) for of in ("dense", "sparse") for k in range(count)):
-        driven = drive_episode(venue, contender, number, True, progress)
+        driven = drive_episode(venue, contender, number, venue.camera, progress)
         if name := names.pop(bool(driven.played.success[0]), ""):
             yield name, episode_figure(driven, contender)
         if not names:

@@ -48,6 +48,8 @@ class Tab:
         while True:
             answer = json.loads(self._connection.recv(60))
             if answer.get("id") == self._number:
+                if "context was destroyed" in answer.get("error", {}).get("message", ""):  # the page was still loading
+                    return self.send(method, **arguments)
                 assert "error" not in answer, answer
                 return answer["result"]
 

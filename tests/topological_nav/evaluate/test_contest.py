@@ -19,7 +19,7 @@ from topological_nav.config import DataConfig, EvaluationConfig
 from topological_nav.data.domains import PRESETS, as_seen_from
 from topological_nav.drives.driving import local_policy
 from topological_nav.evaluate import contest as rows
-from topological_nav.evaluate.contest import Contest, contest_scenes
+from topological_nav.evaluate.contest import Contest, ContestScene, contest_scenes
 from topological_nav.evaluate.evaluation import NavigatorPlayer
 from topological_nav.learn.learning import WEIGHTS
 from topological_nav.learn.training import load_trained, save_trained
@@ -243,6 +243,18 @@ def test_a_cpu_draws_images_at_most_twice_as_large(contest, monkeypatch):
     assert (venue.request("dense")["drawn"][-1], finer.request("dense")["drawn"][-1]) == (1, 2)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert drawn_for(learned, None) == learned
+
+
+def test_a_film_shows_the_navigators_view_with_more_pixels(contest):
+    venue, blurred = (contest_scenes(dataclasses.replace(contest, domain=of))[0] for of in ("clean", "blur"))
+    where = venue.episodes.start_xy_w[:1], np.zeros(1)
+    assert venue.film_camera is not None
+    (small,), (large,) = venue.camera(*where), venue.film_camera(*where)
+    assert small.shape == (32, 32, 3) and large.shape == (480, 480, 3)
+    averaged = large.reshape(32, 15, 32, 15, 3).mean((1, 3))
+    assert np.ptp(small) > 50 and np.abs(averaged - small).mean() < 4
+    assert blurred.film_camera is blurred.camera  # its blur is in pixels
+    assert ContestScene(venue.scene.path, contest, None).film_camera is None
 
 
 def test_true_views_through_a_camera_with_errors_are_refused(contest):
