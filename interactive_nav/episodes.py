@@ -294,6 +294,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         num_objects=arguments.num_objects,
         objects=arguments.objects,
         task=arguments.task,
+        **({"control_mode": "hand", "hook_force_n": 100.0} if arguments.task == "lift" else {}),
     )
     file = draw_episode_file(env, arguments.episodes, arguments.seed)
     save_episode_file(file, arguments.out)
