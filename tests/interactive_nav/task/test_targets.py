@@ -228,6 +228,17 @@ def test_lifted_is_half_of_a_share_and_carried_is_the_rest(tmp_path):
             interactive_nav.make("fetch", [folder], **{**HOOK, "control_mode": "hand", "task": "lift", **settings})
 
 
+def test_the_command_draws_episodes_of_lift(tmp_path, capsys):
+    blocks = ("chair", 1.0, 0.0, 5.0, 0.5), ("table", -1.0, 1.0, 9.0, 0.5)
+    folder = str(write_room(tmp_path / "lift", (6.0, 4.0), blocks))
+    words = ["make", "--task", "lift", "--scenes", folder, "--num-objects", "0", "--episodes", "3"]
+    assert episodes.main([*words, "--robot", "fetch", "-o", str(tmp_path / "lift.json")]) == 0
+    file = episodes.load_episode_file(tmp_path / "lift.json")
+    assert file.task == "lift" and [row["target"] for row in file.episodes] == ["chair_0"] * 3
+    assert episodes.main([*words, "--robot", "turtlebot", "-o", str(tmp_path / "none.json")]) == 2
+    assert "robot 'turtlebot' has no control mode 'hand'" in capsys.readouterr().err
+
+
 def test_draws_keep_the_largest_distance(opening):
     keys = jax.random.split(jax.random.PRNGKey(1), 64)
     starts = jax.vmap(lambda key: opening.draw_start(key, limit_m=jnp.float32(1.5)))(keys)
