@@ -89,6 +89,7 @@ class Hook:
         tables += shift * inverse[..., 0], np.where(hinge, 3.0, 2.0)[:, 0] * inverse[..., 1]
         self._tables = tuple(table.astype(np.float32) for table in tables)
         self._com_b = np.float32(world.models[0].body_ipos[self.layout.robot_bodies[self._link]])
+        # A hand bears the weight in the scene's model: with a random mass, the spring takes up the difference.
         masses_kg = np.stack([model.body_mass[self.layout.slot_body] for model in world.models])
         weights_n = np.where(self._held[:, 0] | (self._link == 0), 0.0, -world.models[0].opt.gravity[2] * masses_kg)
         self._borne_n = (weights_n[..., None] * [0.0, 0.0, 1.0]).astype(np.float32)
@@ -113,11 +114,15 @@ class Hook:
         return tuple(xp.where(*parts) for parts in body), self._mine(robot)
 
     def _mine(self, robot: RobotState) -> _Motion:
-        """Return the motion of the hook's body; a hand's is without its spin, but with the velocity of its grip."""
+        """Return the motion of the body with the hook.
+
+        Of a hand, the velocity is its grip's and the angular velocity 0, so that `_point` returns the grip's velocity.
+        """
         place, axes, xp = robot.qpos[..., :3], matrix_from_quat(robot.qpos[..., 3:7]), namespace(robot.qpos)
         velocity, spin = robot.qvel[..., :3], robot.qvel[..., 3:6]
         if not self._link:
             return place, axes, velocity, spin
+        # In qvel, joints stand one place earlier than in qpos, as the base's free joint has one number less there.
         (hand, hand_axes), joints = self._links.frames(robot.qpos)[self._link], np.array(self._arm)
         lever = self._links.jacobian(robot.qpos, self._link, self._arm, self.point_b)
         grip_b = apply_axes(axes.swapaxes(-1, -2), _point((hand, hand_axes, velocity, spin), self.point_b)[0] - place)
@@ -164,8 +169,8 @@ class Hook:
         borne_n = xp.asarray(self._borne_n)[scene, slot]
         force = spring_force(here_w - there_w, mine - theirs, hook[..., 4], self._step_s, self._most_n, borne_n)
         force = xp.where((place >= 0)[..., None], force, 0.0)
-        hand = layout.robot_bodies[self._link : self._link + 1]
-        out, bodies = xp.zeros_like(old), (xp.asarray(layout.slot_body)[place][..., None], hand)
+        holder = layout.robot_bodies[self._link : self._link + 1]
+        out, bodies = xp.zeros_like(old), (xp.asarray(layout.slot_body)[place][..., None], holder)
         for point, motion, com, body in zip((there_w, here_w), motions, coms, bodies, strict=True):
             wrench = xp.concatenate([force, xp.cross(point - _point(motion, com)[0], force)], -1)
             mine = xp.arange(old.shape[-2]) == body

@@ -56,7 +56,8 @@ class Links:
     def jacobian(self, qpos: Array, link: int, joints: Sequence[int], point_b: np.ndarray = _ORIGIN) -> Array:
         """Return [..., 3, J]: how fast a link's point moves in the base's frame, m/rad or m/m, with each joint.
 
-        `joints` are addresses in `qpos` [..., nq], of joints that carry the link; 0 is the base among the links.
+        `joints` are addresses in `qpos` [..., nq], of joints that carry the link; 0 is the base among the links. The
+        point `point_b` (3,), m, is in the link's frame; by default, it is the origin.
         """
         xp, frames, columns = namespace(qpos), self.frames(qpos), {}
         base, place = frames[0][1], frames[link][0] + apply_axes(frames[link][1], repeated(qpos, point_b))

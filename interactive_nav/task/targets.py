@@ -123,7 +123,7 @@ def build_targets(world: World, config: NavConfig, tables: SceneTables) -> Targe
 def opened(tables: SceneTables, at: NavInfo, qpos: jax.Array) -> jax.Array:
     """Return [] in [0, 1]: how far an episode's target is open, as a share of what counts.
 
-    Of an object without a joint, it is how far it is lifted, and a half of it how far it is carried.
+    For an object without a joint, lifting it counts for one half, and carrying it while it is lifted for the other.
     """
     targets: Any = tables.targets
     address = targets.address[at.target]
@@ -176,7 +176,7 @@ def reaching_terms(env: Any) -> tuple[Term, ...]:
         return jnp.stack([jnp.where(step.broken, shares[0], near(step.nav, step.physics)), shares[0]])
 
     doc = "The change of the hook's nearness to the target; 1 where it holds it."
-    return (Term("reaching", doc, "reward", lambda near, _: near[0] - near[1], lambda nav: jnp.zeros(2), update),)
+    return (Term("reaching", doc, "reward", lambda pair, _: pair[0] - pair[1], lambda nav: jnp.zeros(2), update),)
 
 
 _CATEGORY = Term("category", "Of what to touch, one-hot.", "observation", _category, size=len(CATEGORIES))
