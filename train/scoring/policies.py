@@ -115,12 +115,15 @@ class PlannedRoute:
 class Planner(HostPolicy):
     """Plan and steer episodes from their states; `weight` of `Ways`: 0 pushes everything, None avoids everything."""
 
+    barred = False
+    """Whether doors that are shut are obstacles."""
+
     def __init__(self, env: Any, weight: float | None, name: str = "namo"):
         if weight is not None and not 0.0 <= weight <= 1.0:
             raise UserError(f"policy namo: weight is {weight}, expected between 0 and 1, as in namo:0.5")
         need_twist(env.robot, f"policy {name}")
         self._env, self._weight = env, weight
-        self._ways = Ways(env, weight, barred=name == "puller")
+        self._ways = Ways(env, weight, barred=self.barred)
         self._plans: dict[int, PlannedRoute] = {}
         self.no_path = 0
         """Plans without a path."""
@@ -194,8 +197,9 @@ class Puller(Planner):
     """Pull the target open with the hook, as often as it takes, then drive to the goal like `namo:1`.
 
     The robot couples near a leaf's free edge and backs off on a circle about the hinge, or straight from a drawer.
-    Doors that are shut are obstacles.
     """
+
+    barred = True
 
     def __init__(self, env: Any):
         if env.config.task not in ("open", "clear") or not env.hook:
