@@ -92,7 +92,7 @@ def play(env, policy, target, start, goal):
     return {name: float(value[0]) for name, value in played.metrics.items()}
 
 
-@pytest.mark.parametrize("robot", ["fetch", "turtlebot"])
+@pytest.mark.parametrize("robot", [pytest.param("fetch", marks=pytest.mark.heavy), "turtlebot"])
 def test_the_puller_opens_a_door_towards_it_and_drives_through(tmp_path, robot):
     room = write_room(tmp_path / "room", (4.0, 5.0), door=True, door_rad=(0.0, 1.5), door_y_m=-0.5)
     env = interactive_nav.make(robot, [room], task="clear", **HOOK)
