@@ -87,12 +87,11 @@ def test_runs_above_the_planners_played_the_same_episodes_as_these():
         summary, versions = (json.loads((run / f"{x}.json").read_text()) for x in ("summary", "versions"))
         assert summary["completed"] and [summary["env_steps"]] == list(rows[rows.run == name].train_env_steps.unique())
         assert [versions["commit"]] == list(commits) and len(read_metrics(run / PACKED_METRICS)) >= 10
-        if run.name.endswith("seed0"):  # the configs of other seeds differ in their seed only, and are not kept
-            config = RunFolder(run).read_config()
-            assert config.network.memory == "gru" and config.env.k_int == 0
+        assert versions["argv"][:3] == ["train", "--config", "turtlebot_above"]
     for robot in ("turtlebot", "fetch"):  # the packaged policies are those of seed 0
         packaged = ROOT / "train" / "policies" / f"{robot}_above"
         config, trained = (RunFolder(x).read_config() for x in (packaged, kept / "runs" / f"{robot}-seed0"))
+        assert trained.network.memory == "gru" and trained.env.k_int == 0
         assert dataclasses.replace(config.env, scenes=trained.env.scenes) == trained.env
         assert (config.ppo, config.network) == (trained.ppo, trained.network)
         (meta,) = packaged.glob("checkpoints/000013107200/meta.json")

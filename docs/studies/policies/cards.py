@@ -51,8 +51,8 @@ def scale(seeds: pandas.DataFrame, planner: pandas.DataFrame, rows: pandas.DataF
         panel.errorbar([*less], means, bars, fmt="o-", color=BLUE, label="one seed", capsize=3)
         panel.axhline(0, color="black", linewidth=1)
         each = [(of_homes(part) - base).mean() for _, part in seeds.groupby("seed")]
-        at = 13.1 if played is lengths else 100
-        panel.plot([at] * len(each), each, "_", color="black", markersize=9, label="ten seeds of 13.1 million steps")
+        at = seeds.checkpoint_steps.max() / 1e6 if played is lengths else 100
+        panel.plot([at] * len(each), each, "_", color="black", markersize=9, label="each seed of 13.1 million steps")
         panel.set_xscale("log")
         panel.set_xticks([*less], [f"{x:.1f}".removesuffix(".0") for x in less])
         panel.minorticks_off()
